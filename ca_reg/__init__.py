@@ -1,0 +1,46 @@
+"""Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting, in any code base.
+
+- :class:`GaussianDropout` and :class:`OpacityNoise` regularize the activated opacities on their way to the rasterizer;
+  :func:`scale_opacity` is what dropout needs at test time.
+- :class:`CAScore` measures co-adaptation with any render callable, :class:`CAMonitor` logs it during training, and
+  :func:`color_variance` is the paper's second metric.
+- :mod:`ca_reg.functional` holds the same as pure functions, :mod:`ca_reg.schedules` rates that change during training,
+  :mod:`ca_reg.types` what a render callable may return, :mod:`ca_reg.dynamics` the plots of a monitor's log.
+
+After "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian Splatting", called "the paper" throughout.
+Importing this package loads torch and numpy only.
+"""
+
+from ca_reg import functional
+from ca_reg.functional import ColorVariance, color_variance, scale_opacity
+from ca_reg.modules import GaussianDropout, OpacityNoise
+from ca_reg.monitor import CAMonitor
+from ca_reg.reason import Reason
+from ca_reg.result import CAResult, CASummary, summarize
+from ca_reg.schedules import Constant, LinearRamp, Schedule, StartStop
+from ca_reg.score import CAScore
+from ca_reg.types import RenderFn, Rendering
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "CAMonitor",
+    "CAResult",
+    "CAScore",
+    "CASummary",
+    "ColorVariance",
+    "Constant",
+    "GaussianDropout",
+    "LinearRamp",
+    "OpacityNoise",
+    "Reason",
+    "RenderFn",
+    "Rendering",
+    "Schedule",
+    "StartStop",
+    "__version__",
+    "color_variance",
+    "functional",
+    "scale_opacity",
+    "summarize",
+]

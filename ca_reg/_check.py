@@ -1,0 +1,77 @@
+"""Argument checks shared by the package.
+
+Types and shapes go through kornia's checks, whose ``TypeCheckError`` is a :class:`TypeError` and whose ``ShapeError``
+is a :class:`ValueError`; values raise a plain :class:`ValueError`. kornia is imported at the first check and not with
+the package, because it takes longer to load than all the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral, Real
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["check_count", "check_finite", "check_opacity", "check_opacity_range", "check_per_gaussian", "check_rate"]
+
+
+def check_opacity(opacity: Any) -> None:
+    """Raise unless ``opacity`` is a floating-point tensor of shape (N,) or (N, 1)."""
+    from kornia.core.check import KORNIA_CHECK_IS_TENSOR, KORNIA_CHECK_SHAPE
+
+    KORNIA_CHECK_IS_TENSOR(opacity, "opacity must be a torch tensor; convert it with torch.as_tensor.")
+    KORNIA_CHECK_SHAPE(
+        opacity, ["N", "1"] if opacity.ndim > 1 else ["N"], "opacity must have shape (N,) or (N, 1), one per Gaussian."
+    )
+    if not opacity.is_floating_point():
+        raise TypeError(f"opacity must be a floating-point tensor, got {opacity.dtype}; convert it with .float().")
+
+
+def check_opacity_range(opacity: Tensor, upper: float = 1.0) -> None:
+    """Raise unless all opacities lie in [0, upper]. Reads the values, which on a GPU waits for them."""
+    if opacity.numel() == 0:
+        return
+    low, high = (float(x) for x in torch.aminmax(opacity.detach()))
+    if not (low >= 0.0 and high <= upper):
+        raise ValueError(
+            f"opacity must be activated, in [0, {upper:g}], got values from {low:g} to {high:g}; "
+            "pass torch.sigmoid(logits), what the rasterizer receives, not the raw parameter."
+        )
+
+
+def check_per_gaussian(x: Any, opacity: Tensor, name: str) -> None:
+    """Raise unless ``x`` is a tensor of shape (N,) for the N opacities."""
+    from kornia.core.check import KORNIA_CHECK_IS_TENSOR
+
+    KORNIA_CHECK_IS_TENSOR(x, f"{name} must be a torch tensor, as the draw function returned it.")
+    if x.shape != opacity.shape[:1]:
+        raise ValueError(
+            f"{name} must have shape ({opacity.shape[0]},), one value per opacity, got {tuple(x.shape)}; "
+            "after Gaussians were added or removed a former draw no longer fits: draw again."
+        )
+
+
+def check_rate(p: Any, name: str = "p") -> None:
+    """Raise unless ``p`` is a real number in [0, 1)."""
+    check_finite(p, name)
+    if not 0.0 <= p < 1.0:
+        raise ValueError(f"{name} must be in [0, 1), got {p}; it is the fraction of Gaussians that is dropped.")
+
+
+def check_finite(x: Any, name: str, *, minimum: float = -math.inf) -> None:
+    """Raise unless ``x`` is a finite real number of at least ``minimum``."""
+    if not isinstance(x, Real):
+        raise TypeError(f"{name} must be a real number, got {type(x).__name__}.")
+    if not math.isfinite(x) or x < minimum:
+        at_least = "" if minimum == -math.inf else f" and at least {minimum:g}"
+        raise ValueError(f"{name} must be finite{at_least}, got {x}.")
+
+
+def check_count(x: Any, name: str, *, minimum: int) -> None:
+    """Raise unless ``x`` is an integer of at least ``minimum``."""
+    if not isinstance(x, Integral) or isinstance(x, bool):
+        raise TypeError(f"{name} must be an integer, got {type(x).__name__}.")
+    if x < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, got {x}.")

@@ -1,0 +1,110 @@
+"""Opacity noise: in each training step every opacity is multiplied by its own random factor around 1."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ca_reg._check import check_count, check_finite, check_opacity, check_per_gaussian
+
+__all__ = ["apply_opacity_noise", "draw_opacity_noise", "opacity_noise"]
+
+
+def draw_opacity_noise(
+    n: int,
+    sigma: float,
+    *,
+    clip: bool = False,
+    generator: torch.Generator | None = None,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """Draw one normal number of standard deviation ``sigma`` per Gaussian.
+
+    Args:
+        n: number of Gaussians.
+        sigma: standard deviation, at least 0.
+        clip: clip the draw to [-sigma, sigma], as the authors' released code does and the paper does not say. The
+            variance is then 0.516 sigma^2.
+        generator: source of the draw; the global state of the random numbers is then untouched. It decides where the
+            numbers are drawn, so one CPU generator gives the same noise for every device.
+        device: where the noise is returned; by default where it was drawn.
+
+    Returns:
+        The relative noise, shape (n,), float32 whatever the opacities are.
+
+    Raises:
+        TypeError: if ``n`` is not an integer or ``sigma`` not a number.
+        ValueError: if ``n`` or ``sigma`` is negative, or ``sigma`` not finite.
+
+    Example:
+        >>> noise = draw_opacity_noise(1000, 0.8, clip=True)
+        >>> noise.shape, noise.abs().max() <= 0.8
+        (torch.Size([1000]), tensor(True))
+    """
+    check_count(n, "n", minimum=0)
+    check_finite(sigma, "sigma", minimum=0.0)
+    source = device if generator is None else generator.device
+    noise = torch.randn(n, generator=generator, dtype=torch.float32, device=source)
+    if clip:
+        noise = noise.clamp(-1.0, 1.0)
+    noise = noise * sigma
+    return noise if device is None else noise.to(device)
+
+
+def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:
+    """Return ``opacity * (1 + noise)``, clamped to [0, 1] (paper, opacity noise injection).
+
+    The clamp stops the gradient of the opacities that it moves. It also takes away some of the noise of opacities near
+    1, whose mean therefore falls.
+
+    Args:
+        opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+        noise: relative noise, shape (N,).
+
+    Returns:
+        The noisy opacities, a new tensor of the same shape and dtype as ``opacity``.
+
+    Raises:
+        TypeError: if an argument is not a tensor, or ``opacity`` is not floating point.
+        ValueError: if the shapes are not as above.
+
+    Example:
+        >>> apply_opacity_noise(torch.tensor([0.5, 0.5, 0.5]), torch.tensor([0.2, -1.5, 3.0]))
+        tensor([0.6000, 0.0000, 1.0000])
+    """
+    check_opacity(opacity)
+    check_per_gaussian(noise, opacity, "noise")
+    factor = 1.0 + noise.to(opacity.dtype).view_as(opacity)
+    return (opacity * factor).clamp(0.0, 1.0)
+
+
+def opacity_noise(
+    opacity: Tensor, sigma: float, *, clip: bool = False, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor | None]:
+    """Draw noise and apply it: :func:`draw_opacity_noise`, then :func:`apply_opacity_noise`.
+
+    Args:
+        opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+        sigma: standard deviation of the relative noise, at least 0. The paper tunes it in [0.05, 0.8].
+        clip: clip the draw to [-sigma, sigma].
+        generator: source of the draw; the global state of the random numbers is then untouched.
+
+    Returns:
+        The noisy opacities in [0, 1] and the noise of shape (N,). With ``sigma = 0`` the very same ``opacity`` and
+        None: nothing is drawn.
+
+    Raises:
+        TypeError: if ``opacity`` is not a floating-point tensor.
+        ValueError: if its shape is neither (N,) nor (N, 1), or ``sigma`` is negative or not finite.
+
+    Example:
+        >>> noisy, noise = opacity_noise(torch.full((4,), 0.5), 0.1)
+        >>> torch.equal(noisy, apply_opacity_noise(torch.full((4,), 0.5), noise))
+        True
+    """
+    check_opacity(opacity)
+    check_finite(sigma, "sigma", minimum=0.0)
+    if sigma == 0:
+        return opacity, None
+    noise = draw_opacity_noise(opacity.shape[0], sigma, clip=clip, generator=generator, device=opacity.device)
+    return apply_opacity_noise(opacity, noise), noise

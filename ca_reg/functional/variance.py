@@ -1,0 +1,76 @@
+"""Colour variance: how much the colours that make up a pixel differ."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ca_reg.reason import Reason
+
+__all__ = ["ColorVariance", "color_variance"]
+
+
+class ColorVariance(NamedTuple):
+    """Colour variance of an image and of its pixels.
+
+    Args:
+        value: mean of ``variance`` over the covered pixels, a scalar tensor; nan if there is none.
+        variance: per pixel, mean over RGB, shape (...); 0 where nothing covers the pixel.
+        covered: pixels whose weights do not sum to zero, shape (...), bool.
+        reason: ``Reason.OK``, or ``Reason.EMPTY`` if no pixel is covered.
+    """
+
+    value: Tensor
+    variance: Tensor
+    covered: Tensor
+    reason: Reason
+
+
+def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
+    """Measure the colour variance CV of pixels from the splats that are blended into them (paper, appendix, CV metric).
+
+    Per pixel and channel ``sum_i w_i (c_i - m)^2 / sum_i w_i`` with the weighted mean ``m``: the paper's
+    ``E[c^2] - E[c]^2`` without its cancellation. Differentiable in both arguments.
+
+    Convention: any order of the splats will do, as long as both arguments share it. The background is not a splat.
+
+    Args:
+        weights: blend weights ``w_i = alpha_i T_i``, at least 0, shape (..., n). A zero stands for no splat, so lists
+            of different lengths are padded with zeros.
+        colors: their colours, shape (..., n, 3).
+
+    Returns:
+        The mean over covered pixels, the map, the mask of covered pixels and the reason.
+
+    Raises:
+        TypeError: if an argument is not a tensor.
+        ValueError: if the shapes do not match or a weight is negative or NaN.
+
+    Example:
+        >>> weights = torch.tensor([[0.5, 0.5], [0.3, 0.0], [0.0, 0.0]])
+        >>> colors = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]).expand(3, 2, 3)
+        >>> cv = color_variance(weights, colors)
+        >>> cv.variance, cv.covered, cv.value
+        (tensor([0.2500, 0.0000, 0.0000]), tensor([ True,  True, False]), tensor(0.1250))
+    """
+    from kornia.core.check import KORNIA_CHECK_IS_TENSOR, KORNIA_CHECK_SHAPE
+
+    KORNIA_CHECK_IS_TENSOR(weights, "weights must be a torch tensor of shape (..., n).")
+    KORNIA_CHECK_SHAPE(colors, ["*", "n", "3"], "colors must have shape (..., n, 3), RGB last.")
+    if colors.shape[:-1] != weights.shape:
+        raise ValueError(
+            f"colors must have the shape of weights and a last axis of 3, {(*weights.shape, 3)}, "
+            f"got {tuple(colors.shape)}; expand the colours if the pixels share them."
+        )
+    if not bool((weights >= 0).all()):
+        raise ValueError("weights must be at least 0, got a negative or NaN one; pass alpha_i T_i of every splat.")
+
+    total = weights.sum(-1)
+    covered = total > 0
+    share = (weights / torch.where(covered, total, 1.0)[..., None])[..., None]
+    mean = (share * colors).sum(-2, keepdim=True)
+    variance = (share * (colors - mean).square()).sum(-2).mean(-1)
+    reason = Reason.OK if bool(covered.any()) else Reason.EMPTY
+    return ColorVariance(variance[covered].mean(), variance, covered, reason)

@@ -1,0 +1,220 @@
+"""The regularizers as modules: they hold the rate, the step and the last draw; the work is done in ``functional``."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ca_reg import functional
+from ca_reg._check import check_count, check_finite, check_opacity, check_opacity_range, check_rate
+from ca_reg.schedules import Constant, Schedule, as_schedule
+
+__all__ = ["GaussianDropout", "OpacityNoise"]
+
+
+class _Regularizer(nn.Module):
+    """What both regularizers share: a rate that may depend on the step, and the look at the first opacities."""
+
+    def __init__(self, schedule: Schedule) -> None:
+        super().__init__()
+        self._schedule = schedule
+        self._opacity_seen = False
+        self.step = 0
+
+    def set_step(self, step: int) -> None:
+        """Tell the module the training step, at least 0. Only schedules need it."""
+        check_count(step, "step", minimum=0)
+        self.step = int(step)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return what ``state_dict`` saves: the step."""
+        return {"step": self.step}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Take the step from a ``state_dict``."""
+        self.set_step(state["step"])
+
+    def _check(self, opacity: Any) -> None:
+        """Check shape and type always, and once that the values are opacities: on a GPU that look costs a wait."""
+        check_opacity(opacity)
+        if not self._opacity_seen:
+            # Compensated dropout may come before this module: it makes opacities above 1.
+            check_opacity_range(opacity, upper=math.inf)
+            self._opacity_seen = True
+
+    def _rate_repr(self) -> str:
+        return str(self._schedule.value) if isinstance(self._schedule, Constant) else repr(self._schedule)
+
+
+class GaussianDropout(_Regularizer):
+    """Drop a random subset of Gaussians in training; scale the opacities in evaluation (paper, Gaussian dropout).
+
+    ``train()``: ``opacity * keep``. ``eval()``: ``opacity * (1 - p)``, the mean over all masks. With ``compensate`` the
+    survivors are multiplied by ``1 / (1 - p)`` in training instead, and evaluation leaves the opacities as they are;
+    the two schemes are not equivalent, because compositing is not linear in the opacities. The module has no
+    parameters; put it between the activation of the opacities and the rasterizer.
+
+    Dropped Gaussians must leave no trace in density control: zero their radii, ``radii * dropout.keep``.
+
+    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call checks this.
+
+    Args:
+        p: drop rate in [0, 1), or a schedule of it. The paper uses 0.2.
+        compensate: scale the survivors in training rather than all opacities in evaluation.
+
+    Attributes:
+        keep: the last mask, True where the Gaussian stayed, (N,) bool; None if nothing was dropped.
+        p: the rate at the present step.
+        step: the training step, set with :meth:`set_step` and saved in ``state_dict``.
+
+    Raises:
+        TypeError: if ``p`` is neither a number nor callable.
+        ValueError: if a constant ``p`` is outside [0, 1); a schedule is checked at each use.
+
+    Example:
+        >>> dropout = GaussianDropout(p=0.2)
+        >>> opacity = torch.full((5,), 0.5)
+        >>> in_training = dropout(opacity)
+        >>> torch.equal(in_training, opacity * dropout.keep)
+        True
+        >>> torch.equal(dropout(opacity, keep=dropout.keep), in_training)  # replay
+        True
+        >>> dropout.eval()(opacity)
+        tensor([0.4000, 0.4000, 0.4000, 0.4000, 0.4000])
+    """
+
+    keep: Tensor | None
+
+    def __init__(self, p: float | Schedule, *, compensate: bool = False) -> None:
+        if not callable(p):
+            check_rate(p)
+        super().__init__(as_schedule(p))
+        self.compensate = compensate
+        self.keep = None
+
+    @property
+    def p(self) -> float:
+        """The drop rate at the present step."""
+        rate = self._schedule(self.step)
+        check_rate(rate, f"p at step {self.step}")
+        return rate
+
+    def forward(
+        self, opacity: Tensor, *, keep: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Return the opacities to render.
+
+        Args:
+            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+            keep: a former mask to apply again instead of drawing one, shape (N,), bool; in training only.
+            generator: source of the draw; the global state of the random numbers is then untouched.
+
+        Returns:
+            Opacities of the same shape and dtype; the very same tensor if there is nothing to do.
+
+        Raises:
+            TypeError: if ``opacity`` is not a floating-point tensor or ``keep`` not a bool one.
+            ValueError: if a shape is wrong, ``opacity`` looks like logits, or ``keep`` is given in evaluation.
+        """
+        self._check(opacity)
+        p = self.p
+        if not self.training:
+            if keep is not None:
+                raise ValueError("keep was given in eval(), where nothing is dropped; call train() or leave it out.")
+            self.keep = None
+            return opacity if self.compensate else functional.scale_opacity(opacity, p)
+        if keep is not None:
+            opacity = functional.apply_dropout(opacity, keep, p=p, compensate=self.compensate)
+            self.keep = keep
+            return opacity
+        opacity, self.keep = functional.gaussian_dropout(opacity, p, compensate=self.compensate, generator=generator)
+        return opacity
+
+    def extra_repr(self) -> str:
+        """Return the arguments, for ``print``."""
+        return f"p={self._rate_repr()}, compensate={self.compensate}"
+
+
+class OpacityNoise(_Regularizer):
+    """Multiply opacities by random factors in training, change nothing in evaluation (paper, opacity noise).
+
+    ``train()``: ``clamp(opacity * (1 + noise), 0, 1)`` with ``noise ~ N(0, sigma^2)`` per Gaussian. ``eval()``: the
+    very same tensor. With dropout it comes second: ``nn.Sequential(GaussianDropout(0.2), OpacityNoise(0.8))``.
+
+    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call checks this.
+
+    Args:
+        sigma: standard deviation of the relative noise, at least 0, or a schedule of it.
+        clip: clip the noise to [-sigma, sigma], as the authors' released code does.
+
+    Attributes:
+        noise: the last draw, (N,) float32; None if there was none.
+        sigma: the standard deviation at the present step.
+        step: the training step, set with :meth:`set_step` and saved in ``state_dict``.
+
+    Raises:
+        TypeError: if ``sigma`` is neither a number nor callable.
+        ValueError: if a constant ``sigma`` is negative or not finite; a schedule is checked at each use.
+
+    Example:
+        >>> noise = OpacityNoise(sigma=0.8)
+        >>> opacity = torch.full((5, 1), 0.5)
+        >>> first = noise(opacity)
+        >>> torch.equal(noise(opacity, noise=noise.noise), first)  # replay
+        True
+        >>> noise.eval()(opacity) is opacity
+        True
+    """
+
+    noise: Tensor | None
+
+    def __init__(self, sigma: float | Schedule, *, clip: bool = False) -> None:
+        if not callable(sigma):
+            check_finite(sigma, "sigma", minimum=0.0)
+        super().__init__(as_schedule(sigma))
+        self.clip = clip
+        self.noise = None
+
+    @property
+    def sigma(self) -> float:
+        """The standard deviation at the present step."""
+        sigma = self._schedule(self.step)
+        check_finite(sigma, f"sigma at step {self.step}", minimum=0.0)
+        return sigma
+
+    def forward(
+        self, opacity: Tensor, *, noise: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Return the opacities to render.
+
+        Args:
+            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+            noise: a former draw to apply again instead of drawing one, shape (N,); in training only.
+            generator: source of the draw; the global state of the random numbers is then untouched.
+
+        Returns:
+            Opacities of the same shape and dtype; the very same tensor if there is nothing to do.
+
+        Raises:
+            TypeError: if ``opacity`` is not a floating-point tensor.
+            ValueError: if a shape is wrong, ``opacity`` looks like logits, or ``noise`` is given in evaluation.
+        """
+        self._check(opacity)
+        if not self.training:
+            if noise is not None:
+                raise ValueError("noise was given in eval(), where none is added; call train() or leave it out.")
+            self.noise = None
+            return opacity
+        if noise is not None:
+            opacity = functional.apply_opacity_noise(opacity, noise)
+            self.noise = noise
+            return opacity
+        opacity, self.noise = functional.opacity_noise(opacity, self.sigma, clip=self.clip, generator=generator)
+        return opacity
+
+    def extra_repr(self) -> str:
+        """Return the arguments, for ``print``."""
+        return f"sigma={self._rate_repr()}, clip={self.clip}"

@@ -1,0 +1,209 @@
+"""Co-adaptation while training: scores logged against the step."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ca_reg._check import check_count, check_opacity
+from ca_reg.functional import scale_opacity
+from ca_reg.result import summarize
+from ca_reg.score import CAScore
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
+__all__ = ["LOG_NAME", "CAMonitor"]
+
+LOG_NAME = "ca.jsonl"
+"""Name of the log inside the log directory."""
+
+_log = logging.getLogger(__name__)
+
+
+class CAMonitor:
+    """Log co-adaptation and PSNR of groups of views every so many steps (the paper's training dynamics).
+
+    Each measurement becomes one line of ``ca.jsonl``, on disk when the call returns: ``step``, ``gaussians`` and for
+    each group of views ``ca/<group>``, ``ca_std_error/<group>``, ``ca_reason/<group>``, ``ca_empty_views/<group>`` and
+    ``psnr/<group>``, then the settings of the score. Where there is no value the line says null. If tensorboard is
+    installed, ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` are written as scalars as well. ``backends`` and a
+    line of the logger ``ca_reg.monitor`` (level INFO) say which of the two are in use.
+    :func:`ca_reg.dynamics.plot_dynamics` draws the file.
+
+    Every measurement uses the same masks per view as long as the number of Gaussians stays, which takes sampling noise
+    out of the comparison of steps.
+
+    Args:
+        score: how to measure. Its ``p`` is also the rate by which opacities are scaled for ``psnr``.
+        log_dir: directory of the log and the TensorBoard events; made if it does not exist.
+        views: groups of views by name, usually ``{"train": [...], "test": [...]}``; none empty. The views are passed on
+            to the callables as they are.
+        every: number of steps between measurements, at least 1.
+        psnr: ``psnr(opacity, view)``, the quality in dB of the view rendered with these opacities, which are already
+            scaled by ``1 - p`` for the test. Called without gradients. None leaves PSNR out.
+        resume_step: None for a new run, which replaces a log that is already there. A resumed run gives the step of its
+            checkpoint: lines up to this step are kept, later ones dropped.
+
+    Attributes:
+        backends: ``("jsonl",)`` or ``("jsonl", "tensorboard")``.
+
+    Raises:
+        TypeError: if ``views`` is not a mapping or an argument is of the wrong type.
+        ValueError: if there are no views, a group is empty, or ``every`` or ``resume_step`` is out of range.
+
+    Example:
+        >>> import tempfile
+        >>> score = CAScore(lambda opacity, view: (view * opacity.mean(), torch.ones(4, 4)))
+        >>> views = {"train": [torch.rand(3, 4, 4)], "test": [torch.rand(3, 4, 4)]}
+        >>> with tempfile.TemporaryDirectory() as folder, CAMonitor(score, folder, views=views, every=100) as monitor:
+        ...     for step in range(1, 201):
+        ...         record = monitor(step, torch.full((50,), 0.5))
+        >>> record["step"], sorted(record)[:4]
+        (200, ['ca/test', 'ca/train', 'ca_empty_views/test', 'ca_empty_views/train'])
+    """
+
+    def __init__(
+        self,
+        score: CAScore,
+        log_dir: str | os.PathLike[str],
+        *,
+        views: Mapping[str, Sequence[Any]],
+        every: int = 500,
+        psnr: Callable[[Tensor, Any], float] | None = None,
+        resume_step: int | None = None,
+    ) -> None:
+        check_count(every, "every", minimum=1)
+        if resume_step is not None:
+            check_count(resume_step, "resume_step", minimum=0)
+        if not isinstance(views, Mapping):
+            raise TypeError(f"views must be a mapping from names to sequences of views, got {type(views).__name__}.")
+        if not views or any(len(group) == 0 for group in views.values()):
+            raise ValueError(
+                f"views must name at least one group and none may be empty, got "
+                f"{ {name: len(group) for name, group in views.items()} }; leave out groups without views."
+            )
+        self.score = score
+        self.views = {name: list(group) for name, group in views.items()}
+        self.every = every
+        self.psnr = psnr
+
+        folder = Path(log_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.path = folder / LOG_NAME
+        self._last_step = _keep_lines(self.path, resume_step)
+        self._file = self.path.open("a", encoding="utf-8")
+        self._writer = _summary_writer(folder, resume_step)
+        self.backends: tuple[str, ...] = ("jsonl",) if self._writer is None else ("jsonl", "tensorboard")
+        hint = "" if self._writer else "; for TensorBoard: pip install 'ca_reg[tensorboard]'"
+        _log.info("co-adaptation is logged to %s (%s)%s", self.path, ", ".join(self.backends), hint)
+
+    def __call__(self, step: int, opacity: Tensor) -> dict[str, float | int | str | None] | None:
+        """Measure and log if it is the turn of this step: a multiple of ``every`` that is not in the log yet.
+
+        Args:
+            step: the training step.
+            opacity: activated opacities of the model in [0, 1], neither dropped nor scaled, shape (N,) or (N, 1).
+
+        Returns:
+            What was logged, or None if it was not the turn.
+
+        Raises:
+            TypeError: as for a call of the score.
+            ValueError: as for a call of the score, or if the monitor is closed.
+        """
+        if step % self.every or step <= self._last_step:
+            return None
+        if self._file.closed:
+            raise ValueError("the monitor is closed; make a new one with resume_step to add to its log.")
+        check_opacity(opacity)
+        opacity = opacity.detach()
+        record: dict[str, float | int | str | None] = {"step": step, "gaussians": opacity.shape[0]}
+        index = 0
+        for name, group in self.views.items():
+            results = []
+            for view in group:
+                results.append(self.score(opacity, view, index=index))
+                index += 1
+            summary = summarize(results).as_dict()
+            record[f"ca/{name}"] = summary["value"]
+            record[f"ca_std_error/{name}"] = summary["std_error"]
+            record[f"ca_reason/{name}"] = summary["reason"]
+            record[f"ca_empty_views/{name}"] = summary["empty_views"]
+            if self.psnr is not None:
+                record[f"psnr/{name}"] = self._mean_psnr(self.psnr, opacity, group)
+        record.update(asdict(self.score.settings))
+        self._write(record)
+        self._last_step = step
+        return record
+
+    def close(self) -> None:
+        """Close the files. A second call does nothing."""
+        self._file.close()
+        if self._writer is not None:
+            self._writer.close()
+
+    def __enter__(self) -> CAMonitor:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @torch.no_grad()
+    def _mean_psnr(self, psnr: Callable[[Tensor, Any], float], opacity: Tensor, group: list[Any]) -> float | None:
+        """Average PSNR over views, each with the opacities of the test; None if it is not finite."""
+        scaled = scale_opacity(opacity, self.score.p)
+        mean = sum(float(psnr(scaled, view)) for view in group) / len(group)
+        return mean if math.isfinite(mean) else None
+
+    def _write(self, record: dict[str, float | int | str | None]) -> None:
+        """Append one line, and the scalars to TensorBoard."""
+        self._file.write(json.dumps(record, allow_nan=False) + "\n")
+        self._file.flush()
+        if self._writer is None:
+            return
+        for key, x in record.items():
+            if key.startswith(("ca/", "psnr/", "gaussians")) and isinstance(x, int | float):
+                self._writer.add_scalar(key, x, record["step"])
+        self._writer.flush()
+
+
+def _keep_lines(path: Path, resume_step: int | None) -> int:
+    """Drop the lines after ``resume_step``, all if it is None, and return the last step that stays, -1 if none does."""
+    kept: list[str] = []
+    last = -1
+    if resume_step is not None and path.exists():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                step = int(json.loads(line)["step"])
+            except ValueError:  # a run that was killed may leave half a line behind
+                continue
+            if step <= resume_step:
+                kept.append(line + "\n")
+                last = max(last, step)
+    partial = path.with_suffix(".tmp")
+    partial.write_text("".join(kept), encoding="utf-8")
+    partial.replace(path)  # never a moment without the log on disk
+    return last
+
+
+def _summary_writer(folder: Path, resume_step: int | None) -> SummaryWriter | None:
+    """Return a TensorBoard writer, or None where tensorboard is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    # Hides what the former run wrote beyond the checkpoint; a new run hides all of it.
+    return SummaryWriter(str(folder), purge_step=0 if resume_step is None else resume_step + 1)

@@ -1,0 +1,37 @@
+"""Why a score has the value it has: the outcome as data."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+__all__ = ["Reason"]
+
+
+class Reason(Enum):
+    """The outcome of a measurement. Every member but ``OK`` comes with the value nan, a message and a remedy.
+
+    Example:
+        >>> Reason.OK.message
+        'the value was measured'
+        >>> print(Reason.NO_VIEWS)
+        no view was measured; call update(opacity, view) before compute()
+    """
+
+    OK = ("the value was measured", "")
+    EMPTY = (
+        "no pixel counts: none is covered in all the renders",
+        "lower the threshold or the drop rate; right after an opacity reset, or in a scene that is nowhere opaque, "
+        "there is nothing to measure",
+    )
+    NOT_FINITE = (
+        "the renders hold NaN or infinite colours at visible pixels",
+        "look at the colours and opacities of the model: the training has diverged or the renderer is at fault",
+    )
+    NO_VIEWS = ("no view was measured", "call update(opacity, view) before compute()")
+
+    def __init__(self, message: str, remedy: str) -> None:
+        self.message = message
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        return f"{self.message}; {self.remedy}" if self.remedy else self.message

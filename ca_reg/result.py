@@ -1,0 +1,189 @@
+"""What a score returns: for one view, and for the mean over views."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ca_reg.reason import Reason
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["CAResult", "CASettings", "CASummary", "summarize"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CASettings:
+    """The choices behind a score. A score without them cannot be compared with another.
+
+    The background that the renderer composites on matters as well (up to ``1 - threshold`` of it shows inside the
+    visible region); it belongs to the render callable, so report it beside these.
+
+    Args:
+        samples: number of renders K.
+        drop_rate: fraction of the Gaussians that is dropped in each.
+        threshold: a pixel is visible where the accumulated alpha exceeds this in all K renders.
+        ddof: the variance divides by ``samples - ddof``. With 0 its expectation is (K - 1)/K of the true variance.
+        seed: where the masks come from.
+    """
+
+    samples: int
+    drop_rate: float
+    threshold: float
+    ddof: int
+    seed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Score(CASettings):
+    """A value with its standard error, and why it is what it is."""
+
+    value: float
+    std_error: float
+    reason: Reason
+
+    def as_dict(self) -> dict[str, float | int | str | None]:
+        """Return all numbers and the name of the reason, ready for JSON: nan becomes None, maps are left out."""
+        out: dict[str, float | int | str | None] = {}
+        for field in fields(self):
+            x = getattr(self, field.name)
+            if isinstance(x, Reason):
+                out[field.name] = x.name
+            elif isinstance(x, int | float):
+                out[field.name] = None if math.isnan(x) else x
+        return out
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CAResult(_Score):
+    """The co-adaptation score of one view.
+
+    Args:
+        value: the score: variance of the renders, mean over RGB and over the visible pixels; nan unless ``reason`` is
+            ``Reason.OK``.
+        std_error: standard error of ``value`` over the choice of masks; nan below three samples or without a value.
+        variance: variance of every pixel, mean over RGB, shape (H, W), float64, visible or not.
+        visible: pixels that count, shape (H, W), bool.
+        reason: why the value is what it is.
+
+    The settings of the score (``samples``, ``drop_rate``, ``threshold``, ``ddof``, ``seed``) come with it.
+    """
+
+    variance: Tensor
+    visible: Tensor
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the standard deviation of every pixel as a heat map; pixels that do not count stay grey.
+
+        The map shows the root of ``variance``, in units of colour: a few pixels hold most of the variance and would
+        leave the rest black.
+
+        Args:
+            ax: where to draw; a new figure by default.
+
+        Returns:
+            The axes, for titles and ``ax.figure.savefig(path)``.
+
+        Raises:
+            ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
+        """
+        ax = new_axes() if ax is None else ax
+        heat = self.variance.sqrt().masked_fill(~self.visible, math.nan).cpu().numpy()
+        ax.set_facecolor("0.6")
+        picture = ax.imshow(heat, cmap="inferno", vmin=0.0)
+        ax.figure.colorbar(picture, ax=ax, label="std over masks")
+        ax.set_title(f"CA {self.value:.3g} ± {self.std_error:.1g}" if self.reason is Reason.OK else self.reason.message)
+        ax.set_xticks([])
+        ax.set_yticks([])
+        return ax
+
+
+@dataclass(frozen=True, kw_only=True)
+class CASummary(_Score):
+    """The mean co-adaptation score of several views.
+
+    Args:
+        value: mean over the views that have a value; nan unless ``reason`` is ``Reason.OK``.
+        std_error: standard error of ``value`` over the choice of masks, the views held fixed.
+        reason: ``NOT_FINITE`` if any view is, ``EMPTY`` if all views are, ``NO_VIEWS`` without views, else ``OK``.
+        views: number of views that were measured.
+        empty_views: how many of them have no visible pixel, and hence no share in ``value``.
+    """
+
+    views: int
+    empty_views: int
+
+
+def summarize(results: Iterable[CAResult]) -> CASummary:
+    """Average the scores of several views of one model.
+
+    Args:
+        results: at least one, all made with the same settings.
+
+    Raises:
+        ValueError: if there is none, or the settings differ.
+
+    Example:
+        >>> from ca_reg import CAScore
+        >>> score = CAScore(lambda opacity, view: (torch.rand(3, 4, 4), torch.ones(4, 4)))
+        >>> summarize(score(torch.ones(10), view=None, index=i) for i in range(2)).views
+        2
+    """
+    tally = ViewTally()
+    settings: set[CASettings] = set()
+    for result in results:
+        tally.add(result)
+        settings.add(CASettings(**{field.name: getattr(result, field.name) for field in fields(CASettings)}))
+    if len(settings) != 1:
+        raise ValueError(f"expected results of one score, with one set of settings, got {len(settings)} of them.")
+    return tally.summary(settings.pop())
+
+
+class ViewTally:
+    """Sums over views, as one tensor so that ranks can add theirs up."""
+
+    def __init__(self) -> None:
+        # sum of values, sum of squared errors, views, empty views, views that are not finite
+        self.sums = torch.zeros(5, dtype=torch.float64)
+
+    def add(self, result: CAResult) -> None:
+        """Count one view."""
+        ok = result.reason is Reason.OK
+        row = [result.value, result.std_error**2] if ok else [0.0, 0.0]
+        row += [1.0, float(result.reason is Reason.EMPTY), float(result.reason is Reason.NOT_FINITE)]
+        self.sums += torch.tensor(row, dtype=torch.float64)
+
+    def summary(self, settings: CASettings) -> CASummary:
+        """Return the mean over the views counted."""
+        total, squared_error, views, empty, not_finite = self.sums.tolist()
+        counted = views - empty
+        if views == 0:
+            reason = Reason.NO_VIEWS
+        elif not_finite > 0:
+            reason = Reason.NOT_FINITE
+        else:
+            reason = Reason.OK if counted > 0 else Reason.EMPTY
+        ok = reason is Reason.OK
+        return CASummary(
+            value=total / counted if ok else math.nan,
+            std_error=math.sqrt(squared_error) / counted if ok else math.nan,
+            reason=reason,
+            views=int(views),
+            empty_views=int(empty),
+            **asdict(settings),
+        )
+
+
+def new_axes() -> Any:
+    """Return the axes of a new figure, or say how to get matplotlib."""
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError as error:
+        raise ImportError("plots need matplotlib; install it with: pip install 'ca_reg[plot]'") from error
+    return plt.subplots()[1]

@@ -1,0 +1,222 @@
+"""What a renderer looks like to this package, and the reading of what it returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple, Protocol, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["Layout", "RenderFn", "Rendering", "read_alpha_pass", "read_rendering"]
+
+Layout = Literal["CHW", "HWC"]
+"""Order of the axes of the images that a renderer returns."""
+
+_IMAGE_NAMES = ("image", "render", "rgb", "rendered_image")
+_ALPHA_NAMES = ("alpha", "rendered_alpha", "accumulation")
+_FORMS = (
+    "return (image, alpha), the image alone, or a mapping or object with an image named "
+    f"{' | '.join(_IMAGE_NAMES)} and an alpha named {' | '.join(_ALPHA_NAMES)}"
+)
+
+
+class RenderFn(Protocol):
+    """A renderer of one's own model: ``render_fn(opacity, view)``.
+
+    It renders ``view``, whatever that is, with ``opacity`` in place of the model's own activated opacities, and returns
+    one of
+
+    - a tuple ``(image, alpha)`` in either order, or ``(image,)``;
+    - the image alone;
+    - a mapping or an object with an image named ``image``, ``render``, ``rgb`` or ``rendered_image`` and, if there is
+      one, an alpha named ``alpha``, ``rendered_alpha`` or ``accumulation``.
+
+    The image is RGB, (3, H, W) or (H, W, 3) as the layout says, the alpha (H, W), (1, H, W) or (H, W, 1); both are
+    floating-point torch tensors or numpy arrays, and a leading batch axis of 1 is dropped. Longer tuples are refused:
+    in ``(color, radii, depth, alpha)`` nothing but the position tells depth from alpha.
+
+    Example:
+        >>> def render_fn(opacity: Tensor, view: str) -> tuple[Tensor, Tensor]:
+        ...     alpha = opacity.mean().expand(4, 5)
+        ...     return alpha.expand(3, 4, 5), alpha
+    """
+
+    def __call__(self, opacity: Tensor, view: Any, /) -> Any:
+        """Render ``view`` with these activated opacities, of the shape that the score was given."""
+
+
+class Rendering(NamedTuple):
+    """One image with its accumulated alpha.
+
+    Args:
+        image: RGB, shape (3, H, W).
+        alpha: accumulated alpha, shape (H, W); None if the renderer returned none.
+    """
+
+    image: Tensor
+    alpha: Tensor | None = None
+
+
+def read_rendering(result: Any, *, layout: Layout = "CHW") -> Rendering:
+    """Bring what a :class:`RenderFn` returned into one form.
+
+    Args:
+        result: see :class:`RenderFn`.
+        layout: order of the axes of the image, ``"CHW"`` or ``"HWC"``.
+
+    Returns:
+        The image (3, H, W) and the alpha (H, W) or None, torch tensors that share memory with torch results.
+
+    Raises:
+        TypeError: if the result is of another kind, or not floating point.
+        ValueError: if a shape does not fit, a name is missing, or ``layout`` is unknown.
+
+    Example:
+        >>> result = {"rgb": np.zeros((4, 5, 3), np.float32), "accumulation": np.ones((4, 5, 1), np.float32)}
+        >>> image, alpha = read_rendering(result, layout="HWC")
+        >>> image.shape, alpha.shape
+        (torch.Size([3, 4, 5]), torch.Size([4, 5]))
+    """
+    check_layout(layout)
+    if isinstance(result, Tensor | np.ndarray):
+        return Rendering(_read_image(_as_tensor(result, "image"), layout))
+    if isinstance(result, tuple | list) and not hasattr(result, "_fields"):
+        return _read_tuple(result, layout)
+    image, alpha = _by_name(result, _IMAGE_NAMES), _by_name(result, _ALPHA_NAMES)
+    if image is None:
+        raise TypeError(f"a render callable returned {_describe(result)} without an image; {_FORMS}.")
+    read = _read_image(_as_tensor(image, "image"), layout)
+    return Rendering(read, None if alpha is None else _read_alpha(alpha, read))
+
+
+def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Tensor:
+    """Read the accumulated alpha off a white-on-black render, whose colours are all 1 over a background of 0.
+
+    Args:
+        result: the alpha itself, (H, W), (1, H, W) or (H, W, 1), or a render in any form of :class:`RenderFn`.
+        image: the image that belongs to it, shape (3, H, W), for the size.
+        layout: order of the axes of a rendered image.
+
+    Returns:
+        The accumulated alpha, shape (H, W).
+
+    Raises:
+        TypeError: if the result is of another kind, or not floating point.
+        ValueError: if its size is not that of ``image``.
+
+    Example:
+        >>> white = torch.full((3, 4, 5), 0.9)
+        >>> read_alpha_pass(white, torch.zeros(3, 4, 5)).shape
+        torch.Size([4, 5])
+    """
+    if isinstance(result, Tensor | np.ndarray):
+        plane = _as_plane(_as_tensor(result, "alpha"), image)
+        if plane is not None:
+            return plane
+    white = read_rendering(result, layout=layout).image
+    if white.shape != image.shape:
+        raise ValueError(
+            f"the white-on-black render has shape {tuple(white.shape)}, the image {tuple(image.shape)} (as CHW); "
+            "alpha_fn must render the same view at the same size."
+        )
+    return white.mean(0)
+
+
+def check_layout(layout: str) -> None:
+    """Raise unless ``layout`` is known."""
+    if layout not in get_args(Layout):
+        raise ValueError(f"layout must be one of {', '.join(get_args(Layout))}, got {layout!r}.")
+
+
+def _read_tuple(result: tuple[Any, ...] | list[Any], layout: Layout) -> Rendering:
+    """Tell image and alpha apart by their shapes, in a tuple of one or two."""
+    if not 1 <= len(result) <= 2:
+        raise ValueError(
+            f"a render callable returned a tuple of {len(result)}: {_describe(result)}; which member is the alpha "
+            "cannot be told from a depth map. Pick the two: return (image, alpha)."
+        )
+    members = [_as_tensor(x, f"member {i} of the tuple") for i, x in enumerate(result)]
+    if len(members) == 1:
+        return Rendering(_read_image(members[0], layout))
+    for image, alpha in (members, members[::-1]):
+        if _is_image(image, layout):
+            read = _read_image(image, layout)
+            plane = _as_plane(alpha, read)
+            if plane is not None:
+                return Rendering(read, plane)
+    raise ValueError(
+        f"a render callable returned {_describe(result)}, expected an RGB image in {layout} order and an alpha of its "
+        "size, (H, W), (1, H, W) or (H, W, 1). If the second member is not the alpha (INRIA rasterizers return radii "
+        "there), return the image alone and give CAScore an alpha_fn; if the axes are in another order, set layout."
+    )
+
+
+def _by_name(result: Any, names: tuple[str, ...]) -> Any:
+    """Look up the first of ``names`` that a mapping or an object has, and that is not None."""
+    for name in names:
+        value = result.get(name) if isinstance(result, Mapping) else getattr(result, name, None)
+        if value is not None:
+            return value
+    return None
+
+
+def _as_tensor(x: Any, name: str) -> Tensor:
+    """Return a floating-point tensor without a batch axis, or raise."""
+    if isinstance(x, np.ndarray):
+        x = torch.from_numpy(np.array(x))  # copied: torch takes neither read-only memory nor negative strides
+    if not isinstance(x, Tensor):
+        raise TypeError(f"{name} of a render callable must be a torch tensor or a numpy array, got {type(x).__name__}.")
+    if not x.is_floating_point():
+        raise TypeError(
+            f"{name} of a render callable must be floating point with colours in [0, 1], got {x.dtype}; "
+            "return the raw render, not the 8-bit picture."
+        )
+    return x[0] if x.ndim == 4 and x.shape[0] == 1 else x
+
+
+def _is_image(x: Tensor, layout: Layout) -> bool:
+    """Whether the tensor is an RGB image in this layout."""
+    return x.ndim == 3 and x.shape[layout.index("C")] == 3
+
+
+def _read_image(x: Tensor, layout: Layout) -> Tensor:
+    """Return an image as (3, H, W), or raise."""
+    if not _is_image(x, layout):
+        expected = "(3, H, W)" if layout == "CHW" else "(H, W, 3)"
+        raise ValueError(
+            f"the image of a render callable must be RGB of shape {expected} (layout {layout!r}), "
+            f"got {tuple(x.shape)}; set layout if the axes are in the other order."
+        )
+    return x if layout == "CHW" else x.permute(2, 0, 1)
+
+
+def _read_alpha(x: Any, image: Tensor) -> Tensor:
+    """Return a named alpha as (H, W), or raise."""
+    alpha = _as_tensor(x, "alpha")
+    plane = _as_plane(alpha, image)
+    if plane is None:
+        raise ValueError(
+            f"the alpha of a render callable must have the size of its image, (H, W) = {tuple(image.shape[1:])}, "
+            f"(1, H, W) or (H, W, 1), got {tuple(alpha.shape)}."
+        )
+    return plane
+
+
+def _as_plane(x: Tensor, image: Tensor) -> Tensor | None:
+    """Return a one-channel picture of the size of ``image`` as (H, W); None if it is not one."""
+    height, width = image.shape[1:]
+    if tuple(x.shape) in ((height, width), (1, height, width), (height, width, 1)):
+        return x.reshape(height, width)
+    return None
+
+
+def _describe(result: Any) -> str:
+    """Name the kind of a result and the shapes in it."""
+    if isinstance(result, tuple | list):
+        return "(" + ", ".join(_describe(x) for x in result) + ")"
+    if isinstance(result, Mapping):
+        return f"{type(result).__name__} with the keys {', '.join(map(str, result))}"
+    shape = getattr(result, "shape", None)
+    return type(result).__name__ if shape is None else f"{type(result).__name__} {tuple(shape)}"

@@ -1,0 +1,1 @@
+"""Adapters to other code bases, one module each; installed as `ca_reg.integrations`."""

@@ -1,0 +1,145 @@
+"""The modules against their functional twins, and the state they keep."""
+
+import io
+
+import pytest
+import torch
+from torch import nn
+
+from ca_reg import GaussianDropout, LinearRamp, OpacityNoise, StartStop, functional
+
+OPACITY = torch.linspace(0.05, 0.95, 40)
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("shape", [(40,), (40, 1)])
+@pytest.mark.parametrize("compensate", [False, True])
+def test_dropout_is_its_functional_twin(shape, compensate):
+    opacity, dropout = OPACITY.reshape(shape), GaussianDropout(0.3, compensate=compensate)
+    expected, keep = functional.gaussian_dropout(opacity, 0.3, compensate=compensate, generator=seeded())
+    assert torch.equal(dropout(opacity, generator=seeded()), expected)
+    assert torch.equal(dropout.keep, keep)
+    dropout.eval()
+    evaluated = dropout(opacity)
+    assert evaluated is opacity if compensate else torch.equal(evaluated, functional.scale_opacity(opacity, 0.3))
+    assert dropout.keep is None
+
+
+@pytest.mark.parametrize("clip", [False, True])
+def test_noise_is_its_functional_twin(clip):
+    module = OpacityNoise(0.8, clip=clip)
+    expected, noise = functional.opacity_noise(OPACITY, 0.8, clip=clip, generator=seeded())
+    assert torch.equal(module(OPACITY, generator=seeded()), expected)
+    assert torch.equal(module.noise, noise)
+    assert module.eval()(OPACITY) is OPACITY
+    assert module.noise is None
+
+
+def test_draws_are_replayed_bit_for_bit_without_drawing():
+    dropout, noise = GaussianDropout(0.5), OpacityNoise(0.5)
+    first = dropout(OPACITY), noise(OPACITY)
+    keep, eps = dropout.keep, noise.noise
+    dropout(OPACITY), noise(OPACITY)
+    before = torch.get_rng_state()
+    assert torch.equal(dropout(OPACITY, keep=keep), first[0])
+    assert torch.equal(noise(OPACITY, noise=eps), first[1])
+    assert dropout.keep is keep
+    assert noise.noise is eps
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_nothing_to_do_returns_the_same_tensor_and_no_draw():
+    before = torch.get_rng_state()
+    for module in (GaussianDropout(0.0), OpacityNoise(0.0), GaussianDropout(0.0).eval(), OpacityNoise(0.3).eval()):
+        assert module(OPACITY) is OPACITY
+    assert GaussianDropout(0.0).keep is None
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_they_compose():
+    chain = nn.Sequential(GaussianDropout(0.2), OpacityNoise(0.8))
+    out = chain(OPACITY)
+    keep, noise = chain[0].keep, chain[1].noise
+    torch.testing.assert_close(out, (OPACITY * keep * (1 + noise)).clamp(0, 1))
+    torch.testing.assert_close(chain.eval()(OPACITY), OPACITY * 0.8)
+
+
+def test_noise_accepts_the_large_opacities_of_compensated_dropout():
+    out = nn.Sequential(GaussianDropout(0.9, compensate=True), OpacityNoise(0.1))(OPACITY)
+    assert out.max() <= 1
+
+
+def test_the_rate_follows_the_step():
+    dropout, noise = GaussianDropout(LinearRamp(0.0, 0.2, 0, 100)), OpacityNoise(StartStop(0.4, start=50))
+    assert dropout(OPACITY) is OPACITY
+    assert noise(OPACITY) is OPACITY
+    for module in (dropout, noise):
+        module.set_step(50)
+    assert dropout.p == pytest.approx(0.1)
+    assert noise.sigma == 0.4
+    expected, _ = functional.gaussian_dropout(OPACITY, dropout.p, generator=seeded())
+    assert torch.equal(dropout(OPACITY, generator=seeded()), expected)
+    torch.testing.assert_close(dropout.eval()(OPACITY), OPACITY * 0.9)
+
+
+def test_the_step_survives_a_checkpoint_on_disk():
+    saved = nn.Sequential(GaussianDropout(LinearRamp(0.0, 0.2, 0, 100)), OpacityNoise(0.1))
+    for module in saved:
+        module.set_step(70)
+    file = io.BytesIO()
+    torch.save(saved.state_dict(), file)
+    file.seek(0)
+    loaded = nn.Sequential(GaussianDropout(LinearRamp(0.0, 0.2, 0, 100)), OpacityNoise(0.1))
+    loaded.load_state_dict(torch.load(file, weights_only=True))
+    assert [module.step for module in loaded] == [70, 70]
+    assert loaded[0].p == saved[0].p
+
+
+def test_logits_are_recognised_at_the_first_call():
+    for module in (GaussianDropout(0.2), OpacityNoise(0.2), GaussianDropout(0.2).eval()):
+        with pytest.raises(ValueError, match="sigmoid"):
+            module(torch.randn(50))
+
+
+def test_a_draw_cannot_be_replayed_in_eval_nor_on_another_number_of_gaussians():
+    dropout, noise = GaussianDropout(0.2), OpacityNoise(0.2)
+    dropout(OPACITY), noise(OPACITY)
+    keep, eps = dropout.keep, noise.noise
+    with pytest.raises(ValueError, match="draw again"):
+        dropout(OPACITY[:-1], keep=keep)
+    with pytest.raises(ValueError, match="draw again"):
+        noise(OPACITY[:-1], noise=eps)
+    with pytest.raises(ValueError, match="eval"):
+        dropout.eval()(OPACITY, keep=keep)
+    with pytest.raises(ValueError, match="eval"):
+        noise.eval()(OPACITY, noise=eps)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: GaussianDropout(1.0), lambda: GaussianDropout(-0.1), lambda: OpacityNoise(-1)]
+)
+def test_rates_are_checked_at_construction(make):
+    with pytest.raises(ValueError, match="must be"):
+        make()
+
+
+def test_a_schedule_that_leaves_the_range_is_refused_with_its_step():
+    dropout = GaussianDropout(lambda step: step / 100)
+    dropout.set_step(100)
+    with pytest.raises(ValueError, match="p at step 100"):
+        dropout(OPACITY)
+
+
+def test_unknown_keywords_raise():
+    with pytest.raises(TypeError):
+        GaussianDropout(0.2)(OPACITY, genrator=seeded())
+    with pytest.raises(TypeError):
+        OpacityNoise(0.2, clipped=True)
+
+
+def test_printing_shows_the_arguments():
+    assert repr(GaussianDropout(0.2)) == "GaussianDropout(p=0.2, compensate=False)"
+    assert "LinearRamp(" in repr(OpacityNoise(LinearRamp(0.0, 0.8, 0, 10)))
