@@ -1,0 +1,86 @@
+"""The pinhole camera: the one thing that scenes and the renderer share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+__all__ = ["Camera"]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: pose, intrinsics and image size.
+
+    Convention: OpenCV (x right, y down, z forward). Pixel centres lie at half-integers: the centre of the pixel in row
+    ``i`` and column ``j`` projects to ``(j + 0.5, i + 0.5)``, so the image spans ``[0, width] x [0, height]``.
+
+    Args:
+        world_to_camera: the view matrix, shape (4, 4): ``x_camera = R x_world + t``.
+        fx: focal length in x, pixels.
+        fy: focal length in y, pixels.
+        cx: principal point in x, pixels.
+        cy: principal point in y, pixels.
+        width: image width, pixels.
+        height: image height, pixels.
+
+    Raises:
+        ValueError: if the view matrix is not a finite (4, 4) tensor, a focal length is not positive or the size is
+            not positive.
+
+    Example:
+        >>> camera = Camera(torch.eye(4), fx=100.0, fy=100.0, cx=32.0, cy=24.0, width=64, height=48)
+        >>> camera.scaled(0.5).width
+        32
+        >>> camera.position.tolist()
+        [0.0, 0.0, 0.0]
+    """
+
+    world_to_camera: Tensor
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        pose = self.world_to_camera
+        if pose.shape != (4, 4) or not bool(torch.isfinite(pose).all()):
+            raise ValueError(f"world_to_camera must be a finite (4, 4) tensor, got shape {tuple(pose.shape)}: {pose}.")
+        if not (self.fx > 0 and self.fy > 0):
+            raise ValueError(f"focal lengths must be positive pixels, got fx={self.fx}, fy={self.fy}.")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"the image size must be positive, got {self.width}x{self.height}.")
+
+    @property
+    def position(self) -> Tensor:
+        """Camera centre in world coordinates, shape (3,)."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.T @ translation
+
+    @property
+    def forward(self) -> Tensor:
+        """Unit viewing direction (the camera's +z axis) in world coordinates, shape (3,)."""
+        return self.world_to_camera[2, :3]
+
+    def scaled(self, factor: float) -> Camera:
+        """Return the camera of the same picture resized by ``factor``; the size is rounded to whole pixels.
+
+        The intrinsics follow the rounded size exactly, so that the picture keeps its field of view.
+        """
+        width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
+        return self.resized(width, height)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """Return the camera of the same picture resized to ``width`` x ``height`` pixels."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
+        """Return the camera with its view matrix on another device or in another dtype."""
+        return replace(self, world_to_camera=self.world_to_camera.to(device=device, dtype=dtype))

@@ -1,0 +1,240 @@
+"""What a COLMAP reconstruction holds, as plain data, and its camera models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from reference_trainer.camera import Camera
+
+__all__ = ["CAMERA_MODELS", "CameraModel", "ColmapCamera", "ColmapImage", "ColmapModel", "ColmapPoints"]
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A camera model: its number and name, how many focal lengths it has, and how many distortion parameters.
+
+    A fisheye model is no pinhole even where its distortion parameters are 0, so it cannot be approximated by one.
+    """
+
+    id: int
+    name: str
+    focal_lengths: int
+    distortion: int
+    fisheye: bool = False
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters: focal lengths, principal point, distortion."""
+        return self.focal_lengths + 2 + self.distortion
+
+
+# COLMAP, src/colmap/sensor/models.h. The distortion parameters are k1 k2 p1 p2 k3 k4 k5 k6 or a beginning of that list.
+CAMERA_MODELS = (
+    CameraModel(0, "SIMPLE_PINHOLE", 1, 0),
+    CameraModel(1, "PINHOLE", 2, 0),
+    CameraModel(2, "SIMPLE_RADIAL", 1, 1),
+    CameraModel(3, "RADIAL", 1, 2),
+    CameraModel(4, "OPENCV", 2, 4),
+    CameraModel(5, "OPENCV_FISHEYE", 2, 4, fisheye=True),
+    CameraModel(6, "FULL_OPENCV", 2, 8),
+    CameraModel(7, "FOV", 2, 1, fisheye=True),
+    CameraModel(8, "SIMPLE_RADIAL_FISHEYE", 1, 1, fisheye=True),
+    CameraModel(9, "RADIAL_FISHEYE", 1, 2, fisheye=True),
+    CameraModel(10, "THIN_PRISM_FISHEYE", 2, 8, fisheye=True),
+)
+
+
+@dataclass(frozen=True)
+class ColmapCamera:
+    """Intrinsics of one camera. Convention: half-pixel centres, as in the rest of the program.
+
+    Args:
+        id: number of the camera.
+        model: name of the camera model.
+        width: image width, pixels.
+        height: image height, pixels.
+        parameters: focal length or lengths, principal point, distortion, in COLMAP's order.
+
+    Raises:
+        ValueError: if the size or a parameter makes no sense.
+    """
+
+    id: int
+    model: CameraModel
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.parameters) != self.model.parameters or not np.isfinite(self.parameters).all():
+            raise ValueError(
+                f"camera {self.id}: {self.model.name} needs {self.model.parameters} finite parameters, "
+                f"got {self.parameters}."
+            )
+        if self.width < 1 or self.height < 1 or self.fx <= 0 or self.fy <= 0:
+            raise ValueError(
+                f"camera {self.id}: size and focal lengths must be positive, got {self.width}x{self.height}, "
+                f"fx={self.fx}, fy={self.fy}."
+            )
+
+    @property
+    def fx(self) -> float:
+        """Focal length in x, pixels."""
+        return self.parameters[0]
+
+    @property
+    def fy(self) -> float:
+        """Focal length in y, pixels."""
+        return self.parameters[self.model.focal_lengths - 1]
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Principal point (x, y), pixels."""
+        x, y = self.parameters[self.model.focal_lengths : self.model.focal_lengths + 2]
+        return x, y
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """Distortion parameters, in COLMAP's order; empty for the pinhole models."""
+        return self.parameters[self.model.focal_lengths + 2 :]
+
+    def pinhole(self, world_to_camera: NDArray[np.float64]) -> Camera:
+        """Return the camera at a pose (4, 4) without its distortion.
+
+        Raises:
+            ValueError: if the model is a fisheye.
+        """
+        if self.model.fisheye:
+            raise ValueError(
+                f"camera {self.id} is {self.model.name}, which no pinhole camera approximates. Undistort the images "
+                "first (colmap image_undistorter)."
+            )
+        cx, cy = self.principal_point
+        return Camera(torch.from_numpy(world_to_camera), self.fx, self.fy, cx, cy, self.width, self.height)
+
+    def corner_displacement(self) -> float:
+        """Return how far the distortion moves an image corner, at most over the four, in pixels.
+
+        The renderer knows pinhole cameras only, so this is the error made at the corner by ignoring the distortion.
+        """
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *[0.0] * (8 - len(self.distortion)))
+        cx, cy = self.principal_point
+        x = np.array([0.0, self.width, 0.0, self.width])
+        y = np.array([0.0, 0.0, self.height, self.height])
+        x, y = (x - cx) / self.fx, (y - cy) / self.fy
+        r2 = x * x + y * y
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6))) - 1
+        dx = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        dy = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+        return float(np.hypot(dx * self.fx, dy * self.fy).max())
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """One registered image.
+
+    Args:
+        id: number of the image.
+        name: its path within the image folder.
+        camera_id: number of its camera.
+        world_to_camera: its pose, shape (4, 4), float64.
+        keypoints: its 2D features, pixels, shape (K, 2), float64.
+        point_ids: number of the 3D point of each feature, -1 for none, shape (K,), int64.
+    """
+
+    id: int
+    name: str
+    camera_id: int
+    world_to_camera: NDArray[np.float64]
+    keypoints: NDArray[np.float64]
+    point_ids: NDArray[np.int64]
+
+    @staticmethod
+    def pose(qvec: tuple[float, ...], tvec: tuple[float, ...]) -> NDArray[np.float64]:
+        """Build the view matrix (4, 4) from COLMAP's quaternion, wxyz, and translation.
+
+        Raises:
+            ValueError: if they are not finite, or the quaternion is zero.
+        """
+        q = np.array(qvec)
+        norm = np.linalg.norm(q)
+        if not (np.isfinite(q).all() and np.isfinite(tvec).all() and norm > 0):
+            raise ValueError(f"the pose must be a finite non-zero quaternion and translation, got {qvec} and {tvec}.")
+        w, x, y, z = q / norm
+        matrix = np.eye(4)
+        matrix[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        matrix[:3, 3] = tvec
+        return matrix
+
+
+@dataclass(frozen=True)
+class ColmapPoints:
+    """The triangulated points.
+
+    Args:
+        ids: their numbers, shape (M,), int64.
+        positions: world coordinates, shape (M, 3), float64.
+        colors: RGB, shape (M, 3), uint8.
+        tracks: for each point the numbers of the images that it was found in, each an int64 array; empty if the
+            reconstruction does not say.
+
+    Raises:
+        ValueError: if a position is not finite.
+    """
+
+    ids: NDArray[np.int64]
+    positions: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    tracks: tuple[NDArray[np.int64], ...]
+
+    def __post_init__(self) -> None:
+        bad = self.ids[~np.isfinite(self.positions).all(axis=1)]
+        if len(bad):
+            raise ValueError(f"{len(bad)} of {len(self.ids)} points have no finite position, such as point {bad[0]}.")
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """A reconstruction.
+
+    Args:
+        cameras: from number to camera.
+        images: the images, sorted by name.
+        points: the points; there may be none.
+
+    Raises:
+        ValueError: if an image has a camera that is not there, or two images have one name.
+    """
+
+    cameras: dict[int, ColmapCamera]
+    images: tuple[ColmapImage, ...]
+    points: ColmapPoints
+
+    def __post_init__(self) -> None:
+        for image in self.images:
+            if image.camera_id not in self.cameras:
+                raise ValueError(
+                    f"image {image.name!r} has camera {image.camera_id}; there are {sorted(self.cameras)}."
+                )
+        if len({image.name for image in self.images}) != len(self.images):
+            raise ValueError("two images have the same name.")
+
+    def seen_by(self) -> frozenset[str]:
+        """Return the names of the images that the points come from.
+
+        These are the images in the points' tracks. If any point has no track, it may come from any image, so these are
+        all the images of the reconstruction.
+        """
+        if any(len(track) == 0 for track in self.points.tracks):
+            return frozenset(image.name for image in self.images)
+        used = set(np.concatenate(self.points.tracks).tolist()) if self.points.tracks else set()
+        names = {image.id: image.name for image in self.images}
+        return frozenset(names.get(i, f"<image {i}>") for i in used)

@@ -1,0 +1,177 @@
+"""Image files: reading, compositing, resizing, and finding the file that a scene file names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["composite", "image_size", "list_images", "match_images", "path_inside", "read_image", "resize_image"]
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
+
+
+def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
+    """Read an 8-bit image file.
+
+    Convention: alpha is straight, as PNG defines it: the colours are not multiplied by it. An orientation tag is
+    ignored, as COLMAP does, because the cameras belong to the stored pixels.
+
+    Args:
+        path: the file; any format that Pillow reads.
+
+    Returns:
+        Colours in [0, 1], shape (3, H, W), float32, and the coverage in [0, 1], shape (H, W), or None if the file has
+        no transparency.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is not an image, is damaged, or has more than 8 bits per channel.
+    """
+    with _opened(path) as file:
+        if file.mode.startswith(("I", "F")):
+            raise ValueError(f"{path} has pixel mode {file.mode}; convert it to 8 bits per channel first.")
+        has_alpha = file.mode in ("RGBA", "LA", "PA") or "transparency" in file.info
+        pixels = np.array(file.convert("RGBA" if has_alpha else "RGB"))
+    channels = torch.from_numpy(pixels).permute(2, 0, 1).to(torch.float32) / 255
+    return channels[:3].contiguous(), channels[3].contiguous() if has_alpha else None
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Return the width and height of an image file, pixels, without decoding it.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is not an image.
+    """
+    with _opened(path) as file:
+        return int(file.width), int(file.height)
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[Any]:
+    """Open an image with Pillow and turn its many errors into one."""
+    from PIL import Image
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no image file {path}.")
+    try:
+        with Image.open(path) as file:
+            yield file
+    except (OSError, SyntaxError, EOFError) as error:  # Pillow's UnidentifiedImageError is an OSError
+        raise ValueError(f"{path} is not a readable image: {error}") from error
+
+
+def composite(image: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
+    """Lay a picture with straight alpha over a plain background: ``image * alpha + background * (1 - alpha)``.
+
+    Args:
+        image: colours in [0, 1], shape (3, H, W).
+        alpha: coverage in [0, 1], shape (H, W).
+        background: RGB in [0, 1], shape (3,).
+
+    Returns:
+        Colours in [0, 1], shape (3, H, W).
+
+    Example:
+        >>> image, alpha = torch.ones(3, 1, 1), torch.full((1, 1), 0.25)
+        >>> composite(image, alpha, torch.zeros(3)).flatten().tolist()
+        [0.25, 0.25, 0.25]
+    """
+    return image * alpha + background[:, None, None] * (1 - alpha)
+
+
+def resize_image(image: Tensor, width: int, height: int) -> Tensor:
+    """Resize a picture with the bicubic filter, widened when shrinking so that nothing aliases.
+
+    This is Pillow's default filter, with which the published 3DGS loaders resize, without their rounding to 8 bits.
+
+    Args:
+        image: values in [0, 1], shape (C, H, W).
+        width: new width, pixels.
+        height: new height, pixels.
+
+    Returns:
+        Values clamped to [0, 1], shape (C, height, width).
+
+    Example:
+        >>> resize_image(torch.full((3, 4, 6), 0.5), 3, 2).shape
+        torch.Size([3, 2, 3])
+    """
+    resized = torch.nn.functional.interpolate(image[None], size=(height, width), mode="bicubic", antialias=True)[0]
+    return resized.clamp(0, 1)
+
+
+def list_images(folder: str | Path) -> list[Path]:
+    """Return the image files of a folder, sorted by name.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if it holds no images.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"there is no image folder {folder}.")
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    if not files:
+        raise ValueError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}).")
+    return files
+
+
+def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
+    """Find the file of each named image, also in a folder of resized copies.
+
+    Files are matched by their full name, else by their name without extension, else, if there are as many files as
+    names, by the order of both sorted lists, which is how the LLFF data set relates ``images_8/image000.png`` to
+    ``images/IMG_4026.JPG``.
+
+    Args:
+        folder: the image folder.
+        names: image names, as a scene file gives them, with ``/`` between folders.
+
+    Returns:
+        From each name to its file.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if the names cannot be matched, or one leads out of the folder.
+    """
+    folder = Path(folder)
+    paths = {name: path_inside(folder, name) for name in names}
+    if folder.is_dir() and all(path.is_file() for path in paths.values()):
+        return paths
+    files = list_images(folder)
+    by_stem = {file.stem: file for file in files}
+    if len(by_stem) == len(files) and all(Path(name).stem in by_stem for name in names):
+        return {name: by_stem[Path(name).stem] for name in names}
+    if len(files) == len(names):
+        return dict(zip(sorted(names), files, strict=True))
+    missing = [name for name in names if not paths[name].is_file()]
+    raise ValueError(
+        f"{folder} lacks {len(missing)} of the {len(names)} images of the scene, such as {missing[:3]}; it holds "
+        f"{len(files)} files, such as {[file.name for file in files[:3]]}. Choose another image folder."
+    )
+
+
+def path_inside(root: str | Path, relative: str) -> Path:
+    """Return ``root / relative``, where ``relative`` comes from a file and must not lead out of ``root``.
+
+    Links are not followed for this check: a data set may link to pictures elsewhere, but must not name them.
+
+    Raises:
+        ValueError: if the path is absolute or leaves ``root``.
+
+    Example:
+        >>> path_inside("scene", "./train/r_2").as_posix()
+        'scene/train/r_2'
+    """
+    normal = os.path.normpath(relative)
+    if os.path.isabs(relative) or normal.split(os.sep)[0] == os.pardir:
+        raise ValueError(f"the path {relative!r} leads out of the scene folder {root}; it must stay inside.")
+    return Path(root) / normal

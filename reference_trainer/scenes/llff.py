@@ -1,0 +1,62 @@
+"""LLFF scenes: ``poses_bounds.npy`` beside a folder of images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from reference_trainer.camera import Camera
+from reference_trainer.scenes.frames import Frame
+from reference_trainer.scenes.images import list_images
+
+__all__ = ["read_llff"]
+
+
+def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
+    """Read the cameras of ``poses_bounds.npy`` and pair them with the images of a folder in sorted order.
+
+    Convention: each row holds a (3, 5) matrix, row by row, and the nearest and farthest depth. The matrix is
+    [R | t | (height, width, focal length)], camera to world, with the camera's axes down, right, back. The principal
+    point is the centre of the picture. The frames' cameras are OpenCV and world to camera.
+
+    Args:
+        path: the file ``poses_bounds.npy``.
+        folder: the image folder; it may hold resized copies.
+
+    Returns:
+        The frames, sorted by name.
+
+    Raises:
+        FileNotFoundError: if the file or the folder is missing.
+        ValueError: if the file is not (N, 17) finite numbers with rotations in them, or there are not N images.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}.")
+    try:
+        rows = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"{path} is not a NumPy array of numbers: {error}") from error
+    if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows.astype(np.float64)).all():
+        raise ValueError(f"{path} must hold finite numbers of shape (N, 17), got shape {rows.shape}.")
+    files = list_images(folder)
+    if len(files) != len(rows):
+        raise ValueError(f"{path} has {len(rows)} poses but {folder} has {len(files)} images; each needs one.")
+    frames = []
+    for file, row in zip(files, rows.astype(np.float64), strict=True):
+        matrix = row[:15].reshape(3, 5)
+        height, width, focal = matrix[:, 4].tolist()
+        down, right, back = matrix[:, 0], matrix[:, 1], matrix[:, 2]
+        rotation = np.stack([right, down, -back])  # rows: the OpenCV axes in world coordinates
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+            raise ValueError(f"{path}: the pose of {file.name} is not a rotation: {matrix[:, :3].tolist()}.")
+        pose = np.eye(4)
+        pose[:3, :3] = rotation
+        pose[:3, 3] = -rotation @ matrix[:, 3]
+        camera = Camera(
+            torch.from_numpy(pose), focal, focal, width / 2, height / 2, width=round(width), height=round(height)
+        )
+        frames.append(Frame(file.name, file, camera, bounds=(float(row[15]), float(row[16]))))
+    return frames

@@ -1,0 +1,77 @@
+"""Point clouds in PLY files, as COLMAP, MeshLab and the INRIA code write them: positions and 8-bit colours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from reference_trainer.scenes.scene import PointCloud
+
+__all__ = ["ply_points"]
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+
+
+def ply_points(path: str | Path) -> PointCloud:
+    """Read the vertices of a PLY file.
+
+    Args:
+        path: a PLY file, binary little-endian or ASCII, whose first element is ``vertex`` with at least the properties
+            ``x y z red green blue``, colours as bytes.
+
+    Returns:
+        The points; ``seen_by`` is None, for a PLY file does not say which images it comes from.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is truncated or not such a PLY file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no point cloud {path}.")
+    data = path.read_bytes()
+    header, found, body = data.partition(b"end_header")
+    body = body.removeprefix(b"\r").removeprefix(b"\n")
+    words = [line.split() for line in header.decode("ascii", errors="replace").splitlines() if line.strip()]
+    try:
+        if not found or words[0] != ["ply"]:
+            raise ValueError("it has no PLY header")
+        form = next(line[1] for line in words if line[0] == "format")
+        elements = [at for at, line in enumerate(words) if line[0] == "element"]
+        if words[elements[0]][1] != "vertex":
+            raise ValueError(f"its first element is {words[elements[0]][1]}, not vertex")
+        count = int(words[elements[0]][2])
+        rows = words[elements[0] + 1 : elements[1] if len(elements) > 1 else None]
+        dtype = np.dtype([(line[2], "<" + _TYPES[line[1]]) for line in rows if line[0] == "property"])
+        missing = {"x", "y", "z", "red", "green", "blue"} - set(dtype.names or ())
+        if missing or dtype["red"] != np.uint8:
+            raise ValueError(f"its vertices need x, y, z and red, green, blue as bytes, but have {dtype}")
+        vertices = _vertices(body, form, dtype, count)
+    except (ValueError, IndexError, KeyError, StopIteration) as error:
+        raise ValueError(f"{path} is not a point cloud this program can read: {error}.") from error
+    positions = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1).astype(np.float32) / 255
+    if len(vertices) == 0 or not np.isfinite(positions).all():
+        raise ValueError(f"{path} must hold points with finite positions; it has {len(vertices)} points.")
+    return PointCloud(torch.from_numpy(positions), torch.from_numpy(colors), source=str(path))
+
+
+def _vertices(body: bytes, form: str, dtype: np.dtype[np.void], count: int) -> np.ndarray:
+    """Read the vertex records that follow the header."""
+    if form == "binary_little_endian":
+        if count < 0 or count * dtype.itemsize > len(body):
+            raise ValueError(f"{count} vertices of {dtype.itemsize} bytes do not fit in {len(body)} bytes")
+        return np.frombuffer(body, dtype, count)
+    if form == "ascii":
+        lines = body.decode("ascii").split("\n")[: max(count, 0)]
+        rows = [tuple(line.split()) for line in lines if line.strip()]
+        if len(rows) != count:
+            raise ValueError(f"it announces {count} vertices but has {len(rows)}")
+        return np.array(rows, dtype)
+    raise ValueError(f"its format is {form}; convert it to binary_little_endian or ascii")

@@ -1,0 +1,86 @@
+"""What a scene is to the rest of the program: photographs with cameras, and optional initial points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+
+__all__ = ["PointCloud", "Scene", "View"]
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph with its camera.
+
+    Args:
+        name: the file name or another unique label.
+        camera: its camera; ``camera.height`` and ``camera.width`` equal the image's.
+        image: colours in [0, 1], shape (3, H, W), float32, already composited on the scene's background.
+        alpha: coverage in [0, 1], shape (H, W), where the source has one, else None.
+        depth: true depth along the camera's z axis, shape (H, W), where it is known, else None; 0 where nothing is hit.
+    """
+
+    name: str
+    camera: Camera
+    image: Tensor
+    alpha: Tensor | None = None
+    depth: Tensor | None = None
+
+    def to(self, device: torch.device | str) -> View:
+        """Return the view on another device."""
+
+        def move(x: Tensor | None) -> Tensor | None:
+            return None if x is None else x.to(device)
+
+        return View(self.name, self.camera.to(device), self.image.to(device), move(self.alpha), move(self.depth))
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points to initialise Gaussians from.
+
+    Args:
+        positions: world coordinates, shape (M, 3), float32.
+        colors: RGB in [0, 1], shape (M, 3), float32.
+        source: where they come from, for the log: a path or ``"random"``.
+        seen_by: names of all the images that the points were triangulated from, where that is known.
+    """
+
+    positions: Tensor
+    colors: Tensor
+    source: str
+    seen_by: frozenset[str] | None = None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene: training and test views and the points to start from.
+
+    Args:
+        name: short label for reports.
+        train: views to fit.
+        test: held-out views, never used in training.
+        points: initial points, or None to let the trainer draw random ones.
+        background: the colour (3,) behind everything, in [0, 1].
+    """
+
+    name: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    points: PointCloud | None
+    background: Tensor
+
+    @property
+    def extent(self) -> float:
+        """Radius of the training rig: 1.1 x the largest distance of a training camera from their mean position.
+
+        Convention: the INRIA code scales its position learning rate and its densification thresholds by this number.
+        A rig of one camera has no radius; then the result is 1.
+        """
+        positions = torch.stack([view.camera.position for view in self.train])
+        radius = (positions - positions.mean(0)).norm(dim=1).max().item()
+        return 1.1 * radius if radius > 0 else 1.0

@@ -1,0 +1,164 @@
+"""Which photographs are trained on and which are held out: the published sparse-view protocols."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+__all__ = ["blender_split", "evenly_spaced", "file_split", "llff_split"]
+
+BLENDER_TRAIN = (2, 16, 26, 55, 73, 76, 86, 93)  # the 8 views of DietNeRF, which every later paper takes
+BLENDER_TEST_FRAMES = 200  # the size of a full NeRF-synthetic test set
+TEST_EVERY = 8
+
+
+def evenly_spaced(count: int, views: int) -> list[int]:
+    """Choose ``views`` of ``count`` items, evenly, first and last included.
+
+    Convention: Python's ``round``, half to even, of ``np.linspace(0, count - 1, views)``, as RegNeRF and its followers.
+
+    Raises:
+        ValueError: if not ``1 <= views <= count``.
+
+    Example:
+        >>> evenly_spaced(17, 3)
+        [0, 8, 16]
+    """
+    if not 1 <= views <= count:
+        raise ValueError(f"cannot choose {views} training views from {count}; ask for 1 to {count}.")
+    return [round(x) for x in np.linspace(0, count - 1, views).tolist()]
+
+
+def llff_split(count: int, views: int) -> tuple[list[int], list[int]]:
+    """Split the images of a forward-facing scene, sorted by name, the LLFF way.
+
+    Every eighth image is a test view, beginning with the first; the training views are spread evenly over the rest.
+
+    Args:
+        count: number of images.
+        views: number of training views.
+
+    Returns:
+        Indices of the training views and of the test views.
+
+    Raises:
+        ValueError: if there are not enough images.
+
+    Example:
+        >>> llff_split(20, 3)
+        ([1, 10, 19], [0, 8, 16])
+    """
+    pool = [i for i in range(count) if i % TEST_EVERY]
+    return [pool[i] for i in evenly_spaced(len(pool), views)], list(range(0, count, TEST_EVERY))
+
+
+def blender_split(train_count: int, test_count: int, views: int) -> tuple[list[int], list[int]]:
+    """Choose the training and test views of a Blender (NeRF-synthetic) scene, by their place in the JSON files.
+
+    From the full data set the 8-view protocol takes eight fixed training views and every eighth of the 200 test views.
+    A scene that lists no more than ``views`` training frames is subsampled already: all are taken. Other numbers of
+    views are spread evenly. A test list shorter than 200 is taken whole.
+
+    Args:
+        train_count: frames in ``transforms_train.json``.
+        test_count: frames in ``transforms_test.json``.
+        views: number of training views.
+
+    Returns:
+        Indices of the training views and of the test views.
+
+    Raises:
+        ValueError: if there is no training frame or ``views`` is not positive.
+
+    Example:
+        >>> train, test = blender_split(100, 200, 8)
+        >>> train, len(test)
+        ([2, 16, 26, 55, 73, 76, 86, 93], 25)
+        >>> blender_split(8, 25, 8)[0]
+        [0, 1, 2, 3, 4, 5, 6, 7]
+    """
+    if views == len(BLENDER_TRAIN) and train_count > max(BLENDER_TRAIN):
+        train = list(BLENDER_TRAIN)
+    else:
+        train = evenly_spaced(train_count, min(views, train_count))
+    return train, list(range(0, test_count, TEST_EVERY if test_count >= BLENDER_TEST_FRAMES else 1))
+
+
+def file_split(path: str | Path, names: Sequence[str], views: int | None) -> tuple[list[int], list[int]]:
+    """Read a split from a JSON file with a list ``test`` and one or more lists of training images.
+
+    With ``views`` given, the list is ``train_<views>``, else ``train`` if it has that length, else ``views`` images
+    spread evenly over ``train_all``. Without, it is ``train``, else ``train_3``.
+
+    Args:
+        path: the JSON file; it names images with or without extension.
+        names: the names of all images of the scene.
+        views: number of training views, or None for the file's own choice.
+
+    Returns:
+        Indices into ``names`` of the training views and of the test views, each in increasing order.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file has no fitting list, names unknown images, or trains on test images.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no split file {path}.")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is not valid JSON: {error}") from error
+    lists = (
+        {key: value for key, value in content.items() if isinstance(value, list)} if isinstance(content, dict) else {}
+    )
+    train = _training_list(path, lists, views)
+    if "test" not in lists:
+        raise ValueError(f"{path} has no list 'test'; it has {sorted(lists)}.")
+    train_ids, test_ids = (_indices(path, chosen, names) for chosen in (train, lists["test"]))
+    both = sorted(set(train_ids) & set(test_ids))
+    if both:
+        raise ValueError(f"{path} uses {[names[i] for i in both]} both to train and to test.")
+    return train_ids, test_ids
+
+
+def _training_list(path: Path, lists: dict[str, list[str]], views: int | None) -> list[str]:
+    """Pick the training list for this number of views."""
+    if views is None:
+        chosen = lists.get("train", lists.get("train_3"))
+    else:
+        chosen = lists.get(f"train_{views}")
+        if chosen is None and len(lists.get("train", [])) == views:
+            chosen = lists["train"]
+        if chosen is None and "train_all" in lists:
+            pool = sorted(lists["train_all"])
+            chosen = [pool[i] for i in evenly_spaced(len(pool), views)]
+    if not chosen:
+        found = {key: len(value) for key, value in lists.items() if key.startswith("train")}
+        raise ValueError(
+            f"{path} lists no training set of {views or 3} views; it has {found}. Add a list 'train_{views or 3}', or "
+            "choose another split, such as 'llff'."
+        )
+    return chosen
+
+
+def _indices(path: Path, chosen: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Find the images by name, or by name without extension where that is unambiguous."""
+    stems = [PurePosixPath(name).stem for name in names]
+    indices = []
+    for name in chosen:
+        stem = PurePosixPath(str(name)).stem
+        if name in names:
+            indices.append(list(names).index(name))
+        elif stems.count(stem) == 1:
+            indices.append(stems.index(stem))
+        else:
+            raise ValueError(
+                f"{path} names the image {name!r}; the scene has {list(names)[:4]}... ({len(names)} images)."
+            )
+    if len(set(indices)) != len(indices):
+        raise ValueError(f"{path} names an image twice in one list: {list(chosen)}.")
+    return sorted(indices)

@@ -1,0 +1,77 @@
+"""Procedural solid textures: a colour for every point in space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+__all__ = ["Noise", "Texture", "checker", "color_ramp"]
+
+Texture = Callable[[Tensor], Tensor]
+"""From points (R, 3) to RGB reflectances (R, 3) in [0, 1]."""
+
+
+class Noise:
+    """Smooth noise in space: random values on a periodic integer lattice, interpolated, summed over octaves.
+
+    Args:
+        generator: source of the lattice values.
+
+    Example:
+        >>> noise = Noise(torch.Generator().manual_seed(0))
+        >>> noise(torch.rand(10, 3), octaves=4).shape
+        torch.Size([10])
+    """
+
+    PERIOD = 32
+
+    def __init__(self, generator: torch.Generator) -> None:
+        self.lattice = torch.rand(self.PERIOD**3, generator=generator)
+
+    def __call__(self, points: Tensor, octaves: int = 1) -> Tensor:
+        """Return the noise at points (R, 3): values in [0, 1], shape (R,), with a feature size of 1 and below."""
+        total, weight = points.new_zeros(points.shape[0]), 0.0
+        for octave in range(octaves):
+            # The shift keeps the lattice planes of the octaves apart.
+            total += self._single(points * 2**octave + 7.3 * octave) * 0.5**octave
+            weight += 0.5**octave
+        return total / weight
+
+    def _single(self, points: Tensor) -> Tensor:
+        """One octave: trilinear interpolation with the smoothstep fade."""
+        base = points.floor()
+        fade = points - base
+        fade = fade * fade * (3 - 2 * fade)
+        low = base.long() % self.PERIOD
+        high = (low + 1) % self.PERIOD
+        strides = (self.PERIOD**2, self.PERIOD, 1)
+        (x0, x1), (y0, y1), (z0, z1) = ((low[:, i] * strides[i], high[:, i] * strides[i]) for i in range(3))
+        fx, fy, fz = fade.unbind(1)
+
+        def along_z(xy: Tensor) -> Tensor:
+            return torch.lerp(self.lattice[xy + z0], self.lattice[xy + z1], fz)
+
+        return torch.lerp(
+            torch.lerp(along_z(x0 + y0), along_z(x0 + y1), fy), torch.lerp(along_z(x1 + y0), along_z(x1 + y1), fy), fx
+        )
+
+
+def color_ramp(values: Tensor, colors: Sequence[tuple[float, float, float]]) -> Tensor:
+    """Map values in [0, 1], shape (R,), to colours (R, 3) on a piecewise linear path through ``colors``.
+
+    Example:
+        >>> color_ramp(torch.tensor([0.0, 0.5]), [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)]).tolist()
+        [[0.0, 0.0, 0.0], [0.5, 0.5, 0.5]]
+    """
+    table = torch.tensor(colors)
+    at = values.clamp(0, 1) * (len(colors) - 1)
+    index = at.floor().long().clamp(max=len(colors) - 2)
+    return torch.lerp(table[index], table[index + 1], (at - index)[:, None])
+
+
+def checker(u: Tensor, v: Tensor, joint: float) -> tuple[Tensor, Tensor]:
+    """Return which colour of a unit checkerboard (u, v) falls on, 0 or 1, and whether on a joint between tiles."""
+    edge = torch.minimum((u - u.round()).abs(), (v - v.round()).abs())
+    return (u.floor() + v.floor()).long() % 2, edge < joint / 2

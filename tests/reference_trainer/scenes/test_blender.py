@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from reference_trainer.scenes.blender import read_transforms
+from reference_trainer.scenes.colmap import colmap_frames, read_colmap
+
+
+def rewrite(path, change):
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_frames_follow_the_file(blender_scene):
+    frames = read_transforms(blender_scene / "transforms_train.json")
+    assert [frame.name for frame in frames] == ["train/r_0", "train/r_1", "train/r_2"]
+    camera = frames[1].camera
+    # Half the field of view has tangent 1/2, so the focal length is the width.
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (8, 6, 4, 3)
+    assert camera.fx == pytest.approx(8)
+    assert camera.fy == pytest.approx(8)
+    assert camera.position.tolist() == [0, 0, 5]
+    assert camera.forward.tolist() == [0, 0, -1]
+
+
+def test_opengl_points_land_where_they_should(blender_scene):
+    # A point to the right of and above the optical axis, in OpenGL terms, is in the upper right quarter of the picture.
+    camera = read_transforms(blender_scene / "transforms_train.json")[0].camera
+    x, y, z, _ = (camera.world_to_camera @ torch.tensor([1.0, 0.5, 0.0, 1.0], dtype=torch.float64)).tolist()
+    assert (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy) == (pytest.approx(6), pytest.approx(2))
+
+
+def test_intrinsics_in_pixels_win_over_the_angle(blender_scene):
+    path = blender_scene / "transforms_train.json"
+    rewrite(path, lambda c: c.update(w=80, h=60, fl_x=90.0, fl_y=91.0, cx=41.0, cy=29.0))
+    camera = read_transforms(path)[0].camera
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (80, 60, 90, 91, 41, 29)
+
+
+def test_extension_may_be_given_and_dots_may_be_in_names(blender_scene):
+    path = blender_scene / "transforms_train.json"
+    (blender_scene / "train" / "r_1.png").rename(blender_scene / "train" / "r.1.png")
+    rewrite(path, lambda c: c["frames"][0].update(file_path="train/r_0.png"))
+    rewrite(path, lambda c: c["frames"][1].update(file_path="train/r.1"))
+    frames = read_transforms(path)
+    assert [frame.path.name for frame in frames] == ["r_0.png", "r.1.png", "r_2.png"]
+    assert [frame.name for frame in frames] == ["train/r_0", "train/r.1", "train/r_2"]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda c: c.pop("frames"), "no entry 'frames'"),
+        (lambda c: c.pop("camera_angle_x"), "no entry 'camera_angle_x'"),
+        (lambda c: c.update(camera_angle_x=math.pi), "camera_angle_x must be"),
+        (lambda c: c.update(frames=3), "not a valid transforms file"),
+        (lambda c: c["frames"].append(5), "not a valid transforms file"),
+        (lambda c: c["frames"].append(c["frames"][0]), "lists an image twice"),
+        (lambda c: c["frames"][0].update(file_path="../../etc/x"), "leads out of the scene"),
+        (lambda c: c["frames"][0].update(file_path="/etc/x"), "leads out of the scene"),
+        (lambda c: c["frames"][0].update(transform_matrix=[[1, 0], [0, 1]]), "finite 4x4"),
+        (lambda c: c["frames"][0].update(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), "no rotation"),
+        (lambda c: c["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "no rotation"),
+        (lambda c: c["frames"][0].update(transform_matrix="eye"), "not a valid transforms file"),
+    ],
+)
+def test_bad_files_are_refused_with_their_path(blender_scene, change, reason):
+    path = blender_scene / "transforms_train.json"
+    rewrite(path, change)
+    with pytest.raises(ValueError, match=reason) as caught:
+        read_transforms(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_files(blender_scene):
+    with pytest.raises(FileNotFoundError, match="no file"):
+        read_transforms(blender_scene / "transforms_val.json")
+    (blender_scene / "train" / "r_1.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"r_1\.png"):
+        read_transforms(blender_scene / "transforms_train.json")
+    (blender_scene / "transforms_test.json").write_text("{")
+    with pytest.raises(ValueError, match="not a valid transforms file"):
+        read_transforms(blender_scene / "transforms_test.json")
+
+
+@pytest.mark.data
+def test_blender_and_colmap_files_describe_the_same_cameras(data_root):
+    root = data_root / "fountain"
+    blender = {
+        frame.path.stem: frame
+        for kind in ("train", "test")
+        for frame in read_transforms(root / "blender" / f"transforms_{kind}.json")
+    }
+    for frame in colmap_frames(read_colmap(root / "sparse" / "0"), root / "images"):
+        twin = blender.pop(frame.path.stem)
+        torch.testing.assert_close(twin.camera.world_to_camera, frame.camera.world_to_camera, atol=1e-6, rtol=0)
+        assert (twin.camera.fx, twin.camera.cx) == (frame.camera.fx, frame.camera.cx)
+    assert not blender

@@ -1,0 +1,193 @@
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+import pytest
+import torch
+
+from reference_trainer.scenes.colmap import colmap_frames, read_colmap
+from reference_trainer.scenes.colmap_binary import read_cameras_binary, read_images_binary, read_points_binary
+from reference_trainer.scenes.colmap_model import CAMERA_MODELS, ColmapCamera, ColmapImage
+
+MODELS = {model.name: model for model in CAMERA_MODELS}
+READERS = {"cameras": read_cameras_binary, "images": read_images_binary, "points3D": read_points_binary}
+
+
+def test_text_and_binary_hold_the_same_model(tmp_path, colmap_binary, colmap_text):
+    colmap_binary(tmp_path / "bin")
+    colmap_text(tmp_path / "txt")
+    a, b = read_colmap(tmp_path / "bin"), read_colmap(tmp_path / "txt")
+    assert a.cameras == b.cameras
+    assert [image.name for image in a.images] == [image.name for image in b.images] == ["a b.png", "b.png", "c.png"]
+    for one, other in zip(a.images, b.images, strict=True):
+        assert (one.id, one.camera_id) == (other.id, other.camera_id)
+        for field in ("world_to_camera", "keypoints", "point_ids"):
+            assert np.array_equal(getattr(one, field), getattr(other, field))
+            assert getattr(one, field).dtype == getattr(other, field).dtype
+    for field in ("ids", "positions", "colors"):
+        assert np.array_equal(getattr(a.points, field), getattr(b.points, field))
+        assert getattr(a.points, field).dtype == getattr(b.points, field).dtype
+    assert [t.tolist() for t in a.points.tracks] == [t.tolist() for t in b.points.tracks] == [[3, 9], [9]]
+
+
+def test_values_are_those_written(tmp_path, colmap_binary):
+    colmap_binary(tmp_path)
+    model = read_colmap(tmp_path)
+    camera = model.cameras[7]
+    assert (camera.model.name, camera.width, camera.height, camera.fx, camera.fy) == ("SIMPLE_RADIAL", 32, 24, 40, 40)
+    assert (camera.principal_point, camera.distortion) == ((16, 12), (0.125,))
+    assert model.cameras[1].fy == 51.25
+    b = model.images[1]
+    # The quaternion (1, 1, 1, 1) / 2 turns 120 degrees about (1, 1, 1): x -> y -> z -> x.
+    assert np.array_equal(b.world_to_camera[:3, :3], [[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    assert b.world_to_camera[:3, 3].tolist() == [1, -2, 3.5]
+    assert b.keypoints.tolist() == [[1.5, 2.5], [3.25, 4.75]]
+    assert b.point_ids.tolist() == [10, -1]
+    assert model.points.positions.tolist() == [[0.5, -1.5, 2.25], [-4, 8, 0.125]]
+    assert model.points.colors.tolist() == [[255, 0, 17], [1, 2, 3]]
+    assert model.seen_by() == {"b.png", "c.png"}
+
+
+def test_quaternion_is_the_axis_angle_rotation():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        angle = rng.uniform(-3, 3)
+        q = rng.uniform(0.5, 2) * np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis)])
+        v = rng.normal(size=3)
+        # Rodrigues
+        turned = v * math.cos(angle) + np.cross(axis, v) * math.sin(angle) + axis * (axis @ v) * (1 - math.cos(angle))
+        assert np.allclose(ColmapImage.pose(tuple(q), (0, 0, 0))[:3, :3] @ v, turned, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_every_truncation_is_refused(tmp_path, colmap_binary, name):
+    colmap_binary(tmp_path)
+    path = tmp_path / f"{name}.bin"
+    whole = path.read_bytes()
+    READERS[name](path)
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match=rf"{name}\.bin is truncated"):
+            READERS[name](path)
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("count", [2**62, 2**63 - 1, 2**64 - 1, 1000])
+def test_absurd_counts_are_refused_before_allocating(tmp_path, colmap_binary, name, count):
+    colmap_binary(tmp_path)
+    path = tmp_path / f"{name}.bin"
+    path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:])
+    # The whole count is refused, not the first record that is missing.
+    with pytest.raises(ValueError, match=rf"truncated or not a COLMAP file: {count} \w+ needs"):
+        read_colmap(tmp_path)
+
+
+def test_damaged_text_names_file_and_line(tmp_path, colmap_text):
+    colmap_text(tmp_path)
+    for name, bad in {
+        "cameras.txt": ["1 PINHOLE 64 48 50.5", "1 PINHOLE 0 48 50 50 1 1", "1 WRONG 64 48 1 1 1 1", "1", "x y z w"],
+        "images.txt": ["3 0.5 0.5 0.5", "3 0 0 0 0 1 1 1 1 b.png\n", "3 1 0 0 0 1 1 1 1 b.png\n1 2"],
+        "points3D.txt": ["10 0 1 2 255 0", "10 0 1 2 255 0 300 0.5", "10 0 1 2 1 1 1 0.5 3"],
+    }.items():
+        whole = (tmp_path / name).read_text()
+        for line in bad:
+            (tmp_path / name).write_text(f"# a comment\n{line}\n")
+            with pytest.raises(ValueError, match=rf"{name}, line 2"):
+                read_colmap(tmp_path)
+        (tmp_path / name).write_text(whole)
+
+
+def test_inconsistent_models_are_refused(tmp_path, colmap_text):
+    colmap_text(tmp_path)
+    images = (tmp_path / "images.txt").read_text()
+    (tmp_path / "images.txt").write_text(images.replace("2 1 b.png", "2 5 b.png").replace("3.5 1 b", "3.5 5 b"))
+    with pytest.raises(ValueError, match=r"'b\.png' has camera 5; there are \[1, 7\]"):
+        read_colmap(tmp_path)
+    (tmp_path / "images.txt").write_text(images.replace("c.png", "b.png"))
+    with pytest.raises(ValueError, match="same name"):
+        read_colmap(tmp_path)
+    (tmp_path / "images.txt").write_text(images)
+    points = (tmp_path / "points3D.txt").read_text()
+    (tmp_path / "points3D.txt").write_text(points.replace("-4 8", "nan 8"))
+    with pytest.raises(ValueError, match=r"points3D\.txt: 1 of 2 points have no finite position, such as point 11"):
+        read_colmap(tmp_path)
+    (tmp_path / "points3D.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no points3D\.bin or points3D\.txt.*cameras\.txt"):
+        read_colmap(tmp_path)
+
+
+def test_points_without_tracks_may_come_from_any_image(tmp_path, colmap_text):
+    colmap_text(tmp_path)
+    (tmp_path / "points3D.txt").write_text("10 0.5 -1.5 2.25 255 0 17 0.5 3 0\n11 -4 8 0.125 1 2 3 0.25\n")
+    assert read_colmap(tmp_path).seen_by() == {"a b.png", "b.png", "c.png"}
+
+
+@pytest.mark.parametrize("model", CAMERA_MODELS, ids=lambda model: model.name)
+def test_every_camera_model_is_parsed(tmp_path, model):
+    parameters = tuple(range(1, model.parameters + 1))
+    data = struct.pack("<QiiQQ", 1, 4, model.id, 10, 20) + struct.pack(f"<{model.parameters}d", *parameters)
+    (tmp_path / "cameras.bin").write_bytes(data)
+    (camera,) = read_cameras_binary(tmp_path / "cameras.bin").values()
+    assert camera.parameters == parameters
+    assert len(camera.distortion) == model.distortion
+    if model.fisheye:
+        with pytest.raises(ValueError, match="Undistort"):
+            camera.pinhole(np.eye(4))
+    else:
+        pinhole = camera.pinhole(np.eye(4))
+        assert (pinhole.fx, pinhole.fy) == (1, model.focal_lengths)
+        assert (pinhole.cx, pinhole.cy) == (model.focal_lengths + 1, model.focal_lengths + 2)
+
+
+def test_unknown_camera_model(tmp_path):
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 4, 99, 10, 20, 1, 1, 1, 1))
+    with pytest.raises(ValueError, match="unknown camera model 99"):
+        read_cameras_binary(tmp_path / "cameras.bin")
+
+
+def test_corner_displacement_closed_forms():
+    f, k = 200.0, 0.02
+    radial = ColmapCamera(1, MODELS["SIMPLE_RADIAL"], 160, 120, (f, 80.0, 60.0, k))
+    # The corner is 100 px from the centre; a radial term moves it by k r^3 f with r = 100 / f.
+    assert radial.corner_displacement() == pytest.approx(k * (100 / f) ** 3 * f, rel=1e-12)
+    tangential = ColmapCamera(1, MODELS["OPENCV"], 160, 120, (f, f, 80.0, 60.0, 0.0, 0.0, 0.01, 0.0))
+    x, y = 80 / f, 60 / f
+    expected = f * math.hypot(2 * 0.01 * x * y, 0.01 * (x * x + y * y + 2 * y * y))
+    assert tangential.corner_displacement() == pytest.approx(expected, rel=1e-12)
+    assert ColmapCamera(1, MODELS["PINHOLE"], 160, 120, (f, f, 80.0, 60.0)).corner_displacement() == 0
+
+
+def test_frames_have_the_pinhole_part_and_say_what_is_ignored(tmp_path, colmap_binary):
+    colmap_binary(tmp_path / "sparse")
+    for name in ("a b.png", "b.png", "c.png"):
+        (tmp_path / name).touch()
+    frames = colmap_frames(read_colmap(tmp_path / "sparse"), tmp_path)
+    assert [frame.name for frame in frames] == ["a b.png", "b.png", "c.png"]
+    assert frames[0].distortion_px > 0
+    assert frames[1].distortion_px == 0
+    assert frames[1].camera.world_to_camera.dtype == torch.float64
+    assert frames[1].path == tmp_path / "b.png"
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    "folder", ["fern/sparse_3views", "fountain/sparse", "fountain/sparse_3near", "herz-jesu/sparse_3views"]
+)
+def test_points_project_onto_their_features(data_root, folder):
+    model = read_colmap(data_root / folder / "0")
+    rows = {number: row for row, number in enumerate(model.points.ids.tolist())}
+    errors = []
+    for image in model.images:
+        camera = model.cameras[image.camera_id].pinhole(image.world_to_camera)
+        seen = image.point_ids >= 0
+        world = torch.from_numpy(model.points.positions[[rows[i] for i in image.point_ids[seen].tolist()]])
+        x, y, z = (world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
+        assert (z > 0).all()
+        projected = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=1)
+        errors.append((projected - torch.from_numpy(image.keypoints[seen])).norm(dim=1))
+    # A shift by half a pixel, the likeliest mistake of convention, would show.
+    assert torch.cat(errors).median() < 0.25

@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from reference_trainer.scenes.images import (
+    composite,
+    image_size,
+    list_images,
+    match_images,
+    path_inside,
+    read_image,
+    resize_image,
+)
+
+
+def test_reads_the_stored_bytes(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 4), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    Image.fromarray(pixels[:, :, :3].copy()).save(tmp_path / "b.png")
+    image, alpha = read_image(tmp_path / "a.png")
+    assert image.dtype == alpha.dtype == torch.float32
+    assert image.shape == (3, 5, 7)
+    assert np.array_equal(image.permute(1, 2, 0).numpy(), pixels[:, :, :3] / np.float32(255))
+    assert np.array_equal(alpha.numpy(), pixels[:, :, 3] / np.float32(255))
+    opaque, none = read_image(tmp_path / "b.png")
+    assert torch.equal(opaque, image)
+    assert none is None
+    assert image_size(tmp_path / "a.png") == (7, 5)
+
+
+def test_grey_and_palette_files_become_rgb(tmp_path):
+    grey = np.array([[0, 128], [200, 255]], dtype=np.uint8)
+    Image.fromarray(grey).save(tmp_path / "grey.png")
+    Image.fromarray(grey).convert("P").save(tmp_path / "palette.png", transparency=0)
+    image, alpha = read_image(tmp_path / "grey.png")
+    assert alpha is None
+    assert all(np.array_equal(channel.numpy(), grey / np.float32(255)) for channel in image)
+    assert read_image(tmp_path / "palette.png")[1].tolist() == [[0, 1], [1, 1]]
+
+
+def test_bad_files_are_refused_with_their_path(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no image file .*none\.png"):
+        read_image(tmp_path / "none.png")
+    (tmp_path / "text.png").write_text("not an image")
+    with pytest.raises(ValueError, match=r"text\.png is not a readable image"):
+        read_image(tmp_path / "text.png")
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "whole.png")
+    (tmp_path / "half.png").write_bytes((tmp_path / "whole.png").read_bytes()[:6000])
+    with pytest.raises(ValueError, match=r"half\.png is not a readable image"):
+        read_image(tmp_path / "half.png")
+    Image.fromarray(np.full((4, 4), 40_000, np.uint16)).save(tmp_path / "deep.png")
+    with pytest.raises(ValueError, match="8 bits"):
+        read_image(tmp_path / "deep.png")
+
+
+def test_composite_is_straight_alpha():
+    image = torch.tensor([0.8, 0.4, 0.0])[:, None, None].expand(3, 1, 3)
+    alpha = torch.tensor([[0.0, 0.5, 1.0]])
+    result = composite(image, alpha, torch.tensor([1.0, 0.0, 0.5]))
+    expected = torch.tensor([[[1.0, 0.9, 0.8]], [[0.0, 0.2, 0.4]], [[0.5, 0.25, 0.0]]])
+    torch.testing.assert_close(result, expected)
+
+
+@pytest.mark.parametrize(("width", "height"), [(20, 15), (13, 9), (40, 30), (80, 45)])
+def test_resize_equals_pillows_bicubic_in_float(width, height):
+    generator = torch.Generator().manual_seed(0)
+    # Kept away from 0 and 1, so that the clamp does not hide a difference.
+    image = 0.3 + 0.4 * torch.rand(3, 30, 40, generator=generator)
+    pillow = [
+        np.asarray(Image.fromarray(channel.numpy()).resize((width, height), Image.Resampling.BICUBIC))
+        for channel in image
+    ]
+    assert np.abs(resize_image(image, width, height).numpy() - np.stack(pillow)).max() < 1e-6
+
+
+def test_resize_stays_in_range():
+    image = torch.zeros(1, 8, 8)
+    image[:, :, 4:] = 1
+    resized = resize_image(image, 23, 23)
+    assert resized.min() == 0
+    assert resized.max() == 1
+
+
+def touch(folder, *names):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / name).touch()
+
+
+def test_match_images_by_name_stem_and_order(tmp_path):
+    touch(tmp_path / "a", "x.png", "y.png", "z.png", "notes.txt")
+    assert match_images(tmp_path / "a", ["y.png"]) == {"y.png": tmp_path / "a" / "y.png"}
+    assert match_images(tmp_path / "a", ["y.JPG", "x.JPG"])["x.JPG"].name == "x.png"
+    by_order = match_images(tmp_path / "a", ["IMG_3.JPG", "IMG_1.JPG", "IMG_2.JPG"])
+    assert {name: file.name for name, file in by_order.items()} == {
+        "IMG_1.JPG": "x.png",
+        "IMG_2.JPG": "y.png",
+        "IMG_3.JPG": "z.png",
+    }
+    with pytest.raises(ValueError, match=r"lacks 2 of the 2 images.*IMG_1\.JPG.*3 files.*x\.png"):
+        match_images(tmp_path / "a", ["IMG_1.JPG", "IMG_2.JPG"])
+
+
+def test_list_images_refuses_empty_and_missing_folders(tmp_path):
+    touch(tmp_path, "notes.txt")
+    with pytest.raises(ValueError, match="holds no images"):
+        list_images(tmp_path)
+    with pytest.raises(FileNotFoundError, match="no image folder"):
+        list_images(tmp_path / "none")
+
+
+@pytest.mark.parametrize("path", ["../secret.png", "/etc/passwd", "a/../../b", "..", "./../x"])
+def test_paths_out_of_the_scene_are_refused(path):
+    with pytest.raises(ValueError, match="leads out of the scene"):
+        path_inside("scene", path)
+
+
+def test_paths_within_the_scene_are_kept():
+    assert path_inside("scene", "a/../b.png").as_posix() == "scene/b.png"
+    assert path_inside("scene", "..b.png").as_posix() == "scene/..b.png"

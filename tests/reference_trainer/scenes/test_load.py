@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+import json
+import logging
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from reference_trainer.scenes import load_scene
+from reference_trainer.scenes.load import detect_format
+
+
+@pytest.fixture
+def photo_scene(tmp_path, colmap_text, save_image):
+    """A COLMAP scene of three photographs in two sizes; its points come from b.png and c.png."""
+    root = tmp_path / "garden"
+    colmap_text(root / "sparse" / "0")
+    rng = np.random.default_rng(0)
+    for name in ("a b", "b", "c"):
+        pixels = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+        save_image(root / "images" / f"{name}.png", pixels)
+        save_image(root / "images_4" / f"{name}.png", pixels[::4, ::4].copy())
+    (root / "split.json").write_text(json.dumps({"train": ["b.png", "c.png"], "test": ["a b.png"]}))
+    return root
+
+
+def test_colmap_scene(photo_scene, caplog):
+    with caplog.at_level(logging.INFO):
+        scene = load_scene(photo_scene, points="sparse/0")
+    assert "distortion is ignored" in caplog.text
+    assert scene.name == "garden"
+    assert [view.name for view in scene.train] == ["b.png", "c.png"]
+    assert [view.name for view in scene.test] == ["a b.png"]
+    assert scene.background.tolist() == [0, 0, 0]
+    assert len(scene.points.positions) == 2
+    b = scene.train[0]
+    assert b.image.shape == (3, 48, 64)
+    assert b.image.dtype == b.camera.world_to_camera.dtype == scene.points.positions.dtype == torch.float32
+    assert b.alpha is None
+    # The camera file of "a b.png" is for 32x24, the picture is 64x48.
+    a = scene.test[0].camera
+    assert (a.width, a.height, a.fx, a.cx, a.cy) == (64, 48, 80, 32, 24)
+
+
+def test_image_folder_and_downscale(photo_scene):
+    quarter = load_scene(photo_scene, images="images_4", points="random:5").train[0]
+    assert quarter.image.shape == (3, 12, 16)
+    assert quarter.camera.fx == pytest.approx(50.5 / 4)
+    half = load_scene(photo_scene, downscale=2, points="random:5").train[0]
+    assert half.image.shape == (3, 24, 32)
+    assert half.camera.fx == pytest.approx(50.5 / 2)
+    for file in (photo_scene / "images").iterdir():
+        file.unlink()
+    (photo_scene / "images").rmdir()
+    assert load_scene(photo_scene, points="random:5").train[0].image.shape == (3, 12, 16)
+
+
+def test_points_that_saw_test_views_are_refused(photo_scene):
+    (photo_scene / "split.json").write_text(json.dumps({"train": ["a b.png", "b.png"], "test": ["c.png"]}))
+    with pytest.raises(ValueError, match=r"seen 1 image outside the training split: c\.png"):
+        load_scene(photo_scene, points="sparse/0")
+    assert load_scene(photo_scene, points="sparse/0", allow_test_points=True).points.seen_by == {"b.png", "c.png"}
+
+
+def test_auto_points_come_from_training_views_or_are_random(photo_scene, colmap_binary):
+    colmap_binary(photo_scene / "sparse_2views" / "0")
+    cloud = load_scene(photo_scene).points
+    assert cloud.source.endswith("sparse_2views/0")
+    (photo_scene / "split.json").write_text(json.dumps({"train": ["a b.png", "b.png"], "test": ["c.png"]}))
+    assert load_scene(photo_scene, points="auto").points.source == "random"
+
+
+def test_random_points_follow_the_seed(photo_scene):
+    one, two, three = (load_scene(photo_scene, points="random:7", seed=seed).points.positions for seed in (0, 0, 1))
+    assert one.shape == (7, 3)
+    assert torch.equal(one, two)
+    assert not torch.equal(one, three)
+
+
+def test_blender_scene_is_composited_before_resizing(blender_scene):
+    scene = load_scene(blender_scene, downscale=2)
+    assert [view.name for view in scene.train] == ["train/r_0", "train/r_1", "train/r_2"]
+    assert [view.name for view in scene.test] == ["test/r_0", "test/r_1"]
+    assert scene.background.tolist() == [1, 1, 1]
+    view = scene.train[0]
+    assert (view.camera.width, view.camera.height) == (4, 3)
+    assert view.camera.fx == pytest.approx(4)
+    pixels = np.asarray(Image.open(blender_scene / "train" / "r_0.png")).astype(np.float32) / 255
+    for background, base in (("white", 1.0), ("black", 0.0)):
+        composed = pixels[..., :3] * pixels[..., 3:] + base * (1 - pixels[..., 3:])
+        expected = np.stack(
+            [np.asarray(Image.fromarray(composed[..., i]).resize((4, 3), Image.Resampling.BICUBIC)) for i in range(3)]
+        )
+        got = load_scene(blender_scene, downscale=2, background=background).train[0].image
+        assert np.abs(got.numpy() - expected.clip(0, 1)).max() < 1e-6
+    alpha = np.asarray(Image.fromarray(pixels[..., 3]).resize((4, 3), Image.Resampling.BICUBIC))
+    assert np.abs(view.alpha.numpy() - alpha.clip(0, 1)).max() < 1e-6
+
+
+def test_blender_random_points_fill_the_box(blender_scene):
+    positions = load_scene(blender_scene, points="random:2000").points.positions
+    assert positions.abs().max() <= 1.3
+    assert positions.abs().amax(0).min() > 1.25
+
+
+def test_llff_scene(photo_scene):
+    rows = []
+    for i in range(3):
+        matrix = np.zeros((3, 5))
+        matrix[:, :3] = np.stack([[0, 1, 0], [1, 0, 0], [0, 0, -1]], axis=1)  # down, right, back of a camera along +z
+        matrix[:, 3] = [i, 0, 0]
+        matrix[:, 4] = [480, 640, 500]
+        rows.append([*matrix.ravel(), 2.0, 10.0])
+    np.save(photo_scene / "poses_bounds.npy", np.array(rows))
+    scene = load_scene(photo_scene, format="llff", points="random:1000", split="split")
+    assert scene.train[0].camera.fx == pytest.approx(50)
+    assert scene.train[1].camera.position.tolist() == [2, 0, 0]
+    depth = scene.points.positions[:, 2]
+    assert depth.min() >= 1.999
+    assert depth.max() <= 10.001
+    assert depth.max() > 8
+    assert depth.min() < 2.2
+
+
+def test_synthetic_scene_by_name():
+    scene = load_scene("synthetic", downscale=8, views=4)
+    assert scene.name == "synthetic"
+    assert len(scene.train) == 4
+    assert scene.train[0].image.shape == (3, 15, 20)
+
+
+def test_detect_format(photo_scene, blender_scene, tmp_path):
+    assert detect_format(photo_scene) == "colmap"
+    assert detect_format(blender_scene) == "blender"
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").touch()
+    with pytest.raises(ValueError, match=r"none of transforms_train\.json.*notes\.txt"):
+        detect_format(tmp_path / "other")
+    (tmp_path / "other" / "poses_bounds.npy").touch()
+    assert detect_format(tmp_path / "other") == "llff"
+    with pytest.raises(FileNotFoundError, match="say 'synthetic'"):
+        detect_format(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"format": "nerf"}, "format must be"),
+        ({"background": "green"}, "background must be"),
+        ({"downscale": 0.5}, "downscale must be"),
+        ({"views": 0}, "views must be"),
+        ({"views": 5}, "no training set of 5 views"),
+        ({"split": "other"}, r"no split 'other'; choose auto, llff or a JSON file of the scene: \['split'\]"),
+        ({"images": "pictures"}, "no image folder"),
+        ({"points": "sparse/1"}, r"choose auto, random or one of \['sparse/0'\]"),
+        ({"points": "../sparse/0"}, "leads out of the scene"),
+        ({"points": "random:many"}, "random:<count>"),
+        ({"points": "cloud.ply"}, "no point cloud"),
+    ],
+)
+def test_options_that_make_no_sense(photo_scene, options, reason):
+    with pytest.raises((ValueError, FileNotFoundError), match=reason):
+        load_scene(photo_scene, **{"points": "sparse/0"} | options)
+
+
+def test_options_without_use_are_refused(blender_scene):
+    with pytest.raises(ValueError, match=r"no use for \{'images': 'x'\}"):
+        load_scene(blender_scene, images="x")
+    with pytest.raises(ValueError, match=r"no use for \{'split': 'llff'\}"):
+        load_scene("synthetic", split="llff")
+
+
+def test_pictures_of_another_shape_are_refused(photo_scene, save_image):
+    for name in ("a b", "b", "c"):
+        save_image(photo_scene / "images_3" / f"{name}.png", np.zeros((40, 40, 3), np.uint8))
+    with pytest.raises(ValueError, match="40x40 but its camera is for 64x48"):
+        load_scene(photo_scene, images="images_3", points="sparse/0")
+
+
+@pytest.mark.data
+def test_fern(data_root):
+    scene = load_scene(data_root / "fern", images="images_16")
+    assert [view.name for view in scene.train] == ["image001.png", "image010.png", "image019.png"]
+    assert [view.name for view in scene.test] == ["image000.png", "image008.png", "image016.png"]
+    camera = scene.train[0].camera
+    assert scene.train[0].image.shape == (3, camera.height, camera.width) == (3, 189, 252)
+    assert scene.points.source.endswith("sparse_3views_dense/0")
+    assert len(scene.points.positions) == 15_000
+    with pytest.raises(ValueError, match="outside the training split"):
+        load_scene(data_root / "fern", images="images_16", points="sparse/0")
+    by_rule = load_scene(data_root / "fern", images="images_16", split="llff", format="llff")
+    assert [view.name for view in by_rule.train] == [view.name for view in scene.train]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("scene", "split", "train", "points"),
+    [
+        ("fountain", "auto", ["0001.jpg", "0005.jpg", "0010.jpg"], "sparse_3views/0"),
+        ("fountain", "split_near", ["0001.jpg", "0003.jpg", "0005.jpg"], "sparse_3near/0"),
+        ("herz-jesu", "auto", ["0001.jpg", "0004.jpg", "0007.jpg"], "sparse_3views/0"),
+        ("herz-jesu", "split_near", ["0002.jpg", "0004.jpg", "0006.jpg"], "sparse_3near/0"),
+    ],
+)
+def test_splits_find_their_own_points(data_root, scene, split, train, points):
+    loaded = load_scene(data_root / scene, images="images_2", split=split)
+    assert [view.name for view in loaded.train] == train
+    assert loaded.points.source.endswith(points)
+
+
+@pytest.mark.data
+def test_points_have_the_colors_of_the_pictures(data_root):
+    """Independent of any file but the photographs: projected points fall on pixels of their own colour."""
+    scene = load_scene(data_root / "fern", images="images_16")
+    view = scene.train[1]
+    camera, points = view.camera, scene.points
+    x, y, z = (points.positions @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
+    grid = torch.stack(
+        [2 * (camera.fx * x / z + camera.cx) / 252 - 1, 2 * (camera.fy * y / z + camera.cy) / 189 - 1], 1
+    )
+    inside = (grid.abs() < 1).all(1)
+    assert inside.float().mean() > 0.9
+    sampled = torch.nn.functional.grid_sample(view.image[None], grid[None, None, inside], align_corners=False)[
+        0, :, 0
+    ].T
+    error = (sampled - points.colors[inside]).abs().mean()
+    shuffled = (sampled - points.colors[inside].flip(0)).abs().mean()
+    assert error < 0.5 * shuffled
+
+
+@pytest.mark.data
+def test_lego(data_root):
+    scene = load_scene(data_root / "lego", downscale=4)
+    assert [view.name for view in scene.train] == [f"train/r_{i}" for i in (2, 16, 26, 55, 73, 76, 86, 93)]
+    assert [view.name for view in scene.test] == [f"test/r_{i}" for i in range(0, 200, 8)]
+    view = scene.train[0]
+    assert view.image[:, view.alpha == 0].min() > 0.99
+    assert scene.points.source == "random"

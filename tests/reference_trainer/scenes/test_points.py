@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+import torch
+
+from reference_trainer.camera import Camera
+from reference_trainer.scenes.points import (
+    check_no_leak,
+    colmap_points,
+    mean_neighbor_distance,
+    random_points_in_box,
+    random_points_in_frusta,
+)
+from reference_trainer.scenes.scene import PointCloud
+
+
+def brute_force(positions, k):
+    """Root mean squared distance to the k nearest others, in float64, one pair at a time."""
+    p = positions.double().numpy()
+    squared = ((p[:, None] - p[None]) ** 2).sum(-1)
+    result = []
+    for i, row in enumerate(squared):
+        nearest = sorted(np.delete(row, i))[:k]
+        result.append(max(np.mean(nearest), 1e-7) ** 0.5)
+    return torch.tensor(result)
+
+
+@pytest.mark.parametrize(("n", "k"), [(2, 3), (3, 3), (4, 3), (200, 3), (200, 1), (50, 7)])
+def test_neighbor_distance_equals_brute_force(n, k):
+    positions = torch.randn(n, 3, generator=torch.Generator().manual_seed(n))
+    expected = brute_force(positions, k)
+    torch.testing.assert_close(mean_neighbor_distance(positions, k).double(), expected, rtol=1e-5, atol=0)
+
+
+def test_neighbor_distance_of_near_duplicates_far_from_the_origin():
+    generator = torch.Generator().manual_seed(0)
+    base = torch.rand(40, 3, generator=generator) + 3
+    shifts = 1e-3 * torch.randn(3, 40, 3, generator=generator)
+    positions = torch.cat([base, *(base + shift for shift in shifts)])
+    got = mean_neighbor_distance(positions)
+    torch.testing.assert_close(got.double(), brute_force(positions, 3), rtol=1e-4, atol=0)
+
+
+def test_duplicates_get_the_floor():
+    assert torch.equal(mean_neighbor_distance(torch.ones(5, 3)), torch.full((5,), 1e-7).sqrt())
+
+
+def test_neighbor_distance_does_not_depend_on_the_chunks(monkeypatch):
+    positions = torch.randn(101, 3, generator=torch.Generator().manual_seed(0))
+    whole = mean_neighbor_distance(positions)
+    monkeypatch.setattr("reference_trainer.scenes.points.CHUNK_ELEMENTS", 101 * 7)
+    assert torch.equal(mean_neighbor_distance(positions), whole)
+
+
+@pytest.mark.parametrize("shape", [(1, 3), (0, 3), (4, 2), (12,)])
+def test_neighbor_distance_refuses_other_shapes(shape):
+    with pytest.raises(ValueError, match="shape"):
+        mean_neighbor_distance(torch.zeros(shape))
+
+
+def cloud(seen_by):
+    return PointCloud(torch.zeros(1, 3), torch.zeros(1, 3), "sparse/0", seen_by)
+
+
+def test_leak_is_refused_by_name_with_the_way_out():
+    with pytest.raises(ValueError, match=r"sparse/0 have seen 2 images .*: c, d\..*--allow-test-points"):
+        check_no_leak(cloud(frozenset("abcd")), ["a", "b"])
+    with pytest.raises(ValueError, match="20 images"):
+        check_no_leak(cloud(frozenset(map(str, range(20)))), [])
+
+
+def test_no_leak_passes():
+    check_no_leak(cloud(frozenset("ab")), ["a", "b", "c"])
+    check_no_leak(cloud(frozenset()), ["a"])
+    check_no_leak(cloud(None), ["a"])
+    check_no_leak(cloud(frozenset("abcd")), ["a"], allow=True)
+
+
+def test_colmap_points(tmp_path, colmap_binary):
+    colmap_binary(tmp_path)
+    points = colmap_points(tmp_path)
+    assert points.positions.dtype == points.colors.dtype == torch.float32
+    assert points.positions.tolist() == [[0.5, -1.5, 2.25], [-4, 8, 0.125]]
+    torch.testing.assert_close(points.colors[0] * 255, torch.tensor([255.0, 0, 17]))
+    assert points.seen_by == {"b.png", "c.png"}
+    (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 0))
+    with pytest.raises(ValueError, match="no points to start from"):
+        colmap_points(tmp_path)
+
+
+def looking(position, target):
+    """A camera at a place that looks at a point; which way is up does not matter here."""
+    position, target = torch.tensor(position), torch.tensor(target)
+    forward = torch.nn.functional.normalize(target - position, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.3, 1.0, 0.2])), dim=0)
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return Camera(pose, 60.0, 50.0, 35.0, 22.0, 64, 48)
+
+
+CAMERAS = [
+    looking([3.0, 0.0, -4.0], [1.0, 2.0, 3.0]),
+    looking([-3.0, 1.0, -4.0], [1.0, 2.0, 3.0]),
+    looking([0.0, 5.0, -4.0], [1.0, 2.0, 3.0]),
+]
+
+
+@pytest.mark.parametrize("bounds", [{}, {"near": 0.5, "far": 30.0}])
+def test_random_points_lie_in_the_frusta(bounds):
+    points = random_points_in_frusta(CAMERAS, 500, generator=torch.Generator().manual_seed(0), **bounds)
+    depths = sorted((torch.tensor([1.0, 2.0, 3.0]) - camera.position).norm().item() for camera in CAMERAS)
+    near, far = bounds.get("near", depths[1] / 4), bounds.get("far", depths[1] * 4)
+    seen = torch.zeros(500, dtype=torch.bool)
+    for camera in CAMERAS:
+        x, y, z = (points.positions @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (u > -1e-3) & (u < 64 + 1e-3) & (v > -1e-3) & (v < 48 + 1e-3)
+        seen |= inside & (z > near * 0.999) & (z < far * 1.001)
+    assert seen.all()
+    assert points.seen_by == frozenset()
+
+
+def test_random_points_are_uniform_in_inverse_depth():
+    camera = Camera(torch.eye(4), 60.0, 50.0, 35.0, 22.0, 64, 48)
+    points = random_points_in_frusta([camera], 4000, near=1.0, far=10.0, generator=torch.Generator().manual_seed(1))
+    share = (1 / points.positions[:, 2] - 0.1) / 0.9
+    ordered = share.sort().values
+    distance = (ordered - (torch.arange(4000) + 0.5) / 4000).abs().max()
+    # Kolmogorov-Smirnov: above 1.95 / sqrt(n) in 1 of 1000 seeds.
+    assert distance < 1.95 / 4000**0.5
+
+
+def test_frusta_without_a_meeting_point_are_refused():
+    parallel = [Camera(torch.eye(4), 60.0, 50.0, 35.0, 22.0, 64, 48)] * 2
+    with pytest.raises(ValueError, match="optical axes"):
+        random_points_in_frusta(parallel, 10)
+    apart = [looking([3.0, 0.0, 0.0], [6.0, 0.0, 1.0]), looking([-3.0, 0.0, 0.0], [-6.0, 0.0, 1.0])]
+    with pytest.raises(ValueError, match="optical axes"):
+        random_points_in_frusta(apart, 10)
+    with pytest.raises(ValueError, match="0 < near < far"):
+        random_points_in_frusta(parallel, 10, near=2.0, far=1.0)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [lambda g: random_points_in_box(9, 1.3, generator=g), lambda g: random_points_in_frusta(CAMERAS, 9, generator=g)],
+)
+def test_random_points_repeat_and_leave_the_global_state(draw):
+    before = torch.get_rng_state()
+    one, two = (draw(torch.Generator().manual_seed(5)) for _ in range(2))
+    assert torch.equal(one.positions, two.positions)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert not torch.equal(draw(torch.Generator().manual_seed(6)).positions, one.positions)
