@@ -1,0 +1,164 @@
+"""Render Gaussians: tensors and a camera in, an image out."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.blending import composite
+from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
+from reference_trainer.render.projection import Projection, project
+from reference_trainer.render.spherical_harmonics import evaluate_sh
+from reference_trainer.render.tiles import TileLists, bin_gaussians
+
+__all__ = ["Rendering", "Splats", "render", "splat"]
+
+
+class Splats(NamedTuple):
+    """Gaussians made ready for one camera: projected, coloured, and listed per tile.
+
+    Args:
+        indices: which of the N Gaussians were projected, shape (M,).
+        projection: their ellipses.
+        opacities: activated, shape (M,).
+        colors: towards this camera, shape (M, 3).
+        lists: the splats of every tile.
+    """
+
+    indices: Tensor
+    projection: Projection
+    opacities: Tensor
+    colors: Tensor
+    lists: TileLists
+
+
+class Rendering(NamedTuple):
+    """A rendered view.
+
+    Args:
+        image: colours over the background, not clamped, shape (3, H, W).
+        alpha: accumulated alpha, shape (H, W).
+        depth: sum of weight times camera depth, not divided by alpha, shape (H, W); None unless asked for.
+        splats: what was drawn. ``splats.projection.means`` keeps its gradient (pixels) for densification.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    depth: Tensor | None
+    splats: Splats
+
+
+def splat(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    *,
+    sh: Tensor | None = None,
+    sh_degree: int | None = None,
+    colors: Tensor | None = None,
+) -> Splats:
+    """Project Gaussians, evaluate their colours and list them per tile.
+
+    Gaussians that cannot be seen (behind the near plane, or with an opacity below `MIN_ALPHA`, such as dropped ones)
+    are left out before the projection and cost nothing.
+
+    Args:
+        means: world coordinates, shape (N, 3).
+        quaternions: orientation, wxyz, shape (N, 4).
+        scales: standard deviations, positive, shape (N, 3).
+        opacities: activated, shape (N,) or (N, 1).
+        camera: the view.
+        sh: spherical-harmonic coefficients, shape (N, K, 3).
+        sh_degree: highest band to evaluate; all of ``sh`` by default.
+        colors: colours instead of ``sh``, shape (N, 3).
+
+    Raises:
+        ValueError: if not exactly one of ``sh`` and ``colors`` is given, or the opacities have another shape.
+    """
+    if (sh is None) == (colors is None):
+        raise ValueError("give either sh (N, K, 3) or colors (N, 3), not both and not neither.")
+    n = means.shape[0]
+    if opacities.shape not in ((n,), (n, 1)):
+        raise ValueError(f"opacities must have shape ({n},) or ({n}, 1), got {tuple(opacities.shape)}.")
+    opacities = opacities.reshape(n)
+    camera = camera.to(means.device, means.dtype)
+    if sh is not None:
+        degree = math.isqrt(sh.shape[1]) - 1 if sh_degree is None else sh_degree
+        sh = sh[:, : (degree + 1) ** 2]
+    with torch.no_grad():
+        depths = means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+        indices = torch.nonzero((depths > NEAR_PLANE) & (opacities >= MIN_ALPHA)).squeeze(1)
+    if indices.shape[0] < n:
+        means, quaternions, scales = means[indices], quaternions[indices], scales[indices]
+        opacities = opacities[indices]
+        sh, colors = (None if x is None else x[indices] for x in (sh, colors))
+    projection = project(means, quaternions, scales, camera)
+    if sh is not None:
+        directions = torch.nn.functional.normalize(means - camera.position, dim=-1)
+        colors = evaluate_sh(sh, directions, degree)
+    assert colors is not None
+    with torch.no_grad():
+        lists = bin_gaussians(projection, opacities, camera.width, camera.height)
+    return Splats(indices, projection, opacities, colors, lists)
+
+
+def render(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    *,
+    sh: Tensor | None = None,
+    sh_degree: int | None = None,
+    colors: Tensor | None = None,
+    background: Tensor | None = None,
+    depth: bool = False,
+) -> Rendering:
+    """Render 3D Gaussians; differentiable in every tensor.
+
+    Convention: OpenCV camera, half-pixel centres, wxyz quaternions; the constants of the INRIA rasterizer.
+
+    Args:
+        means: world coordinates, shape (N, 3).
+        quaternions: orientation, need not be normalised, shape (N, 4).
+        scales: standard deviations along the axes, positive, shape (N, 3).
+        opacities: activated, in [0, 1], shape (N,) or (N, 1).
+        camera: the view.
+        sh: spherical-harmonic coefficients, shape (N, K, 3), or
+        sh_degree: highest band to evaluate; all of ``sh`` by default.
+        colors: colours, shape (N, 3).
+        background: colour behind everything, shape (3,); black by default.
+        depth: whether to accumulate depth as well.
+
+    Returns:
+        Image, accumulated alpha, depth if asked for, and the splats.
+
+    Raises:
+        ValueError: if not exactly one of ``sh`` and ``colors`` is given, or a shape is wrong.
+
+    Example:
+        >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
+        >>> out = render(torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.1),
+        ...              torch.tensor([0.8]), camera, colors=torch.tensor([[1.0, 0.5, 0.0]]))
+        >>> out.image.shape, round(out.alpha.max().item(), 1)
+        (torch.Size([3, 32, 32]), 0.8)
+    """
+    splats = splat(means, quaternions, scales, opacities, camera, sh=sh, sh_degree=sh_degree, colors=colors)
+    projection = splats.projection
+    if projection.means.requires_grad:
+        projection.means.retain_grad()
+    columns = [splats.colors, torch.ones_like(splats.opacities)[:, None]]
+    if depth:
+        columns.append(projection.depths[:, None])
+    sums = composite(projection.means, projection.factors, splats.opacities, torch.cat(columns, dim=1), splats.lists)
+    image, alpha = sums[:3], sums[3]
+    if background is not None:
+        image = image + (1 - alpha) * background.to(image)[:, None, None]
+    return Rendering(image, alpha, sums[4] if depth else None, splats)

@@ -1,0 +1,48 @@
+"""Per-pixel statistics of the splats behind a rendering, tile by tile."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ca_reg.functional import color_variance
+from reference_trainer.render.blending import block_alphas, block_size, pack, untile
+from reference_trainer.render.constants import TILE
+from reference_trainer.render.renderer import Splats
+
+__all__ = ["color_variance_map"]
+
+
+@torch.no_grad()
+def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
+    """Measure how much the colours blended at each pixel differ (paper, appendix, CV metric).
+
+    Args:
+        splats: of a rendering.
+
+    Returns:
+        The variance, mean over RGB, shape (H, W), and where any splat contributes, shape (H, W) bool; the variance is 0
+        elsewhere. The image's CV is the mean over the latter.
+
+    Example:
+        >>> from reference_trainer.camera import Camera
+        >>> from reference_trainer.render import splat
+        >>> camera = Camera(torch.eye(4), 50.0, 50.0, 8.0, 8.0, 16, 16)
+        >>> means, quaternions = torch.tensor([[0.0, 0, 1], [0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]] * 2)
+        >>> splats = splat(means, quaternions, torch.full((2, 3), 0.2), torch.full((2,), 0.5), camera,
+        ...                colors=torch.tensor([[0.0, 0, 0], [1.0, 1, 1]]))
+        >>> variance, covered = color_variance_map(splats)
+        >>> round(variance[8, 8].item(), 2)  # weights 1/2 and 1/4: (1/3) (2/3)
+        0.22
+    """
+    lists = splats.lists
+    table = pack(splats.projection.means, splats.projection.factors, splats.opacities)
+    colors = torch.cat([splats.colors, splats.colors.new_zeros(1, 3)])
+    tiles = table.new_zeros(lists.lengths.shape[0], TILE * TILE, 2)
+    for block in lists.blocks(block_size(table.device)):
+        weights = block_alphas(table, block, lists)[0].weights
+        of_pixels = colors[block.gaussians][:, None].expand(-1, TILE * TILE, -1, -1)
+        result = color_variance(weights, of_pixels)
+        tiles[block.tiles] = torch.stack([result.variance, result.covered.to(table)], dim=-1)
+    variance, covered = untile(tiles, lists)
+    return variance, covered > 0

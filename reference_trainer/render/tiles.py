@@ -1,0 +1,150 @@
+"""Which Gaussian touches which tile of the image, in depth order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from reference_trainer.render.constants import MIN_ALPHA, TILE
+from reference_trainer.render.projection import Projection
+
+__all__ = ["Block", "TileLists", "bin_gaussians"]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Tiles of similar list length that are composited together.
+
+    Args:
+        tiles: tile numbers, row by row over the image, shape (T,).
+        gaussians: the Gaussians of each tile, nearest first, padded with the number of Gaussians M, shape (T, L).
+    """
+
+    tiles: Tensor
+    gaussians: Tensor
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """For every tile the Gaussians that can reach `MIN_ALPHA` at one of its pixels, nearest first.
+
+    Args:
+        width: image width, pixels.
+        height: image height, pixels.
+        count: the number of Gaussians M.
+        gaussians: their numbers, tile after tile, shape (P,).
+        lengths: list length of each tile, shape (tiles,).
+        touched: whether a Gaussian is in any list, shape (M,) bool.
+    """
+
+    width: int
+    height: int
+    count: int
+    gaussians: Tensor
+    lengths: Tensor
+    touched: Tensor
+
+    @property
+    def columns(self) -> int:
+        """Tiles in a row of the image."""
+        return -(-self.width // TILE)
+
+    @property
+    def rows(self) -> int:
+        """Tiles in a column of the image."""
+        return -(-self.height // TILE)
+
+    @cached_property
+    def _by_length(self) -> tuple[list[int], Tensor, Tensor]:
+        """Return lengths in descending order, the tiles in that order, and where their lists start."""
+        lengths, tiles = torch.sort(self.lengths, descending=True, stable=True)
+        starts = (self.lengths.cumsum(0) - self.lengths)[tiles]
+        return lengths.tolist(), tiles, starts
+
+    def blocks(self, elements: int) -> Iterator[Block]:
+        """Iterate over all tiles with a non-empty list, in blocks of at most ``elements`` pixel-Gaussian pairs.
+
+        A single tile whose list alone is longer makes a block of its own.
+        """
+        lengths, tiles, starts = self._by_length
+        device = self.gaussians.device
+        first, end = 0, next((i for i, n in enumerate(lengths) if n == 0), len(lengths))
+        while first < end:
+            longest = lengths[first]
+            last = min(end, first + max(1, elements // (TILE * TILE * longest)))
+            position = torch.arange(longest, device=device)
+            inside = position < self.lengths[tiles[first:last], None]
+            where = (starts[first:last, None] + position).clamp_(max=self.gaussians.shape[0] - 1)
+            yield Block(tiles[first:last], torch.where(inside, self.gaussians[where], self.count))
+            first = last
+
+
+def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
+    """List the Gaussians of every tile.
+
+    A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the rectangle spanned by the
+    tile's pixel centres. The test is exact: within a strip of tiles, an ellipse covers an interval of columns.
+
+    Args:
+        projection: M projected Gaussians.
+        opacities: activated, shape (M,).
+        width: image width, pixels.
+        height: image height, pixels.
+    """
+    device = opacities.device
+    order = torch.argsort(projection.depths, stable=True)
+    mean_x, mean_y = projection.means[order].unbind(-1)
+    l11, l21, l22 = projection.factors[order].unbind(-1)
+    xx, xy, yy = projection.covariances[order].unbind(-1)
+    squared_radius = 2.0 * torch.log(opacities[order] / MIN_ALPHA).clamp_(min=0.0)
+
+    reach = torch.sqrt(squared_radius * yy)
+    top = torch.ceil(mean_y - reach - 0.5).clamp_(0, height)
+    bottom = torch.floor(mean_y + reach - 0.5).clamp_(-1, height - 1)
+    first_row = (top / TILE).long()
+    rows = torch.where(bottom >= top, (bottom / TILE).floor().long() - first_row + 1, 0)
+    entry, row = _expand(first_row, rows)
+
+    y = mean_y[entry]
+    upper = row * TILE + 0.5 - y
+    lower = torch.clamp(row * TILE + (TILE - 0.5), max=height - 0.5) - y
+    tip = (xy * torch.sqrt(squared_radius / xx))[entry]  # the dy at which the ellipse reaches furthest right
+    limit, a, b, c, x = squared_radius[entry], l11[entry], l21[entry], l22[entry], mean_x[entry]
+
+    def boundary(dy: Tensor, side: float) -> Tensor:
+        half = torch.sqrt((limit - (c * dy) ** 2).clamp_(min=0.0))
+        return x + (side * half - b * dy) / a
+
+    left = boundary(torch.minimum(torch.maximum(-tip, upper), lower), -1.0)
+    right = boundary(torch.minimum(torch.maximum(tip, upper), lower), 1.0)
+    left = torch.ceil(left - 0.5).clamp_(0, width)
+    right = torch.floor(right - 0.5).clamp_(-1, width - 1)
+    first_column = (left / TILE).long()
+    columns = torch.where(right >= left, (right / TILE).floor().long() - first_column + 1, 0)
+    strip, column = _expand(first_column, columns)
+
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    tile = row[strip] * tiles_x + column
+    gaussians = order[entry[strip]]
+    tile, permutation = torch.sort(tile.int(), stable=True)
+    touched = torch.zeros(order.shape[0], dtype=torch.bool, device=device)
+    touched[gaussians] = True
+    return TileLists(
+        width=width,
+        height=height,
+        count=order.shape[0],
+        gaussians=gaussians[permutation],
+        lengths=torch.bincount(tile, minlength=tiles_x * tiles_y),
+        touched=touched,
+    )
+
+
+def _expand(first: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """List the integers first[i] .. first[i] + counts[i] - 1 of every i; return the i and the integer of each."""
+    source = torch.repeat_interleave(counts)
+    offset = first - (counts.cumsum(0) - counts)
+    return source, offset[source] + torch.arange(source.shape[0], device=first.device)

@@ -1,0 +1,129 @@
+"""Slow independent implementations that the package is tested against."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+
+
+class GaussianScene(NamedTuple):
+    """Random Gaussians in front of a camera; every tensor float64."""
+
+    means: Tensor
+    quaternions: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    camera: Camera
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        return self[:5]
+
+    def to(self, dtype: torch.dtype, device: torch.device | str = "cpu") -> "GaussianScene":
+        return GaussianScene(*(x.to(device, dtype) for x in self[:5]), self.camera.to(device, dtype))
+
+
+def random_scene(n: int, width: int, height: int, seed: int, *, size: float = 0.08) -> GaussianScene:
+    """Draw n Gaussians, some of them behind the camera or outside the picture, seen by a rotated camera."""
+    g = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0, -0.1, 0.2], [0.1, 0, -0.3], [-0.2, 0.3, 0]]).double())
+    pose[:3, 3] = torch.tensor([0.05, -0.1, 2.0])
+    camera = Camera(pose, 1.3 * width, 1.2 * width, 0.45 * width, 0.55 * height, width, height)
+    means = uniform(-0.8, 0.8, n, 3)
+    means[: n // 10, 2] -= 2.5
+    return GaussianScene(
+        means=means,
+        quaternions=torch.randn(n, 4, generator=g, dtype=torch.float64),
+        scales=size * torch.exp(uniform(-1.2, 1.2, n, 3)),
+        opacities=uniform(0.02, 0.999, n),
+        colors=uniform(0.0, 1.0, n, 3),
+        camera=camera,
+    )
+
+
+def brute_force(
+    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """Composite every Gaussian at every pixel, one after the other, straight from the definitions.
+
+    Returns the colour sums (C, H, W) and the accumulated alpha (H, W); differentiable by autograd.
+    """
+    rotation, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    y, x = torch.meshgrid(
+        torch.arange(camera.height, dtype=means.dtype) + 0.5, torch.arange(camera.width, dtype=means.dtype) + 0.5,
+        indexing="ij",
+    )  # fmt: skip
+    pixels = torch.stack([x, y], dim=-1)
+    points = means @ rotation.T + shift
+    image = means.new_zeros(camera.height, camera.width, colors.shape[1])
+    light = means.new_ones(camera.height, camera.width)
+    alive = torch.ones(camera.height, camera.width, dtype=torch.bool)
+    for i in torch.argsort(points[:, 2]).tolist():
+        px, py, pz = points[i]
+        if pz <= 0.2:
+            continue
+        w, qx, qy, qz = quaternions[i] / quaternions[i].norm()
+        skew = torch.stack(
+            [torch.stack([0 * w, -qz, qy]), torch.stack([qz, 0 * w, -qx]), torch.stack([-qy, qx, 0 * w])]
+        )
+        orientation = torch.eye(3, dtype=means.dtype) + 2 * w * skew + 2 * skew @ skew
+        covariance = orientation @ torch.diag(scales[i] ** 2) @ orientation.T
+        u = torch.clamp(px / pz, -1.3 * camera.width / 2 / camera.fx, 1.3 * camera.width / 2 / camera.fx)
+        v = torch.clamp(py / pz, -1.3 * camera.height / 2 / camera.fy, 1.3 * camera.height / 2 / camera.fy)
+        zero = 0 * pz
+        jacobian = torch.stack(
+            [torch.stack([camera.fx / pz, zero, -camera.fx * u / pz]),
+             torch.stack([zero, camera.fy / pz, -camera.fy * v / pz])]
+        )  # fmt: skip
+        projected = jacobian @ rotation @ covariance @ rotation.T @ jacobian.T + 0.3 * torch.eye(2, dtype=means.dtype)
+        centre = torch.stack([camera.fx * px / pz + camera.cx, camera.fy * py / pz + camera.cy])
+        offset = pixels - centre
+        power = -0.5 * ((offset @ torch.linalg.inv(projected)) * offset).sum(-1)
+        raw = opacities[i] * torch.exp(power)
+        alpha = raw + (raw.clamp(max=0.99) - raw).detach()  # the gradient passes through the clamp
+        alpha = torch.where(raw >= 1 / 255, alpha, torch.zeros_like(alpha))
+        alive = alive & (light * (1 - alpha) >= 1e-4)
+        weight = torch.where(alive, alpha * light, torch.zeros_like(light))
+        image = image + weight[..., None] * colors[i]
+        light = torch.where(alive, light * (1 - alpha), light)
+    return image.permute(2, 0, 1), 1 - light
+
+
+def associated_legendre_sh(direction: Tensor, degree: int) -> Tensor:
+    """Real spherical harmonics up to a degree from scipy-free associated Legendre polynomials, order m = -l .. l."""
+    x, y, z = direction.tolist()
+    phi, cosine = math.atan2(y, x), z
+    sine = math.sqrt(max(0.0, 1 - cosine * cosine))
+    values = []
+    for band in range(degree + 1):
+        for m in range(-band, band + 1):
+            k = abs(m)
+            legendre = _legendre(band, k, cosine, sine)
+            norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - k) / math.factorial(band + k))
+            if m == 0:
+                values.append(norm * legendre)
+            else:
+                angle = math.cos(k * phi) if m > 0 else math.sin(k * phi)
+                values.append(math.sqrt(2) * norm * legendre * angle)
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _legendre(band: int, m: int, cosine: float, sine: float) -> float:
+    """Associated Legendre polynomial with the Condon-Shortley phase, by the standard recurrences."""
+    value = 1.0
+    for i in range(1, m + 1):
+        value *= -(2 * i - 1) * sine
+    if band == m:
+        return value
+    previous, value = value, cosine * (2 * m + 1) * value
+    for n in range(m + 2, band + 1):
+        previous, value = value, ((2 * n - 1) * cosine * value - (n + m - 1) * previous) / (n - m)
+    return value
