@@ -1,0 +1,236 @@
+"""The command line ``ca-reg``: one class per command, its fields are the options."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.training.config import PRESETS, TrainConfig
+
+if TYPE_CHECKING:
+    from reference_trainer.evaluation.evaluate import PerceptualMetric
+
+__all__ = ["main"]
+
+Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
+Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Train the built-in scene from three views with and without the regularizers; needs no files, takes minutes.
+
+    Ends with a table of test quality and co-adaptation, a plot of the dynamics, and pictures.
+    """
+
+    out: Path = Path("runs/demo")
+    """Folder for everything that is written; an interrupted demo continues."""
+    iterations: int = 1000
+    """Training steps of each run."""
+    seeds: int = 1
+    """Number of seeds."""
+    jobs: int = 2
+    """Runs at a time."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.studies.demo import demo
+
+        demo(self.out, iterations=self.iterations, seeds=range(self.seeds), jobs=self.jobs, say=print)
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train one model on a scene and evaluate it.
+
+    Writes a checkpoint, a standard 3DGS PLY, CA dynamics (JSONL and TensorBoard), pictures of every view, and scores.
+    The same command continues an interrupted run.
+    """
+
+    out: Path
+    """Folder of the run."""
+    scene: Scene = field(default_factory=SceneOptions)
+    config: Config = field(default_factory=lambda: PRESETS["fsgs"])
+    preset: Literal["fsgs", "inria", "binocular"] = "fsgs"
+    """Schedule of a published code base; other options override it."""
+    device: str = "cpu"
+    """"cpu" or "cuda"."""
+    monitor_every: int = 500
+    """Steps between measurements of CA and PSNR for TensorBoard; 0 for none."""
+    lpips: str | None = None
+    """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.studies.run import run_experiment, summary
+
+        results = run_experiment(
+            self.scene,
+            self.config,
+            self.out,
+            device=self.device,
+            monitor_every=self.monitor_every,
+            perceptual=_perceptual(self.lpips),
+            progress=True,
+            say=print,
+        )
+        print(summary(results))
+        print(f"Everything is in {self.out}; curves: tensorboard --logdir {self.out}")
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure a run, or any 3DGS PLY, on the views of a scene: PSNR, SSIM, LPIPS, CA, CV, per view and mean."""
+
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """Folder of a run of `ca-reg train`."""
+    ply: Path | None = None
+    """A standard 3DGS PLY instead of a run; give its scene with --path."""
+    scene: Scene = field(default_factory=SceneOptions)
+    dropout: float = 0.0
+    """For a PLY: the dropout rate that it was trained with."""
+    samples: int = 5
+    """Renders per view for the CA score."""
+    seed: int = 0
+    """Seed of the CA score's masks."""
+    lpips: str | None = None
+    """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
+    device: str = "cpu"
+    """"cpu" or "cuda"."""
+    out: Path | None = None
+    """Folder for evaluation.json and pictures; by default <run>/evaluation."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.studies.measure import measure, of_ply, of_run
+
+        if self.run is not None:
+            model, scene, default = of_run(self.run, self.device)
+        elif self.ply is not None:
+            model, scene, default = of_ply(self.ply, self.scene, dropout=self.dropout, device=self.device)
+        else:
+            raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE and --path SCENE.")
+        perceptual = _perceptual(self.lpips)
+        measure(model, scene, self.out or default, samples=self.samples, seed=self.seed, perceptual=perceptual)
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a run's views, or a flight between its training cameras, as PNG (and GIF)."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run of `ca-reg train`."""
+    what: Literal["test", "train", "flight"] = "test"
+    """Which views; "flight" moves through the training cameras."""
+    frames: int = 60
+    """Pictures of a flight."""
+    out: Path | None = None
+    """Folder for the pictures; by default <run>/render_<what>."""
+    device: str = "cpu"
+    """"cpu" or "cuda"."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.studies.measure import render_run
+
+        render_run(self.run, self.what, self.out, frames=self.frames, device=self.device, say=print)
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Train baseline, dropout, noise and both on a scene with several seeds; one table with mean and spread.
+
+    Finished runs are kept: the same command continues an interrupted comparison, or adds seeds.
+    """
+
+    out: Path
+    """Folder of the comparison; each run has a folder <strategy>/seed_<k> in it."""
+    scene: Scene = field(default_factory=SceneOptions)
+    config: Config = field(default_factory=lambda: PRESETS["fsgs"])
+    preset: Literal["fsgs", "inria", "binocular"] = "fsgs"
+    """Schedule of a published code base; other options override it."""
+    strategies: tuple[Literal["baseline", "dropout", "noise", "both"], ...] = ("baseline", "dropout", "noise", "both")
+    """What to compare; --dropout and --noise give the rates (0.2 and 0.8 if they are 0)."""
+    seeds: int = 3
+    """Number of seeds."""
+    jobs: int = 1
+    """Runs at a time, each in its own process with its share of the processors."""
+    device: str = "cpu"
+    """"cpu" or "cuda"."""
+    monitor_every: int = 500
+    """Steps between measurements of CA and PSNR; 0 for none."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.studies.compare import compare, report, strategies
+
+        config = replace(self.config, dropout=0.0, noise=0.0)
+        every = strategies(config, dropout=self.config.dropout or 0.2, noise=self.config.noise or 0.8)
+        chosen: dict[str, TrainConfig] = {name: every[name] for name in self.strategies}
+        comparison = compare(
+            self.scene,
+            chosen,
+            range(self.seeds),
+            self.out,
+            jobs=self.jobs,
+            device=self.device,
+            monitor_every=self.monitor_every,
+            say=print,
+        )
+        report(comparison, self.out, say=print)
+
+
+def _perceptual(choice: str | None) -> PerceptualMetric | None:
+    """Load the perceptual metric that was asked for."""
+    if choice is None:
+        return None
+    from reference_trainer.evaluation.lpips import LPIPS_HINT, load_lpips
+
+    metric = load_lpips(None if choice == "installed" else Path(choice))
+    if metric is None:
+        raise ValueError(f"no perceptual metric is installed. {LPIPS_HINT}")
+    return metric
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run ``ca-reg``; errors that a user can mend end with one line and exit code 2, an interruption with 130."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    peek.add_argument("--preset", choices=list(PRESETS), default="fsgs")
+    preset = peek.parse_known_args(arguments)[0].preset
+    config = PRESETS[preset]
+    commands: Any = tyro.extras.subcommand_type_from_defaults(
+        {
+            "demo": Demo(),
+            "train": Train(out=Path("runs/train"), config=config, preset=preset),
+            "evaluate": Evaluate(),
+            "render": Render(run=Path("runs/train")),
+            "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
+        },
+    )
+    command = tyro.cli(
+        commands,
+        prog="ca-reg",
+        description="Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting.",
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
+    )
+    try:
+        command()
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        sys.exit(f"ca-reg: {error}")
+    except KeyboardInterrupt:
+        sys.exit("\nca-reg: interrupted; the same command continues where it was.")
+
+
+if __name__ == "__main__":
+    main()

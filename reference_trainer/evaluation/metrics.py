@@ -1,0 +1,77 @@
+"""Image quality against a photograph: PSNR and SSIM, one number per image, in float64."""
+
+from __future__ import annotations
+
+import math
+
+from kornia.metrics import ssim as kornia_ssim
+from torch import Tensor
+from torch.nn.functional import pad
+
+__all__ = ["psnr", "ssim"]
+
+_WINDOW = 11
+
+
+def psnr(image: Tensor, target: Tensor) -> float:
+    """Return the peak signal-to-noise ratio ``-10 log10(mean squared error)`` in decibels; the peak is 1.
+
+    Over several images report the mean of their values, as the papers do, not the PSNR of the pooled error.
+
+    Args:
+        image: colours in [0, 1], shape (3, H, W).
+        target: colours in [0, 1], shape (3, H, W).
+
+    Returns:
+        Decibels, computed in float64; infinite for equal images.
+
+    Raises:
+        ValueError: if the shapes differ, are not (C, H, W), or a value is not finite.
+
+    Example:
+        >>> import torch
+        >>> round(psnr(torch.full((3, 4, 4), 0.5), torch.full((3, 4, 4), 0.6)), 3)
+        20.0
+    """
+    x, y = _checked(image, target)
+    error = (x - y).square().mean().item()
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def ssim(image: Tensor, target: Tensor) -> float:
+    """Return the structural similarity of the Gaussian-splatting papers (the INRIA code's variant).
+
+    An 11 x 11 Gaussian window with sigma 1.5, zeros beyond the border, constants 0.01^2 and 0.03^2, population
+    variances, the mean over all pixels and channels (Wang et al. 2004 with these choices). scikit-image crops the
+    border instead, so its numbers differ.
+
+    Args:
+        image: colours in [0, 1], shape (3, H, W).
+        target: colours in [0, 1], shape (3, H, W).
+
+    Returns:
+        A number in [-1, 1], computed in float64: in float32 it can exceed 1.
+
+    Raises:
+        ValueError: if the shapes differ, are not (C, H, W), or a value is not finite.
+
+    Example:
+        >>> import torch
+        >>> ssim(torch.full((3, 16, 16), 0.5), torch.full((3, 16, 16), 0.5))
+        1.0
+    """
+    x, y = (pad(z[None], (_WINDOW // 2,) * 4) for z in _checked(image, target))
+    # eps would shift every value by 1e-12 / denominator; the constants already keep the denominator positive.
+    return float(kornia_ssim(x, y, _WINDOW, max_val=1.0, eps=0.0, padding="valid").mean().item())
+
+
+def _checked(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Return both images detached in float64 after checking them."""
+    if image.ndim != 3 or image.shape != target.shape:
+        raise ValueError(
+            f"image and target must share one shape (3, H, W), got {tuple(image.shape)} and {tuple(target.shape)}."
+        )
+    x, y = image.detach().double(), target.detach().double()
+    if not bool(x.isfinite().all() and y.isfinite().all()):
+        raise ValueError("image and target must be finite; the rendering or the photograph holds NaN or infinity.")
+    return x, y

@@ -1,0 +1,177 @@
+"""Pictures of results: PNG files, heat maps, error maps, comparisons side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from reference_trainer.files import replacing
+
+__all__ = ["error_map", "heat_map", "save_gif", "save_png", "side_by_side", "to_uint8"]
+
+_GAP = 4  # pixels between pictures
+_LABEL_HEIGHT = 16  # pixels; the built-in font of pillow is about 11 high
+_UNDEFINED = 0.5  # grey of values that are not finite: no colour of the map
+
+
+def to_uint8(image: Tensor) -> Tensor:
+    """Return colours as bytes, rounded to nearest after clamping to [0, 1].
+
+    Args:
+        image: colours, any shape, floating point; values outside [0, 1] are clamped.
+
+    Returns:
+        Same shape, uint8, on the CPU.
+
+    Raises:
+        ValueError: if a value is NaN: it has no byte.
+
+    Example:
+        >>> to_uint8(torch.tensor([-1.0, 0.5, 1.0, 7.0])).tolist()
+        [0, 128, 255, 255]
+    """
+    if bool(image.isnan().any()):
+        raise ValueError("the image holds NaN; look for the cause in the rendering, or draw it with heat_map.")
+    return (image.detach().clamp(0, 1) * 255).round().to("cpu", torch.uint8)
+
+
+def save_png(path: str | Path, image: Tensor) -> None:
+    """Write an image as an 8-bit PNG; the file appears at once or not at all.
+
+    Args:
+        path: the file; missing folders are made.
+        image: colours in [0, 1], shape (3, H, W); values outside are clamped.
+
+    Raises:
+        ValueError: if the shape is not (3, H, W) or a value is NaN.
+        OSError: if the file cannot be written.
+    """
+    from PIL import Image
+
+    picture = Image.fromarray(to_uint8(_checked(image)).permute(1, 2, 0).contiguous().numpy())
+    with replacing(path) as place:
+        picture.save(place, format="PNG")
+
+
+def save_gif(path: str | Path, images: Sequence[Tensor], *, fps: int = 20) -> None:
+    """Write pictures as an endless animation; the file appears at once or not at all.
+
+    Args:
+        path: the file; missing folders are made.
+        images: at least one, each (3, H, W), colours in [0, 1].
+        fps: pictures per second.
+    """
+    from PIL import Image
+
+    frames = [Image.fromarray(to_uint8(_checked(image)).permute(1, 2, 0).contiguous().numpy()) for image in images]
+    with replacing(path) as place:
+        frames[0].save(place, "GIF", save_all=True, append_images=frames[1:], duration=1000 // fps, loop=0)
+
+
+def heat_map(values: Tensor, vmax: float) -> Tensor:
+    """Colour a map of numbers from 0 (black) through red to ``vmax`` (pale yellow): matplotlib's "inferno".
+
+    Numbers beyond the ends take the end colours; those that are not finite (a pixel without a score) are grey. Use one
+    ``vmax`` for all maps that are to be compared.
+
+    Args:
+        values: numbers, shape (H, W).
+        vmax: the number that gets the brightest colour, positive.
+
+    Returns:
+        Colours in [0, 1], shape (3, H, W), float32, on the CPU.
+
+    Raises:
+        ValueError: if ``values`` is not (H, W) or ``vmax`` is not positive.
+
+    Example:
+        >>> heat_map(torch.tensor([[0.0, 1.0]]), vmax=1.0).mean(0)[0].diff() > 0
+        tensor([True])
+    """
+    import matplotlib
+
+    if values.ndim != 2:
+        raise ValueError(f"values must have shape (H, W), got {tuple(values.shape)}.")
+    if not vmax > 0:
+        raise ValueError(f"vmax must be positive, got {vmax}.")
+    table = torch.from_numpy(matplotlib.colormaps["inferno"](range(256))[:, :3]).float()  # [256, 3]
+    values = values.detach().to("cpu", torch.float64)
+    defined = values.isfinite()
+    index = (torch.where(defined, values, 0) / vmax).clamp(0, 1).mul(255).round().long()
+    colours = torch.where(defined[..., None], table[index], torch.tensor(_UNDEFINED))
+    return colours.permute(2, 0, 1).contiguous()
+
+
+def error_map(image: Tensor, target: Tensor, *, vmax: float = 0.25) -> Tensor:
+    """Colour the absolute error, averaged over the channels.
+
+    Args:
+        image: a rendering, shape (3, H, W).
+        target: the photograph, shape (3, H, W).
+        vmax: the error that gets the brightest colour; colours lie in [0, 1].
+
+    Returns:
+        Colours in [0, 1], shape (3, H, W).
+
+    Raises:
+        ValueError: if the shapes differ or are not (3, H, W), or ``vmax`` is not positive.
+    """
+    if _checked(image).shape != target.shape:
+        raise ValueError(f"image and target must have one shape, got {tuple(image.shape)} and {tuple(target.shape)}.")
+    return heat_map((image - target).abs().mean(0), vmax)
+
+
+def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: int | None = None) -> Tensor:
+    """Lay pictures out in a grid with a label above each and a thin white gap between them.
+
+    Args:
+        images: pictures of one size, each (3, H, W), colours in [0, 1].
+        labels: one line for each, Latin letters (the built-in font has few others); what is wider than the picture is
+            cut.
+        columns: pictures in a row; None puts all of them in one.
+
+    Returns:
+        Colours in [0, 1], shape (3, H', W'), on the CPU.
+
+    Raises:
+        ValueError: if there is no image, the sizes or the numbers differ, or ``columns`` is not positive.
+
+    Example:
+        >>> side_by_side([torch.zeros(3, 30, 40)] * 3, ["a", "b", "c"], columns=2).shape
+        torch.Size([3, 96, 84])
+    """
+    if not images or len(images) != len(labels):
+        raise ValueError(f"expected one label for each of at least one image, got {len(images)} and {len(labels)}.")
+    if len({_checked(image).shape for image in images}) != 1:
+        raise ValueError(f"the images must have one size, got {[tuple(image.shape) for image in images]}.")
+    columns = len(images) if columns is None else columns
+    if columns < 1:
+        raise ValueError(f"columns must be positive, got {columns}.")
+    _, height, width = images[0].shape
+    cell_height, rows = height + _LABEL_HEIGHT, -(-len(images) // columns)
+    columns = min(columns, len(images))
+    grid = torch.ones(3, rows * (cell_height + _GAP) - _GAP, columns * (width + _GAP) - _GAP)
+    for index, (image, label) in enumerate(zip(images, labels, strict=True)):
+        top, left = index // columns * (cell_height + _GAP), index % columns * (width + _GAP)
+        grid[:, top : top + _LABEL_HEIGHT, left : left + width] = _label(label, width)
+        grid[:, top + _LABEL_HEIGHT : top + cell_height, left : left + width] = image.detach().cpu().clamp(0, 1)
+    return grid
+
+
+def _label(text: str, width: int) -> Tensor:
+    """Return black text on white, shape (_LABEL_HEIGHT, width), in [0, 1]."""
+    from PIL import Image, ImageDraw
+
+    strip = Image.new("L", (width, _LABEL_HEIGHT), 255)
+    ImageDraw.Draw(strip).text((2, 2), text, fill=0)
+    return torch.frombuffer(bytearray(strip.tobytes()), dtype=torch.uint8).reshape(_LABEL_HEIGHT, width) / 255
+
+
+def _checked(image: Tensor) -> Tensor:
+    """Return the image if it is (3, H, W)."""
+    if image.ndim != 3 or image.shape[0] != 3:
+        raise ValueError(f"expected an image of shape (3, H, W), got {tuple(image.shape)}.")
+    return image

@@ -1,0 +1,190 @@
+"""Results as data: JSON files, Markdown tables, means with their spread, and the machine they come from."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import torch
+
+from reference_trainer.files import replacing
+
+__all__ = ["format_mean_std", "machine", "markdown_table", "mean_std", "write_json"]
+
+_ABSENT = "n/a"
+
+
+def write_json(path: str | Path, data: object) -> None:
+    """Write data as indented JSON; the file appears at once or not at all.
+
+    Args:
+        path: the file; missing folders are made.
+        data: nested mappings, lists, tuples, strings, numbers, booleans and None. NaN and infinities become null,
+            because JSON has no word for them. Keys must be strings.
+
+    Raises:
+        TypeError: if something else is in ``data``.
+        OSError: if the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_json(f"{folder}/a/result.json", {"ca": math.nan, "views": (1, 2)})
+        ...     json.loads(Path(f"{folder}/a/result.json").read_text())
+        {'ca': None, 'views': [1, 2]}
+    """
+    text = json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    with replacing(path) as place:
+        place.write_text(text, encoding="utf-8")
+
+
+def mean_std(values: Iterable[float]) -> tuple[float, float]:
+    """Return the mean and the sample standard deviation (divided by n - 1) of the values that are finite.
+
+    Args:
+        values: numbers, such as one score per seed; those that are NaN or infinite are left out.
+
+    Returns:
+        Mean and deviation. The mean of nothing and the deviation of fewer than two values are NaN.
+
+    Example:
+        >>> mean_std([1.0, 3.0, math.nan])
+        (2.0, 1.4142135623730951)
+    """
+    finite = [float(value) for value in values if math.isfinite(value)]
+    mean = statistics.fmean(finite) if finite else math.nan
+    return mean, statistics.stdev(finite) if len(finite) > 1 else math.nan
+
+
+def format_mean_std(values: Iterable[float], *, unit: float = 1.0) -> str:
+    """Return mean and spread as text: two digits of the deviation, and the mean to the same place.
+
+    Args:
+        values: numbers; those that are not finite are left out, and the text says how many remain.
+        unit: what one counts in: with ``unit=1e-3``, 0.0023 is written 2.3 (name it in the column's header).
+
+    Returns:
+        ``"20.51 ± 0.12"``; the mean alone, to four digits, if there is no deviation; ``"n/a"`` if there is no value.
+
+    Raises:
+        ValueError: if ``unit`` is not positive.
+
+    Example:
+        >>> format_mean_std([20.39, 20.51, 20.63])
+        '20.51 ± 0.12'
+        >>> format_mean_std([0.00221, 0.00231, 0.00241], unit=1e-3)
+        '2.31 ± 0.10'
+        >>> format_mean_std([20.39, 20.63, math.nan])
+        '20.51 ± 0.17 (2 of 3)'
+    """
+    if not unit > 0:
+        raise ValueError(f"unit must be positive, got {unit}.")
+    scaled = [value / unit for value in values]
+    mean, std = mean_std(scaled)
+    count = sum(map(math.isfinite, scaled))
+    note = f" ({count} of {len(scaled)})" if 0 < count < len(scaled) else ""
+    if not count:
+        return _ABSENT
+    if not std > 0:
+        return f"{_number(mean)}{' ± 0' if std == 0 else ''}{note}"
+    # Rounding first: a deviation of 0.0999 is 0.10, which has one place less.
+    decimals = max(0, 1 - math.floor(math.log10(float(f"{std:.1e}"))))
+    return f"{mean:.{decimals}f} ± {std:.{decimals}f}{note}"
+
+
+def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
+    """Return rows as a Markdown table.
+
+    Args:
+        rows: one mapping from column to content each. Text is kept, fractions get four digits; what is missing, None
+            or not finite becomes ``n/a``.
+        columns: the columns in their order, which are also the headers; the first is aligned left, the others right.
+
+    Returns:
+        The table, with a line break at its end.
+
+    Raises:
+        ValueError: if there is no column.
+
+    Example:
+        >>> print(markdown_table([{"run": "baseline", "PSNR": 19.36}, {"run": "dropout"}], ["run", "PSNR"]), end="")
+        | run | PSNR |
+        |:---|---:|
+        | baseline | 19.36 |
+        | dropout | n/a |
+    """
+    if not columns:
+        raise ValueError("a table needs at least one column.")
+    lines = [[_cell(column) for column in columns]]
+    lines += [[_cell(row.get(column)) for column in columns] for row in rows]
+    text = [f"| {' | '.join(line)} |" for line in lines]
+    return "\n".join([text[0], "|:---" + "|---:" * (len(columns) - 1) + "|", *text[1:], ""])
+
+
+def machine() -> dict[str, str | int]:
+    """Return what a measurement depends on: versions, processor, cores, threads and the GPU if there is one.
+
+    Example:
+        >>> sorted(machine())
+        ['ca_reg', 'cores', 'cpu', 'device', 'kornia', 'platform', 'python', 'threads', 'torch']
+    """
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **{name: _version(name) for name in ("torch", "kornia", "ca_reg")},
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count() or 0,
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
+    }
+
+
+def _plain(data: object) -> object:
+    """Replace numbers that JSON cannot hold, and tuples by lists."""
+    if isinstance(data, float):
+        return data if math.isfinite(data) else None
+    if isinstance(data, Mapping):
+        # json.dumps would turn the key 1 into "1" and None into "null" without a word.
+        if wrong := [key for key in data if not isinstance(key, str)]:
+            raise TypeError(f"keys must be strings, got {wrong[0]!r}.")
+        return {key: _plain(value) for key, value in data.items()}
+    if isinstance(data, (list, tuple)):
+        return [_plain(value) for value in data]
+    return data
+
+
+def _cell(value: object) -> str:
+    """Return one table cell; a bar or a line break inside would split it."""
+    text = _number(value) if isinstance(value, float) else _ABSENT if value is None else str(value)
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def _number(value: float) -> str:
+    """Return four significant digits, and never fewer than all before the point."""
+    if not math.isfinite(value):
+        return _ABSENT
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+
+
+def _version(name: str) -> str:
+    """Return the installed version of a distribution."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _cpu_name() -> str:
+    """Return the processor's name; Linux tells it in /proc only."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -1,0 +1,1 @@
+"""The Gaussians: parameters, optimizer, density control, PLY files."""

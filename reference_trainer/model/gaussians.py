@@ -1,0 +1,124 @@
+"""The parameters of a set of 3D Gaussians, and their activations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+__all__ = ["SH_C0", "Gaussians", "inverse_sigmoid"]
+
+SH_C0 = 0.28209479177387814  # the constant band of the spherical harmonics: sqrt(1 / (4 pi))
+
+
+def inverse_sigmoid(x: Tensor) -> Tensor:
+    """Return the logit of ``x`` in (0, 1), any shape."""
+    return torch.log(x / (1 - x))
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians as raw parameters, the way the INRIA code and the PLY files hold them.
+
+    Convention: quaternions are wxyz and need not be normalised; spherical-harmonic colours add 0.5 after evaluation;
+    opacities and scales are stored as logits and logarithms.
+
+    Args:
+        means: world coordinates, shape (N, 3).
+        log_scales: logarithms of the standard deviations along the axes, shape (N, 3).
+        quaternions: orientation, wxyz, shape (N, 4).
+        opacity_logits: logits of the opacities, shape (N,).
+        sh_dc: constant colour coefficients, shape (N, 1, 3).
+        sh_rest: the other coefficients, shape (N, (degree + 1)^2 - 1, 3).
+
+    Raises:
+        ValueError: if the shapes disagree.
+
+    Example:
+        >>> gaussians = Gaussians.from_points(torch.rand(10, 3), torch.rand(10, 3), torch.full((10,), 0.1), sh_degree=1)
+        >>> len(gaussians), gaussians.sh_degree
+        (10, 1)
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    quaternions: Tensor
+    opacity_logits: Tensor
+    sh_dc: Tensor
+    sh_rest: Tensor
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        expected = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "opacity_logits": (n,)}
+        expected |= {"sh_dc": (n, 1, 3), "sh_rest": (n, self.sh_rest.shape[1] if self.sh_rest.ndim == 3 else -1, 3)}
+        for name, shape in expected.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {tuple(getattr(self, name).shape)}.")
+        if self.sh_rest.shape[1] not in (0, 3, 8, 15):
+            raise ValueError(f"sh_rest must hold 0, 3, 8 or 15 coefficients, got {self.sh_rest.shape[1]}.")
+
+    @classmethod
+    def from_points(
+        cls, positions: Tensor, colors: Tensor, distances: Tensor, *, sh_degree: int, opacity: float = 0.1
+    ) -> Gaussians:
+        """Make round Gaussians at points.
+
+        Args:
+            positions: world coordinates, shape (N, 3).
+            colors: RGB in [0, 1], shape (N, 3).
+            distances: standard deviation of each Gaussian, positive, shape (N,).
+            sh_degree: degree of the colour's spherical harmonics, 0 to 3.
+            opacity: opacity of each, in (0, 1).
+        """
+        n = positions.shape[0]
+        quaternions = positions.new_zeros(n, 4)
+        quaternions[:, 0] = 1.0
+        return cls(
+            means=positions.clone(),
+            log_scales=distances.log()[:, None].repeat(1, 3),
+            quaternions=quaternions,
+            opacity_logits=positions.new_full((n,), math.log(opacity / (1 - opacity))),
+            sh_dc=((colors - 0.5) / SH_C0)[:, None, :].clone(),
+            sh_rest=positions.new_zeros(n, (sh_degree + 1) ** 2 - 1, 3),
+        )
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return math.isqrt(self.sh_rest.shape[1] + 1) - 1
+
+    @property
+    def opacities(self) -> Tensor:
+        """Activated opacities in [0, 1], shape (N,): what every `ca_reg` regularizer works on."""
+        return torch.sigmoid(self.opacity_logits)
+
+    @property
+    def scales(self) -> Tensor:
+        """Standard deviations along the axes, shape (N, 3)."""
+        return torch.exp(self.log_scales)
+
+    @property
+    def sh(self) -> Tensor:
+        """All colour coefficients, shape (N, (degree + 1)^2, 3)."""
+        return torch.cat([self.sh_dc, self.sh_rest], dim=1)
+
+    def named(self) -> Iterator[tuple[str, Tensor]]:
+        """Iterate over the parameters with their names."""
+        return ((field.name, getattr(self, field.name)) for field in fields(self))
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        """Return Gaussians whose tensors are ``function(tensor)``."""
+        return replace(self, **{name: function(tensor) for name, tensor in self.named()})
+
+    def __getitem__(self, index: Tensor) -> Gaussians:
+        return self.map(lambda x: x[index])
+
+    def to(self, device: torch.device | str) -> Gaussians:
+        """Return the Gaussians on another device."""
+        return self.map(lambda x: x.to(device))

@@ -1,0 +1,123 @@
+"""Adam over a changing set of Gaussians: the one place where parameters and optimizer state are cut and joined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from reference_trainer.model.gaussians import Gaussians
+
+__all__ = ["GaussianOptimizer", "LearningRates"]
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's learning rate of each parameter; that of the means is set at every step by the trainer.
+
+    Args:
+        means: world units per step.
+        log_scales: per step.
+        quaternions: per step.
+        opacity_logits: per step.
+        sh_dc: per step.
+        sh_rest: per step; a twentieth of ``sh_dc`` in the INRIA code.
+    """
+
+    means: float
+    log_scales: float = 5e-3
+    quaternions: float = 1e-3
+    opacity_logits: float = 0.05
+    sh_dc: float = 2.5e-3
+    sh_rest: float = 2.5e-3 / 20
+
+
+class GaussianOptimizer:
+    """Gaussians whose tensors are leaves, and the Adam that moves them.
+
+    Args:
+        gaussians: initial values; they are copied.
+        rates: learning rates.
+
+    Example:
+        >>> start = Gaussians.from_points(torch.zeros(4, 3), torch.rand(4, 3), torch.ones(4), sh_degree=0)
+        >>> optimizer = GaussianOptimizer(start, LearningRates(means=1e-3))
+        >>> optimizer.gaussians.means.sum().backward()
+        >>> optimizer.step()
+        >>> optimizer.select(torch.tensor([0, 2]))
+        >>> len(optimizer.gaussians)
+        2
+    """
+
+    def __init__(self, gaussians: Gaussians, rates: LearningRates) -> None:
+        self.gaussians = gaussians.map(lambda x: x.detach().clone().requires_grad_())
+        groups = [{"params": [x], "lr": getattr(rates, name), "name": name} for name, x in self.gaussians.named()]
+        self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+    def step(self) -> None:
+        """Move all parameters along their gradients and clear these."""
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+
+    def set_means_rate(self, rate: float) -> None:
+        """Set the learning rate of the means, world units per step."""
+        self._group("means")["lr"] = rate
+
+    def select(self, index: Tensor) -> None:
+        """Keep only the Gaussians of ``index`` (bool mask or positions), with their optimizer state."""
+        self._rebuild(lambda name, x: x[index], lambda moment: moment[index])
+
+    def append(self, new: Gaussians) -> None:
+        """Add Gaussians; their optimizer state starts at zero."""
+        count = len(new)
+        added = dict(new.named())
+        self._rebuild(
+            lambda name, x: torch.cat([x, added[name]]),
+            lambda moment: torch.cat([moment, moment.new_zeros(count, *moment.shape[1:])]),
+        )
+
+    def set_opacity_logits(self, logits: Tensor, *, forget: bool) -> None:
+        """Overwrite the opacity logits, shape (N,); ``forget`` also clears their optimizer state."""
+        parameter = self.gaussians.opacity_logits
+        with torch.no_grad():
+            parameter.copy_(logits)
+        if forget:
+            for name in ("exp_avg", "exp_avg_sq"):
+                if name in self._adam.state[parameter]:
+                    self._adam.state[parameter][name].zero_()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return parameters and moments as plain tensors, for a checkpoint."""
+        moments = {
+            name: {key: value.clone() for key, value in self._adam.state[x].items()}
+            for name, x in self.gaussians.named()
+        }
+        return {"gaussians": {name: x.detach().clone() for name, x in self.gaussians.named()}, "moments": moments}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self._replace({name: x.detach().clone().requires_grad_() for name, x in state["gaussians"].items()})
+        for name, x in self.gaussians.named():
+            self._adam.state[x] = {key: value.clone() for key, value in state["moments"][name].items()}
+
+    def _group(self, name: str) -> dict[str, Any]:
+        return next(group for group in self._adam.param_groups if group["name"] == name)
+
+    def _replace(self, tensors: dict[str, Tensor]) -> None:
+        """Make these leaves the parameters; their optimizer state is to be set by the caller."""
+        self._adam.state.clear()
+        for name, x in tensors.items():
+            self._group(name)["params"] = [x]
+        self.gaussians = Gaussians(**tensors)
+
+    def _rebuild(self, parameter: Any, moment: Any) -> None:
+        """Replace every parameter and its two moments by functions of the old ones."""
+        old = {name: self._adam.state[x] for name, x in self.gaussians.named()}
+        with torch.no_grad():
+            self._replace({n: parameter(n, x).detach().requires_grad_() for n, x in self.gaussians.named()})
+            for name, x in self.gaussians.named():
+                self._adam.state[x] = {
+                    key: value if key == "step" else moment(value) for key, value in old[name].items()
+                }

@@ -1,0 +1,33 @@
+"""The demonstration: the built-in scene from three views, with and without the regularizers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies.compare import Comparison, compare, report, strategies
+from reference_trainer.training.config import with_preset
+
+__all__ = ["demo"]
+
+
+def demo(
+    out: Path, *, iterations: int = 1000, seeds: Sequence[int] = (0,), jobs: int = 2, say: Callable[[str], None] = print
+) -> Comparison:
+    """Train the built-in scene with every strategy and report.
+
+    Args:
+        out: folder for everything; an interrupted demo continues.
+        iterations: training steps of each run.
+        seeds: of the runs.
+        jobs: runs at a time.
+        say: receives the text.
+    """
+    config = with_preset("fsgs", iterations=iterations, opacity_reset_every=0, densify_from=min(500, iterations // 4))
+    options = SceneOptions("synthetic")
+    chosen = strategies(config)
+    say(f"Training the built-in scene (3 views) with {', '.join(chosen)}: {iterations} steps each, {jobs} at a time.")
+    comparison = compare(options, chosen, seeds, out, jobs=jobs, monitor_every=max(1, iterations // 5), say=say)
+    report(comparison, out, say=say)
+    return comparison

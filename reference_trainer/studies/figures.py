@@ -1,0 +1,41 @@
+"""Figures of a comparison: dynamics, and the same test view under every strategy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from ca_reg.dynamics import plot_dynamics
+from reference_trainer.evaluation.pictures import save_png, side_by_side
+from reference_trainer.scenes.images import read_image
+
+__all__ = ["comparison_figure", "dynamics_figure"]
+
+
+def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
+    """Draw CA and PSNR of several runs against the iteration (paper, training dynamics).
+
+    Args:
+        runs: folder of each run by label.
+        path: the PNG to write.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    plot_dynamics(dict(runs), ax=figure.add_subplot())
+    figure.savefig(path, dpi=110)
+
+
+def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split: str = "test") -> None:
+    """Lay the panels (photograph, render, error, CA map) of one view under several strategies below each other.
+
+    Args:
+        runs: folder of each run by label.
+        path: the PNG to write.
+        view: name of the view, without extension.
+        split: ``"train"`` or ``"test"``.
+    """
+    panels = [read_image(folder / "views" / split / f"{view}_panel.png")[0] for folder in runs.values()]
+    save_png(path, side_by_side(panels, list(runs), columns=1))

@@ -1,0 +1,148 @@
+"""Measure and draw what has been trained before: runs of this program and anyone's PLY files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from reference_trainer.evaluation.evaluate import Evaluation, Model, PerceptualMetric, evaluate
+from reference_trainer.evaluation.pictures import save_gif, save_png
+from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.evaluation.trajectory import interpolate_cameras
+from reference_trainer.model.ply import load_ply
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.studies.run import load_run, model_of
+from reference_trainer.training.trainer import render_gaussians
+
+__all__ = ["evaluation_table", "measure", "of_ply", "of_run", "render_run"]
+
+Say = Callable[[str], None]
+
+
+def of_run(run: Path, device: str = "cpu") -> tuple[Model, Scene, Path]:
+    """Return a run's model at its last checkpoint, its scene, and the folder for its evaluation.
+
+    Raises:
+        FileNotFoundError: if the folder holds no run.
+    """
+    trainer = load_run(run, device)
+    return model_of(trainer), trainer.scene, run / "evaluation"
+
+
+def of_ply(ply: Path, options: SceneOptions, *, dropout: float = 0.0, device: str = "cpu") -> tuple[Model, Scene, Path]:
+    """Return the model of a standard 3DGS PLY, a scene for it, and the folder for its evaluation.
+
+    A PLY that says that the test-time scaling is baked into its opacities is not scaled again.
+
+    Args:
+        ply: the model.
+        options: the scene whose cameras and photographs are used.
+        dropout: the rate that the model was trained with.
+        device: where to render.
+    """
+    loaded = load_ply(ply)
+    scene = options.load()
+    model = Model(
+        gaussians=loaded.gaussians.to(device),
+        background=scene.background.to(device),
+        dropout=dropout,
+        opacity_scale=1.0 if loaded.opacity_scale < 1 else 1.0 - dropout,
+    )
+    return model, scene, ply.with_name(ply.stem + "_evaluation")
+
+
+def measure(
+    model: Model,
+    scene: Scene,
+    out: Path,
+    *,
+    samples: int = 5,
+    seed: int = 0,
+    perceptual: PerceptualMetric | None = None,
+    say: Say = print,
+) -> Evaluation:
+    """Measure a model on a scene; write ``evaluation.json`` and pictures, and print the table.
+
+    Args:
+        model: what to measure.
+        scene: its views.
+        out: folder for the results.
+        samples: K of the CA score.
+        seed: of its masks.
+        perceptual: a perceptual metric.
+        say: receives the table and the progress.
+    """
+    result = evaluate(
+        model, scene, samples=samples, seed=seed, perceptual=perceptual, pictures=out / "views", progress=say
+    )
+    settings = model.ca_score(samples=samples, seed=seed).settings
+    data = {
+        "scene": scene.name,
+        **result.as_dict(),
+        "ca_settings": asdict(settings),
+        "background": model.background.tolist(),
+        "machine": machine(),
+    }
+    write_json(out / "evaluation.json", data)
+    say(evaluation_table(result))
+    say(f"Scores and pictures are in {out}")
+    return result
+
+
+def evaluation_table(result: Evaluation) -> str:
+    """Return one row per view and the means, in Markdown; CA in units of 1e-3."""
+    quantities = ("psnr", "ssim", "lpips", "ca", "ca_std_error", "visible", "cv")
+    unit = {"ca": 1e-3, "ca_std_error": 1e-3}
+    title = {name: f"{name} x1e-3" if name in unit else name for name in quantities}
+    rows: list[dict[str, object]] = [
+        {"view": f"{view.split} {view.name}"} | {title[q]: getattr(view, q) / unit.get(q, 1) for q in quantities}
+        for view in result.views
+    ]
+    for split in sorted({view.split for view in result.views}):
+        rows.append({"view": f"mean {split}"} | {title[q]: result.mean(split, q) / unit.get(q, 1) for q in quantities})
+    shown = [title[q] for q in quantities if q != "lpips" or result.perceptual_metric is not None]
+    return markdown_table(rows, ["view", *shown])
+
+
+@torch.no_grad()
+def render_run(
+    run: Path, what: str, out: Path | None = None, *, frames: int = 60, device: str = "cpu", say: Say = print
+) -> Path:
+    """Render a run with its test-time opacities.
+
+    Args:
+        run: folder of the run.
+        what: ``"test"``, ``"train"``, or ``"flight"`` through the training cameras.
+        out: folder for PNG files, and a GIF of a flight; ``<run>/render_<what>`` by default.
+        frames: pictures of a flight.
+        device: where to render.
+        say: receives where the pictures are.
+
+    Returns:
+        The folder.
+    """
+    trainer = load_run(run, device)
+    model = model_of(trainer)
+    folder = out or run / f"render_{what}"
+    if what == "flight":
+        path = interpolate_cameras([view.camera for view in trainer.scene.train], frames)
+        cameras = {f"{i:04d}": camera for i, camera in enumerate(path)}
+    else:
+        views = trainer.scene.test if what == "test" else trainer.scene.train
+        cameras = {Path(view.name).stem: view.camera for view in views}
+    opacities = model.gaussians.opacities * model.opacity_scale
+    images = []
+    for name, camera in cameras.items():
+        rendering = render_gaussians(
+            model.gaussians, camera, model.background, opacities=opacities, sh_degree=model.sh_degree
+        )
+        images.append(rendering.image.clamp(0, 1).cpu())
+        save_png(folder / f"{name}.png", images[-1])
+    if what == "flight":
+        save_gif(folder / "flight.gif", images)
+    say(f"{len(images)} pictures are in {folder}")
+    return folder

@@ -1,0 +1,202 @@
+"""One run from photographs to scores: train, monitor, checkpoint, evaluate, write pictures. Resumable at any point."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ca_reg import CAMonitor
+from reference_trainer.evaluation.evaluate import Model, PerceptualMetric, evaluate
+from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.model.ply import save_ply
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import View
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.trainer import Trainer
+
+__all__ = ["CHECKPOINT", "CONFIG", "PLY", "RESULTS", "load_run", "model_of", "run_experiment", "summary"]
+
+CONFIG = "config.json"
+CHECKPOINT = "checkpoint.pt"
+PLY = "point_cloud.ply"
+RESULTS = "results.json"
+
+
+def model_of(trainer: Trainer) -> Model:
+    """Return the trainer's model as it is to be used at test time."""
+    config = trainer.config
+    return Model(
+        gaussians=trainer.gaussians.map(Tensor.detach),
+        background=trainer.background,
+        dropout=0.0 if config.compensate else config.dropout,
+        opacity_scale=config.test_time_scale,
+        sh_degree=trainer.sh_degree,
+    )
+
+
+def run_experiment(
+    options: SceneOptions,
+    config: TrainConfig,
+    out: Path,
+    *,
+    device: torch.device | str = "cpu",
+    monitor_every: int = 500,
+    checkpoint_every: int = 500,
+    perceptual: PerceptualMetric | None = None,
+    progress: bool = False,
+    say: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """Train on a scene and measure the result; what a former call has done already is not done again.
+
+    The folder receives ``config.json``, ``checkpoint.pt``, ``ca.jsonl`` with TensorBoard events, ``point_cloud.ply``,
+    ``views/`` with pictures of every view, and ``results.json``, which marks the run as complete.
+
+    Args:
+        options: the scene; random initial points use the seed of ``config``.
+        config: all settings of the training.
+        out: folder of this run.
+        device: where to train.
+        monitor_every: steps between measurements of CA and PSNR; 0 for none.
+        checkpoint_every: steps between checkpoints.
+        perceptual: a perceptual metric for the evaluation.
+        progress: whether to show a progress bar.
+        say: receives a line about what is happening.
+
+    Returns:
+        The content of ``results.json``.
+
+    Raises:
+        ValueError: if the folder holds a run with other settings.
+        TrainingStoppedError: if training cannot go on; a checkpoint of the last step is kept.
+    """
+    settings = dataclasses.asdict(config)
+    _claim(out, {"scene": dataclasses.asdict(options), "config": settings})
+    if (out / RESULTS).exists():
+        say(f"{out}: complete, nothing to do")
+        results: dict[str, Any] = json.loads((out / RESULTS).read_text(encoding="utf-8"))
+        return results
+    scene = options.load(seed=config.seed)
+    checkpoint = out / CHECKPOINT
+    resumed = checkpoint.exists()
+    trainer = Trainer.load(checkpoint, scene, device) if resumed else Trainer(scene, config, device)
+    if resumed:
+        say(f"{out}: continues from step {trainer.step}")
+    try:
+        _train(trainer, out, monitor_every, checkpoint_every, resumed=resumed, progress=progress, say=say)
+    finally:
+        if not checkpoint.exists() or trainer.step < config.iterations:
+            trainer.save(checkpoint)
+    model = model_of(trainer)
+    save_ply(model.gaussians, out / PLY)
+    evaluation = evaluate(model, scene, perceptual=perceptual, pictures=out / "views")
+    results = {
+        "scene": scene.name,
+        "config": settings,
+        "seconds": trainer.seconds,
+        **evaluation.as_dict(),
+        "machine": machine(),
+    }
+    write_json(out / RESULTS, results)
+    return results
+
+
+def summary(results: Mapping[str, Any]) -> str:
+    """Return the content of ``results.json`` as a short table in Markdown; CA in units of 1e-3."""
+    rows: list[dict[str, object]] = []
+    for split, mean in sorted(results["mean"].items()):
+        known = {name: float("nan") if value is None else value for name, value in mean.items()}
+        rows.append(
+            {
+                "views": split,
+                "PSNR": known["psnr"],
+                "SSIM": known["ssim"],
+                "LPIPS": known["lpips"],
+                "CA x1e-3": known["ca"] * 1e3,
+                "CV": known["cv"],
+                "Gaussians": results["gaussians"],
+                "seconds": results["seconds"],
+            }
+        )
+    return markdown_table(rows, list(rows[0]))
+
+
+def load_run(folder: Path, device: torch.device | str = "cpu") -> Trainer:
+    """Load the trainer of a run, finished or not, with its scene.
+
+    Raises:
+        FileNotFoundError: if the folder holds no run.
+    """
+    if not (folder / CONFIG).exists():
+        raise FileNotFoundError(f"{folder} holds no run (no {CONFIG}): give the --out folder of ca-reg train.")
+    settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+    scene = SceneOptions(**settings["scene"]).load(seed=settings["config"]["seed"])
+    return Trainer.load(folder / CHECKPOINT, scene, device)
+
+
+def _claim(out: Path, settings: dict[str, Any]) -> None:
+    """Write the settings of a new run; refuse a folder that holds another one."""
+    file = out / CONFIG
+    if not file.exists():
+        write_json(file, settings)
+        return
+    found = json.loads(file.read_text(encoding="utf-8"))
+    changed = [
+        f"{key}: {found.get(part, {}).get(key)} -> {value}"
+        for part, values in settings.items()
+        for key, value in values.items()
+        if found.get(part, {}).get(key) != value
+    ]
+    if changed:
+        raise ValueError(
+            f"{out} holds a run with other settings ({'; '.join(changed)}): give another folder, or delete this one."
+        )
+
+
+def _train(
+    trainer: Trainer,
+    out: Path,
+    monitor_every: int,
+    checkpoint_every: int,
+    *,
+    resumed: bool,
+    progress: bool,
+    say: Callable[[str], None],
+) -> None:
+    """Train to the end with a monitor and checkpoints on the way."""
+    last = trainer.config.iterations
+
+    def checkpoint(trainer: Trainer) -> None:
+        if trainer.step % checkpoint_every == 0 or trainer.step == last:
+            trainer.save(out / CHECKPOINT)
+
+    if not monitor_every:
+        trainer.train(after_step=checkpoint, progress=progress)
+        return
+
+    def render_now(opacity: Tensor, view: View) -> tuple[Tensor, Tensor]:
+        return model_of(trainer).render(opacity, view)
+
+    score = model_of(trainer).ca_score(render_fn=render_now)
+    views = {"train": trainer.views, "test": [view.to(trainer.device) for view in trainer.scene.test]}
+
+    def quality(opacity: Tensor, view: View) -> float:
+        return psnr(render_now(opacity, view)[0].clamp(0, 1), view.image)
+
+    views = {name: group for name, group in views.items() if group}
+    with CAMonitor(
+        score, out, views=views, every=monitor_every, psnr=quality, resume_step=trainer.step if resumed else None
+    ) as monitor:
+        say(f"{out}: CA and PSNR go to {' and '.join(monitor.backends)} every {monitor_every} steps")
+
+        def after_step(trainer: Trainer) -> None:
+            monitor(trainer.step, trainer.gaussians.opacities)
+            checkpoint(trainer)
+
+        trainer.train(after_step=after_step, progress=progress)

@@ -1,0 +1,43 @@
+"""Checkpoints: written whole or not at all, read without executing anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from reference_trainer.files import replacing
+
+__all__ = ["load_checkpoint", "save_checkpoint"]
+
+_FORMAT = "ca_reg-checkpoint-1"
+
+
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write a state of tensors, numbers and strings; an interrupted write leaves the file that was there before.
+
+    Args:
+        path: where to; its folder is made.
+        state: nested dicts of tensors, numbers, strings and None.
+    """
+    with replacing(path) as place:
+        torch.save({"format": _FORMAT, **state}, place)
+
+
+def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Read what `save_checkpoint` wrote.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a checkpoint of this program, or damaged.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no checkpoint at {path}: train first, or give the path of a checkpoint.pt.")
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # torch.load raises many types for damaged files
+        raise ValueError(f"{path} is not a readable checkpoint ({type(error).__name__}: {error}).") from error
+    if not isinstance(state, dict) or state.get("format") != _FORMAT:
+        raise ValueError(f"{path} is not a checkpoint of this program (expected format {_FORMAT!r}).")
+    return state

@@ -1,0 +1,133 @@
+"""Everything that decides a training run, and the presets of published code bases."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+__all__ = ["PRESETS", "TrainConfig", "with_preset"]
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Settings of one training run. The defaults are those of the ``fsgs`` preset with 3,000 iterations."""
+
+    iterations: int = 3_000
+    """Optimization steps, one view each."""
+    seed: int = 0
+    """Decides everything random: the order of views, masks, noise and splits."""
+
+    dropout: float = 0.0
+    """Rate p of Gaussian dropout, in [0, 1); at test time opacities are scaled by 1 - p."""
+    compensate: bool = False
+    """Inverted dropout: survivors are scaled by 1 / (1 - p) while training, nothing at test time."""
+    noise: float = 0.0
+    """Standard deviation sigma of the multiplicative opacity noise; the paper uses up to 0.8."""
+    clip_noise: bool = False
+    """Clip the noise to [-sigma, sigma], as the authors' released code does; the paper does not."""
+    regularize_from: int = 0
+    """First step that uses dropout and noise."""
+
+    sh_degree: int = 3
+    """Degree of the spherical harmonics of the colours, 0 to 3."""
+    sh_every: int = 500
+    """A band of spherical harmonics is added every so many steps."""
+
+    lambda_dssim: float = 0.2
+    """The loss is (1 - lambda) L1 + lambda (1 - SSIM)."""
+    means_rate: float = 1.6e-4
+    """Initial learning rate of the means, in units of the scene's extent."""
+    means_rate_final: float = 1.6e-6
+    """Its value at the last step; in between it falls exponentially."""
+    scales_rate: float = 5e-3
+    """Learning rate of the logarithms of the scales."""
+    quaternions_rate: float = 1e-3
+    """Learning rate of the orientations."""
+    opacity_rate: float = 0.05
+    """Learning rate of the opacity logits."""
+    color_rate: float = 2.5e-3
+    """Learning rate of the constant colour; the other bands get a twentieth."""
+
+    initial_opacity: float = 0.1
+    """Opacity of the initial Gaussians."""
+    densify_from: int = 500
+    """First step that may densify."""
+    densify_until: int | None = None
+    """Last step that may densify; None: the last step."""
+    densify_every: int = 100
+    """Steps between densifications; 0 never densifies."""
+    densify_gradient: float = 5e-4
+    """Gaussians whose mean projected gradient reaches this are cloned or split."""
+    dense_fraction: float = 0.01
+    """Gaussians larger than this fraction of the scene's extent are split, smaller ones cloned."""
+    prune_opacity: float = 0.005
+    """Fainter Gaussians are removed at each densification."""
+    max_gaussians: int | None = None
+    """Densification stops above this number; None: no limit."""
+
+    opacity_reset: float = 0.05
+    """What opacities are lowered to at a reset."""
+    opacity_reset_from: int = 2_001
+    """First reset."""
+    opacity_reset_every: int = 3_000
+    """Steps between resets; 0 never resets."""
+    opacity_decay: float = 1.0
+    """Opacities are multiplied by this at every step from ``densify_from`` on; 1 does nothing."""
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"iterations must be at least 1, got {self.iterations}.")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout must be in [0, 1), got {self.dropout}: 0 turns it off.")
+        if self.noise < 0:
+            raise ValueError(f"noise must not be negative, got {self.noise}: 0 turns it off.")
+        if self.sh_degree not in (0, 1, 2, 3):
+            raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}.")
+        if not 0 < self.opacity_decay <= 1:
+            raise ValueError(f"opacity_decay must be in (0, 1], got {self.opacity_decay}: 1 turns it off.")
+
+    @property
+    def test_time_scale(self) -> float:
+        """Factor of the opacities at test time: 1 - p, or 1 for inverted dropout (paper, Eq. dropout_test)."""
+        return 1.0 if self.compensate else 1.0 - self.dropout
+
+
+PRESETS: dict[str, TrainConfig] = {
+    "fsgs": TrainConfig(iterations=10_000),
+    "inria": TrainConfig(
+        iterations=30_000,
+        sh_every=1_000,
+        densify_until=15_000,
+        densify_gradient=2e-4,
+        opacity_reset=0.01,
+        opacity_reset_from=3_000,
+    ),
+    "binocular": TrainConfig(
+        iterations=30_000,
+        sh_degree=1,
+        sh_every=1_000,
+        densify_gradient=2e-4,
+        opacity_reset_every=0,
+        opacity_decay=0.995,
+    ),
+}
+"""Schedules of published code bases: FSGS, the INRIA 3DGS, and Binocular3DGS without its consistency loss."""
+
+
+def with_preset(name: str, **changes: object) -> TrainConfig:
+    """Return a preset with some fields changed.
+
+    Args:
+        name: a key of `PRESETS`.
+        changes: fields of `TrainConfig`.
+
+    Raises:
+        ValueError: if there is no such preset.
+
+    Example:
+        >>> with_preset("binocular", iterations=3000).opacity_decay
+        0.995
+    """
+    if name not in PRESETS:
+        raise ValueError(f"there is no preset {name!r}; choose one of {', '.join(PRESETS)}.")
+    return dataclasses.replace(PRESETS[name], **changes)  # type: ignore[arg-type]

@@ -1,0 +1,281 @@
+"""The training loop."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ca_reg import GaussianDropout, OpacityNoise, StartStop
+from reference_trainer.camera import Camera
+from reference_trainer.model.density import DensityStatistics, decay_opacity, densify, prune, reset_opacity
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
+from reference_trainer.render import Rendering, render
+from reference_trainer.scenes.points import mean_neighbor_distance
+from reference_trainer.scenes.scene import PointCloud, Scene
+from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.losses import photometric_loss
+from reference_trainer.training.randomness import stream, view_order
+
+__all__ = ["Trainer", "TrainingStoppedError", "render_gaussians"]
+
+
+class TrainingStoppedError(RuntimeError):
+    """Training cannot go on; the message says why and what to try."""
+
+
+def render_gaussians(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor,
+    *,
+    opacities: Tensor | None = None,
+    sh_degree: int | None = None,
+    depth: bool = False,
+) -> Rendering:
+    """Render a model, optionally with other opacities (N,) than its own."""
+    return render(
+        gaussians.means,
+        gaussians.quaternions,
+        gaussians.scales,
+        gaussians.opacities if opacities is None else opacities,
+        camera,
+        sh=gaussians.sh,
+        sh_degree=sh_degree,
+        background=background,
+        depth=depth,
+    )
+
+
+class Trainer:
+    """Fits Gaussians to the training views of a scene.
+
+    Args:
+        scene: photographs, cameras and initial points.
+        config: all settings.
+        device: where to train.
+
+    Raises:
+        ValueError: if the scene has no initial points.
+
+    Example:
+        >>> from reference_trainer.scenes import synthetic_scene
+        >>> trainer = Trainer(synthetic_scene(width=48, height=36, points=200), TrainConfig(iterations=2, dropout=0.2))
+        >>> trainer.train()
+        >>> trainer.step
+        2
+    """
+
+    def __init__(self, scene: Scene, config: TrainConfig, device: torch.device | str = "cpu") -> None:
+        if scene.points is None:
+            raise ValueError(f"scene {scene.name!r} has no initial points: load it with points='random'.")
+        self.scene = scene
+        self.config = config
+        self.device = torch.device(device)
+        self.step = 0
+        self.seconds = 0.0
+        self.views = [view.to(self.device) for view in scene.train]
+        self.background = scene.background.to(self.device)
+        start = config.regularize_from
+        self.dropout = GaussianDropout(StartStop(config.dropout, start), compensate=config.compensate)
+        self.noise = OpacityNoise(StartStop(config.noise, start), clip=config.clip_noise)
+        self.optimizer = GaussianOptimizer(self._initial(scene.points), self._rates())
+        self.statistics = DensityStatistics.zeros(len(self.gaussians), self.device)
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The model as it stands."""
+        return self.optimizer.gaussians
+
+    @property
+    def sh_degree(self) -> int:
+        """The highest band of spherical harmonics in use at this step."""
+        return min(self.config.sh_degree, self.step // self.config.sh_every)
+
+    def train(
+        self,
+        *,
+        until: int | None = None,
+        after_step: Callable[[Trainer], None] | None = None,
+        progress: bool = False,
+    ) -> None:
+        """Train up to a step.
+
+        Args:
+            until: stop after this step; the configured number by default.
+            after_step: called after every step.
+            progress: whether to show a progress bar with loss, PSNR, count and time left.
+
+        Raises:
+            TrainingStoppedError: if the loss is not finite or no Gaussian is left.
+        """
+        from tqdm import tqdm
+
+        last = self.config.iterations if until is None else min(until, self.config.iterations)
+        with tqdm(total=self.config.iterations, initial=self.step, disable=not progress, mininterval=0.5) as bar:
+            while self.step < last:
+                start = time.perf_counter()
+                loss, mse = self.train_step()
+                self.seconds += time.perf_counter() - start
+                if progress and self.step % 10 == 0:
+                    psnr = -10 * math.log10(max(mse, 1e-12))
+                    bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{psnr:.2f}", gaussians=len(self.gaussians))
+                bar.update()
+                if after_step is not None:
+                    after_step(self)
+
+    def train_step(self) -> tuple[float, float]:
+        """Take one step on one view; return the loss and the mean squared error of the (regularized) render."""
+        self._control_density()
+        config, step = self.config, self.step
+        view = self.views[view_order(config.seed, step, len(self.views))]
+        rendering = render_gaussians(
+            self.gaussians, view.camera, self.background, opacities=self._regularized(), sh_degree=self.sh_degree
+        )
+        loss = photometric_loss(rendering.image, view.image, config.lambda_dssim)
+        value = loss.item()
+        if not math.isfinite(value):
+            raise TrainingStoppedError(f"the loss became {value} at step {step + 1}: lower the learning rates.")
+        if rendering.splats.indices.numel() > 0:
+            loss.backward()  # type: ignore[no-untyped-call]
+            self._count(rendering, view.camera)
+            self.optimizer.set_means_rate(self._means_rate(step))
+            self.optimizer.step()
+        self.step += 1
+        with torch.no_grad():
+            mse = torch.mean((rendering.image.clamp(0, 1) - view.image) ** 2).item()
+        return value, mse
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint from which `load` continues to the identical result."""
+        state = {
+            "config": json.dumps(dataclasses.asdict(self.config)),
+            "scene": self.scene.name,
+            "train_views": [view.name for view in self.scene.train],
+            "step": self.step,
+            "seconds": self.seconds,
+            "statistics": vars(self.statistics),
+            **self.optimizer.state_dict(),
+        }
+        save_checkpoint(path, state)
+
+    @classmethod
+    def load(cls, path: Path, scene: Scene, device: torch.device | str = "cpu") -> Trainer:
+        """Continue from a checkpoint.
+
+        Args:
+            path: of the checkpoint.
+            scene: the scene that it was trained on.
+            device: where to train.
+
+        Raises:
+            ValueError: if the checkpoint belongs to other training views.
+        """
+        state = load_checkpoint(path, device)
+        names = [view.name for view in scene.train]
+        if state["train_views"] != names:
+            raise ValueError(f"{path} was trained on the views {state['train_views']}, the scene has {names}.")
+        trainer = cls(scene, TrainConfig(**json.loads(state["config"])), device)
+        trainer.step, trainer.seconds = state["step"], state["seconds"]
+        trainer.optimizer.load_state_dict(state)
+        trainer.statistics = DensityStatistics(**state["statistics"])
+        return trainer
+
+    def _initial(self, points: PointCloud) -> Gaussians:
+        """Make one round Gaussian per point, as wide as the distance to its neighbours."""
+        start = Gaussians.from_points(
+            points.positions,
+            points.colors,
+            mean_neighbor_distance(points.positions),
+            sh_degree=self.config.sh_degree,
+            opacity=self.config.initial_opacity,
+        )
+        return start.to(self.device)
+
+    def _rates(self) -> LearningRates:
+        config = self.config
+        return LearningRates(
+            means=self._means_rate(0),
+            log_scales=config.scales_rate,
+            quaternions=config.quaternions_rate,
+            opacity_logits=config.opacity_rate,
+            sh_dc=config.color_rate,
+            sh_rest=config.color_rate / 20,
+        )
+
+    def _means_rate(self, step: int) -> float:
+        """Learning rate of the means: falls exponentially over the run, in world units."""
+        config = self.config
+        along = step / config.iterations
+        rate = math.exp((1 - along) * math.log(config.means_rate) + along * math.log(config.means_rate_final))
+        return rate * self.scene.extent
+
+    def _regularized(self) -> Tensor:
+        """Opacities of this step: some dropped, some shaken."""
+        opacities = self.gaussians.opacities
+        for regularizer, name in ((self.dropout, "dropout"), (self.noise, "noise")):
+            regularizer.set_step(self.step)
+            opacities = regularizer(opacities, generator=stream(self.config.seed, self.step, name, self.device))
+        return opacities
+
+    def _count(self, rendering: Rendering, camera: Camera) -> None:
+        """Enter the Gaussians that were drawn into the densification statistics."""
+        splats = rendering.splats
+        gradient = splats.projection.means.grad
+        assert gradient is not None
+        drawn = splats.lists.touched
+        self.statistics.update(
+            splats.indices[drawn], gradient[drawn], splats.projection.radii[drawn], camera.width, camera.height
+        )
+
+    def _control_density(self) -> None:
+        """Densify, prune, reset and decay as the schedule says for the steps that are done.
+
+        This happens before a step and not after it, so that whoever looks at the model between steps finds it
+        optimized: a clone doubles the opacity of its place until the next steps have adapted to it.
+        """
+        config, step = self.config, self.step
+        until = config.iterations if config.densify_until is None else config.densify_until
+        every = config.densify_every
+        if every and config.densify_from < step <= until and step % every == 0:
+            self._densify()
+            if len(self.gaussians) == 0:
+                raise TrainingStoppedError(
+                    f"all Gaussians were pruned after step {step}: lower prune_opacity or the noise."
+                )
+        if config.opacity_decay < 1 and step > config.densify_from:
+            decay_opacity(self.optimizer, config.opacity_decay)
+        since = step - config.opacity_reset_from
+        if config.opacity_reset_every and since >= 0 and since % config.opacity_reset_every == 0 and step < until:
+            reset_opacity(self.optimizer, config.opacity_reset)
+
+    def _densify(self) -> None:
+        config = self.config
+        room = config.max_gaussians is None or len(self.gaussians) < config.max_gaussians
+        radii = self.statistics.largest_radius
+        if room:
+            radii = densify(
+                self.optimizer,
+                self.statistics,
+                gradient_threshold=config.densify_gradient,
+                size_threshold=config.dense_fraction * self.scene.extent,
+                generator=stream(config.seed, self.step, "split", self.device),
+            )
+        # Once opacities have been reset, what is still large on the screen or in the world is a floater.
+        after_reset = config.opacity_reset_every > 0 and self.step > config.opacity_reset_every
+        prune(
+            self.optimizer,
+            min_opacity=config.prune_opacity,
+            max_scale=0.1 * self.scene.extent if after_reset else None,
+            largest_radius=radii,
+            max_radius=20.0 if after_reset else None,
+        )
+        self.statistics = DensityStatistics.zeros(len(self.gaussians), self.device)

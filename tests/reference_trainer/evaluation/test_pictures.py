@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from reference_trainer.evaluation.pictures import error_map, heat_map, save_png, side_by_side, to_uint8
+
+
+def test_bytes_survive_the_way_to_float_and_back():
+    values = torch.arange(256, dtype=torch.uint8)
+    assert torch.equal(to_uint8(values.float() / 255), values)
+
+
+def test_bytes_are_the_nearest():
+    x = torch.rand(1000, generator=torch.Generator().manual_seed(0))
+    assert (to_uint8(x).double() / 255 - x).abs().max() <= 0.5 / 255 + 1e-7
+
+
+def test_nan_has_no_byte():
+    with pytest.raises(ValueError, match="NaN"):
+        to_uint8(torch.tensor([float("nan")]))
+
+
+def test_png_holds_the_image(tmp_path):
+    image = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(0))
+    save_png(tmp_path / "new" / "a.png", image)
+    with Image.open(tmp_path / "new" / "a.png") as picture:
+        assert picture.size == (7, 5)
+        assert picture.mode == "RGB"
+        pixels = np.array(picture)
+    assert np.array_equal(pixels, np.round(image.numpy().transpose(1, 2, 0) * 255).astype(np.uint8))
+    assert [entry.name for entry in (tmp_path / "new").iterdir()] == ["a.png"]
+
+
+def test_png_takes_gradients_and_clamps(tmp_path):
+    save_png(tmp_path / "a.png", torch.full((3, 2, 2), 1.5, requires_grad=True))
+    with Image.open(tmp_path / "a.png") as picture:
+        assert np.array(picture).min() == 255
+
+
+def test_heat_map_has_the_colours_of_inferno():
+    colours = heat_map(torch.tensor([[0.0, 1.0, 2.0], [-1.0, 5.0, 0.5]]), vmax=2.0)
+    expected = [matplotlib.colormaps["inferno"](x)[:3] for x in (0.0, 128, 1.0, 0.0, 1.0, 64)]
+    torch.testing.assert_close(colours.reshape(3, 6).T, torch.tensor(expected, dtype=torch.float32), atol=1e-6, rtol=0)
+
+
+def test_heat_map_is_monotone_in_brightness_and_leaves_grey_for_the_undefined():
+    colours = heat_map(torch.linspace(0, 1, 100)[None], vmax=1.0)
+    brightness = (torch.tensor([0.2126, 0.7152, 0.0722])[:, None, None] * colours).sum(0)[0]
+    assert (brightness.diff() >= 0).all()
+    undefined = heat_map(torch.tensor([[float("nan"), float("inf")]]), vmax=1.0)
+    assert torch.equal(undefined, torch.full((3, 1, 2), 0.5))
+
+
+def test_error_map_is_the_heat_map_of_the_mean_error():
+    image, target = torch.rand(2, 3, 6, 4, generator=torch.Generator().manual_seed(0))
+    errors = sum((image[c] - target[c]).abs() for c in range(3)) / 3
+    torch.testing.assert_close(error_map(image, target, vmax=0.4), heat_map(errors, 0.4), atol=0.02, rtol=0)
+    assert torch.equal(error_map(image, image), heat_map(torch.zeros(6, 4), 1.0))
+
+
+def test_side_by_side_places_every_picture():
+    pictures = [torch.full((3, 20, 50), level) for level in (0.1, 0.4, 0.7)]
+    grid = side_by_side(pictures, ["one", "two", "three"], columns=2)
+    assert grid.shape == (3, 2 * 36 + 4, 2 * 50 + 4)
+    for k, (top, left) in enumerate([(16, 0), (16, 54), (56, 0)]):
+        assert torch.equal(grid[:, top : top + 20, left : left + 50], pictures[k])
+    assert (grid[:, :, 50:54] == 1).all()
+    assert (grid[:, 36:40] == 1).all()
+    assert (grid[:, 40:, 54:] == 1).all()
+    for top, left in [(0, 0), (0, 54), (40, 0)]:
+        assert grid[:, top : top + 16, left : left + 50].min() < 0.5, "the label has ink"
+    assert not torch.equal(grid[:, :16, :50], grid[:, :16, 54:104])
+
+
+def test_one_row_by_default_and_no_room_for_absent_columns():
+    pictures = [torch.zeros(3, 8, 9)] * 3
+    assert side_by_side(pictures, ["a"] * 3).shape == (3, 24, 3 * 9 + 2 * 4)
+    assert side_by_side(pictures[:1], ["a"], columns=5).shape == (3, 24, 9)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: heat_map(torch.zeros(3), 1.0), r"\(H, W\)"),
+        (lambda: heat_map(torch.zeros(3, 3), 0.0), "vmax"),
+        (lambda: error_map(torch.zeros(3, 4, 4), torch.zeros(3, 4, 5)), "one shape"),
+        (lambda: error_map(torch.zeros(4, 4), torch.zeros(4, 4)), r"\(3, H, W\)"),
+        (lambda: save_png("unused.png", torch.zeros(1, 4, 4)), r"\(3, H, W\)"),
+        (lambda: side_by_side([], []), "at least one"),
+        (lambda: side_by_side([torch.zeros(3, 4, 4)], []), "one label for each"),
+        (lambda: side_by_side([torch.zeros(3, 4, 4), torch.zeros(3, 4, 5)], ["a", "b"]), "one size"),
+        (lambda: side_by_side([torch.zeros(3, 4, 4)], ["a"], columns=0), "columns"),
+    ],
+)
+def test_wrong_arguments(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

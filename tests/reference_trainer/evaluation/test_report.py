@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, mean_std, write_json
+
+NAN = float("nan")
+
+
+def test_json_round_trip(tmp_path):
+    data = {"name": "fern ± é", "n": 3, "ok": True, "none": None, "list": [1.5, [2]], "nested": {"x": 0.1}}
+    write_json(tmp_path / "new" / "a.json", data)
+    assert json.loads((tmp_path / "new" / "a.json").read_text(encoding="utf-8")) == data
+    assert [entry.name for entry in (tmp_path / "new").iterdir()] == ["a.json"]
+
+
+def test_json_without_numbers_that_it_cannot_hold(tmp_path):
+    write_json(tmp_path / "a.json", {"a": NAN, "b": [math.inf, {"c": -math.inf}], "d": (np.float64("nan"), 1)})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": None, "b": [None, {"c": None}], "d": [None, 1]}
+
+
+@pytest.mark.parametrize("data", [{"x": torch.ones(2)}, {1: "x"}, {"x": {None: 2}}])
+def test_json_refuses_the_rest_and_keeps_the_old_file(tmp_path, data):
+    write_json(tmp_path / "a.json", [1])
+    with pytest.raises(TypeError):
+        write_json(tmp_path / "a.json", data)
+    assert json.loads((tmp_path / "a.json").read_text()) == [1]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_mean_std_equals_numpy():
+    values = np.random.default_rng(0).normal(20, 3, 17)
+    mean, std = mean_std(values)
+    assert mean == pytest.approx(np.mean(values), rel=1e-12)
+    assert std == pytest.approx(np.std(values, ddof=1), rel=1e-12)
+    assert mean_std([*values, NAN, math.inf]) == (mean, std)
+
+
+def test_mean_std_of_too_few():
+    assert mean_std([5.0])[0] == 5
+    assert math.isnan(mean_std([5.0])[1])
+    assert all(map(math.isnan, mean_std([NAN])))
+    assert all(map(math.isnan, mean_std([])))
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ([20.39, 20.51, 20.63], "20.51 ± 0.12"),
+        ([0.6481, 0.6512, 0.6543], "0.6512 ± 0.0031"),
+        ([19_900.0, 20_000.0, 20_100.0], "20000 ± 100"),
+        ([1.0 - 0.0999, 1.0, 1.0 + 0.0999], "1.00 ± 0.10"),
+        ([10.0 - 9.99, 10.0, 10.0 + 9.99], "10 ± 10"),
+        ([2.0, 2.0], "2 ± 0"),
+        ([20.51], "20.51"),
+        ([12_345.6], "12346"),
+        ([], "n/a"),
+        ([NAN, NAN], "n/a"),
+        ([20.51, NAN], "20.51 (1 of 2)"),
+    ],
+)
+def test_format(values, text):
+    assert format_mean_std(values) == text
+
+
+def test_format_in_thousandths():
+    assert format_mean_std([0.00221, 0.00231, 0.00241], unit=1e-3) == "2.31 ± 0.10"
+    with pytest.raises(ValueError, match="unit"):
+        format_mean_std([1.0], unit=0)
+
+
+def test_format_takes_a_generator_once():
+    assert format_mean_std(x for x in (20.39, 20.51, 20.63)) == "20.51 ± 0.12"
+
+
+def test_table():
+    rows = [{"run": "base|line", "PSNR": 19.3612, "n": 12}, {"run": "x\ny", "PSNR": NAN, "n": None, "other": 1}, {}]
+    lines = markdown_table(rows, ["run", "PSNR", "n"]).splitlines()
+    assert lines == [
+        "| run | PSNR | n |",
+        "|:---|---:|---:|",
+        "| base\\|line | 19.36 | 12 |",
+        "| x y | n/a | n/a |",
+        "| n/a | n/a | n/a |",
+    ]
+    with pytest.raises(ValueError, match="column"):
+        markdown_table([], [])
+
+
+def test_machine_can_be_written(tmp_path):
+    facts = machine()
+    write_json(tmp_path / "a.json", facts)
+    assert json.loads((tmp_path / "a.json").read_text()) == facts
+    assert facts["torch"].split("+")[0] == torch.__version__.split("+")[0]
+    assert facts["threads"] == torch.get_num_threads()
+    assert facts["cores"] >= 1
+    assert facts["cpu"]
