@@ -38,11 +38,11 @@ def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
     lists = splats.lists
     table = pack(splats.projection.means, splats.projection.factors, splats.opacities)
     colors = torch.cat([splats.colors, splats.colors.new_zeros(1, 3)])
-    tiles = table.new_zeros(lists.lengths.shape[0], TILE * TILE, 2)
+    tiles = table.new_zeros(lists.lengths.shape[0], 2, TILE * TILE)
     for block in lists.blocks(block_size(table.device)):
         weights = block_alphas(table, block, lists)[0].weights
         of_pixels = colors[block.gaussians][:, None].expand(-1, TILE * TILE, -1, -1)
         result = color_variance(weights, of_pixels)
-        tiles[block.tiles] = torch.stack([result.variance, result.covered.to(table)], dim=-1)
+        tiles[block.tiles] = torch.stack([result.variance, result.covered.to(table)], dim=1)
     variance, covered = untile(tiles, lists)
     return variance, covered > 0

@@ -1,0 +1,87 @@
+"""The projection against autograd Jacobians, float128-like arithmetic and numpy."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from oracles import random_scene
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.projection import project, rotation_matrices
+
+
+def in_front(n, seed):
+    scene = random_scene(n, 40, 30, seed=seed)
+    camera = scene.camera
+    depth = scene.means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    keep = depth > 0.5
+    return scene.means[keep], scene.quaternions[keep], scene.scales[keep], camera
+
+
+def test_centres_follow_the_pinhole_equation_with_half_pixel_centres():
+    # A point on the ray through the centre of the pixel in row 7, column 3.
+    camera = Camera(torch.eye(4, dtype=torch.float64), 21.0, 19.0, 5.25, 4.5, 10, 9)
+    direction = torch.tensor([(3.5 - 5.25) / 21, (7.5 - 4.5) / 19, 1.0], dtype=torch.float64)
+    out = project(4.2 * direction[None], torch.tensor([[1.0, 0, 0, 0]]).double(), torch.ones(1, 3).double(), camera)
+    torch.testing.assert_close(out.means, torch.tensor([[3.5, 7.5]], dtype=torch.float64))
+    torch.testing.assert_close(out.depths, torch.tensor([4.2], dtype=torch.float64))
+
+
+def test_covariance_is_the_jacobian_sandwich():
+    means, quaternions, scales, camera = in_front(30, seed=2)
+    out = project(means, quaternions, scales, camera)
+    axes = rotation_matrices(quaternions)
+    for i in range(len(means)):
+        # The Jacobian of the pixel position with respect to the world position, by autograd.
+        jacobian = torch.autograd.functional.jacobian(
+            lambda m, i=i: project(m[None], quaternions[i : i + 1], scales[i : i + 1], camera).means[0], means[i]
+        )
+        point = camera.world_to_camera[:3, :3] @ means[i] + camera.world_to_camera[:3, 3]
+        inside = abs(point[0] / point[2]) < 1.3 * 20 / camera.fx and abs(point[1] / point[2]) < 1.3 * 15 / camera.fy
+        if not inside:  # there the linearisation point is clamped on purpose
+            continue
+        covariance = axes[i] @ torch.diag(scales[i] ** 2) @ axes[i].T
+        expected = jacobian @ covariance @ jacobian.T + 0.3 * torch.eye(2, dtype=torch.float64)
+        xx, xy, yy = out.covariances[i]
+        torch.testing.assert_close(torch.stack([torch.stack([xx, xy]), torch.stack([xy, yy])]), expected)
+
+
+def test_factors_invert_the_covariance():
+    out = project(*in_front(50, seed=3))
+    xx, xy, yy = out.covariances.unbind(1)
+    inverse = torch.linalg.inv(torch.stack([xx, xy, xy, yy], dim=1).view(-1, 2, 2))
+    l11, l21, l22 = out.factors.unbind(1)
+    factor = torch.stack([l11, l21, torch.zeros_like(l11), l22], dim=1).view(-1, 2, 2)
+    torch.testing.assert_close(factor.mT @ factor, inverse, rtol=1e-10, atol=1e-12)
+
+
+def test_radii_are_three_standard_deviations_of_the_longer_axis():
+    out = project(*in_front(50, seed=4))
+    xx, xy, yy = out.covariances.unbind(1)
+    largest = np.linalg.eigvalsh(torch.stack([xx, xy, xy, yy], dim=1).view(-1, 2, 2).numpy())[:, 1]
+    np.testing.assert_array_equal(out.radii.numpy(), np.ceil(3 * np.sqrt(largest)))
+
+
+@pytest.mark.parametrize("ratio", [1e1, 1e3, 1e5])
+def test_float32_factors_of_needles_keep_their_digits(ratio):
+    # A needle at 45 degrees in the image plane: xx yy - xy^2 in float32 would have lost all digits at the larger ratios.
+    angle = math.pi / 8
+    quaternion = torch.tensor([[math.cos(angle), 0.0, 0.0, math.sin(angle)]], dtype=torch.float64)
+    scales = torch.tensor([[1e-3 * ratio, 1e-3, 1e-3]], dtype=torch.float64)
+    camera = Camera(torch.eye(4, dtype=torch.float64), 300.0, 300.0, 128.0, 128.0, 256, 256)
+    mean = torch.tensor([[0.1, -0.05, 3.0]], dtype=torch.float64)
+    exact = project(mean, quaternion, scales, camera).factors
+    single = project(mean.float(), quaternion.float(), scales.float(), camera.to(dtype=torch.float32)).factors
+    torch.testing.assert_close(single.double(), exact, rtol=2e-5, atol=0)
+
+
+def test_quaternion_length_does_not_matter_and_rotations_are_orthonormal():
+    quaternions = torch.randn(20, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rotations = rotation_matrices(quaternions)
+    torch.testing.assert_close(rotations, rotation_matrices(7.5 * quaternions))
+    torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3, dtype=torch.float64).expand(20, 3, 3))
+    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(20, dtype=torch.float64))
+    # wxyz: a quarter turn about z takes x to y.
+    turn = rotation_matrices(torch.tensor([[1.0, 0, 0, 1.0]], dtype=torch.float64))[0]
+    torch.testing.assert_close(turn @ torch.tensor([1.0, 0, 0]).double(), torch.tensor([0.0, 1, 0]).double())
