@@ -57,7 +57,7 @@ class GaussianDropout(_Regularizer):
     the two schemes are not equivalent, because compositing is not linear in the opacities. The module has no
     parameters; put it between the activation of the opacities and the rasterizer.
 
-    Dropped Gaussians must leave no trace in density control: zero their radii, ``radii * dropout.keep``.
+    Dropped Gaussians must leave no trace in density control: pass the radii through :meth:`mask_radii`.
 
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call checks this.
 
@@ -132,6 +132,37 @@ class GaussianDropout(_Regularizer):
             return opacity
         opacity, self.keep = functional.gaussian_dropout(opacity, p, compensate=self.compensate, generator=generator)
         return opacity
+
+    def mask_radii(self, radii: Tensor) -> Tensor:
+        """Zero the radii of the Gaussians that the last call dropped, so that density control does not count them.
+
+        If they were counted as seen, their mean gradient would shrink by ``1 - p`` and the threshold in effect rise by
+        ``1 / (1 - p)``.
+
+        Args:
+            radii: of all Gaussians as the rasterizer returned them, Gaussians first, shape (N,) or (N, ...).
+
+        Returns:
+            The same shape and dtype; the very same tensor if nothing was dropped.
+
+        Raises:
+            ValueError: if the number of Gaussians is not that of the last call.
+
+        Example:
+            >>> dropout = GaussianDropout(p=0.5)
+            >>> _ = dropout(torch.full((4,), 0.5))
+            >>> radii = torch.tensor([3, 1, 2, 5])
+            >>> torch.equal(dropout.mask_radii(radii) > 0, dropout.keep)
+            True
+        """
+        if self.keep is None:
+            return radii
+        if radii.shape[:1] != self.keep.shape:
+            raise ValueError(
+                f"radii must have the {self.keep.shape[0]} Gaussians of the last call as the first axis, got shape "
+                f"{tuple(radii.shape)}; call mask_radii before Gaussians are added or removed."
+            )
+        return radii * self.keep.view(-1, *[1] * (radii.ndim - 1)).to(radii.device)
 
     def extra_repr(self) -> str:
         """Return the arguments, for ``print``."""

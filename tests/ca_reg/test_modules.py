@@ -143,3 +143,21 @@ def test_unknown_keywords_raise():
 def test_printing_shows_the_arguments():
     assert repr(GaussianDropout(0.2)) == "GaussianDropout(p=0.2, compensate=False)"
     assert "LinearRamp(" in repr(OpacityNoise(LinearRamp(0.0, 0.8, 0, 10)))
+
+
+@pytest.mark.parametrize("shape", [(6,), (6, 2)])
+@pytest.mark.parametrize("dtype", [torch.int32, torch.float32])
+def test_mask_radii_zeroes_the_dropped_and_nothing_else(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    dropout = GaussianDropout(p=0.5)
+    radii = torch.arange(1, 1 + torch.Size(shape).numel()).reshape(shape).to(dtype)
+    keep = torch.tensor([True, False, True, True, False, False])
+    dropout(torch.full((6,), 0.5), keep=keep)
+    masked = dropout.mask_radii(radii)
+    assert masked.dtype == dtype
+    assert torch.equal(masked[keep], radii[keep])
+    assert not masked[~keep].any()
+    with pytest.raises(ValueError, match="6 Gaussians of the last call"):
+        dropout.mask_radii(radii[:5])
+    dropout.eval()
+    dropout(torch.full((6,), 0.5))
+    assert dropout.mask_radii(radii) is radii
