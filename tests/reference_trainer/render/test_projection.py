@@ -65,7 +65,7 @@ def test_radii_are_three_standard_deviations_of_the_longer_axis():
 
 @pytest.mark.parametrize("ratio", [1e1, 1e3, 1e5])
 def test_float32_factors_of_needles_keep_their_digits(ratio):
-    # A needle at 45 degrees in the image plane: xx yy - xy^2 in float32 would have lost all digits at the larger ratios.
+    # A needle at 45 degrees in the image plane: xx yy - xy^2 in float32 would lose all digits at the larger ratios.
     angle = math.pi / 8
     quaternion = torch.tensor([[math.cos(angle), 0.0, 0.0, math.sin(angle)]], dtype=torch.float64)
     scales = torch.tensor([[1e-3 * ratio, 1e-3, 1e-3]], dtype=torch.float64)
