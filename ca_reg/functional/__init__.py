@@ -1,18 +1,34 @@
 """The pure functions behind the modules: they hold no state, change no argument and draw only when asked to."""
 
 from ca_reg.functional.dropout import apply_dropout, draw_keep_mask, gaussian_dropout
+from ca_reg.functional.moments import (
+    PixelMoments,
+    alpha_moments,
+    contributions,
+    first_order_variance,
+    neutral_background,
+    pixel_moments,
+)
+from ca_reg.functional.multipliers import Multiplier
 from ca_reg.functional.noise import apply_opacity_noise, draw_opacity_noise, opacity_noise
 from ca_reg.functional.scaling import scale_opacity
 from ca_reg.functional.variance import ColorVariance, color_variance
 
 __all__ = [
     "ColorVariance",
+    "Multiplier",
+    "PixelMoments",
+    "alpha_moments",
     "apply_dropout",
     "apply_opacity_noise",
     "color_variance",
+    "contributions",
     "draw_keep_mask",
     "draw_opacity_noise",
+    "first_order_variance",
     "gaussian_dropout",
+    "neutral_background",
     "opacity_noise",
+    "pixel_moments",
     "scale_opacity",
 ]

@@ -1,0 +1,283 @@
+"""Exact mean and variance of pixels whose splats are multiplied by independent random factors.
+
+A pixel is composited back to front by ``C_i = a_i c_i + (1 - a_i) C_{i+1}`` with ``C_{n+1} = b``, the background. A
+regularizer replaces ``a_i = alpha_i`` by ``a_i = xi_i alpha_i``, where ``xi_i`` has mean m and variance v and is
+independent of everything behind it. Hence, by the law of total variance and per channel,
+
+    mu_i = m alpha_i c_i + (1 - m alpha_i) mu_{i+1}
+    V_i  = [(1 - m alpha_i)^2 + v alpha_i^2] V_{i+1} + v alpha_i^2 (c_i - mu_{i+1})^2
+
+with ``mu_{n+1} = b`` and ``V_{n+1} = 0``. ``V_1`` is the limit of the paper's co-adaptation at the pixel for infinitely
+many samples. From the front it reads ``sum_i v alpha_i^2 (c_i - mu_{i+1})^2 S_i``, where ``S_i`` is the product of the
+brackets of all splats in front: a sum of non-negative terms, one per splat, without the cancellation of a difference of
+mean squares. A splat counts by how much its colour differs from the expected colour behind it.
+
+Limits: the factors must be independent, one per Gaussian (not one per anchor or cluster). The variance is that over all
+draws, whereas the paper's score takes only pixels that stay covered in every sample. Renderers cut alphas below 1/255,
+clamp them at 0.99 and stop behind opaque splats; :class:`~ca_reg.functional.Multiplier` says what this changes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ca_reg.functional.multipliers import Multiplier
+
+__all__ = [
+    "PixelMoments",
+    "alpha_moments",
+    "contributions",
+    "first_order_variance",
+    "neutral_background",
+    "pixel_moments",
+]
+
+
+class PixelMoments(NamedTuple):
+    """Mean and variance over the random factors.
+
+    Args:
+        mean: expected value of the pixel, shape (..., C) for colours, (...) for the accumulated alpha.
+        variance: its variance, at least 0, same shape.
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+
+def pixel_moments(
+    alphas: Tensor, colors: Tensor, multiplier: Multiplier, *, background: Tensor | None = None
+) -> PixelMoments:
+    """Return the exact mean and variance of pixels under a random factor per splat.
+
+    Exact up to rounding, in float32 and float64, and differentiable in every tensor. The variance is the sum of
+    :func:`contributions`.
+
+    Convention: splats are ordered by depth, the nearest first.
+
+    Args:
+        alphas: alpha of each splat at the pixel, in [0, 1], shape (..., n). A zero stands for no splat, so lists of
+            different lengths are padded with zeros.
+        colors: their colours, finite also in the padding, shape (..., n, C), same dtype.
+        multiplier: moments of the factor. Tensors in it must broadcast to the shape of ``alphas``.
+        background: colour behind the last splat, shape (C,) or (..., C); None for zero.
+
+    Returns:
+        Mean and variance per pixel and channel, shape (..., C).
+
+    Raises:
+        TypeError: if an argument is not a tensor, or the dtypes are not floating point or differ.
+        ValueError: if the shapes do not match or an alpha is outside [0, 1].
+
+    Example:
+        >>> alphas = torch.tensor([0.5, 0.5])
+        >>> colors = torch.tensor([[1.0], [0.0]])
+        >>> pixel_moments(alphas, colors, Multiplier.dropout(0.5))
+        PixelMoments(mean=tensor([0.2500]), variance=tensor([0.0625]))
+    """
+    mean, shares = _moments(alphas, colors, multiplier, background)
+    return PixelMoments(mean, shares.sum(-2))
+
+
+def contributions(
+    alphas: Tensor, colors: Tensor, multiplier: Multiplier, *, background: Tensor | None = None
+) -> Tensor:
+    """Return what each splat contributes to the variance of the pixel: ``v alpha_i^2 (c_i - mu_{i+1})^2 S_i``.
+
+    The contributions are at least 0 and sum to the variance, so added up over pixels by the index of the Gaussian they
+    attribute the whole score. The i-th one is the part of the variance that is due to the factor of splat i, given
+    those in front, averaged over those behind; splats behind it matter only by their expected colour.
+
+    Convention: splats are ordered by depth, the nearest first.
+
+    Args:
+        alphas: as for :func:`pixel_moments`, shape (..., n).
+        colors: shape (..., n, C).
+        multiplier: moments of the factor.
+        background: shape (C,) or (..., C); None for zero.
+
+    Returns:
+        The contributions, shape (..., n, C); 0 in the padding.
+
+    Raises:
+        TypeError: as :func:`pixel_moments`.
+        ValueError: as :func:`pixel_moments`.
+
+    Example:
+        >>> alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[1.0], [1.0]])
+        >>> contributions(alphas, colors, Multiplier.dropout(0.5))[:, 0]
+        tensor([0.0352, 0.0391])
+    """
+    return _moments(alphas, colors, multiplier, background)[1]
+
+
+def alpha_moments(alphas: Tensor, multiplier: Multiplier) -> PixelMoments:
+    """Return the exact mean and variance of the accumulated alpha: that of white splats over black.
+
+    Args:
+        alphas: as for :func:`pixel_moments`, shape (..., n).
+        multiplier: moments of the factor.
+
+    Returns:
+        Mean and variance, shape (...).
+
+    Raises:
+        TypeError: as :func:`pixel_moments`.
+        ValueError: as :func:`pixel_moments`.
+
+    Example:
+        >>> alpha_moments(torch.tensor([0.5, 0.5]), Multiplier.dropout(0.5)).mean
+        tensor(0.4375)
+    """
+    _check_alphas(alphas)
+    mean, variance = pixel_moments(alphas, torch.ones_like(alphas)[..., None], multiplier)
+    return PixelMoments(mean[..., 0], variance[..., 0])
+
+
+def neutral_background(alphas: Tensor, colors: Tensor, multiplier: Multiplier) -> Tensor:
+    """Return the background that leaves the mean as it is: the ``b`` for which the expected pixel is ``b`` itself.
+
+    Over a fixed background a pixel varies also because dropped splats open a hole. Composited over its own expected
+    colour a hole shows what was expected there, and only disagreement between the colours of the splats counts; the
+    variance no longer depends on the choice of a background. From ``mu_1 = sum_i w_i c_i + (1 - sum_i w_i) b`` with the
+    expected blend weights ``w_i = m alpha_i prod_{j<i} (1 - m alpha_j)``, the condition ``mu_1 = b`` gives
+
+        b = sum_i w_i c_i / sum_i w_i
+
+    Pass it as ``background`` of :func:`pixel_moments` or :func:`contributions`; the mean is then ``b``.
+    Differentiable; detach it to hold it fixed in a penalty.
+
+    Convention: splats are ordered by depth, the nearest first.
+
+    Args:
+        alphas: as for :func:`pixel_moments`, shape (..., n).
+        colors: shape (..., n, C).
+        multiplier: moments of the factor; only its mean matters.
+
+    Returns:
+        The colour, shape (..., C); 0 where nothing covers the pixel, whose variance is 0 over any background.
+
+    Raises:
+        TypeError: as :func:`pixel_moments`.
+        ValueError: as :func:`pixel_moments`.
+
+    Example:
+        >>> alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[1.0], [0.0]])
+        >>> b = neutral_background(alphas, colors, Multiplier.dropout(0.5))
+        >>> b
+        tensor([0.5714])
+        >>> pixel_moments(alphas, colors, Multiplier.dropout(0.5), background=b).mean
+        tensor([0.5714])
+    """
+    _check_lists(alphas, colors)
+    expected = _per_splat(multiplier.mean, alphas, "mean") * alphas
+    weights = expected * _product_in_front(1.0 - expected)
+    total = weights.sum(-1, keepdim=True)
+    share = weights / torch.where(total > 0, total, 1.0)
+    return (share[..., None] * colors).sum(-2)
+
+
+def first_order_variance(alphas: Tensor, colors: Tensor, multiplier: Multiplier) -> Tensor:
+    """Return the paper's closed form ``v sum_i (c_i alpha_i)^2`` (appendix, Eq. ca_final, where v is ``p (1 - p)``).
+
+    An approximation, for comparison with :func:`pixel_moments`. It drops the transmittance, so that hidden splats count
+    like visible ones, and what lies behind a splat, so that its colour counts instead of its contrast; there is no
+    background. It is right for a single splat over black and in the limit of small accumulated alpha over black, and
+    otherwise mostly too large, the more so the longer the list.
+
+    Args:
+        alphas: as for :func:`pixel_moments`, shape (..., n).
+        colors: shape (..., n, C).
+        multiplier: moments of the factor; only its variance matters.
+
+    Returns:
+        The approximate variance per pixel and channel, shape (..., C).
+
+    Raises:
+        TypeError: as :func:`pixel_moments`.
+        ValueError: as :func:`pixel_moments`.
+
+    Example:
+        >>> alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[1.0], [1.0]])
+        >>> first_order_variance(alphas, colors, Multiplier.dropout(0.5))
+        tensor([0.1250])
+    """
+    _check_lists(alphas, colors)
+    spread = _per_splat(multiplier.variance, alphas, "variance")
+    return (spread[..., None] * (colors * alphas[..., None]).square()).sum(-2)
+
+
+def _moments(
+    alphas: Tensor, colors: Tensor, multiplier: Multiplier, background: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Mean (..., C) and contributions to the variance (..., n, C)."""
+    _check_lists(alphas, colors)
+    expected = _per_splat(multiplier.mean, alphas, "mean") * alphas
+    spread = _per_splat(multiplier.variance, alphas, "variance") * alphas.square()
+    means = [_background(background, alphas, colors)]
+    for weight, color in zip(reversed(expected.unbind(-1)), reversed(colors.unbind(-2)), strict=True):
+        # lerp and not a sum of products: equal colours then have no contrast at all, not one of rounding errors.
+        means.append(torch.lerp(means[-1], color, weight[..., None]))
+    mean = torch.stack(means[::-1], dim=-2)
+    weight = spread * _product_in_front((1.0 - expected).square() + spread)
+    return mean[..., 0, :], weight[..., None] * (colors - mean[..., 1:, :]).square()
+
+
+def _product_in_front(factors: Tensor) -> Tensor:
+    """Product of the factors of all splats in front of each, shape (..., n)."""
+    one = torch.ones_like(factors.sum(-1, keepdim=True))
+    return torch.cat([one, factors.cumprod(-1)], dim=-1)[..., : factors.shape[-1]]
+
+
+def _per_splat(value: float | Tensor, alphas: Tensor, name: str) -> Tensor:
+    """Return a moment of the multiplier as a tensor that broadcasts against the alphas."""
+    x = torch.as_tensor(value, dtype=alphas.dtype, device=alphas.device)
+    if x.ndim > alphas.ndim or any(a not in (1, b) for a, b in zip(x.shape[::-1], alphas.shape[::-1], strict=False)):
+        raise ValueError(
+            f"the {name} of the multiplier must broadcast to the shape of alphas, {tuple(alphas.shape)}, got "
+            f"{tuple(x.shape)}; gather moments per Gaussian by the indices of the splats."
+        )
+    return x
+
+
+def _background(background: Tensor | None, alphas: Tensor, colors: Tensor) -> Tensor:
+    """Return the background per pixel, shape (..., C)."""
+    shape = (*alphas.shape[:-1], colors.shape[-1])
+    if background is None:
+        return colors.new_zeros(shape)
+    if not isinstance(background, Tensor) or background.dtype != colors.dtype:
+        raise TypeError(f"background must be a tensor of the dtype of colors, {colors.dtype}, or None.")
+    if background.shape not in (shape, shape[-1:]):
+        raise ValueError(f"background must have shape {shape[-1:]} or {shape}, got {tuple(background.shape)}.")
+    return background.expand(shape)
+
+
+def _check_lists(alphas: Tensor, colors: Tensor) -> None:
+    """Raise unless alphas and colours are what :func:`pixel_moments` asks for."""
+    from kornia.core.check import KORNIA_CHECK_IS_TENSOR
+
+    _check_alphas(alphas)
+    KORNIA_CHECK_IS_TENSOR(colors, "colors must be a torch tensor of shape (..., n, C).")
+    if colors.shape[:-1] != alphas.shape:
+        raise ValueError(
+            f"colors must have the shape of alphas and a last axis of channels, {(*alphas.shape, 'C')}, "
+            f"got {tuple(colors.shape)}; expand the colours if the pixels share them."
+        )
+    if colors.dtype != alphas.dtype:
+        raise TypeError(f"colors and alphas must have the same dtype, got {colors.dtype} and {alphas.dtype}.")
+
+
+def _check_alphas(alphas: Tensor) -> None:
+    """Raise unless alphas is a floating-point tensor (..., n) of values in [0, 1]."""
+    from kornia.core.check import KORNIA_CHECK_IS_TENSOR
+
+    KORNIA_CHECK_IS_TENSOR(alphas, "alphas must be a torch tensor of shape (..., n).")
+    if not alphas.is_floating_point():
+        raise TypeError(f"alphas must be a floating-point tensor, got {alphas.dtype}; convert it with .float().")
+    if alphas.ndim == 0:
+        raise ValueError("alphas must have shape (..., n), got a scalar.")
+    if not bool(((alphas >= 0) & (alphas <= 1)).all()):
+        raise ValueError("alphas must be in [0, 1], got a value outside; pass min(0.99, opacity * falloff).")

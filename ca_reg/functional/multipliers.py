@@ -1,0 +1,161 @@
+"""Mean and variance of the random factor that a regularizer puts on the alpha of a splat."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ca_reg._check import check_finite, check_opacity_range, check_rate
+
+__all__ = ["Multiplier"]
+
+# Beyond this many standard deviations a normal tail is zero in float64, so a cut there is no cut.
+_FAR = 40.0
+
+
+@dataclass(frozen=True, eq=False)
+class Multiplier:
+    """Mean ``m`` and variance ``v`` of the factor ``xi`` in ``alpha -> xi alpha``, drawn independently per splat.
+
+    Dropout and opacity noise are both of this kind, and the first two moments of a pixel depend on nothing else:
+
+    =============================== ======================= ==================
+    regularizer                     mean                    variance
+    =============================== ======================= ==================
+    dropout                         ``1 - p``               ``p (1 - p)``
+    dropout, survivors compensated  ``1``                   ``p / (1 - p)``
+    opacity noise                   ``1``                   ``sigma^2``
+    opacity noise, clipped draw     ``1``                   ``0.516 sigma^2``
+    =============================== ======================= ==================
+
+    The product of two is the multiplier of one after the other, if they are drawn independently.
+
+    Args:
+        mean: at least 0; a number for all splats, or a tensor with one value per splat or Gaussian.
+        variance: at least 0, likewise.
+
+    Raises:
+        TypeError: if a field is neither a number nor a tensor.
+        ValueError: if a value is negative or not finite. For tensors this reads the values, which on a GPU waits.
+
+    Example:
+        >>> both = Multiplier.dropout(0.5) * Multiplier.opacity_noise(1.0)
+        >>> both.mean, both.variance
+        (0.5, 0.75)
+    """
+
+    mean: float | Tensor
+    variance: float | Tensor
+
+    def __post_init__(self) -> None:
+        for name, x in (("mean", self.mean), ("variance", self.variance)):
+            if not isinstance(x, Tensor):
+                check_finite(x, f"the {name} of a multiplier", minimum=0.0)
+            elif not bool(((x >= 0) & x.isfinite()).all()):
+                raise ValueError(f"the {name} of a multiplier must be finite and at least 0, got a value that is not.")
+
+    def __mul__(self, other: Multiplier) -> Multiplier:
+        """Return the multiplier of both, one after the other, drawn independently."""
+        # (v1 + m1^2)(v2 + m2^2) - m1^2 m2^2, multiplied out: no cancellation.
+        variance = (
+            self.variance * other.variance
+            + self.variance * (other.mean * other.mean)
+            + other.variance * (self.mean * self.mean)
+        )
+        return Multiplier(self.mean * other.mean, variance)
+
+    @classmethod
+    def dropout(cls, p: float, *, compensate: bool = False) -> Multiplier:
+        """Return the multiplier of :func:`~ca_reg.functional.gaussian_dropout` (paper, Eq. dropout_train).
+
+        Exact for renderers that clamp alpha, because a factor of 0 or 1 commutes with the clamp. With ``compensate``
+        it is exact where ``alpha <= 0.99 (1 - p)``: survivors above that are clamped by the renderer but not here.
+
+        Args:
+            p: drop rate in [0, 1).
+            compensate: survivors are multiplied by ``1 / (1 - p)``.
+
+        Raises:
+            TypeError: if ``p`` is not a number.
+            ValueError: if ``p`` is outside [0, 1).
+        """
+        check_rate(p)
+        return cls(1.0, p / (1.0 - p)) if compensate else cls(1.0 - p, p * (1.0 - p))
+
+    @classmethod
+    def opacity_noise(cls, sigma: float, *, clip: bool = False) -> Multiplier:
+        """Return the multiplier ``1 + eps`` of opacity noise, eps normal, without the clamp of the opacity to [0, 1].
+
+        A good approximation while few draws reach the clamp, that is for ``sigma`` well below 1 and opacities well
+        below ``1 / (1 + sigma)``; :meth:`clamped_noise` is without that restriction.
+
+        Args:
+            sigma: standard deviation of the relative noise, at least 0.
+            clip: the draw is clipped to [-sigma, sigma], which leaves 0.516 of its variance.
+
+        Raises:
+            TypeError: if ``sigma`` is not a number.
+            ValueError: if ``sigma`` is negative, not finite, or its square overflows.
+        """
+        check_finite(sigma, "sigma", minimum=0.0)
+        unit = 2.0 * _upper_half(torch.tensor(1.0, dtype=torch.float64))[1].item() if clip else 1.0
+        return cls(1.0, unit * sigma * sigma)
+
+    @classmethod
+    def clamped_noise(cls, opacity: Tensor, sigma: float, *, clip: bool = False) -> Multiplier:
+        """Return the multiplier of :func:`~ca_reg.functional.opacity_noise`, the clamp to [0, 1] included.
+
+        Per Gaussian, ``xi = clamp(o (1 + eps), 0, 1) / o`` is one plus ``sigma`` times a standard normal number that is
+        cut at ``-1 / sigma`` and at ``(1 / o - 1) / sigma``, whose moments are elementary. The upper cut lowers the
+        mean of opacities near 1, the lower one raises the mean of all. Differentiable in ``opacity``.
+
+        Left out is what the renderer does to the noisy alpha. With R the range of the colours and the background:
+
+        - its clamp at 0.99 moves each sampled colour, hence the mean and the standard deviation of the pixel, by at
+          most ``R / 99``, whatever the length of the list;
+        - its cut-off of alphas below 1/255 moves a sampled colour by at most ``R / 255`` for each splat that the noise
+          takes across the cut-off.
+
+        Args:
+            opacity: activated opacities ``o`` in [0, 1], any shape.
+            sigma: standard deviation of the relative noise, at least 0.
+            clip: the draw is clipped to [-sigma, sigma] before it is applied.
+
+        Returns:
+            Mean and variance per Gaussian, shape and dtype of ``opacity``. At ``o = 0`` the limit of small opacities.
+
+        Raises:
+            TypeError: if ``opacity`` is not a floating-point tensor or ``sigma`` not a number.
+            ValueError: if an opacity is outside [0, 1], ``sigma`` negative or not finite, or a variance overflows.
+
+        Example:
+            >>> noise = Multiplier.clamped_noise(torch.tensor([0.01, 1.0]), 0.2)
+            >>> noise.mean, noise.variance
+            (tensor([1.0000, 0.9202]), tensor([0.0400, 0.0136]))
+        """
+        if not isinstance(opacity, Tensor) or not opacity.is_floating_point():
+            raise TypeError("opacity must be a floating-point torch tensor of activated opacities.")
+        check_opacity_range(opacity)
+        check_finite(sigma, "sigma", minimum=0.0)
+        if sigma == 0:
+            return cls(torch.ones_like(opacity), torch.zeros_like(opacity))
+        cut = 1.0 if clip else _FAR
+        # At half the opacity from which on the cut is ``cut``: keeps 0 * inf out of the gradient at o = 0.
+        bounded = opacity.clamp(min=0.5 / (1.0 + cut * sigma))
+        up, up_square = _upper_half(((1.0 - bounded) / (sigma * bounded)).clamp(max=cut))
+        down, down_square = (x.item() for x in _upper_half(torch.tensor(min(1.0 / sigma, cut), dtype=torch.float64)))
+        shift = up - down
+        # Half of the draws are on either side, so shift^2 is at most half of the mean square: at most one bit is lost.
+        return cls(1.0 + sigma * shift, sigma * sigma * (up_square + down_square - shift.square()))
+
+
+def _upper_half(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and mean square of ``min(max(z, 0), x)`` for a standard normal z and x >= 0; sums of positive terms."""
+    tail = 0.5 * torch.erfc(x / math.sqrt(2.0))
+    half_square = 0.5 * x.square()
+    mean = x * tail - torch.expm1(-half_square) / math.sqrt(2.0 * math.pi)
+    # The incomplete gamma function is 2 * integral of t^2 phi(t) over [0, x], whose form with erf cancels for small x.
+    return mean, x.square() * tail + 0.5 * torch.special.gammainc(torch.full_like(x, 1.5), half_square)
