@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -193,7 +193,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``ca-reg``; errors that a user can mend end with one line and exit code 2, an interruption with 130."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    try:
+        _parse(arguments)()
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        print(f"ca-reg: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("\nca-reg: interrupted; the same command continues where it was.", file=sys.stderr)
+        sys.exit(130)
+
+
+def _parse(arguments: Sequence[str]) -> Callable[[], None]:
+    """Return the command with its options; exits where they cannot be understood."""
+    peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
     peek.add_argument("--preset", choices=list(PRESETS), default="fsgs")
     preset = peek.parse_known_args(arguments)[0].preset
     config = PRESETS[preset]
@@ -206,19 +218,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
         },
     )
-    command = tyro.cli(
+    command: Callable[[], None] = tyro.cli(
         commands,
         prog="ca-reg",
         description="Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting.",
         args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
     )
-    try:
-        command()
-    except (ValueError, OSError, ImportError, RuntimeError) as error:
-        sys.exit(f"ca-reg: {error}")
-    except KeyboardInterrupt:
-        sys.exit("\nca-reg: interrupted; the same command continues where it was.")
+    return command
 
 
 if __name__ == "__main__":

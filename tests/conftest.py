@@ -6,6 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
+# The tests are many small operations: a second thread only spins, and slows them down when the cores are busy.
+torch.set_num_threads(1)
+
 
 @pytest.fixture(scope="session")
 def data_root() -> Path:

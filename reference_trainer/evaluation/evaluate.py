@@ -183,6 +183,6 @@ def evaluate(
                 ca_map = heat_map(ca.variance.masked_fill(~ca.visible, math.nan).float(), CA_PICTURE_RANGE)
                 panels = [view.image, image, error_map(image, view.image), ca_map]
                 labels = ["photograph", f"render {views[-1].psnr:.2f} dB", "error", f"CA {ca.value * 1e3:.2f}e-3"]
-                save_png(stem.with_suffix(".png"), image)
+                save_png(stem.with_name(stem.name + ".png"), image)
                 save_png(stem.with_name(stem.name + "_panel.png"), side_by_side(panels, labels))
     return Evaluation(views, len(model.gaussians), None if perceptual is None else perceptual.name)

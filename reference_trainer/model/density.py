@@ -142,8 +142,8 @@ def prune(
 
 def reset_opacity(optimizer: GaussianOptimizer, ceiling: float) -> None:
     """Lower every opacity to at most ``ceiling`` and forget its optimizer state (Kerbl et al. 2023, Sec. 5.2)."""
-    opacities = optimizer.gaussians.opacities.detach().clamp(max=ceiling)
-    optimizer.set_opacity_logits(inverse_sigmoid(opacities), forget=True)
+    logits = optimizer.gaussians.opacity_logits.detach().clamp(max=math.log(ceiling / (1 - ceiling)))
+    optimizer.set_opacity_logits(logits, forget=True)
 
 
 def decay_opacity(optimizer: GaussianOptimizer, factor: float) -> None:

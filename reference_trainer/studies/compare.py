@@ -91,7 +91,14 @@ def compare(
 
     Returns:
         The results of the runs that finished, and the errors of the others.
+
+    Raises:
+        ValueError: if there is nothing to run, or ``jobs`` is not positive.
     """
+    if jobs < 1 or not configs or not seeds:
+        raise ValueError(
+            f"expected at least 1 strategy, 1 seed and 1 job, got {len(configs)}, {len(seeds)} and {jobs}."
+        )
     threads = max(1, (os.cpu_count() or 1) // jobs)
     grid = [(name, seed) for seed in seeds for name in configs]
     results: dict[tuple[str, int], dict[str, Any]] = {}
@@ -110,16 +117,21 @@ def compare(
             ): (name, seed)
             for name, seed in grid
         }
-        for done, future in enumerate(as_completed(futures), start=1):
-            name, seed = futures[future]
-            try:
-                results[name, seed] = result = future.result()
-            except Exception as error:  # one failing run must not stop the others; it is reported
-                failures[f"{name}, seed {seed}"] = f"{type(error).__name__}: {error}"
-                say(f"[{done}/{len(grid)}] {name}, seed {seed}: FAILED, {error}")
-                continue
-            test = result["mean"].get("test", result["mean"]["train"])
-            say(f"[{done}/{len(grid)}] {name}, seed {seed}: {test['psnr']:.2f} dB in {result['seconds']:.0f} s")
+        try:
+            for done, future in enumerate(as_completed(futures), start=1):
+                name, seed = futures[future]
+                try:
+                    results[name, seed] = result = future.result()
+                except Exception as error:  # one failing run must not stop the others; it is reported
+                    failures[f"{name}, seed {seed}"] = f"{type(error).__name__}: {error}"
+                    say(f"[{done}/{len(grid)}] {name}, seed {seed}: FAILED, {error}")
+                    continue
+                psnr = result["mean"].get("test", result["mean"]["train"])["psnr"]
+                quality = "no PSNR" if psnr is None else f"{psnr:.2f} dB"
+                say(f"[{done}/{len(grid)}] {name}, seed {seed}: {quality} in {result['seconds']:.0f} s")
+        except BaseException:  # an interruption must not wait for the runs that have not begun
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
     runs = {name: [results[name, seed] for seed in seeds if (name, seed) in results] for name in configs}
     comparison = Comparison({name: of for name, of in runs.items() if of}, failures)
     if comparison.runs:

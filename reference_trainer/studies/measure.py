@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -12,6 +12,7 @@ from reference_trainer.evaluation.evaluate import Evaluation, Model, PerceptualM
 from reference_trainer.evaluation.pictures import save_gif, save_png
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.evaluation.trajectory import interpolate_cameras
+from reference_trainer.model.gaussians import inverse_sigmoid
 from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
@@ -36,21 +37,32 @@ def of_run(run: Path, device: str = "cpu") -> tuple[Model, Scene, Path]:
 def of_ply(ply: Path, options: SceneOptions, *, dropout: float = 0.0, device: str = "cpu") -> tuple[Model, Scene, Path]:
     """Return the model of a standard 3DGS PLY, a scene for it, and the folder for its evaluation.
 
-    A PLY that says that the test-time scaling is baked into its opacities is not scaled again.
+    A PLY that says that the test-time scaling is baked into its opacities says the rate as well. The scaling is undone,
+    because CA is measured on plain opacities and the evaluation scales by itself.
 
     Args:
         ply: the model.
         options: the scene whose cameras and photographs are used.
-        dropout: the rate that the model was trained with.
+        dropout: the rate that the model was trained with, if the PLY does not say it.
         device: where to render.
+
+    Raises:
+        ValueError: if the PLY says another rate than ``dropout``, or is damaged.
+        FileNotFoundError: if the PLY or the scene is missing.
     """
     loaded = load_ply(ply)
+    gaussians, baked = loaded.gaussians, round(1.0 - loaded.opacity_scale, 12)
+    if baked > 0:
+        if dropout not in (0.0, baked):
+            raise ValueError(f"{ply} was trained with dropout {baked:g}, not {dropout:g}: leave out --dropout.")
+        plain = (gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6)
+        gaussians, dropout = replace(gaussians, opacity_logits=inverse_sigmoid(plain)), baked
     scene = options.load()
     model = Model(
-        gaussians=loaded.gaussians.to(device),
+        gaussians=gaussians.to(device),
         background=scene.background.to(device),
         dropout=dropout,
-        opacity_scale=1.0 if loaded.opacity_scale < 1 else 1.0 - dropout,
+        opacity_scale=1.0 - dropout,
     )
     return model, scene, ply.with_name(ply.stem + "_evaluation")
 
@@ -65,7 +77,7 @@ def measure(
     perceptual: PerceptualMetric | None = None,
     say: Say = print,
 ) -> Evaluation:
-    """Measure a model on a scene; write ``evaluation.json`` and pictures, and print the table.
+    """Measure a model on a scene; write ``evaluation.json``, ``evaluation.md`` and pictures, and print the table.
 
     Args:
         model: what to measure.
@@ -88,7 +100,9 @@ def measure(
         "machine": machine(),
     }
     write_json(out / "evaluation.json", data)
-    say(evaluation_table(result))
+    table = evaluation_table(result)
+    (out / "evaluation.md").write_text(table + "\n", encoding="utf-8")
+    say(table)
     say(f"Scores and pictures are in {out}")
     return result
 

@@ -20,13 +20,15 @@ from reference_trainer.model.ply import save_ply
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["CHECKPOINT", "CONFIG", "PLY", "RESULTS", "load_run", "model_of", "run_experiment", "summary"]
+__all__ = ["BAKED_PLY", "CHECKPOINT", "CONFIG", "PLY", "RESULTS", "load_run", "model_of", "run_experiment", "summary"]
 
 CONFIG = "config.json"
 CHECKPOINT = "checkpoint.pt"
 PLY = "point_cloud.ply"
+BAKED_PLY = "point_cloud_for_viewers.ply"
 RESULTS = "results.json"
 
 
@@ -56,8 +58,9 @@ def run_experiment(
 ) -> dict[str, Any]:
     """Train on a scene and measure the result; what a former call has done already is not done again.
 
-    The folder receives ``config.json``, ``checkpoint.pt``, ``ca.jsonl`` with TensorBoard events, ``point_cloud.ply``,
-    ``views/`` with pictures of every view, and ``results.json``, which marks the run as complete.
+    The folder receives ``config.json``, ``checkpoint.pt``, ``ca.jsonl`` with TensorBoard events, ``point_cloud.ply``
+    with the plain opacities (after dropout also ``point_cloud_for_viewers.ply``, with the test-time scaling baked in
+    and marked), ``views/`` with pictures of every view, and ``results.json``, which marks the run as complete.
 
     Args:
         options: the scene; random initial points use the seed of ``config``.
@@ -75,28 +78,32 @@ def run_experiment(
 
     Raises:
         ValueError: if the folder holds a run with other settings.
-        TrainingStoppedError: if training cannot go on; a checkpoint of the last step is kept.
+        TrainingStoppedError: if training cannot go on; the last checkpoint is kept.
+        TrainingInterrupted: on Ctrl-C, after a checkpoint has been saved; a second Ctrl-C does not wait for it.
     """
     perceptual = lpips_option(lpips, device=device)
     settings = dataclasses.asdict(config)
-    _claim(out, {"scene": dataclasses.asdict(options), "config": settings})
+    claim = {"scene": dataclasses.asdict(options), "config": settings}
+    _refuse_other_run(out, claim)
     if (out / RESULTS).exists():
         say(f"{out}: complete, nothing to do")
-        results: dict[str, Any] = json.loads((out / RESULTS).read_text(encoding="utf-8"))
-        return results
+        return _results(out)
     scene = options.load(seed=config.seed)
     checkpoint = out / CHECKPOINT
     resumed = checkpoint.exists()
     trainer = Trainer.load(checkpoint, scene, device) if resumed else Trainer(scene, config, device)
+    write_json(out / CONFIG, claim)  # not earlier: a mistyped scene must not claim the folder
     if resumed:
         say(f"{out}: continues from step {trainer.step}")
     try:
         _train(trainer, out, monitor_every, checkpoint_every, resumed=resumed, progress=progress, say=say)
-    finally:
-        if not checkpoint.exists() or trainer.step < config.iterations:
-            trainer.save(checkpoint)
+    except TrainingInterrupted:
+        trainer.save(checkpoint)
+        raise
     model = model_of(trainer)
     save_ply(model.gaussians, out / PLY)
+    if model.opacity_scale < 1:
+        save_ply(model.gaussians, out / BAKED_PLY, bake_p=1 - model.opacity_scale)
     evaluation = evaluate(model, scene, perceptual=perceptual, pictures=out / "views")
     results = {
         "scene": scene.name,
@@ -106,7 +113,7 @@ def run_experiment(
         "machine": machine(),
     }
     write_json(out / RESULTS, results)
-    return results
+    return _results(out)
 
 
 def summary(results: Mapping[str, Any]) -> str:
@@ -142,11 +149,16 @@ def load_run(folder: Path, device: torch.device | str = "cpu") -> Trainer:
     return Trainer.load(folder / CHECKPOINT, scene, device)
 
 
-def _claim(out: Path, settings: dict[str, Any]) -> None:
-    """Write the settings of a new run; refuse a folder that holds another one."""
+def _results(out: Path) -> dict[str, Any]:
+    """Read the results of a complete run."""
+    results: dict[str, Any] = json.loads((out / RESULTS).read_text(encoding="utf-8"))
+    return results
+
+
+def _refuse_other_run(out: Path, settings: dict[str, Any]) -> None:
+    """Refuse a folder that holds a run with other settings."""
     file = out / CONFIG
     if not file.exists():
-        write_json(file, settings)
         return
     found = json.loads(file.read_text(encoding="utf-8"))
     changed = [
@@ -196,6 +208,9 @@ def _train(
         score, out, views=views, every=monitor_every, psnr=quality, resume_step=trainer.step if resumed else None
     ) as monitor:
         say(f"{out}: CA and PSNR go to {' and '.join(monitor.backends)} every {monitor_every} steps")
+
+        if trainer.step > 0:  # the last measurement may have been interrupted; one that is in the log is not repeated
+            monitor(trainer.step, trainer.gaussians.opacities)
 
         def after_step(trainer: Trainer) -> None:
             monitor(trainer.step, trainer.gaussians.opacities)

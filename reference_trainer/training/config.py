@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 __all__ = ["PRESETS", "TrainConfig", "with_preset"]
@@ -75,12 +76,28 @@ class TrainConfig:
     """Opacities are multiplied by this at every step from ``densify_from`` on; 1 does nothing."""
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, float) and not math.isfinite(value):  # JSON has no word for it
+                raise ValueError(f"{name} must be finite, got {value}.")
         if self.iterations < 1:
             raise ValueError(f"iterations must be at least 1, got {self.iterations}.")
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout must be in [0, 1), got {self.dropout}: 0 turns it off.")
         if self.noise < 0:
             raise ValueError(f"noise must not be negative, got {self.noise}: 0 turns it off.")
+        for name in ("seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
+        if self.sh_every < 1:
+            raise ValueError(f"sh_every must be at least 1, got {self.sh_every}: set sh_degree=0 for constant colours.")
+        for name in ("means_rate", "means_rate_final"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
+        for name in ("initial_opacity", "opacity_reset"):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(f"{name} must be in (0, 1), got {getattr(self, name)}.")
+        if not 0 <= self.lambda_dssim <= 1:
+            raise ValueError(f"lambda_dssim must be in [0, 1], got {self.lambda_dssim}.")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}.")
         if not 0 < self.opacity_decay <= 1:

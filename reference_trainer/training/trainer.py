@@ -22,6 +22,7 @@ from reference_trainer.scenes.points import mean_neighbor_distance
 from reference_trainer.scenes.scene import PointCloud, Scene
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.interruption import TrainingInterrupted, hold_interrupts
 from reference_trainer.training.losses import photometric_loss
 from reference_trainer.training.randomness import stream, view_order
 
@@ -62,6 +63,10 @@ class Trainer:
         scene: photographs, cameras and initial points.
         config: all settings.
         device: where to train.
+
+    Attributes:
+        step: the number of steps taken.
+        seconds: wall-clock time that they took.
 
     Raises:
         ValueError: if the scene has no initial points.
@@ -115,13 +120,19 @@ class Trainer:
             progress: whether to show a progress bar with loss, PSNR, count and time left.
 
         Raises:
-            TrainingStoppedError: if the loss is not finite or no Gaussian is left.
+            TrainingStoppedError: if the loss or the Gaussians are not finite, or no Gaussian is left.
+            TrainingInterrupted: on Ctrl-C, between two steps: what is saved then continues to the identical result.
         """
         from tqdm import tqdm
 
         last = self.config.iterations if until is None else min(until, self.config.iterations)
-        with tqdm(total=self.config.iterations, initial=self.step, disable=not progress, mininterval=0.5) as bar:
+        with (
+            hold_interrupts() as interrupted,
+            tqdm(total=self.config.iterations, initial=self.step, disable=not progress, mininterval=0.5) as bar,
+        ):
             while self.step < last:
+                if interrupted():
+                    raise TrainingInterrupted
                 start = time.perf_counter()
                 loss, mse = self.train_step()
                 self.seconds += time.perf_counter() - start
@@ -134,8 +145,8 @@ class Trainer:
 
     def train_step(self) -> tuple[float, float]:
         """Take one step on one view; return the loss and the mean squared error of the (regularized) render."""
-        self._control_density()
         config, step = self.config, self.step
+        self._control_density()
         view = self.views[view_order(config.seed, step, len(self.views))]
         rendering = render_gaussians(
             self.gaussians, view.camera, self.background, opacities=self._regularized(), sh_degree=self.sh_degree
@@ -177,10 +188,12 @@ class Trainer:
             device: where to train.
 
         Raises:
-            ValueError: if the checkpoint belongs to other training views.
+            ValueError: if the file is not a readable checkpoint, or belongs to another scene or other training views.
         """
         state = load_checkpoint(path, device)
         names = [view.name for view in scene.train]
+        if state["scene"] != scene.name:
+            raise ValueError(f"{path} was trained on the scene {state['scene']!r}, this one is {scene.name!r}.")
         if state["train_views"] != names:
             raise ValueError(f"{path} was trained on the views {state['train_views']}, the scene has {names}.")
         trainer = cls(scene, TrainConfig(**json.loads(state["config"])), device)
@@ -246,6 +259,11 @@ class Trainer:
         until = config.iterations if config.densify_until is None else config.densify_until
         every = config.densify_every
         if every and config.densify_from < step <= until and step % every == 0:
+            # The renderer leaves out what is not a number, so the loss alone would not tell.
+            if not all(bool(x.isfinite().all()) for _, x in self.gaussians.named()):
+                raise TrainingStoppedError(
+                    f"Gaussians became nan or infinite by step {step}: lower the learning rates."
+                )
             self._densify()
             if len(self.gaussians) == 0:
                 raise TrainingStoppedError(

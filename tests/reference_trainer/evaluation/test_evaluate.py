@@ -1,0 +1,144 @@
+import dataclasses
+import json
+import math
+
+import pytest
+import torch
+from PIL import Image
+
+from reference_trainer.evaluation.evaluate import Evaluation, Model, ViewScores, evaluate
+from reference_trainer.evaluation.metrics import psnr, ssim
+from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
+from reference_trainer.render import render
+from reference_trainer.scenes.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def gaussians(tiny_scene: Scene) -> Gaussians:
+    g = torch.Generator().manual_seed(0)
+    points = tiny_scene.points
+    model = Gaussians.from_points(points.positions, points.colors, torch.full((150,), 0.25), sh_degree=1, opacity=0.9)
+    return dataclasses.replace(model, sh_rest=0.3 * torch.randn(150, 3, 3, generator=g))
+
+
+def scores(result: Evaluation, quantity: str) -> list[float]:
+    return [getattr(view, quantity) for view in result.views]
+
+
+def test_scores_are_those_of_the_rendered_views(tiny_scene, gaussians):
+    model = Model(gaussians, tiny_scene.background, opacity_scale=0.8)
+    result = evaluate(model, tiny_scene)
+    views = [*tiny_scene.train, *tiny_scene.test]
+    assert [(v.split, v.name) for v in result.views] == [("train" if v in tiny_scene.train else "test", v.name)
+                                                          for v in views]  # fmt: skip
+    for view, found in zip(views, result.views, strict=True):
+        image = render(
+            gaussians.means, gaussians.quaternions, gaussians.scales, 0.8 * gaussians.opacities, view.camera,
+            sh=gaussians.sh, background=tiny_scene.background,
+        ).image.clamp(0, 1)  # fmt: skip
+        assert found.psnr == pytest.approx(psnr(image, view.image))
+        assert found.ssim == pytest.approx(ssim(image, view.image))
+        assert math.isnan(found.lpips)
+    assert result.gaussians == 150
+    assert result.perceptual_metric is None
+
+
+def test_images_are_scaled_for_the_test_and_co_adaptation_is_not(tiny_scene, gaussians):
+    half = dataclasses.replace(gaussians, opacity_logits=inverse_sigmoid(0.5 * gaussians.opacities))
+    plain = evaluate(Model(gaussians, tiny_scene.background), tiny_scene)
+    scaled = evaluate(Model(gaussians, tiny_scene.background, opacity_scale=0.5), tiny_scene)
+    halved = evaluate(Model(half, tiny_scene.background), tiny_scene)
+    for quantity in ("psnr", "ssim", "cv"):
+        assert scores(scaled, quantity) == pytest.approx(scores(halved, quantity), rel=1e-4)
+        assert scores(scaled, quantity) != pytest.approx(scores(plain, quantity), rel=1e-3)
+    assert scores(scaled, "ca") == scores(plain, "ca")
+    assert all(value > 0 for value in scores(plain, "ca"))
+
+
+def test_the_drop_rate_of_the_protocol_follows_the_training(tiny_scene, gaussians):
+    trained = Model(gaussians, tiny_scene.background, dropout=0.2, opacity_scale=0.8)
+    assert trained.ca_score().settings.drop_rate == pytest.approx(0.6)  # half of the four fifths that training kept
+    assert Model(gaussians, tiny_scene.background).ca_score().settings.drop_rate == 0.5
+    assert trained.ca_score(drop_rate=0.3, samples=7, seed=4).settings.drop_rate == 0.3
+    dropped, plain = (evaluate(m, tiny_scene, samples=3) for m in (trained, dataclasses.replace(trained, dropout=0.0)))
+    assert scores(plain, "ca_half") == scores(plain, "ca")
+    assert scores(dropped, "ca_half") == scores(plain, "ca")
+    assert scores(dropped, "ca") != scores(plain, "ca")
+
+
+def test_only_the_bands_of_the_model_are_used(tiny_scene, gaussians):
+    grey = dataclasses.replace(gaussians, sh_rest=gaussians.sh_rest[:, :0])
+    cut = evaluate(Model(gaussians, tiny_scene.background, sh_degree=0), tiny_scene)
+    assert scores(cut, "psnr") == scores(evaluate(Model(grey, tiny_scene.background), tiny_scene), "psnr")
+    assert scores(cut, "psnr") != scores(evaluate(Model(gaussians, tiny_scene.background), tiny_scene), "psnr")
+
+
+def test_a_perceptual_metric_sees_clamped_images(tiny_scene, gaussians):
+    class Brightness:
+        name = "brightness"
+
+        def __call__(self, image: torch.Tensor, target: torch.Tensor) -> float:
+            assert image.min() >= 0
+            assert image.max() <= 1
+            return float(image.mean() - target.mean())
+
+    bright = dataclasses.replace(gaussians, sh_dc=gaussians.sh_dc + 4)
+    result = evaluate(Model(bright, tiny_scene.background), tiny_scene, perceptual=Brightness())
+    assert result.perceptual_metric == "brightness"
+    assert all(value > 0 for value in scores(result, "lpips"))
+
+
+def test_an_empty_model_has_no_co_adaptation_and_says_so(tiny_scene, gaussians):
+    nothing = gaussians[torch.zeros(150, dtype=torch.bool)]
+    result = evaluate(Model(nothing, tiny_scene.background), tiny_scene)
+    assert all(math.isnan(value) for value in scores(result, "ca"))
+    assert all(math.isnan(value) for value in scores(result, "cv"))
+    assert scores(result, "visible") == [0.0] * 6
+    assert all(math.isfinite(value) for value in scores(result, "psnr"))
+
+
+def test_no_gradient_and_no_global_random_number(tiny_scene, gaussians):
+    state = torch.get_rng_state()
+    leaves = gaussians.map(lambda x: x.clone().requires_grad_())
+    one = evaluate(Model(leaves, tiny_scene.background), tiny_scene)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert leaves.means.grad is None
+    again = evaluate(Model(gaussians, tiny_scene.background), tiny_scene)
+    assert scores(one, "ca") == scores(again, "ca")
+
+
+def of(name: str, split: str, value: float) -> ViewScores:
+    return ViewScores(name, split, *[value] * 8)
+
+
+def test_means_leave_out_what_does_not_exist():
+    views = [of("a", "test", 1.0), of("b", "test", math.nan), of("c", "test", 4.0), of("d", "train", math.inf)]
+    result = Evaluation(views, 10, None)
+    assert result.mean("test", "ca") == 2.5
+    assert math.isnan(result.mean("train", "psnr"))
+    assert math.isnan(result.mean("validation", "psnr"))
+
+
+def test_as_dict_is_plain_data():
+    result = Evaluation([of("a", "test", 1.0), of("b", "train", 3.0)], 10, "lpips")
+    data = json.loads(json.dumps(result.as_dict()))
+    assert data == result.as_dict()
+    assert data["mean"]["test"]["ssim"] == 1.0
+    assert data["mean"]["train"]["ca_half"] == 3.0
+    assert [view["name"] for view in data["views"]] == ["a", "b"]
+
+
+def test_every_view_gets_its_pictures(tiny_scene, gaussians, tmp_path):
+    """Also where names differ after a dot only, as in photographs named after the time of day."""
+    names = ["12.30.01.jpg", "12.30.02.jpg", "sub/deep.png"]
+    train = tuple(dataclasses.replace(v, name=n) for v, n in zip(tiny_scene.train, names, strict=True))
+    said: list[str] = []
+    scene = dataclasses.replace(tiny_scene, train=train, test=tiny_scene.test[:1])
+    evaluate(Model(gaussians, scene.background), scene, samples=2, pictures=tmp_path, progress=said.append)
+    found = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*"))
+    stems = ["test/test_0", "train/12.30.01", "train/12.30.02", "train/deep"]
+    assert found == sorted(f"{stem}{end}.png" for stem in stems for end in ("", "_panel"))
+    with Image.open(tmp_path / "train" / "deep.png") as image, Image.open(tmp_path / "train/deep_panel.png") as panel:
+        assert image.size == (32, 24)
+        assert panel.width >= 4 * 32
+    assert said == [f"train {name}" for name in names] + ["test test_0"]

@@ -1,0 +1,68 @@
+import math
+
+import pytest
+import torch
+
+from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
+
+
+def some(n: int = 6, degree: int = 1) -> Gaussians:
+    g = torch.Generator().manual_seed(1)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=g),
+        log_scales=torch.randn(n, 3, generator=g),
+        quaternions=torch.randn(n, 4, generator=g),
+        opacity_logits=torch.randn(n, generator=g),
+        sh_dc=torch.randn(n, 1, 3, generator=g),
+        sh_rest=torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=g),
+    )
+
+
+def test_points_become_round_gaussians_of_their_colour():
+    positions, colors, distances = torch.rand(5, 3), torch.rand(5, 3), torch.rand(5) + 0.1
+    made = Gaussians.from_points(positions, colors, distances, sh_degree=2, opacity=0.3)
+    assert torch.equal(made.means, positions)
+    torch.testing.assert_close(made.scales, distances[:, None].expand(5, 3))
+    torch.testing.assert_close(made.opacities, torch.full((5,), 0.3))
+    torch.testing.assert_close(made.sh_dc[:, 0] * SH_C0 + 0.5, colors)
+    assert torch.equal(made.sh_rest, torch.zeros(5, 8, 3))
+    assert torch.equal(made.quaternions, torch.tensor([[1.0, 0, 0, 0]]).expand(5, 4))
+    made.means.zero_()
+    assert positions.abs().sum() > 0  # a copy, not a view
+
+
+def test_the_constant_band_is_the_textbook_value():
+    assert math.sqrt(1 / (4 * math.pi)) == SH_C0
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_activations_and_views(degree):
+    model = some(degree=degree)
+    assert model.sh_degree == degree
+    assert model.sh.shape == (6, (degree + 1) ** 2, 3)
+    assert torch.equal(model.sh[:, 0], model.sh_dc[:, 0])
+    torch.testing.assert_close(model.opacities, 1 / (1 + torch.exp(-model.opacity_logits)))
+    torch.testing.assert_close(model.scales.log(), model.log_scales)
+    torch.testing.assert_close(inverse_sigmoid(model.opacities), model.opacity_logits)
+
+
+@pytest.mark.parametrize("index", [torch.tensor([4, 0, 4]), torch.tensor([True, False, True, True, False, False])])
+def test_indexing_takes_the_same_rows_of_everything(index):
+    model = some()
+    part = model[index]
+    assert [name for name, _ in part.named()] == [
+        "means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest",
+    ]  # fmt: skip
+    for (_, new), (_, old) in zip(part.named(), model.named(), strict=True):
+        assert torch.equal(new, old[index])
+    assert len(part) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [("log_scales", (6, 2)), ("quaternions", (5, 4)), ("opacity_logits", (6, 1)), ("sh_dc", (6, 3)),
+     ("sh_rest", (6, 9)), ("sh_rest", (6, 4, 3)), ("means", (6, 4))],
+)  # fmt: skip
+def test_wrong_shapes_are_named(name, shape):
+    with pytest.raises(ValueError, match=f"{name} must"):
+        Gaussians(**dict(some().named()) | {name: torch.zeros(shape)})

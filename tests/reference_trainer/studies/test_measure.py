@@ -1,0 +1,105 @@
+import dataclasses
+import json
+
+import pytest
+import torch
+from PIL import Image
+
+from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
+from reference_trainer.model.ply import save_ply
+from reference_trainer.scenes.images import read_image
+from reference_trainer.studies.measure import evaluation_table, measure, of_ply, of_run, render_run
+from reference_trainer.studies.run import BAKED_PLY, PLY, run_experiment
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, options, short):
+    out = tmp_path_factory.mktemp("run")
+    return out, run_experiment(options, short, out, monitor_every=0)
+
+
+def test_a_baked_ply_is_not_scaled_twice(run, options):
+    """Three ways to the image of the test: baked and marked, plain with the rate, and the checkpoint."""
+    out, _ = run
+    baked, scene, folder = of_ply(out / BAKED_PLY, options)  # it says its rate itself
+    plain, _, _ = of_ply(out / PLY, options, dropout=0.2)
+    trained, _, _ = of_run(out)
+    assert folder == out / "point_cloud_for_viewers_evaluation"
+    assert baked.dropout == trained.dropout == 0.2
+    torch.testing.assert_close(baked.gaussians.opacities, trained.gaussians.opacities, rtol=0, atol=2e-6)
+    with pytest.raises(ValueError, match=r"was trained with dropout 0\.2, not 0\.5"):
+        of_ply(out / BAKED_PLY, options, dropout=0.5)
+    for view in scene.test:
+        images = [
+            model.rendering(model.gaussians.opacities * model.opacity_scale, view).image
+            for model in (baked, plain, trained)
+        ]
+        torch.testing.assert_close(images[0], images[2], rtol=0, atol=1e-5)
+        assert torch.equal(images[1], images[2])
+        unscaled = trained.rendering(trained.gaussians.opacities, view).image
+        assert (unscaled - images[2]).abs().max() > 1e-3
+
+
+def test_a_ply_without_dropout_is_used_as_it_is(options, tmp_path, run):
+    model = of_run(run[0])[0]
+    save_ply(model.gaussians, tmp_path / "model.ply")
+    assert of_ply(tmp_path / "model.ply", options)[0].opacity_scale == 1.0
+
+
+def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):
+    out, results = run
+    model, scene, default = of_run(out)
+    assert default == out / "evaluation"
+    said: list[str] = []
+    measure(model, scene, tmp_path / "new", say=said.append)
+    found = json.loads((tmp_path / "new" / "evaluation.json").read_text())
+    assert found["views"] == results["views"]
+    assert found["mean"] == results["mean"]
+    assert found["ca_settings"]["drop_rate"] == pytest.approx(0.6)
+    assert found["background"] == [0.0, 0.0, 0.0]
+    assert (tmp_path / "new" / "views" / "test" / "test_0_panel.png").exists()
+    assert any("| mean test |" in text for text in said)
+
+
+def test_the_seed_decides_the_masks(run, tmp_path):
+    model, scene, _ = of_run(run[0])
+    scene = dataclasses.replace(scene, train=scene.train[:1], test=())
+    one, same, other = (
+        measure(model, scene, tmp_path, samples=3, seed=seed, say=lambda text: None) for seed in (0, 0, 1)
+    )
+    assert one.views[0].ca == same.views[0].ca != other.views[0].ca
+    assert one.views[0].psnr == other.views[0].psnr
+
+
+def test_the_table_has_one_row_per_view_and_the_means():
+    views = [ViewScores(f"v{i}", "test", 20.0 + i, 0.5, 0.25, 2e-3, 1e-4, 3e-3, 0.9, 0.04) for i in range(2)]
+    lines = evaluation_table(Evaluation(views, 9, "vgg")).splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert cells[0] == ["view", "psnr", "ssim", "lpips", "ca x1e-3", "ca_std_error x1e-3", "visible", "cv"]
+    assert cells[2] == ["test v0", "20", "0.5", "0.25", "2", "0.1", "0.9", "0.04"]
+    assert cells[4][:2] == ["mean test", "20.5"]
+    assert "lpips" not in evaluation_table(Evaluation(views, 9, None))
+
+
+@pytest.mark.parametrize(("what", "names"), [("test", ["test_0", "test_1", "test_outside"]), ("train", None)])
+def test_views_are_rendered_as_the_run_drew_them(run, what, names):
+    out, _ = run
+    folder = render_run(out, what, say=lambda text: None)
+    assert folder == out / f"render_{what}"
+    found = sorted(path.stem for path in folder.iterdir())
+    assert found == (names or [f"train_{i}" for i in range(3)])
+    for name in found:
+        assert (folder / f"{name}.png").read_bytes() == (out / "views" / what / f"{name}.png").read_bytes()
+
+
+def test_a_flight_begins_and_ends_at_training_cameras(run, tmp_path):
+    out, _ = run
+    said: list[str] = []
+    folder = render_run(out, "flight", tmp_path / "flight", frames=5, say=said.append)
+    assert sorted(path.name for path in folder.iterdir()) == [f"{i:04d}.png" for i in range(5)] + ["flight.gif"]
+    with Image.open(folder / "flight.gif") as animation:
+        assert (animation.n_frames, animation.size) == (5, (20, 15))
+    for frame, view in (("0000", "train_0"), ("0002", "train_1"), ("0004", "train_2")):
+        one, other = (read_image(path)[0] for path in (folder / f"{frame}.png", out / f"views/train/{view}.png"))
+        assert (one - other).abs().max() <= 1 / 255 + 1e-6
+    assert said == [f"5 pictures are in {folder}"]

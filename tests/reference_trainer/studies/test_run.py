@@ -1,0 +1,225 @@
+import dataclasses
+import json
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+
+from ca_reg.monitor import LOG_NAME
+from reference_trainer.model.ply import load_ply
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies import run as run_module
+from reference_trainer.studies.run import (
+    BAKED_PLY,
+    CHECKPOINT,
+    CONFIG,
+    PLY,
+    RESULTS,
+    load_run,
+    model_of,
+    run_experiment,
+    summary,
+)
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.trainer import Trainer, TrainingStoppedError
+
+EVERY = {"monitor_every": 3, "checkpoint_every": 4}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, options, short) -> tuple[Path, dict]:
+    out = tmp_path_factory.mktemp("run")
+    return out, run_experiment(options, short, out, **EVERY)
+
+
+@pytest.fixture
+def interrupted(finished, options, short, monkeypatch, tmp_path):
+    """Start a run that is interrupted in the given function at its given call, then continue it."""
+
+    def run(owner: object, name: str, call: int, **keywords) -> Path:
+        original, calls = getattr(owner, name), [0]
+
+        def interrupt(*args, **kwargs):
+            calls[0] += 1
+            if calls[0] == call:
+                raise KeyboardInterrupt
+            return original(*args, **kwargs)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                run_experiment(options, short, tmp_path, **EVERY | keywords)
+        assert not (tmp_path / RESULTS).exists()
+        run_experiment(options, short, tmp_path, **EVERY | keywords)
+        return tmp_path
+
+    return run
+
+
+def test_everything_is_there(finished, options, short):
+    out, results = finished
+    files = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
+    names = [f"train/train_{i}" for i in range(3)] + ["test/test_0", "test/test_1", "test/test_outside"]
+    pictures = {f"views/{name}{end}.png" for name in names for end in ("", "_panel")}
+    assert {CONFIG, CHECKPOINT, PLY, BAKED_PLY, RESULTS, LOG_NAME} | pictures <= files
+    assert any("tfevents" in name for name in files)
+    assert not [name for name in files if ".part" in name]
+    assert json.loads((out / CONFIG).read_text()) == {
+        "scene": dataclasses.asdict(options),
+        "config": dataclasses.asdict(short),
+    }
+    assert results == json.loads((out / RESULTS).read_text())
+    assert results["gaussians"] == len(load_ply(out / PLY).gaussians) > 3000
+    assert [view["name"] for view in results["views"]] == [name.split("/")[1] for name in names]
+    assert results["mean"]["test"]["lpips"] is None
+    assert [json.loads(line)["step"] for line in (out / LOG_NAME).read_text().splitlines()] == [3, 6, 9]
+
+
+def test_a_second_call_does_nothing(finished, options, short, monkeypatch):
+    out, results = finished
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    monkeypatch.setattr(SceneOptions, "load", lambda *a, **k: pytest.fail("the scene was loaded again"))
+    said: list[str] = []
+    assert run_experiment(options, short, out, **EVERY, say=said.append) == results
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+    assert said == [f"{out}: complete, nothing to do"]
+
+
+def test_ctrl_c_saves_where_it_is(finished, options, short, monkeypatch, tmp_path):
+    """Between two periodic checkpoints nothing is lost."""
+    original = Trainer.train_step
+
+    def train_step(trainer: Trainer) -> tuple[float, float]:
+        if trainer.step == 5:
+            signal.raise_signal(signal.SIGINT)
+        return original(trainer)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train_step", train_step)
+        with pytest.raises(TrainingInterrupted):
+            run_experiment(options, short, tmp_path, **EVERY)
+    said: list[str] = []
+    run_experiment(options, short, tmp_path, **EVERY, say=said.append)
+    assert f"{tmp_path}: continues from step 6" in said
+    assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "call"),
+    [
+        (Trainer, "train_step", 1),
+        (Trainer, "train_step", 6),
+        (Trainer, "train_step", 8),
+        (run_module, "psnr", 2),  # in the middle of a measurement
+        (run_module, "save_ply", 1),
+        (run_module, "evaluate", 1),
+    ],
+)
+def test_an_interrupted_run_ends_like_an_uninterrupted_one(finished, interrupted, owner, name, call):
+    out = interrupted(owner, name, call)
+    for file in (PLY, BAKED_PLY, LOG_NAME):
+        assert (out / file).read_bytes() == (finished[0] / file).read_bytes(), file
+    one, other = (json.loads((folder / RESULTS).read_text()) for folder in (out, finished[0]))
+    for key in ("views", "mean", "gaussians", "config"):
+        assert one[key] == other[key]
+
+
+def test_a_killed_run_continues_from_its_last_checkpoint(finished, options, short, tmp_path):
+    """No farewell: the checkpoint of step 4, and a log that is already further, with half a line at its end."""
+    partial = Trainer(options.load(seed=0), short)
+    partial.train(until=4)
+    partial.save(tmp_path / CHECKPOINT)
+    shutil.copy(finished[0] / CONFIG, tmp_path)
+    shutil.copy(finished[0] / LOG_NAME, tmp_path)
+    with (tmp_path / LOG_NAME).open("a") as log:
+        log.write('{"step": 12, "ca')
+    said: list[str] = []
+    run_experiment(options, short, tmp_path, **EVERY, say=said.append)
+    assert f"{tmp_path}: continues from step 4" in said
+    for file in (PLY, LOG_NAME):
+        assert (tmp_path / file).read_bytes() == (finished[0] / file).read_bytes(), file
+
+
+def test_monitoring_has_no_influence(finished, options, short, tmp_path):
+    run_experiment(options, short, tmp_path, monitor_every=0, checkpoint_every=4)
+    assert not (tmp_path / LOG_NAME).exists()
+    assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
+
+
+def test_another_run_in_the_same_folder_is_refused(finished, options, short):
+    out, results = finished
+    with pytest.raises(ValueError, match=r"other settings \(dropout: 0\.2 -> 0\.5\): give another"):
+        run_experiment(options, dataclasses.replace(short, dropout=0.5), out)
+    with pytest.raises(ValueError, match=r"\(views: None -> 2; seed: 0 -> 3\): give another folder, or delete this"):
+        run_experiment(dataclasses.replace(options, views=2), dataclasses.replace(short, seed=3), out)
+    assert json.loads((out / RESULTS).read_text()) == results
+
+
+def test_a_mistyped_scene_does_not_claim_the_folder(options, short, tmp_path):
+    with pytest.raises(FileNotFoundError, match="no scene folder"):
+        run_experiment(SceneOptions(str(tmp_path / "fren")), short, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def broken_scene(options: SceneOptions, monkeypatch) -> None:
+    """Give one training view a pixel that is not a number."""
+    scene = options.load()
+    image = scene.train[1].image.clone()
+    image[0, 0, 0] = torch.nan
+    bad = dataclasses.replace(scene.train[1], image=image)
+    scene = dataclasses.replace(scene, train=(scene.train[0], bad, scene.train[2]))
+    monkeypatch.setattr(SceneOptions, "load", lambda self, seed: scene)
+
+
+def test_divergence_keeps_the_last_checkpoint(options, short, monkeypatch, tmp_path):
+    broken_scene(options, monkeypatch)
+    for _ in range(2):  # the second call fails in the same way and does no harm
+        with pytest.raises(TrainingStoppedError, match="the loss became nan"):
+            run_experiment(options, short, tmp_path, monitor_every=0, checkpoint_every=1)
+        trainer = load_run(tmp_path)
+        assert 0 < trainer.step < 3
+        assert all(torch.isfinite(x).all() for _, x in trainer.gaussians.named())
+        reference = Trainer(trainer.scene, short)
+        reference.train(until=trainer.step)
+        assert torch.equal(trainer.gaussians.means, reference.gaussians.means)
+        assert not (tmp_path / RESULTS).exists()
+
+
+def test_a_model_that_vanishes_does_not_overwrite_the_checkpoint(options, short, tmp_path):
+    config = dataclasses.replace(short, prune_opacity=0.99)
+    for _ in range(2):
+        with pytest.raises(TrainingStoppedError, match="all Gaussians were pruned after step 4"):
+            run_experiment(options, config, tmp_path, monitor_every=0, checkpoint_every=3)
+        trainer = load_run(tmp_path)
+        assert (trainer.step, len(trainer.gaussians)) == (3, 3000)
+
+
+def test_a_run_can_be_loaded(finished):
+    out, results = finished
+    trainer = load_run(out)
+    assert trainer.step == 11
+    model = model_of(trainer)
+    assert (model.dropout, model.opacity_scale, model.sh_degree) == (0.2, 0.8, 2)
+    assert not model.gaussians.means.requires_grad
+    assert len(model.gaussians) == results["gaussians"]
+
+
+def test_inverted_dropout_needs_nothing_at_test_time(tiny_scene):
+    model = model_of(Trainer(tiny_scene, TrainConfig(dropout=0.2, compensate=True)))
+    assert (model.dropout, model.opacity_scale) == (0.0, 1.0)
+
+
+def test_a_folder_without_a_run(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"holds no run \(no config\.json\): give the --out folder"):
+        load_run(tmp_path)
+
+
+def test_summary(finished):
+    lines = summary(finished[1]).splitlines()
+    assert [line.split("|")[1].strip() for line in lines] == ["views", ":---", "test", "train"]
+    psnr = finished[1]["mean"]["test"]["psnr"]
+    assert f"{psnr:.4g}" in lines[2]
+    assert "n/a" in lines[2]  # no perceptual metric

@@ -1,0 +1,74 @@
+import math
+
+import pytest
+import torch
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.projection import project
+
+EYE = torch.eye(4)
+
+
+def camera(**changes):
+    values = {"world_to_camera": EYE, "fx": 60.0, "fy": 50.0, "cx": 33.0, "cy": 23.0, "width": 64, "height": 48}
+    return Camera(**values | changes)
+
+
+def quarter_turn() -> torch.Tensor:
+    """A camera at (1, 2, 3) that looks along world +x: right is world -z, down is world +y."""
+    pose = torch.eye(4, dtype=torch.float64)
+    right, down, forward = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]
+    pose[:3, :3] = torch.tensor([right, down, forward])
+    pose[:3, 3] = torch.tensor([3.0, -2.0, -1.0])  # -R (1, 2, 3)
+    return pose
+
+
+def test_position_and_direction_of_a_turned_camera():
+    turned = camera(world_to_camera=quarter_turn())
+    assert turned.position.tolist() == [1.0, 2.0, 3.0]
+    assert turned.forward.tolist() == [1.0, 0.0, 0.0]
+
+
+def test_a_point_lands_where_the_hand_puts_it():
+    # 5 in front of the camera, 2 to its right (world -z), 1 below (world +y).
+    point = torch.tensor([[6.0, 3.0, 1.0]], dtype=torch.float64)
+    one = torch.ones(1, 3, dtype=torch.float64)
+    projected = project(
+        point, torch.tensor([[1.0, 0, 0, 0]]).double(), 1e-3 * one, camera(world_to_camera=quarter_turn())
+    )
+    torch.testing.assert_close(projected.means, torch.tensor([[33 + 60 * 2 / 5, 23 + 50 * 1 / 5]]).double())
+    assert projected.depths.item() == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.3, 2.0, 1e-3])
+def test_scaling_keeps_the_field_of_view_and_the_principal_ray(factor):
+    old = camera()
+    new = old.scaled(factor)
+    assert (new.width, new.height) == (max(1, round(64 * factor)), max(1, round(48 * factor)))
+    for size, focal, centre in (("width", "fx", "cx"), ("height", "fy", "cy")):
+        for edge in (0, 1):  # the rays through both edges of the picture stay
+            slope = (edge * getattr(old, size) - getattr(old, centre)) / getattr(old, focal)
+            assert (edge * getattr(new, size) - getattr(new, centre)) / getattr(new, focal) == pytest.approx(slope)
+    assert new.world_to_camera is old.world_to_camera
+
+
+def test_to_changes_the_pose_alone():
+    moved = camera().to(dtype=torch.float64)
+    assert moved.world_to_camera.dtype == torch.float64
+    assert (moved.fx, moved.width) == (60.0, 64)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"world_to_camera": torch.eye(3)}, r"finite \(4, 4\)"),
+        ({"world_to_camera": EYE * math.nan}, r"finite \(4, 4\)"),
+        ({"fx": 0.0}, "focal lengths must be positive"),
+        ({"fy": math.nan}, "focal lengths must be positive"),
+        ({"width": 0}, "image size must be positive"),
+        ({"height": -3}, "image size must be positive"),
+    ],
+)
+def test_impossible_cameras(changes, message):
+    with pytest.raises(ValueError, match=message):
+        camera(**changes)

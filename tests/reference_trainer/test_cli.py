@@ -1,0 +1,191 @@
+import json
+import re
+
+import pytest
+
+from reference_trainer import cli
+from reference_trainer.cli import main
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies import compare as compare_module
+from reference_trainer.studies import run as run_module
+from reference_trainer.training.config import PRESETS
+
+SMALL = ["--downscale", "8", "--iterations", "3", "--monitor-every", "2"]
+
+
+def plain(text: str) -> str:
+    """Strip colours and boxes, and join the lines."""
+    return " ".join(re.sub(r"\x1b\[[0-9;]*m|[│╭╮╰╯─]", " ", text).split())
+
+
+def refused(arguments: list[str], capsys) -> str:
+    """Run a command that must fail with exit code 2, and return what it says."""
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 2
+    return plain(capsys.readouterr().err)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    out = tmp_path_factory.mktemp("cli") / "run"
+    main(["train", "--out", str(out), "--dropout", "0.2", *SMALL])
+    return out
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ([], ["demo", "train", "evaluate", "render", "compare"]),
+        (["demo"], ["--iterations", "--seeds", "--jobs", "--out"]),
+        (["train"], ["--out", "--path", "--views", "--preset", "--dropout", "--noise", "--opacity-decay", "--device"]),
+        (["evaluate"], ["--ply", "--path", "--dropout", "--samples", "--lpips"]),
+        (["render"], ["--what", "--frames", "{test,train,flight}"]),
+        (["compare"], ["--strategies", "--seeds", "--jobs", "--iterations"]),
+    ],
+)
+def test_help(command, options, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main([*command, "--help"])
+    assert exit_.value.code == 0
+    text = plain(capsys.readouterr().out)
+    assert "usage: ca-reg" in text
+    for option in options:
+        assert option in text
+
+
+def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
+    assert (trained / "results.json").exists()
+    results = json.loads((trained / "results.json").read_text())
+    assert results["config"]["dropout"] == 0.2
+
+    main(["evaluate", str(trained), "--samples", "3", "--out", str(tmp_path / "e")])
+    assert "| mean test |" in capsys.readouterr().out
+    evaluation = json.loads((tmp_path / "e" / "evaluation.json").read_text())
+    assert evaluation["ca_settings"]["samples"] == 3
+    assert evaluation["mean"]["test"]["psnr"] == results["mean"]["test"]["psnr"]
+
+    main(["evaluate", "--ply", str(trained / "point_cloud.ply"), "--dropout", "0.2", "--downscale", "8", "--out",
+          str(tmp_path / "p")])  # fmt: skip
+    of_ply = json.loads((tmp_path / "p" / "evaluation.json").read_text())
+    assert of_ply["views"] == results["views"]
+
+    main(["render", str(trained)])
+    assert len(list((trained / "render_test").glob("*.png"))) == 3
+    main(["render", str(trained), "--what", "flight", "--frames", "4", "--out", str(tmp_path / "flight")])
+    assert (tmp_path / "flight" / "flight.gif").exists()
+
+
+def test_training_again_says_that_nothing_is_to_be_done(trained, capsys):
+    main(["train", "--out", str(trained), "--dropout", "0.2", *SMALL])
+    out = capsys.readouterr().out
+    assert "complete, nothing to do" in out
+    assert "| test |" in out
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_options_override_the_preset(preset, monkeypatch, tmp_path):
+    asked: dict = {}
+
+    def fake(scene, config, out, **keywords):
+        asked.update(scene=scene, config=config, out=out, **keywords)
+        return {}
+
+    monkeypatch.setattr(run_module, "run_experiment", fake)
+    monkeypatch.setattr(run_module, "summary", lambda results: "")
+    main(["train", "--preset", preset, "--iterations", "3", "--noise", "0.8", "--path", "fern", "--images", "images_8",
+          "--views", "5", "--out", str(tmp_path)])  # fmt: skip
+    expected = PRESETS[preset]
+    assert asked["config"] == type(expected)(**vars(expected) | {"iterations": 3, "noise": 0.8})
+    assert asked["scene"] == SceneOptions("fern", images="images_8", views=5)
+    assert asked["out"] == tmp_path
+
+
+def test_the_preset_of_binocular_decays_opacities(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(run_module, "run_experiment", lambda scene, config, out, **rest: asked.append(config))
+    monkeypatch.setattr(run_module, "summary", lambda results: "")
+    main(["train", "--iterations", "3", "--preset=binocular", "--out", str(tmp_path)])
+    assert (asked[0].opacity_decay, asked[0].iterations) == (0.995, 3)
+
+
+@pytest.mark.parametrize(
+    ("given", "rates"),
+    [([], {"baseline": (0.0, 0.0), "dropout": (0.2, 0.0), "noise": (0.0, 0.8), "both": (0.2, 0.8)}),
+     (["--strategies", "baseline", "both", "--dropout", "0.3", "--noise", "0.1"],
+      {"baseline": (0.0, 0.0), "both": (0.3, 0.1)})],
+)  # fmt: skip
+def test_what_is_compared(given, rates, monkeypatch, tmp_path):
+    asked: dict = {}
+
+    def fake(scene, configs, seeds, out, **keywords):
+        asked.update(configs=configs, seeds=list(seeds), out=out, **keywords)
+
+    monkeypatch.setattr(compare_module, "compare", fake)
+    monkeypatch.setattr(compare_module, "report", lambda comparison, out, say: None)
+    main(["compare", "--out", str(tmp_path), "--seeds", "2", "--jobs", "3", "--iterations", "7", *given])
+    assert {name: (config.dropout, config.noise) for name, config in asked["configs"].items()} == rates
+    assert {config.iterations for config in asked["configs"].values()} == {7}
+    assert (asked["seeds"], asked["jobs"], asked["out"]) == ([0, 1], 3, tmp_path)
+
+
+# Mistakes end with one line that says what to do, and exit code 2
+
+
+def test_an_unknown_scene(capsys, tmp_path):
+    text = refused(["train", "--path", str(tmp_path / "fren"), "--out", str(tmp_path / "out")], capsys)
+    assert text == f"ca-reg: there is no scene folder {tmp_path / 'fren'}; for the built-in scene, say 'synthetic'."
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "--dropout", "1.5"], "dropout must be in [0, 1), got 1.5"),
+        (["train", "--sh-every", "0"], "sh_every must be at least 1, got 0"),
+        (["train", "--downscale", "0.5"], "downscale must be at least 1"),
+        (["compare", "--seeds", "0"], "at least 1 strategy, 1 seed and 1 job"),
+        (["compare", "--jobs", "0"], "at least 1 strategy, 1 seed and 1 job"),
+        (["evaluate"], "nothing to evaluate: give the folder of a run, or --ply FILE"),
+        (["evaluate", "nowhere"], "nowhere holds no run (no config.json): give the --out folder"),
+        (["render", "nowhere"], "nowhere holds no run"),
+        (["evaluate", "--ply", "nowhere.ply"], "nowhere.ply"),
+    ],
+)
+def test_mistakes(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = refused(arguments, capsys)
+    assert text.startswith("ca-reg: ")
+    assert message in text
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["train", "--preset", "gsplat"], "gsplat"), (["fly"], "fly"), (["train", "--dropuot", "0.2"], "--dropuot")],
+)
+def test_what_cannot_be_parsed(arguments, message, capsys):
+    assert message in refused(arguments, capsys)
+
+
+def test_other_settings_in_the_same_folder(trained, capsys):
+    text = refused(["train", "--out", str(trained), "--dropout", "0.3", *SMALL], capsys)
+    assert "holds a run with other settings (dropout: 0.2 -> 0.3)" in text
+
+
+def test_an_interruption(monkeypatch, capsys, tmp_path):
+    def interrupt(*args, **keywords):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_module, "run_experiment", interrupt)
+    with pytest.raises(SystemExit) as exit_:
+        main(["train", "--out", str(tmp_path)])
+    assert exit_.value.code == 130
+    assert "the same command continues where it was" in capsys.readouterr().err
+
+
+def test_the_real_arguments_are_the_default(monkeypatch, capsys):
+    monkeypatch.setattr(cli.sys, "argv", ["ca-reg", "evaluate"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "nothing to evaluate" in capsys.readouterr().err

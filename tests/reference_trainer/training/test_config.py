@@ -1,0 +1,59 @@
+import dataclasses
+import math
+
+import pytest
+
+from reference_trainer.training.config import PRESETS, TrainConfig, with_preset
+
+
+def test_the_defaults_are_the_fsgs_preset():
+    assert dataclasses.replace(PRESETS["fsgs"], iterations=3_000) == TrainConfig()
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_presets_accept_changes_and_keep_the_rest(name):
+    changed = with_preset(name, iterations=7, dropout=0.2)
+    assert (changed.iterations, changed.dropout) == (7, 0.2)
+    assert dataclasses.replace(changed, iterations=PRESETS[name].iterations, dropout=0.0) == PRESETS[name]
+
+
+def test_an_unknown_preset_names_the_known_ones():
+    with pytest.raises(ValueError, match=r"no preset 'gsplat'.*fsgs, inria, binocular"):
+        with_preset("gsplat")
+
+
+@pytest.mark.parametrize(("compensate", "scale"), [(False, 0.8), (True, 1.0)])
+def test_test_time_scale(compensate, scale):
+    assert TrainConfig(dropout=0.2, compensate=compensate).test_time_scale == scale
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("iterations", 0),
+        ("seed", -1),
+        ("dropout", 1.0),
+        ("dropout", -0.1),
+        ("dropout", math.nan),
+        ("noise", -0.1),
+        ("noise", math.nan),
+        ("densify_gradient", math.inf),
+        ("regularize_from", -1),
+        ("sh_degree", 4),
+        ("sh_every", 0),
+        ("lambda_dssim", 1.5),
+        ("means_rate", 0.0),
+        ("means_rate_final", -1e-6),
+        ("initial_opacity", 1.0),
+        ("initial_opacity", 0.0),
+        ("densify_from", -1),
+        ("densify_every", -1),
+        ("opacity_reset", 0.0),
+        ("opacity_reset_every", -5),
+        ("opacity_decay", 0.0),
+        ("opacity_decay", 1.1),
+    ],
+)
+def test_impossible_values_are_named(field, value):
+    with pytest.raises(ValueError, match=f"{field} must .*{value}"):
+        TrainConfig(**{field: value})

@@ -1,0 +1,336 @@
+import dataclasses
+import math
+import signal
+from itertools import pairwise
+
+import pytest
+import torch
+
+from reference_trainer.camera import Camera
+from reference_trainer.model.density import reset_opacity
+from reference_trainer.model.gaussians import inverse_sigmoid
+from reference_trainer.scenes.scene import PointCloud, Scene, View
+from reference_trainer.training import trainer as trainer_module
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.trainer import Trainer, TrainingStoppedError
+
+
+def assert_identical(one: Trainer, other: Trainer) -> None:
+    """Parameters, Adam's moments and counts, and the statistics of density control, bit for bit."""
+    assert one.step == other.step
+    left, right = one.optimizer.state_dict(), other.optimizer.state_dict()
+    for name, x in left["gaussians"].items():
+        assert torch.equal(x, right["gaussians"][name]), name
+        for key, moment in left["moments"][name].items():
+            assert torch.equal(moment, right["moments"][name][key]), (name, key)
+    for name, x in vars(one.statistics).items():
+        assert torch.equal(x, vars(other.statistics)[name]), name
+
+
+def straight(scene: Scene, config: TrainConfig) -> tuple[Trainer, list[int]]:
+    trainer, counts = Trainer(scene, config), []
+    trainer.train(after_step=lambda t: counts.append(len(t.gaussians)))
+    return trainer, counts
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_scene: Scene, busy: TrainConfig) -> tuple[Trainer, list[int]]:
+    return straight(tiny_scene, busy)
+
+
+@pytest.fixture(scope="module")
+def decaying(tiny_scene: Scene, busy: TrainConfig) -> Trainer:
+    return straight(tiny_scene, dataclasses.replace(busy, iterations=13, opacity_decay=0.99, densify_from=2))[0]
+
+
+# Continuing
+
+
+@pytest.mark.parametrize("at", [0, 8, 9, 19])  # 8: density control is due; 19: a reset is due
+def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(tiny_scene, busy, whole, tmp_path, at):
+    trainer, counts = whole
+    assert max(counts) > 150  # the schedule does grow and prune
+    assert any(later < earlier for earlier, later in pairwise(counts))
+    first = Trainer(tiny_scene, busy)
+    first.train(until=at)
+    first.save(tmp_path / "checkpoint.pt")
+    second = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
+    assert_identical(first, second)
+    second.train()
+    assert second.step == busy.iterations
+    assert_identical(trainer, second)
+
+
+@pytest.mark.parametrize("at", [4, 8, 11])  # at 4 and 8 density control is due in the next step
+def test_ctrl_c_waits_for_the_end_of_the_step(tiny_scene, decaying, tmp_path, monkeypatch, at):
+    """A signal in the middle of a change of the model; what is saved continues to the identical result."""
+    first = Trainer(tiny_scene, decaying.config)
+    step = first.optimizer.step
+
+    def interrupted_step() -> None:
+        if first.step == at:
+            signal.raise_signal(signal.SIGINT)
+        step()
+
+    monkeypatch.setattr(first.optimizer, "step", interrupted_step)
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(TrainingInterrupted):
+        first.train()
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert first.step == at + 1
+    first.save(tmp_path / "checkpoint.pt")
+    second = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
+    second.train()
+    assert_identical(decaying, second)
+
+
+def test_a_second_ctrl_c_does_not_wait(tiny_scene, monkeypatch):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=3))
+
+    def impatient() -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(trainer.optimizer, "step", impatient)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        trainer.train()
+    assert not isinstance(caught.value, TrainingInterrupted)
+    assert trainer.step == 0
+
+
+def test_gaussians_that_are_not_numbers_stop_at_the_next_densification(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=9, densify_from=1, densify_every=4))
+    with torch.no_grad():
+        trainer.gaussians.means[5, 1] = math.nan
+    with pytest.raises(TrainingStoppedError, match="nan or infinite by step 4"):
+        trainer.train()
+
+
+def test_checkpoints_of_another_scene_are_refused(tiny_scene, busy, tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    Trainer(tiny_scene, busy).save(path)
+    with pytest.raises(ValueError, match=r"checkpoint\.pt was trained on the scene 'synthetic', this one is 'fern'"):
+        Trainer.load(path, dataclasses.replace(tiny_scene, name="fern"))
+    with pytest.raises(ValueError, match=r"checkpoint\.pt was trained on the views .*train_2.*the scene has"):
+        Trainer.load(path, dataclasses.replace(tiny_scene, train=tiny_scene.train[:2]))
+
+
+# Learning
+
+
+def test_training_fits_the_photographs(tiny_scene):
+    def error(trainer: Trainer) -> float:
+        total = 0.0
+        for view in tiny_scene.train:
+            image = trainer_module.render_gaussians(trainer.gaussians, view.camera, tiny_scene.background).image
+            total += (image - view.image).square().mean().item()
+        return total / len(tiny_scene.train)
+
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=60, densify_every=0))
+    before = error(trainer)
+    trainer.train()
+    assert error(trainer) < before / 3  # 4.8 dB
+
+
+def test_the_loss_of_a_step_is_that_of_the_view_it_renders(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=3, lambda_dssim=0.0, sh_degree=0))
+    images = [
+        trainer_module.render_gaussians(trainer.gaussians, v.camera, tiny_scene.background).image.detach()
+        for v in tiny_scene.train
+    ]
+    loss, mse = trainer.train_step()
+    pairs = [
+        ((i - v.image).abs().mean().item(), (i.clamp(0, 1) - v.image).square().mean().item())
+        for i, v in zip(images, tiny_scene.train, strict=True)
+    ]
+    assert (loss, mse) in [pytest.approx(pair, rel=1e-5) for pair in pairs]
+
+
+# Randomness
+
+
+def test_draws_depend_on_seed_and_step_alone_and_leave_the_global_generator(tiny_scene, busy):
+    def masks(config: TrainConfig, *, shake: bool) -> list[torch.Tensor]:
+        trainer, kept = Trainer(tiny_scene, dataclasses.replace(config, densify_every=0, iterations=5)), []
+
+        def after_step(t: Trainer) -> None:
+            kept.append(t.dropout.keep)
+            if shake:  # what else the process draws has no say
+                torch.rand(7)
+
+        trainer.train(after_step=after_step)
+        return kept
+
+    state = torch.get_rng_state()
+    quiet = masks(busy, shake=False)
+    assert torch.equal(torch.get_rng_state(), state)
+    noisy = masks(busy, shake=True)
+    other = masks(dataclasses.replace(busy, seed=1), shake=False)
+    for step in range(5):
+        assert torch.equal(quiet[step], noisy[step])
+        assert not torch.equal(quiet[step], other[step])
+    assert len({tuple(mask.tolist()) for mask in quiet}) == 5
+
+
+def test_a_run_repeats_bit_for_bit(tiny_scene, busy, whole):
+    assert_identical(whole[0], straight(tiny_scene, busy)[0])
+
+
+# What ends a run
+
+
+def with_first_pixel(scene: Scene, value: float) -> Scene:
+    image = scene.train[1].image.clone()
+    image[0, 0, 0] = value
+    train = (scene.train[0], dataclasses.replace(scene.train[1], image=image), scene.train[2])
+    return dataclasses.replace(scene, train=train)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_loss_that_is_not_finite_stops_before_it_does_harm(tiny_scene, value):
+    trainer = Trainer(with_first_pixel(tiny_scene, value), TrainConfig(iterations=9))
+    with pytest.raises(TrainingStoppedError, match=r"the loss became (nan|inf) at step [123]"):
+        trainer.train()
+    assert trainer.step < 3  # the view is met in the first epoch
+    assert all(torch.isfinite(x).all() for _, x in trainer.gaussians.named())
+
+
+def test_a_model_without_gaussians_stops(tiny_scene):
+    config = TrainConfig(iterations=9, densify_from=1, densify_every=2, prune_opacity=0.99)
+    trainer = Trainer(tiny_scene, config)
+    with pytest.raises(TrainingStoppedError, match="all Gaussians were pruned after step 2"):
+        trainer.train()
+
+
+def test_views_that_show_nothing_are_steps_without_a_move(tiny_scene):
+    """Behind the camera, and in front of it but beside the picture."""
+    for shift in (torch.tensor([0.0, 0.0, -100.0]), torch.tensor([500.0, 0.0, 0.0])):
+        cloud = dataclasses.replace(tiny_scene.points, positions=tiny_scene.points.positions + shift)
+        trainer = Trainer(dataclasses.replace(tiny_scene, points=cloud), TrainConfig(iterations=2))
+        before = trainer.gaussians.means.detach().clone()
+        trainer.train()
+        assert trainer.step == 2
+        assert torch.equal(trainer.gaussians.means, before)
+        assert trainer.statistics.steps.sum() == 0
+
+
+def test_a_scene_without_points_says_what_to_do(tiny_scene):
+    with pytest.raises(ValueError, match="no initial points: load it with points='random'"):
+        Trainer(dataclasses.replace(tiny_scene, points=None), TrainConfig())
+
+
+# Schedules
+
+
+def test_bands_of_spherical_harmonics_come_one_by_one(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=20, sh_degree=2, sh_every=3, densify_every=0))
+    degrees, moved = [], []
+
+    def after_step(t: Trainer) -> None:
+        degrees.append(t.sh_degree)
+        moved.append([bool((t.gaussians.sh_rest[:, a:b] != 0).any()) for a, b in ((0, 3), (3, 8))])
+
+    trainer.train(until=9, after_step=after_step)
+    assert degrees == [0, 0, 1, 1, 1, 2, 2, 2, 2]
+    assert moved == [[False] * 2] * 3 + [[True, False]] * 3 + [[True, True]] * 3
+
+
+def test_the_rate_of_the_means_falls_exponentially_in_units_of_the_extent(tiny_scene, monkeypatch):
+    trainer, rates = Trainer(tiny_scene, TrainConfig(iterations=4, means_rate=1e-2, means_rate_final=1e-4)), []
+    monkeypatch.setattr(trainer.optimizer, "set_means_rate", rates.append)
+    trainer.train()
+    expected = [tiny_scene.extent * 1e-2 * 10 ** (-2 * step / 4) for step in range(4)]
+    assert rates == pytest.approx(expected)
+
+
+def test_regularizers_wait_for_their_step(tiny_scene):
+    config = TrainConfig(iterations=4, dropout=0.5, noise=0.3, regularize_from=2)
+    trainer, seen = Trainer(tiny_scene, config), []
+    trainer.train(after_step=lambda t: seen.append((t.dropout.p, t.noise.sigma, t.dropout.keep is None)))
+    assert seen == [(0.0, 0.0, True)] * 2 + [(0.5, 0.3, False)] * 2
+    plain = Trainer(tiny_scene, dataclasses.replace(config, dropout=0.0, noise=0.0))
+    plain.train(until=2)
+    late = Trainer(tiny_scene, config)
+    late.train(until=2)
+    assert_identical(plain, late)
+
+
+def control(monkeypatch, scene: Scene, config: TrainConfig, steps: int) -> dict[str, list[int]]:
+    """Run with nothing but the calls of density control, and list the steps of each."""
+    trainer = Trainer(scene, config)
+    calls: dict[str, list[int]] = {"densify": [], "prune": [], "reset_opacity": [], "decay_opacity": []}
+
+    def note(name: str, result: torch.Tensor | None):
+        def called(*args, **keywords):
+            calls[name].append(trainer.step)
+            return result
+
+        monkeypatch.setattr(trainer_module, name, called)
+
+    for name in calls:
+        note(name, trainer.statistics.largest_radius if name == "densify" else None)
+    for trainer.step in range(steps):
+        trainer._control_density()
+    return calls
+
+
+def test_when_density_is_controlled(tiny_scene, monkeypatch):
+    config = TrainConfig(
+        iterations=40, densify_from=10, densify_every=5, densify_until=25, opacity_decay=0.9,
+        opacity_reset_from=7, opacity_reset_every=9,
+    )  # fmt: skip
+    calls = control(monkeypatch, tiny_scene, config, 40)
+    assert calls["densify"] == calls["prune"] == [15, 20, 25]
+    assert calls["reset_opacity"] == [7, 16]  # 25 is no longer before densify_until
+    assert calls["decay_opacity"] == list(range(11, 40))
+
+
+def test_when_density_is_left_alone(tiny_scene, monkeypatch):
+    config = TrainConfig(iterations=40, densify_from=10, densify_every=0, opacity_reset_every=0)
+    assert not any(control(monkeypatch, tiny_scene, config, 40).values())
+
+
+def test_growth_ends_at_the_limit_but_pruning_goes_on(tiny_scene, monkeypatch):
+    config = TrainConfig(iterations=40, densify_from=10, densify_every=5, max_gaussians=150, opacity_reset_every=0)
+    calls = control(monkeypatch, tiny_scene, config, 40)
+    assert calls["densify"] == []
+    assert calls["prune"] == [15, 20, 25, 30, 35]
+
+
+def test_large_gaussians_are_floaters_after_a_reset_only(tiny_scene):
+    config = TrainConfig(
+        iterations=40, densify_from=1, densify_every=4, densify_gradient=1e9, opacity_reset_every=6,
+        opacity_reset_from=1000,
+    )  # fmt: skip
+    trainer = Trainer(tiny_scene, config)
+    with torch.no_grad():
+        trainer.gaussians.log_scales[:] = math.log(0.05 * tiny_scene.extent)
+        trainer.gaussians.log_scales[:5] = math.log(0.2 * tiny_scene.extent)
+        trainer.optimizer.set_opacity_logits(inverse_sigmoid(torch.full((150,), 0.5)), forget=False)
+    for trainer.step in (4, 8):
+        before = len(trainer.gaussians)
+        trainer.statistics.largest_radius[7:9] = 21
+        trainer._control_density()
+        assert before - len(trainer.gaussians) == {4: 0, 8: 7}[trainer.step]
+
+
+def test_resets_reach_the_model(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=9, opacity_reset_from=3, opacity_reset=0.02))
+    trainer.step = 3
+    trainer._control_density()
+    expected = Trainer(tiny_scene, trainer.config)
+    reset_opacity(expected.optimizer, 0.02)
+    assert torch.equal(trainer.gaussians.opacity_logits, expected.gaussians.opacity_logits)
+    assert trainer.gaussians.opacities.max().item() == pytest.approx(0.02)
+
+
+def test_initial_gaussians():
+    """Two points, one camera: the scale is their distance, the colour theirs; the extent of one camera is 1."""
+    view = View("a", Camera(torch.eye(4), 20.0, 20.0, 8.0, 8.0, 16, 16), torch.zeros(3, 16, 16))
+    positions, colors = torch.tensor([[0.0, 0, 4], [0.0, 0.3, 4]]), torch.tensor([[1.0, 0, 0], [0, 0.5, 1]])
+    scene = Scene("two", (view,), (), PointCloud(positions, colors, "hand"), torch.zeros(3))
+    gaussians = Trainer(scene, TrainConfig(iterations=1, initial_opacity=0.25)).gaussians
+    torch.testing.assert_close(gaussians.scales.detach(), torch.full((2, 3), 0.3))
+    torch.testing.assert_close(gaussians.opacities.detach(), torch.tensor([0.25, 0.25]))
+    torch.testing.assert_close(gaussians.sh_dc.detach()[:, 0] * math.sqrt(1 / (4 * math.pi)) + 0.5, colors)
