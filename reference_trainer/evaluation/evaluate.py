@@ -15,10 +15,10 @@ from ca_reg import CAScore, RenderFn
 from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.evaluation.pictures import error_map, heat_map, save_png, side_by_side
 from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render import Rendering
 from reference_trainer.render.statistics import color_variance_map
 from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.training.trainer import render_gaussians
 
 __all__ = ["Evaluation", "Model", "PerceptualMetric", "ViewScores", "evaluate"]
 

@@ -14,10 +14,10 @@ from reference_trainer.evaluation.report import machine, markdown_table, write_j
 from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.model.gaussians import inverse_sigmoid
 from reference_trainer.model.ply import load_ply
+from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.studies.run import load_run, model_of
-from reference_trainer.training.trainer import render_gaussians
 
 __all__ = ["evaluation_table", "measure", "of_ply", "of_run", "render_run"]
 

@@ -17,7 +17,8 @@ from reference_trainer.camera import Camera
 from reference_trainer.model.density import DensityStatistics, decay_opacity, densify, prune, reset_opacity
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
-from reference_trainer.render import Rendering, render
+from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.render import Rendering
 from reference_trainer.scenes.points import mean_neighbor_distance
 from reference_trainer.scenes.scene import PointCloud, Scene
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
@@ -26,34 +27,11 @@ from reference_trainer.training.interruption import TrainingInterrupted, hold_in
 from reference_trainer.training.losses import photometric_loss
 from reference_trainer.training.randomness import stream, view_order
 
-__all__ = ["Trainer", "TrainingStoppedError", "render_gaussians"]
+__all__ = ["Trainer", "TrainingStoppedError"]
 
 
 class TrainingStoppedError(RuntimeError):
     """Training cannot go on; the message says why and what to try."""
-
-
-def render_gaussians(
-    gaussians: Gaussians,
-    camera: Camera,
-    background: Tensor,
-    *,
-    opacities: Tensor | None = None,
-    sh_degree: int | None = None,
-    depth: bool = False,
-) -> Rendering:
-    """Render a model, optionally with other opacities (N,) than its own."""
-    return render(
-        gaussians.means,
-        gaussians.quaternions,
-        gaussians.scales,
-        gaussians.opacities if opacities is None else opacities,
-        camera,
-        sh=gaussians.sh,
-        sh_degree=sh_degree,
-        background=background,
-        depth=depth,
-    )
 
 
 class Trainer:

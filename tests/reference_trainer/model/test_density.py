@@ -6,7 +6,7 @@ import torch
 from reference_trainer.model.density import DensityStatistics, decay_opacity, densify, prune, reset_opacity
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
-from reference_trainer.training.trainer import render_gaussians
+from reference_trainer.model.rendering import render_gaussians
 
 
 def some(n: int, seed: int = 0, **given: torch.Tensor) -> Gaussians:
