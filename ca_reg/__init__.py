@@ -2,8 +2,8 @@
 
 - :class:`GaussianDropout` and :class:`OpacityNoise` regularize the activated opacities on their way to the rasterizer;
   :func:`scale_opacity` is what dropout needs at test time.
-- :class:`CAScore` measures co-adaptation with any render callable, :class:`CAMonitor` logs it during training, and
-  :func:`color_variance` is the paper's second metric.
+- :class:`CAScore` measures co-adaptation with any render callable, by sampling, or exactly if the renderer offers
+  moments; :class:`CAMonitor` logs it during training, and :func:`color_variance` is the paper's second metric.
 - :mod:`ca_reg.functional` holds the same as pure functions, :mod:`ca_reg.schedules` rates that change during training,
   :mod:`ca_reg.types` what a render callable may return, :mod:`ca_reg.dynamics` the plots of a monitor's log.
 
@@ -19,7 +19,7 @@ from ca_reg.reason import Reason
 from ca_reg.result import CAResult, CASummary, summarize
 from ca_reg.schedules import Constant, LinearRamp, Schedule, StartStop
 from ca_reg.score import CAScore
-from ca_reg.types import RenderFn, Rendering
+from ca_reg.types import MomentsFn, RenderFn, Rendering
 
 __version__ = "0.1.0"
 
@@ -32,6 +32,7 @@ __all__ = [
     "Constant",
     "GaussianDropout",
     "LinearRamp",
+    "MomentsFn",
     "OpacityNoise",
     "Reason",
     "RenderFn",

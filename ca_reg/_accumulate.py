@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["RenderMoments", "VarianceMap", "jackknife_error", "merge"]
+__all__ = ["MeanAlpha", "RenderMoments", "VarianceMap", "jackknife_error", "merge"]
 
 
 class RenderMoments:
@@ -40,6 +40,27 @@ class RenderMoments:
         self.mean += deviation / self.count
         self.scatter += (deviation * (x - self.mean)).mean(0)
         self.visible &= visible
+
+
+class MeanAlpha:
+    """Mean of the accumulated alpha over the renders seen so far, in float64."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.total = torch.empty(0)  # (H, W)
+
+    def add(self, alpha: Tensor) -> None:
+        """Take in the alpha (H, W) of one render."""
+        if self.count > 0 and alpha.shape != self.total.shape:
+            raise ValueError(
+                f"the renders of one view must have one size, got {tuple(self.total.shape)} and {tuple(alpha.shape)}."
+            )
+        self.total = alpha.to(torch.float64) if self.count == 0 else self.total + alpha
+        self.count += 1
+
+    def above(self, threshold: float) -> Tensor:
+        """Return the pixels (H, W) at which the mean exceeds the threshold."""
+        return self.total / self.count > threshold
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ class Reason(Enum):
 
     OK = ("the value was measured", "")
     EMPTY = (
-        "no pixel counts: none is covered in all the renders",
+        "no pixel counts: none is covered beyond the threshold",
         "lower the threshold or the drop rate; right after an opacity reset, or in a scene that is nowhere opaque, "
         "there is nothing to measure",
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,7 +15,10 @@ from ca_reg.reason import Reason
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["CAResult", "CASettings", "CASummary", "summarize"]
+__all__ = ["CAResult", "CASettings", "CASummary", "LimitEstimate", "Method", "summarize"]
+
+Method = Literal["sampling", "adaptive", "exact", "exact_neutral"]
+"""How a score was made: see :class:`CASettings`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,19 +28,42 @@ class CASettings:
     The background that the renderer composites on matters as well (up to ``1 - threshold`` of it shows inside the
     visible region); it belongs to the render callable, so report it beside these.
 
+    What does not apply to a method is None: an exact score has neither samples nor ddof nor a seed.
+
     Args:
-        samples: number of renders K.
+        method: ``"sampling"``, the paper's protocol with a fixed number of renders; ``"adaptive"``, as many renders as
+            the error asks for; ``"exact"``, the limit of infinitely many, from the moments of the renderer; or
+            ``"exact_neutral"``, the same over the expected colour of each pixel instead of the background.
+        samples: number of renders K; None for adaptive scores too, where it is decided at each view.
         drop_rate: fraction of the Gaussians that is dropped in each.
-        threshold: a pixel is visible where the accumulated alpha exceeds this in all K renders.
+        threshold: a pixel is visible where the accumulated alpha exceeds this: in all K renders with ``"sampling"``, on
+            average over the renders with ``"adaptive"``, in expectation with the exact methods.
         ddof: the variance divides by ``samples - ddof``. With 0 its expectation is (K - 1)/K of the true variance.
         seed: where the masks come from.
+        relative_error: standard error, as a fraction of the score, at which adaptive sampling stops.
+        max_samples: number of renders at which it stops in any case.
     """
 
-    samples: int
+    method: Method
+    samples: int | None
     drop_rate: float
     threshold: float
-    ddof: int
-    seed: int
+    ddof: int | None
+    seed: int | None
+    relative_error: float | None
+    max_samples: int | None
+
+
+class LimitEstimate(NamedTuple):
+    """What a score would be with infinitely many renders, as far as these can tell.
+
+    Args:
+        value: estimate without bias for a given visible region.
+        std_error: its standard error.
+    """
+
+    value: float
+    std_error: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,13 +74,50 @@ class _Score(CASettings):
     std_error: float
     reason: Reason
 
+    @property
+    def settings(self) -> CASettings:
+        """The choices behind the score, which are the same for every view of one :class:`~ca_reg.CAScore`."""
+        values = {field.name: getattr(self, field.name) for field in fields(CASettings)}
+        if self.method == "adaptive":
+            values["samples"] = None
+        return CASettings(**values)
+
+    @property
+    def expected_fraction(self) -> float:
+        """The share of its limit for infinitely many renders that the score is expected to be, given the region.
+
+        ``(K - 1) / (K - ddof)``: 0.8 for the paper's 5 renders with ``ddof=0``; 1 for scores without that bias.
+        """
+        if self.samples is None or self.ddof is None:
+            return 1.0
+        return (self.samples - 1) / (self.samples - self.ddof)
+
+    @property
+    def limit(self) -> LimitEstimate:
+        """The score for infinitely many renders, as estimated from these: both numbers over ``expected_fraction``.
+
+        It corrects the bias of the variance and nothing else. The visible region of the paper's protocol shrinks with
+        every further render, and keeping the pixels that stayed covered prefers masks that change little: an exact or
+        adaptive score, whose region is that of the expected alpha, can still differ by more than the error.
+
+        Example:
+            >>> from ca_reg import CAScore
+            >>> score = CAScore(lambda opacity, view: (opacity[:48].view(3, 4, 4), torch.ones(4, 4)))
+            >>> result = score(torch.ones(50), view=None)
+            >>> result.expected_fraction, round(result.limit.value / result.value, 6)
+            (0.8, 1.25)
+        """
+        return LimitEstimate(self.value / self.expected_fraction, self.std_error / self.expected_fraction)
+
     def as_dict(self) -> dict[str, float | int | str | None]:
-        """Return all numbers and the name of the reason, ready for JSON: nan becomes None, maps are left out."""
+        """Return all numbers and names, ready for JSON: nan becomes None, maps are left out."""
         out: dict[str, float | int | str | None] = {}
         for field in fields(self):
             x = getattr(self, field.name)
             if isinstance(x, Reason):
                 out[field.name] = x.name
+            elif x is None or isinstance(x, str):
+                out[field.name] = x
             elif isinstance(x, int | float):
                 out[field.name] = None if math.isnan(x) else x
         return out
@@ -67,12 +130,14 @@ class CAResult(_Score):
     Args:
         value: the score: variance of the renders, mean over RGB and over the visible pixels; nan unless ``reason`` is
             ``Reason.OK``.
-        std_error: standard error of ``value`` over the choice of masks; nan below three samples or without a value.
+        std_error: standard error of ``value`` over the choice of masks; 0 if it is exact; nan below three samples or
+            without a value.
         variance: variance of every pixel, mean over RGB, shape (H, W), float64, visible or not.
         visible: pixels that count, shape (H, W), bool.
         reason: why the value is what it is.
 
-    The settings of the score (``samples``, ``drop_rate``, ``threshold``, ``ddof``, ``seed``) come with it.
+    The settings of the score come with it, see :class:`CASettings`; ``samples`` is the number of renders that were
+    made, also if it was adaptive, and None if the score is exact.
     """
 
     variance: Tensor
@@ -98,7 +163,8 @@ class CAResult(_Score):
         ax.set_facecolor("0.6")
         picture = ax.imshow(heat, cmap="inferno", vmin=0.0)
         ax.figure.colorbar(picture, ax=ax, label="std over masks")
-        ax.set_title(f"CA {self.value:.3g} ± {self.std_error:.1g}" if self.reason is Reason.OK else self.reason.message)
+        error = "exact" if self.samples is None else f"± {self.std_error:.1g}"
+        ax.set_title(f"CA {self.value:.3g} {error}" if self.reason is Reason.OK else self.reason.message)
         ax.set_xticks([])
         ax.set_yticks([])
         return ax
@@ -136,10 +202,10 @@ def summarize(results: Iterable[CAResult]) -> CASummary:
         2
     """
     tally = ViewTally()
-    settings: set[CASettings] = set()
+    settings = set()
     for result in results:
         tally.add(result)
-        settings.add(CASettings(**{field.name: getattr(result, field.name) for field in fields(CASettings)}))
+        settings.add(result.settings)
     if len(settings) != 1:
         raise ValueError(f"expected results of one score, with one set of settings, got {len(settings)} of them.")
     return tally.summary(settings.pop())

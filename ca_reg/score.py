@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -11,22 +11,29 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from ca_reg._accumulate import RenderMoments, jackknife_error, merge
-from ca_reg._check import check_count, check_finite, check_opacity, check_opacity_range, check_rate
-from ca_reg.functional import apply_dropout, draw_keep_mask
+from ca_reg._accumulate import MeanAlpha, RenderMoments, jackknife_error, merge
+from ca_reg._check import check_count, check_opacity, check_opacity_range, check_rate
+from ca_reg._settings import GROUPS, make_settings
+from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from ca_reg.reason import Reason
-from ca_reg.result import CAResult, CASettings, CASummary, ViewTally
-from ca_reg.types import Layout, RenderFn, Rendering, check_layout, read_alpha_pass, read_rendering
+from ca_reg.result import CAResult, CASummary, ViewTally
+from ca_reg.types import (
+    ExactMoments,
+    Layout,
+    MomentsFn,
+    RenderFn,
+    Rendering,
+    check_layout,
+    read_alpha_pass,
+    read_moments,
+    read_rendering,
+)
 
 __all__ = ["CAScore"]
 
-# The renders are pooled in at most this many groups, which bounds the memory; with fewer groups the standard error
-# would be known less well (relative error about 1/sqrt(2 (groups - 1)), here 27 %).
-_GROUPS = 8
-
 
 class CAScore:
-    """Measure co-adaptation with any renderer, by Monte Carlo over masks (paper, "Quantifying Co-Adaptation").
+    """Measure co-adaptation with any renderer, by sampling or exactly (paper, "Quantifying Co-Adaptation").
 
     One view is rendered ``samples`` times, each time without a random subset of the Gaussians. The score is the
     variance of these renders, per pixel and channel, averaged over RGB and over the pixels whose accumulated alpha
@@ -42,27 +49,47 @@ class CAScore:
     The memory does not grow with ``samples``: renders are pooled in at most 8 groups, each with one float64 image and
     two maps.
 
+    Two other methods go to the limit of infinitely many renders. For the paper's region, the pixels that all renders
+    cover, there is no such limit, because it shrinks with every render; both take the pixels whose *expected* alpha
+    exceeds the threshold.
+
+    - *Exact*: give ``exact`` if the renderer offers moments (:func:`ca_reg.functional.pixel_moments`). Nothing is
+      sampled, the error is 0, and neither the seed nor the index of the view matters. With ``neutral`` each pixel is
+      composited over its own expected colour (:func:`ca_reg.functional.neutral_background`), so that a hole no longer
+      shows the background, and only disagreement between the colours of the Gaussians counts.
+    - *Adaptive*: give ``relative_error``. Renders are added, 8 at a time, until the standard error is at most this
+      fraction of the score. The error is itself estimated, to about 27 %.
+
     Convention: ``opacity`` is activated, in [0, 1], (N,) or (N, 1), and neither scaled nor dropped; images are
     (3, H, W), or (H, W, 3) with ``layout="HWC"``. Regularizers inside the callable must be off.
 
     Args:
-        render_fn: the renderer of the model, ``render_fn(opacity, view)``; see :class:`ca_reg.types.RenderFn`.
-        samples: number of renders K, at least 2.
+        render_fn: the renderer of the model, ``render_fn(opacity, view)``; see :class:`ca_reg.types.RenderFn`. Not used
+            by an exact score, which takes None.
+        samples: number of renders K, at least 2; by default 5, or as many as ``relative_error`` asks for.
         p: dropout rate that the model was trained with, 0 if it was trained without (or with compensated) dropout.
         drop_rate: fraction of the Gaussians to drop in each render, in [0, 1); by default ``1 - (1 - p)/2``, that is
             half of those that training left.
         threshold: accumulated alpha above which a pixel is visible.
-        ddof: the variance divides by ``samples - ddof``: 0 as in the released code, 1 for an unbiased estimate.
+        ddof: the variance divides by ``samples - ddof``: 0 as in the released code, 1 for an unbiased estimate. By
+            default 0; always 1 for adaptive scores, whose expectation would depend on the number of renders otherwise.
         layout: order of the axes of the images, ``"CHW"`` or ``"HWC"``.
         alpha_fn: for renderers that return no alpha: ``alpha_fn(opacity, view)`` renders the same view with all colours
             1 over a background of 0, or returns an alpha of its own. It is called once per render and so doubles the
             cost; if it is given, an alpha from ``render_fn`` is not used.
         seed: seed of the masks. They are drawn on the CPU from (seed, view index) alone: the same on every device, and
-            adding a view does not change the masks of the others.
+            adding a view does not change the masks of the others. A larger number of renders continues the masks of a
+            smaller one.
+        exact: moments of the model's renderer, ``exact(opacity, view, multiplier, background)``; see
+            :class:`ca_reg.types.MomentsFn`. The score is then exact.
+        neutral: make the exact score independent of the background; takes two calls of ``exact``.
+        relative_error: standard error to sample for, as a fraction of the score, above 0.
+        max_samples: number of renders at which adaptive sampling gives up, at least 8, by default 256. The standard
+            error of the result then says how far it came.
 
     Raises:
         TypeError: if an argument is of the wrong type.
-        ValueError: if one is out of range.
+        ValueError: if one is out of range, or does not apply to the method.
 
     Example:
         A wall of ten layers of different grey; with a layer missing the next one shows through.
@@ -76,43 +103,64 @@ class CAScore:
         >>> result = score(torch.full((10,), 0.9), view=None)
         >>> result.reason, 0.005 < result.value < 0.05, result.variance.shape
         (<Reason.OK: ...>, True, torch.Size([4, 4]))
+        >>> adaptive = CAScore(render_fn, relative_error=0.2, threshold=0.5)(torch.full((10,), 0.9), view=None)
+        >>> adaptive.std_error / adaptive.value <= 0.2
+        True
+        >>> adaptive.samples in range(8, 257, 8)
+        True
     """
 
     higher_is_better = False
 
     def __init__(
         self,
-        render_fn: RenderFn,
+        render_fn: RenderFn | None = None,
         *,
-        samples: int = 5,
+        samples: int | None = None,
         p: float = 0.0,
         drop_rate: float | None = None,
         threshold: float = 0.8,
-        ddof: int = 0,
+        ddof: int | None = None,
         layout: Layout = "CHW",
         alpha_fn: RenderFn | None = None,
         seed: int = 0,
+        exact: MomentsFn | None = None,
+        neutral: bool = False,
+        relative_error: float | None = None,
+        max_samples: int | None = None,
     ) -> None:
         for name, fn in (("render_fn", render_fn), ("alpha_fn", alpha_fn)):
             if fn is not None and not callable(fn):
                 raise TypeError(f"{name} must be callable as {name}(opacity, view), got {type(fn).__name__}.")
-        check_count(samples, "samples", minimum=2)
+        if exact is not None and not callable(exact):
+            raise TypeError(
+                f"exact must be callable as exact(opacity, view, multiplier, background), got {type(exact).__name__}; "
+                "it is the renderer's moments function, not a switch."
+            )
+        if render_fn is None and exact is None:
+            raise ValueError("give render_fn, or exact if the renderer offers moments; without both nothing renders.")
+        if exact is not None and alpha_fn is not None:
+            raise ValueError("alpha_fn does not apply to an exact score, whose moments hold the expected alpha.")
+        check_layout(layout)
         check_rate(p)
         drop_rate = 1.0 - (1.0 - p) / 2.0 if drop_rate is None else drop_rate
-        check_rate(drop_rate, "drop_rate")
-        check_finite(threshold, "threshold")
-        check_count(ddof, "ddof", minimum=0)
-        if ddof >= samples:
-            raise ValueError(f"ddof must be below samples, got ddof {ddof} and {samples} samples.")
-        check_layout(layout)
-        check_count(seed, "seed", minimum=0)
+        self.settings = make_settings(
+            exact=exact is not None,
+            neutral=neutral,
+            drop_rate=drop_rate,
+            threshold=threshold,
+            seed=seed,
+            samples=samples,
+            ddof=ddof,
+            relative_error=relative_error,
+            max_samples=max_samples,
+        )
         self.render_fn = render_fn
         self.alpha_fn = alpha_fn
+        self.exact = exact
         self.layout: Layout = layout
         self.p = p
-        self.settings = CASettings(
-            samples=int(samples), drop_rate=drop_rate, threshold=threshold, ddof=int(ddof), seed=int(seed)
-        )
+        self.seed = int(seed)
         self.reset()
 
     def __call__(self, opacity: Tensor, view: Any, *, index: int = 0) -> CAResult:
@@ -133,18 +181,11 @@ class CAScore:
         check_opacity(opacity)
         check_opacity_range(opacity)
         check_count(index, "index", minimum=0)
-        settings = self.settings
-        generator = torch.Generator()
-        entropy = np.random.SeedSequence([settings.seed, index]).generate_state(1, np.uint64)
-        generator.manual_seed(int(entropy[0] >> np.uint64(1)))
-        groups = [RenderMoments() for _ in range(min(settings.samples, _GROUPS))]
         with torch.no_grad():
-            opacity = opacity.detach()
-            for k in range(settings.samples):
-                keep = draw_keep_mask(opacity.shape[0], settings.drop_rate, generator=generator, device=opacity.device)
-                image, alpha = self._render(apply_dropout(opacity, keep), view)
-                groups[k % len(groups)].add(image, alpha > settings.threshold)
-            return self._result(groups)
+            if self.exact is not None:
+                return self._exact(self.exact, opacity.detach(), view)
+            assert self.render_fn is not None
+            return self._sample(self.render_fn, opacity.detach(), view, index)
 
     def update(self, opacity: Tensor, view: Any, *, index: int | None = None) -> CAResult:
         """Measure one view and count it in the mean that :meth:`compute` returns.
@@ -188,9 +229,62 @@ class CAScore:
         self._tally = ViewTally()
         self._updates = 0
 
-    def _render(self, opacity: Tensor, view: Any) -> tuple[Tensor, Tensor]:
+    def _exact(self, moments_fn: MomentsFn, opacity: Tensor, view: Any) -> CAResult:
+        """Read the score off the moments of the renderer."""
+        settings = self.settings
+        multiplier = Multiplier.dropout(settings.drop_rate)
+
+        def moments(background: Tensor | None) -> ExactMoments:
+            return read_moments(moments_fn(opacity, view, multiplier, background), layout=self.layout)
+
+        if settings.method == "exact_neutral":
+            # Over black the mean is sum w c, and the expected alpha sum w: no background has to be taken out again.
+            over_black = moments(opacity.new_zeros(3))
+            total = over_black.alpha_mean
+            neutral = over_black.mean / torch.where(total > 0, total, 1.0)
+            image = moments(neutral if self.layout == "CHW" else neutral.permute(1, 2, 0))
+        else:
+            image = moments(None)
+        variance = image.variance.to(torch.float64).mean(0)
+        visible = image.alpha_mean.to(variance.device) > settings.threshold
+        value, reason = _mean(variance, visible)
+        return CAResult(
+            value=value,
+            std_error=0.0 if reason is Reason.OK else math.nan,
+            variance=variance,
+            visible=visible,
+            reason=reason,
+            **asdict(settings),
+        )
+
+    def _sample(self, render_fn: RenderFn, opacity: Tensor, view: Any, index: int) -> CAResult:
+        """Render with random masks, a fixed number of times or until the error is small enough."""
+        settings = self.settings
+        generator = torch.Generator()
+        entropy = np.random.SeedSequence([self.seed, index]).generate_state(1, np.uint64)
+        generator.manual_seed(int(entropy[0] >> np.uint64(1)))
+        most = settings.samples or settings.max_samples or 0
+        groups = [RenderMoments() for _ in range(min(most, GROUPS))]
+        coverage = MeanAlpha() if settings.method == "adaptive" else None
+        for k in range(most):
+            keep = draw_keep_mask(opacity.shape[0], settings.drop_rate, generator=generator, device=opacity.device)
+            image, alpha = self._render(render_fn, apply_dropout(opacity, keep), view)
+            groups[k % len(groups)].add(image, alpha > settings.threshold)
+            if coverage is not None:
+                coverage.add(alpha)
+                # Only where all groups are equally large: the jackknife is at its best, and the test costs little.
+                if (k + 1) % GROUPS == 0 and self._is_settled(self._result(groups, coverage)):
+                    break
+        return self._result(groups, coverage)
+
+    def _is_settled(self, result: CAResult) -> bool:
+        """Whether further renders are not needed: the error is small enough, or there is no value to refine."""
+        target = self.settings.relative_error
+        return result.reason is not Reason.OK or (target is not None and result.std_error <= target * result.value)
+
+    def _render(self, render_fn: RenderFn, opacity: Tensor, view: Any) -> tuple[Tensor, Tensor]:
         """Render colours (3, H, W) and alpha (H, W) with masked opacities."""
-        rendering: Rendering = read_rendering(self.render_fn(opacity, view), layout=self.layout)
+        rendering: Rendering = read_rendering(render_fn(opacity, view), layout=self.layout)
         if self.alpha_fn is not None:
             alpha = read_alpha_pass(self.alpha_fn(opacity, view), rendering.image, layout=self.layout)
         elif rendering.alpha is not None:
@@ -203,26 +297,31 @@ class CAScore:
             )
         return rendering.image, alpha.to(rendering.image.device)
 
-    def _result(self, groups: list[RenderMoments]) -> CAResult:
-        """Reduce the moments to the score."""
-        settings = self.settings
+    def _result(self, groups: list[RenderMoments], coverage: MeanAlpha | None) -> CAResult:
+        """Reduce the moments to the score, over the pixels covered on average or, without ``coverage``, in all."""
         total = merge(groups)
-        variance = total.scatter / (settings.samples - settings.ddof)
-        value = std_error = math.nan
-        if not bool(total.visible.any()):
-            reason = Reason.EMPTY
-        else:
-            mean = float(variance[total.visible].mean())
-            reason = Reason.OK if math.isfinite(mean) else Reason.NOT_FINITE
-            if reason is Reason.OK:
-                value = mean
-                # For a given visible region the two variances differ by this factor exactly, and so do their errors.
-                std_error = jackknife_error(groups, total) * (settings.samples - 1) / (settings.samples - settings.ddof)
+        if coverage is not None:
+            total = replace(total, visible=coverage.above(self.settings.threshold))
+        divisor = total.count - (self.settings.ddof or 0)
+        variance = total.scatter / divisor
+        value, reason = _mean(variance, total.visible)
+        std_error = math.nan
+        if reason is Reason.OK:
+            # For a given visible region the two variances differ by this factor exactly, and so do their errors.
+            std_error = jackknife_error(groups, total) * (total.count - 1) / divisor
         return CAResult(
             value=value,
             std_error=std_error,
             variance=variance,
             visible=total.visible,
             reason=reason,
-            **asdict(settings),
+            **asdict(replace(self.settings, samples=total.count)),
         )
+
+
+def _mean(variance: Tensor, visible: Tensor) -> tuple[float, Reason]:
+    """Average over the visible pixels, or say why not."""
+    if not bool(visible.any()):
+        return math.nan, Reason.EMPTY
+    mean = float(variance[visible].mean())
+    return (mean, Reason.OK) if math.isfinite(mean) else (math.nan, Reason.NOT_FINITE)

@@ -9,7 +9,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Layout", "RenderFn", "Rendering", "read_alpha_pass", "read_rendering"]
+from ca_reg.functional import Multiplier
+
+__all__ = [
+    "ExactMoments",
+    "Layout",
+    "MomentsFn",
+    "RenderFn",
+    "Rendering",
+    "read_alpha_pass",
+    "read_moments",
+    "read_rendering",
+]
 
 Layout = Literal["CHW", "HWC"]
 """Order of the axes of the images that a renderer returns."""
@@ -47,6 +58,35 @@ class RenderFn(Protocol):
         """Render ``view`` with these activated opacities, of the shape that the score was given."""
 
 
+class MomentsFn(Protocol):
+    """A renderer that offers exact moments: ``moments_fn(opacity, view, multiplier, background)``.
+
+    It renders what :class:`RenderFn` does, but over all draws of an independent random factor on the alpha of every
+    splat (:func:`ca_reg.functional.pixel_moments` in every pixel), and returns a mapping or an object with
+
+    - ``mean``: expected colours over the background, (3, H, W), or (H, W, 3) as the layout says;
+    - ``variance``: variances of the colours, same shape;
+    - ``alpha_mean``: expected accumulated alpha, (H, W), (1, H, W) or (H, W, 1).
+
+    ``background`` is None for the model's own, one colour of shape (3,), or an image, one colour for each pixel. No
+    early stop is allowed that ignores the factors: splats behind an opaque surface shine through its dropped ones.
+
+    Example:
+        >>> from ca_reg.functional import alpha_moments, pixel_moments
+        >>> def moments_fn(
+        ...     opacity: Tensor, view: Tensor, multiplier: Multiplier, background: Tensor | None
+        ... ) -> dict[str, Tensor]:
+        ...     mean, variance = pixel_moments(opacity, view, multiplier, background=background)
+        ...     images = {"mean": mean, "variance": variance}
+        ...     return {name: x[:, None, None].expand(3, 4, 5) for name, x in images.items()} | {
+        ...         "alpha_mean": alpha_moments(opacity, multiplier).mean.expand(4, 5)
+        ...     }
+    """
+
+    def __call__(self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None, /) -> Any:
+        """Render the moments of ``view`` with these activated opacities, neither dropped nor scaled."""
+
+
 class Rendering(NamedTuple):
     """One image with its accumulated alpha.
 
@@ -57,6 +97,20 @@ class Rendering(NamedTuple):
 
     image: Tensor
     alpha: Tensor | None = None
+
+
+class ExactMoments(NamedTuple):
+    """Moments of one image over the random factors.
+
+    Args:
+        mean: expected colours, shape (3, H, W).
+        variance: their variances, shape (3, H, W).
+        alpha_mean: expected accumulated alpha, shape (H, W).
+    """
+
+    mean: Tensor
+    variance: Tensor
+    alpha_mean: Tensor
 
 
 def read_rendering(result: Any, *, layout: Layout = "CHW") -> Rendering:
@@ -122,6 +176,43 @@ def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Te
             "alpha_fn must render the same view at the same size."
         )
     return white.mean(0)
+
+
+def read_moments(result: Any, *, layout: Layout = "CHW") -> ExactMoments:
+    """Bring what a :class:`MomentsFn` returned into one form.
+
+    Args:
+        result: see :class:`MomentsFn`.
+        layout: order of the axes of the images, ``"CHW"`` or ``"HWC"``.
+
+    Returns:
+        Images (3, H, W) and the expected alpha (H, W), torch tensors.
+
+    Raises:
+        TypeError: if a member is missing or not floating point.
+        ValueError: if a shape does not fit, or ``layout`` is unknown.
+
+    Example:
+        >>> image = torch.rand(4, 5, 3)
+        >>> result = {"mean": image, "variance": image / 9, "alpha_mean": torch.ones(4, 5)}
+        >>> read_moments(result, layout="HWC").variance.shape
+        torch.Size([3, 4, 5])
+    """
+    check_layout(layout)
+    members = [_by_name(result, (name,)) for name in ExactMoments._fields]
+    missing = [name for name, x in zip(ExactMoments._fields, members, strict=True) if x is None]
+    if missing:
+        raise TypeError(
+            f"a moments callable returned {_describe(result)} without {', '.join(missing)}; return a mapping or object "
+            f"with {', '.join(ExactMoments._fields)}."
+        )
+    mean, variance = (_read_image(_as_tensor(x, "an image of moments"), layout) for x in members[:2])
+    if variance.shape != mean.shape:
+        raise ValueError(
+            f"mean and variance of a moments callable must have one shape, got {tuple(mean.shape)} and "
+            f"{tuple(variance.shape)} (as CHW)."
+        )
+    return ExactMoments(mean, variance, _read_alpha(members[2], mean))
 
 
 def check_layout(layout: str) -> None:

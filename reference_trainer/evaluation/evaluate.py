@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAScore, RenderFn
+from ca_reg.functional import Multiplier
 from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.evaluation.pictures import error_map, heat_map, save_png, side_by_side
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render import Rendering
+from reference_trainer.render import Rendering, splat
+from reference_trainer.render.moments import MomentImages, render_moments
 from reference_trainer.render.statistics import color_variance_map
 from reference_trainer.scenes.scene import Scene, View
 
@@ -64,6 +66,29 @@ class Model:
             self.gaussians, view.camera, self.background, opacities=opacities, sh_degree=self.sh_degree
         )
 
+    def moments(
+        self, opacities: Tensor, view: View, multiplier: Multiplier, background: Tensor | None = None
+    ) -> MomentImages:
+        """Render the exact moments of a view under random factors: the moments callable of `CAScore`.
+
+        Args:
+            opacities: activated, shape (N,).
+            view: what to render.
+            multiplier: moments of the factors.
+            background: instead of the model's own, shape (3,) or (3, H, W).
+        """
+        model = self.gaussians
+        splats = splat(
+            model.means,
+            model.quaternions,
+            model.scales,
+            opacities,
+            view.camera,
+            sh=model.sh,
+            sh_degree=self.sh_degree,
+        )
+        return render_moments(splats, multiplier, background=self.background if background is None else background)
+
     def ca_score(
         self, *, samples: int = 5, drop_rate: float | None = None, seed: int = 0, render_fn: RenderFn | None = None
     ) -> CAScore:
@@ -76,6 +101,15 @@ class Model:
             render_fn: instead of `render`, for a model that changes.
         """
         return CAScore(render_fn or self.render, samples=samples, p=self.dropout, drop_rate=drop_rate, seed=seed)
+
+    def exact_ca_score(self, *, drop_rate: float | None = None, neutral: bool = False) -> CAScore:
+        """Return the limit of the protocol for infinitely many samples, over the region of expected alpha above 0.8.
+
+        Args:
+            drop_rate: instead of the paper's 1 - (1 - p) / 2.
+            neutral: composite every pixel over its own expected colour instead of the background.
+        """
+        return CAScore(exact=self.moments, p=self.dropout, drop_rate=drop_rate, neutral=neutral)
 
 
 @dataclass(frozen=True)
@@ -90,6 +124,7 @@ class ViewScores:
     ca: float
     ca_std_error: float
     ca_half: float
+    ca_exact: float
     visible: float
     cv: float
 
@@ -99,7 +134,8 @@ class Evaluation:
     """Scores of all views and their means.
 
     ``ca`` is the paper's protocol; ``ca_half`` the same at a drop rate of 0.5 for every model, which compares models of
-    different dropout rates on equal terms; ``visible`` the share of pixels that the score covers.
+    different dropout rates on equal terms; ``ca_exact`` the limit for infinitely many samples, at the drop rate of
+    ``ca`` and over the pixels whose expected alpha is above 0.8; ``visible`` the share of pixels that ``ca`` covers.
     """
 
     views: list[ViewScores]
@@ -155,6 +191,7 @@ def evaluate(
     opacities = model.gaussians.opacities
     score = model.ca_score(samples=samples, seed=seed)
     half = model.ca_score(samples=samples, seed=seed, drop_rate=0.5)
+    exact = model.exact_ca_score()
     for split, members in (("train", scene.train), ("test", scene.test)):
         for index, view in enumerate(member.to(opacities.device) for member in members):
             if progress is not None:
@@ -174,6 +211,7 @@ def evaluate(
                     ca=ca.value,
                     ca_std_error=ca.std_error,
                     ca_half=ca_half.value,
+                    ca_exact=exact(opacities, view).value,
                     visible=ca.visible.double().mean().item(),
                     cv=variance[covered].double().mean().item() if bool(covered.any()) else math.nan,
                 )

@@ -62,10 +62,13 @@ def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor
     Args:
         splats: of the full model, with its plain opacities.
         multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,), one value each.
-        background: fixed colour behind everything, shape (3,); black by default.
+        background: fixed colour behind everything, shape (3,), or one for each pixel, (3, H, W); black by default.
 
     Returns:
         The moments of colours and accumulated alpha.
+
+    Raises:
+        ValueError: if the background has another shape.
 
     Example:
         >>> from reference_trainer.camera import Camera
@@ -80,14 +83,22 @@ def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor
     table = pack(splats.projection.means, splats.projection.factors, splats.opacities)
     factors = torch.stack([_per_splat(x, splats) for x in (multiplier.mean, multiplier.variance)])
     values = torch.cat([splats.colors, torch.ones_like(splats.opacities)[:, None]], dim=1)
-    behind = values.new_zeros(4)
-    if background is not None:
-        behind[:3] = background
     absent = torch.nn.functional.pad
     mean, variance = _Moments.apply(  # type: ignore[no-untyped-call]
-        table, absent(values, (0, 0, 0, 1)), absent(factors, (0, 1)), behind, splats.lists
+        table, absent(values, (0, 0, 0, 1)), absent(factors, (0, 1)), _behind(background, splats), splats.lists
     )
     return MomentImages(mean[:3], variance[:3], mean[3], variance[3])
+
+
+def _behind(background: Tensor | None, splats: Splats) -> Tensor:
+    """Return what lies behind the last splat, colours and an alpha of 0, per tile (tiles, 4, 64)."""
+    shape = (3, splats.lists.height, splats.lists.width)
+    if background is None:
+        background = splats.colors.new_zeros(3)
+    if background.shape not in (shape, shape[:1]):
+        raise ValueError(f"background must have shape (3,) or {shape}, got {tuple(background.shape)}.")
+    image = (background if background.ndim == 3 else background[:, None, None]).to(splats.colors).expand(shape)
+    return tile(torch.cat([image, torch.zeros_like(image[:1])]), splats.lists)
 
 
 def _per_splat(moment: float | Tensor, splats: Splats) -> Tensor:
@@ -129,13 +140,14 @@ def _factors(
     return _Factors(raw, alpha, m, v, expected, spread, shrink, colors), splats
 
 
-def _walk(f: _Factors, background: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
+def _walk(f: _Factors, behind: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Run the recursion back to front; before each splat yield its number and mean and variance (C, T, 64) behind it.
 
-    After the nearest splat -1 is yielded with the pixel itself. The tensors are overwritten by the next step.
+    It starts from what is behind all splats, (T, C, 64). After the nearest splat -1 is yielded with the pixel itself.
+    The tensors are overwritten by the next step.
     """
-    longest, tiles, _ = f.alpha.shape
-    mean = background[:, None, None].expand(-1, tiles, PIXELS).clone()
+    longest = f.alpha.shape[0]
+    mean = behind.transpose(0, 1).clone(memory_format=torch.contiguous_format)
     variance = torch.zeros_like(mean)
     for i in range(longest - 1, -1, -1):
         yield i, mean, variance
@@ -150,29 +162,28 @@ class _Moments(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, table: Tensor, values: Tensor, factors: Tensor, background: Tensor, lists: TileLists
+        ctx: Any, table: Tensor, values: Tensor, factors: Tensor, behind: Tensor, lists: TileLists
     ) -> tuple[Tensor, Tensor]:
-        count = lists.lengths.shape[0]
-        means = background[:, None].repeat(count, 1, PIXELS)
+        means = behind.clone()
         variances = torch.zeros_like(means)
         for block in lists.blocks(_FORWARD_BLOCKS * block_size(table.device)):
             f, _ = _factors(table, values, factors, block, lists)
-            *_, (_, mean, variance) = _walk(f, background)
+            *_, (_, mean, variance) = _walk(f, behind[block.tiles])
             means[block.tiles], variances[block.tiles] = mean.transpose(0, 1), variance.transpose(0, 1)
-        ctx.save_for_backward(table, values, factors, background)
+        ctx.save_for_backward(table, values, factors, behind)
         ctx.lists = lists
         return untile(means, lists), untile(variances, lists)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
-        table, values, factors, background = ctx.saved_tensors
+        table, values, factors, behind = ctx.saved_tensors
         lists: TileLists = ctx.lists
         upstream = [tile(gradient, lists) for gradient in gradients]
         sums = table.new_zeros(table.shape[1], 6 + values.shape[1] + 2)
-        behind = upstream[0][lists.lengths == 0].sum((0, 2))
+        to_behind = upstream[0].clone()  # of the tiles without splats; the others are overwritten
         for block in lists.blocks(block_size(table.device)):
             f, splats = _factors(table, values, factors, block, lists)
-            states = [(mean.clone(), variance.clone()) for _, mean, variance in _walk(f, background)]
+            states = [(mean.clone(), variance.clone()) for _, mean, variance in _walk(f, behind[block.tiles])]
             to_mean, to_variance = (x[block.tiles].transpose(0, 1).contiguous() for x in upstream)
             longest = f.alpha.shape[0]
             to_alpha = torch.empty_like(f.alpha)
@@ -195,11 +206,11 @@ class _Moments(torch.autograd.Function):
                 to_v.append((to_spread * f.alpha[i].square()).sum(-1))
                 to_mean = to_mean - to_contrast
                 to_variance = to_variance * f.shrink[i]
-            behind = behind + to_mean.sum((1, 2))
+            to_behind[block.tiles] = to_mean.transpose(0, 1)
             along = to_alpha.mul_(f.raw).view(-1, PIXELS)
             moments = torch.mm(along, monomials(table.dtype, table.device)).view(longest, -1, 6).permute(1, 2, 0)
             geometry = table_gradient(splats, moments).permute(2, 0, 1)
             to_factors = torch.stack([torch.stack(to_m), torch.stack(to_v)], dim=-1)
             rows = torch.cat([geometry, torch.stack(to_values).transpose(1, 2), to_factors], dim=2)
             sums.index_add_(0, block.gaussians.T.flatten(), rows.flatten(0, 1))
-        return sums[:, :6].T, sums[:, 6:-2], sums[:, -2:].T, behind, None
+        return sums[:, :6].T, sums[:, 6:-2], sums[:, -2:].T, to_behind, None

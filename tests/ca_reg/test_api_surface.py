@@ -16,6 +16,7 @@ EXPECTED = {
     "Constant",
     "GaussianDropout",
     "LinearRamp",
+    "MomentsFn",
     "OpacityNoise",
     "Reason",
     "RenderFn",

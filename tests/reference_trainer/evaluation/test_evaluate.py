@@ -6,6 +6,8 @@ import pytest
 import torch
 from PIL import Image
 
+from ca_reg import CAScore
+from ca_reg.functional import Multiplier
 from reference_trainer.evaluation.evaluate import Evaluation, Model, ViewScores, evaluate
 from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
@@ -66,6 +68,40 @@ def test_the_drop_rate_of_the_protocol_follows_the_training(tiny_scene, gaussian
     assert scores(dropped, "ca") != scores(plain, "ca")
 
 
+def test_the_exact_score_is_the_limit_of_many_samples(tiny_scene, gaussians):
+    scene = dataclasses.replace(tiny_scene, train=tiny_scene.train[:1], test=())
+    model = Model(gaussians, scene.background, dropout=0.2)
+    (view,) = evaluate(model, scene, samples=2).views
+    score = model.exact_ca_score()
+    result = score(gaussians.opacities, scene.train[0])
+    assert view.ca_exact == result.value
+    assert (result.drop_rate, result.threshold) == (pytest.approx(0.6), 0.8)
+    adaptive = CAScore(model.render, p=0.2, relative_error=0.03, max_samples=160)(gaussians.opacities, scene.train[0])
+    # 5 standard errors, themselves known to 27 %: false alarm below 1e-3, and the seed is fixed.
+    assert abs(adaptive.value - result.value) < 5 * adaptive.std_error < 0.5 * result.value
+
+
+def test_exact_scores_at_another_drop_rate_and_over_the_expected_colour(tiny_scene, gaussians):
+    view, model = tiny_scene.train[0], Model(gaussians, tiny_scene.background)
+    other = dataclasses.replace(model, background=1 - tiny_scene.background)
+    assert model.exact_ca_score(drop_rate=0.3).settings.drop_rate == 0.3
+    plain, bright = (m.exact_ca_score()(gaussians.opacities, view).value for m in (model, other))
+    neutral, same = (m.exact_ca_score(neutral=True)(gaussians.opacities, view) for m in (model, other))
+    assert plain != bright
+    assert neutral.method == "exact_neutral"
+    assert neutral.value == same.value
+
+
+def test_moments_use_only_the_bands_and_the_background_of_the_model(tiny_scene, gaussians):
+    view, sure = tiny_scene.train[0], Multiplier(1.0, 0.0)
+    faint = 0.1 * gaussians.opacities  # no pixel ends early
+    model = Model(gaussians, torch.tensor([0.2, 0.7, 0.4]), sh_degree=0)
+    moments = model.moments(faint, view, sure)
+    torch.testing.assert_close(moments.mean, model.render(faint, view)[0], rtol=0, atol=1e-5)
+    black = dataclasses.replace(model, background=torch.zeros(3))
+    assert torch.equal(model.moments(faint, view, sure, torch.zeros(3)).mean, black.moments(faint, view, sure).mean)
+
+
 def test_only_the_bands_of_the_model_are_used(tiny_scene, gaussians):
     grey = dataclasses.replace(gaussians, sh_rest=gaussians.sh_rest[:, :0])
     cut = evaluate(Model(gaussians, tiny_scene.background, sh_degree=0), tiny_scene)
@@ -92,6 +128,7 @@ def test_an_empty_model_has_no_co_adaptation_and_says_so(tiny_scene, gaussians):
     nothing = gaussians[torch.zeros(150, dtype=torch.bool)]
     result = evaluate(Model(nothing, tiny_scene.background), tiny_scene)
     assert all(math.isnan(value) for value in scores(result, "ca"))
+    assert all(math.isnan(value) for value in scores(result, "ca_exact"))
     assert all(math.isnan(value) for value in scores(result, "cv"))
     assert scores(result, "visible") == [0.0] * 6
     assert all(math.isfinite(value) for value in scores(result, "psnr"))
@@ -108,7 +145,7 @@ def test_no_gradient_and_no_global_random_number(tiny_scene, gaussians):
 
 
 def of(name: str, split: str, value: float) -> ViewScores:
-    return ViewScores(name, split, *[value] * 8)
+    return ViewScores(name, split, *[value] * 9)
 
 
 def test_means_leave_out_what_does_not_exist():

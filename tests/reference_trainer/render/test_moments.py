@@ -11,6 +11,11 @@ from reference_trainer.render.moments import render_moments
 BACKGROUND = torch.tensor([0.3, 0.9, 0.1], dtype=torch.float64)
 
 
+def backdrop(height, width):
+    """A different background at every pixel."""
+    return torch.rand(3, height, width, generator=torch.Generator().manual_seed(11), dtype=torch.float64)
+
+
 def dense_moments(splats, multiplier, background, width, height):
     """The same moments from the alphas of every splat at every pixel, through ca_reg's closed form."""
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -24,6 +29,7 @@ def dense_moments(splats, multiplier, background, width, height):
         which = splats.indices[order]
         multiplier = Multiplier(multiplier.mean[which], multiplier.variance[which])
     colors = splats.colors[order].expand(*alpha.shape, 3)
+    background = background if background.ndim == 1 else background.permute(1, 2, 0)
     mean, variance = pixel_moments(alpha, colors, multiplier, background=background)
     return (mean.permute(2, 0, 1), variance.permute(2, 0, 1), *alpha_moments(alpha, multiplier))
 
@@ -37,22 +43,24 @@ def per_gaussian(n):
 @pytest.mark.parametrize(
     "multiplier", [Multiplier.dropout(0.5), Multiplier.opacity_noise(0.8), per_gaussian(90)], ids=["p", "sigma", "each"]
 )
-def test_moments_equal_the_closed_form_per_pixel(multiplier):
+@pytest.mark.parametrize("background", [BACKGROUND, backdrop(21, 37)], ids=["one colour", "per pixel"])
+def test_moments_equal_the_closed_form_per_pixel(multiplier, background):
     scene = random_scene(90, 37, 21, seed=2)
     splats = splat(*scene[:4], scene.camera, colors=scene.colors)
-    ours = render_moments(splats, multiplier, background=BACKGROUND)
-    for mine, other in zip(ours, dense_moments(splats, multiplier, BACKGROUND, 37, 21), strict=True):
+    ours = render_moments(splats, multiplier, background=background)
+    for mine, other in zip(ours, dense_moments(splats, multiplier, background, 37, 21), strict=True):
         torch.testing.assert_close(mine, other, rtol=0, atol=1e-13)
 
 
-def test_gradients_equal_autograd_through_the_closed_form():
+@pytest.mark.parametrize("behind", [BACKGROUND, backdrop(13, 19)], ids=["one colour", "per pixel"])
+def test_gradients_equal_autograd_through_the_closed_form(behind):
     scene = random_scene(40, 19, 13, seed=7)
     g = torch.Generator().manual_seed(0)
     weights = torch.randn(8, 13, 19, generator=g, dtype=torch.float64)
     gradients = []
     for route in (render_moments, None):
         leaves = [x.clone().requires_grad_() for x in (*scene.tensors(), *torch.rand(2, 40, generator=g).double())]
-        background = BACKGROUND.clone().requires_grad_()
+        background = behind.clone().requires_grad_()
         splats = splat(*leaves[:4], scene.camera, colors=leaves[4])
         multiplier = per_gaussian(40)
         multiplier = Multiplier(multiplier.mean.requires_grad_(), multiplier.variance.requires_grad_())
@@ -113,9 +121,20 @@ def test_float32_stays_close_to_float64():
     assert abs(single.variance.double().mean() / exact.variance.mean() - 1) < 1e-4
 
 
-def test_nothing_in_view():
+@pytest.mark.parametrize("background", [BACKGROUND, backdrop(7, 9)], ids=["one colour", "per pixel"])
+def test_nothing_in_view(background):
     scene = random_scene(3, 9, 7, seed=1)
     splats = splat(scene.means - 10 * scene.camera.forward, *scene[1:4], scene.camera, colors=scene.colors)
-    moments = render_moments(splats, Multiplier.dropout(0.5), background=BACKGROUND)
-    assert torch.equal(moments.mean, BACKGROUND[:, None, None].expand(3, 7, 9))
+    background = background.clone().requires_grad_()
+    moments = render_moments(splats, Multiplier.dropout(0.5), background=background)
+    assert torch.equal(moments.mean, background.reshape(3, *background.shape[1:] or (1, 1)).expand(3, 7, 9))
     assert not moments.variance.any()
+    moments.mean.sum().backward()
+    assert torch.equal(background.grad, torch.full_like(background, 63 * 3 / background.numel()))
+
+
+def test_a_background_of_another_size_is_refused():
+    scene = random_scene(3, 9, 7, seed=1)
+    splats = splat(*scene[:4], scene.camera, colors=scene.colors)
+    with pytest.raises(ValueError, match=r"\(3,\) or \(3, 7, 9\), got \(3, 9, 7\)"):
+        render_moments(splats, Multiplier.dropout(0.5), background=backdrop(9, 7))

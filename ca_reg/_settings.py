@@ -1,0 +1,86 @@
+"""The settings of a score from the arguments that a caller gave: which method they mean, and its defaults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ca_reg._check import check_count, check_finite, check_rate
+from ca_reg.result import CASettings, Method
+
+__all__ = ["GROUPS", "make_settings"]
+
+GROUPS = 8
+"""Renders are pooled in at most this many groups, which bounds the memory; with fewer groups the standard error would
+be known less well (relative error about 1/sqrt(2 (groups - 1)), here 27 %)."""
+
+_APPLIES = {
+    "sampling": ("samples", "ddof"),
+    "adaptive": ("relative_error", "max_samples"),
+    "exact": (),
+    "exact_neutral": (),
+}
+_REMEDY = {
+    "sampling": "give relative_error as well for adaptive sampling",
+    "adaptive": "with relative_error the number of renders is found (up to max_samples), and ddof is 1",
+    "exact": "an exact score samples nothing",
+    "exact_neutral": "an exact score samples nothing",
+}
+
+
+def make_settings(
+    *,
+    exact: bool,
+    neutral: bool,
+    drop_rate: float,
+    threshold: float,
+    seed: int,
+    samples: int | None,
+    ddof: int | None,
+    relative_error: float | None,
+    max_samples: int | None,
+) -> CASettings:
+    """Find the method and fill in its defaults; raise if an argument is out of range or does not apply."""
+    check_rate(drop_rate, "drop_rate")
+    check_finite(threshold, "threshold")
+    check_count(seed, "seed", minimum=0)
+    method = _method(exact, neutral, relative_error)
+    given = {"samples": samples, "ddof": ddof, "relative_error": relative_error, "max_samples": max_samples}
+    for name, value in given.items():
+        if value is not None and name not in _APPLIES[method]:
+            raise ValueError(f"{name} does not apply to the method {method!r}: {_REMEDY[method]}.")
+    settings = CASettings(
+        method=method,
+        samples=None,
+        drop_rate=drop_rate,
+        threshold=threshold,
+        ddof=None,
+        seed=None,
+        relative_error=None,
+        max_samples=None,
+    )
+    if method == "sampling":
+        samples, ddof = 5 if samples is None else samples, 0 if ddof is None else ddof
+        check_count(samples, "samples", minimum=2)
+        check_count(ddof, "ddof", minimum=0)
+        if ddof >= samples:
+            raise ValueError(f"ddof must be below samples, got ddof {ddof} and {samples} samples.")
+        return replace(settings, samples=int(samples), ddof=int(ddof), seed=int(seed))
+    if relative_error is not None:
+        max_samples = 256 if max_samples is None else max_samples
+        check_finite(relative_error, "relative_error")
+        if relative_error <= 0:
+            raise ValueError(f"relative_error must be above 0, got {relative_error}; for an exact score, give exact.")
+        check_count(max_samples, "max_samples", minimum=GROUPS)
+        return replace(
+            settings, ddof=1, seed=int(seed), relative_error=float(relative_error), max_samples=int(max_samples)
+        )
+    return settings
+
+
+def _method(exact: bool, neutral: bool, relative_error: float | None) -> Method:
+    """Return the method that the arguments ask for."""
+    if exact:
+        return "exact_neutral" if neutral else "exact"
+    if neutral:
+        raise ValueError("neutral needs exact: compositing over the expected colour takes a renderer with moments.")
+    return "sampling" if relative_error is None else "adaptive"
