@@ -109,8 +109,8 @@ def measure(
 
 def evaluation_table(result: Evaluation) -> str:
     """Return one row per view and the means, in Markdown; CA in units of 1e-3."""
-    quantities = ("psnr", "ssim", "lpips", "ca", "ca_std_error", "visible", "cv")
-    unit = {"ca": 1e-3, "ca_std_error": 1e-3}
+    quantities = ("psnr", "ssim", "lpips", "ca", "ca_std_error", "ca_exact", "visible", "cv")
+    unit = {"ca": 1e-3, "ca_std_error": 1e-3, "ca_exact": 1e-3}
     title = {name: f"{name} x1e-3" if name in unit else name for name in quantities}
     rows: list[dict[str, object]] = [
         {"view": f"{view.split} {view.name}"} | {title[q]: getattr(view, q) / unit.get(q, 1) for q in quantities}

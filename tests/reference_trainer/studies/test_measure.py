@@ -75,8 +75,9 @@ def test_the_table_has_one_row_per_view_and_the_means():
     views = [ViewScores(f"v{i}", "test", 20.0 + i, 0.5, 0.25, 2e-3, 1e-4, 3e-3, 4e-3, 0.9, 0.04) for i in range(2)]
     lines = evaluation_table(Evaluation(views, 9, "vgg")).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    assert cells[0] == ["view", "psnr", "ssim", "lpips", "ca x1e-3", "ca_std_error x1e-3", "visible", "cv"]
-    assert cells[2] == ["test v0", "20", "0.5", "0.25", "2", "0.1", "0.9", "0.04"]
+    head = ["view", "psnr", "ssim", "lpips", "ca x1e-3", "ca_std_error x1e-3", "ca_exact x1e-3", "visible", "cv"]
+    assert cells[0] == head
+    assert cells[2] == ["test v0", "20", "0.5", "0.25", "2", "0.1", "4", "0.9", "0.04"]
     assert cells[4][:2] == ["mean test", "20.5"]
     assert "lpips" not in evaluation_table(Evaluation(views, 9, None))
 
