@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.scene import Scene
@@ -37,6 +38,10 @@ class SceneOptions:
     """"black" or "white" behind transparent pictures; "auto" is white for Blender scenes, else black."""
     allow_test_points: bool = False
     """Accept initial points that were triangulated from test views; such results are not comparable with others."""
+
+    def absolute(self) -> SceneOptions:
+        """Return the options with an absolute path, to be found again from another working directory."""
+        return self if self.path == "synthetic" else replace(self, path=str(Path(self.path).resolve()))
 
     def load(self, *, seed: int = 0) -> Scene:
         """Load the scene; ``seed`` decides random initial points. Errors are those of `load_scene`."""

@@ -83,7 +83,7 @@ def run_experiment(
     """
     perceptual = lpips_option(lpips, device=device)
     settings = dataclasses.asdict(config)
-    claim = {"scene": dataclasses.asdict(options), "config": settings}
+    claim = {"scene": dataclasses.asdict(options.absolute()), "config": settings}
     _refuse_other_run(out, claim)
     if (out / RESULTS).exists():
         say(f"{out}: complete, nothing to do")

@@ -30,3 +30,11 @@ def test_the_seed_moves_the_points_and_not_the_photographs():
     one, other = (SceneOptions("synthetic", downscale=8).load(seed=seed) for seed in (0, 1))
     assert not torch.equal(one.points.positions, other.points.positions)
     assert torch.equal(one.train[0].image, other.train[0].image)
+
+
+def test_absolute_options_find_the_scene_from_anywhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert SceneOptions("my/scene", images="images_8").absolute() == SceneOptions(
+        str(tmp_path.resolve() / "my" / "scene"), images="images_8"
+    )
+    assert SceneOptions("synthetic").absolute() == SceneOptions("synthetic")
