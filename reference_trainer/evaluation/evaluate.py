@@ -45,7 +45,7 @@ class Model:
         gaussians: the parameters.
         background: colour behind them, shape (3,).
         dropout: the rate p that it was trained with; it decides the drop rate of the paper's CA protocol.
-        opacity_scale: what opacities are multiplied with at test time: 1 - p, or 1 if that is already baked in.
+        opacity_scale: what opacities are multiplied with at test time: 1 - p, or 1 for inverted dropout.
         sh_degree: highest band of spherical harmonics to use; None for all.
     """
 

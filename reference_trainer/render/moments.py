@@ -140,21 +140,20 @@ def _factors(
     return _Factors(raw, alpha, m, v, expected, spread, shrink, colors), splats
 
 
-def _walk(f: _Factors, behind: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Run the recursion back to front; before each splat yield its number and mean and variance (C, T, 64) behind it.
+def _walk(f: _Factors, behind: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Run the recursion back to front; before each splat yield mean and variance (C, T, 64) of what is behind it.
 
-    It starts from what is behind all splats, (T, C, 64). After the nearest splat -1 is yielded with the pixel itself.
-    The tensors are overwritten by the next step.
+    It starts from what is behind all splats, (T, C, 64). The last to be yielded are those of the pixel itself. The
+    tensors are overwritten by the next step.
     """
-    longest = f.alpha.shape[0]
     mean = behind.transpose(0, 1).clone(memory_format=torch.contiguous_format)
     variance = torch.zeros_like(mean)
-    for i in range(longest - 1, -1, -1):
-        yield i, mean, variance
+    for i in reversed(range(f.alpha.shape[0])):
+        yield mean, variance
         contrast = f.values[i] - mean
         variance.mul_(f.shrink[i]).addcmul_(contrast * f.spread[i], contrast)
         mean.addcmul_(f.expected[i], contrast)
-    yield -1, mean, variance
+    yield mean, variance
 
 
 class _Moments(torch.autograd.Function):
@@ -168,7 +167,7 @@ class _Moments(torch.autograd.Function):
         variances = torch.zeros_like(means)
         for block in lists.blocks(_FORWARD_BLOCKS * block_size(table.device)):
             f, _ = _factors(table, values, factors, block, lists)
-            *_, (_, mean, variance) = _walk(f, behind[block.tiles])
+            *_, (mean, variance) = _walk(f, behind[block.tiles])
             means[block.tiles], variances[block.tiles] = mean.transpose(0, 1), variance.transpose(0, 1)
         ctx.save_for_backward(table, values, factors, behind)
         ctx.lists = lists
@@ -183,7 +182,7 @@ class _Moments(torch.autograd.Function):
         to_behind = upstream[0].clone()  # of the tiles without splats; the others are overwritten
         for block in lists.blocks(block_size(table.device)):
             f, splats = _factors(table, values, factors, block, lists)
-            states = [(mean.clone(), variance.clone()) for _, mean, variance in _walk(f, behind[block.tiles])]
+            states = [(mean.clone(), variance.clone()) for mean, variance in _walk(f, behind[block.tiles])]
             to_mean, to_variance = (x[block.tiles].transpose(0, 1).contiguous() for x in upstream)
             longest = f.alpha.shape[0]
             to_alpha = torch.empty_like(f.alpha)
