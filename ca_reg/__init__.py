@@ -3,7 +3,11 @@
 - :class:`GaussianDropout` and :class:`OpacityNoise` regularize the activated opacities on their way to the rasterizer;
   :func:`scale_opacity` is what dropout needs at test time.
 - :class:`CAScore` measures co-adaptation with any render callable, by sampling, or exactly if the renderer offers
-  moments; :class:`CAMonitor` logs it during training, and :func:`color_variance` is the paper's second metric.
+  moments, for which :class:`ListMoments` makes do with per-pixel lists; :func:`attribute` and :func:`total_effects`
+  tell which Gaussians it comes from. :class:`CAMonitor` logs it during training, and :func:`color_variance` is the
+  paper's second metric.
+- :class:`CAPenalty` trains with dropout or noise without sampling: the expected render, and the exact co-adaptation as
+  a term of the loss, for a renderer that offers moments.
 - :mod:`ca_reg.functional` holds the same as pure functions, :mod:`ca_reg.schedules` rates that change during training,
   :mod:`ca_reg.types` what a render callable may return, :mod:`ca_reg.dynamics` the plots of a monitor's log.
 
@@ -12,9 +16,12 @@ Importing this package loads torch and numpy only.
 """
 
 from ca_reg import functional
+from ca_reg.attribution import CAAttribution, CATotalEffects, SharesFn, attribute, total_effects
 from ca_reg.functional import ColorVariance, color_variance, scale_opacity
+from ca_reg.lists import ListMoments, PixelLists
 from ca_reg.modules import GaussianDropout, OpacityNoise
 from ca_reg.monitor import CAMonitor
+from ca_reg.penalty import CAPenalty
 from ca_reg.reason import Reason
 from ca_reg.result import CAResult, CASummary, summarize
 from ca_reg.schedules import Constant, LinearRamp, Schedule, StartStop
@@ -24,24 +31,32 @@ from ca_reg.types import MomentsFn, RenderFn, Rendering
 __version__ = "0.1.0"
 
 __all__ = [
+    "CAAttribution",
     "CAMonitor",
+    "CAPenalty",
     "CAResult",
     "CAScore",
     "CASummary",
+    "CATotalEffects",
     "ColorVariance",
     "Constant",
     "GaussianDropout",
     "LinearRamp",
+    "ListMoments",
     "MomentsFn",
     "OpacityNoise",
+    "PixelLists",
     "Reason",
     "RenderFn",
     "Rendering",
     "Schedule",
+    "SharesFn",
     "StartStop",
     "__version__",
+    "attribute",
     "color_variance",
     "functional",
     "scale_opacity",
     "summarize",
+    "total_effects",
 ]

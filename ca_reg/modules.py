@@ -2,54 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ca_reg import functional
-from ca_reg._check import check_count, check_finite, check_opacity, check_opacity_range, check_rate
-from ca_reg.schedules import Constant, Schedule, as_schedule
+from ca_reg._check import check_finite, check_rate
+from ca_reg._regularizer import Regularizer
+from ca_reg.schedules import Schedule, as_schedule
 
 __all__ = ["GaussianDropout", "OpacityNoise"]
 
 
-class _Regularizer(nn.Module):
-    """What both regularizers share: a rate that may depend on the step, and the look at the first opacities."""
-
-    def __init__(self, schedule: Schedule) -> None:
-        super().__init__()
-        self._schedule = schedule
-        self._opacity_seen = False
-        self.step = 0
-
-    def set_step(self, step: int) -> None:
-        """Tell the module the training step, at least 0. Only schedules need it."""
-        check_count(step, "step", minimum=0)
-        self.step = int(step)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return what ``state_dict`` saves: the step."""
-        return {"step": self.step}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take the step from a ``state_dict``."""
-        self.set_step(state["step"])
-
-    def _check(self, opacity: Any) -> None:
-        """Check shape and type always, and once that the values are opacities: on a GPU that look costs a wait."""
-        check_opacity(opacity)
-        if not self._opacity_seen:
-            # Compensated dropout may come before this module: it makes opacities above 1.
-            check_opacity_range(opacity, upper=math.inf)
-            self._opacity_seen = True
-
-    def _rate_repr(self) -> str:
-        return str(self._schedule.value) if isinstance(self._schedule, Constant) else repr(self._schedule)
-
-
-class GaussianDropout(_Regularizer):
+class GaussianDropout(Regularizer):
     """Drop a random subset of Gaussians in training; scale the opacities in evaluation (paper, Gaussian dropout).
 
     ``train()``: ``opacity * keep``. ``eval()``: ``opacity * (1 - p)``, the mean over all masks. With ``compensate`` the
@@ -169,7 +133,7 @@ class GaussianDropout(_Regularizer):
         return f"p={self._rate_repr()}, compensate={self.compensate}"
 
 
-class OpacityNoise(_Regularizer):
+class OpacityNoise(Regularizer):
     """Multiply opacities by random factors in training, change nothing in evaluation (paper, opacity noise).
 
     ``train()``: ``clamp(opacity * (1 + noise), 0, 1)`` with ``noise ~ N(0, sigma^2)`` per Gaussian. ``eval()``: the

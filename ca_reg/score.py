@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,6 +30,14 @@ from ca_reg.types import (
 )
 
 __all__ = ["CAScore"]
+
+
+class ExactView(NamedTuple):
+    """An exact score and what the moments callable was asked for, in its own layout; no background is the model's."""
+
+    result: CAResult
+    multiplier: Multiplier
+    background: Tensor | None
 
 
 class CAScore:
@@ -183,7 +191,7 @@ class CAScore:
         check_count(index, "index", minimum=0)
         with torch.no_grad():
             if self.exact is not None:
-                return self._exact(self.exact, opacity.detach(), view)
+                return self._exact(self.exact, opacity.detach(), view).result
             assert self.render_fn is not None
             return self._sample(self.render_fn, opacity.detach(), view, index)
 
@@ -229,26 +237,29 @@ class CAScore:
         self._tally = ViewTally()
         self._updates = 0
 
-    def _exact(self, moments_fn: MomentsFn, opacity: Tensor, view: Any) -> CAResult:
+    def _exact(self, moments_fn: MomentsFn, opacity: Tensor, view: Any) -> ExactView:
         """Read the score off the moments of the renderer."""
         settings = self.settings
         multiplier = Multiplier.dropout(settings.drop_rate)
 
-        def moments(background: Tensor | None) -> ExactMoments:
-            return read_moments(moments_fn(opacity, view, multiplier, background), layout=self.layout)
+        def moments(background: Tensor | None) -> tuple[ExactMoments, Tensor]:
+            read = read_moments(moments_fn(opacity, view, multiplier, background), layout=self.layout)
+            if read.alpha_mean is None:
+                raise TypeError("a score needs alpha_mean, the expected accumulated alpha, for its visible region.")
+            return read, read.alpha_mean
 
         if settings.method == "exact_neutral":
             # Over black the mean is sum w c, and the expected alpha sum w: no background has to be taken out again.
-            over_black = moments(opacity.new_zeros(3))
-            total = over_black.alpha_mean
+            over_black, total = moments(opacity.new_zeros(3))
             neutral = over_black.mean / torch.where(total > 0, total, 1.0)
-            image = moments(neutral if self.layout == "CHW" else neutral.permute(1, 2, 0))
+            background = neutral if self.layout == "CHW" else neutral.permute(1, 2, 0)
         else:
-            image = moments(None)
+            background = None
+        image, alpha = moments(background)
         variance = image.variance.to(torch.float64).mean(0)
-        visible = image.alpha_mean.to(variance.device) > settings.threshold
+        visible = alpha.to(variance.device) > settings.threshold
         value, reason = _mean(variance, visible)
-        return CAResult(
+        result = CAResult(
             value=value,
             std_error=0.0 if reason is Reason.OK else math.nan,
             variance=variance,
@@ -256,6 +267,7 @@ class CAScore:
             reason=reason,
             **asdict(settings),
         )
+        return ExactView(result, multiplier, background)
 
     def _sample(self, render_fn: RenderFn, opacity: Tensor, view: Any, index: int) -> CAResult:
         """Render with random masks, a fixed number of times or until the error is small enough."""

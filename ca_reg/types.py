@@ -66,7 +66,7 @@ class MomentsFn(Protocol):
 
     - ``mean``: expected colours over the background, (3, H, W), or (H, W, 3) as the layout says;
     - ``variance``: variances of the colours, same shape;
-    - ``alpha_mean``: expected accumulated alpha, (H, W), (1, H, W) or (H, W, 1).
+    - ``alpha_mean``: expected accumulated alpha, (H, W), (1, H, W) or (H, W, 1); a score needs it, a penalty does not.
 
     ``background`` is None for the model's own, one colour of shape (3,), or an image, one colour for each pixel. No
     early stop is allowed that ignores the factors: splats behind an opaque surface shine through its dropped ones.
@@ -105,12 +105,12 @@ class ExactMoments(NamedTuple):
     Args:
         mean: expected colours, shape (3, H, W).
         variance: their variances, shape (3, H, W).
-        alpha_mean: expected accumulated alpha, shape (H, W).
+        alpha_mean: expected accumulated alpha, shape (H, W); None if the callable returned none.
     """
 
     mean: Tensor
     variance: Tensor
-    alpha_mean: Tensor
+    alpha_mean: Tensor | None
 
 
 def read_rendering(result: Any, *, layout: Layout = "CHW") -> Rendering:
@@ -186,7 +186,7 @@ def read_moments(result: Any, *, layout: Layout = "CHW") -> ExactMoments:
         layout: order of the axes of the images, ``"CHW"`` or ``"HWC"``.
 
     Returns:
-        Images (3, H, W) and the expected alpha (H, W), torch tensors.
+        Images (3, H, W) and the expected alpha (H, W) or None, torch tensors.
 
     Raises:
         TypeError: if a member is missing or not floating point.
@@ -199,20 +199,21 @@ def read_moments(result: Any, *, layout: Layout = "CHW") -> ExactMoments:
         torch.Size([3, 4, 5])
     """
     check_layout(layout)
-    members = [_by_name(result, (name,)) for name in ExactMoments._fields]
-    missing = [name for name, x in zip(ExactMoments._fields, members, strict=True) if x is None]
+    images = {name: _by_name(result, (name,)) for name in ("mean", "variance")}
+    missing = [name for name, x in images.items() if x is None]
     if missing:
         raise TypeError(
             f"a moments callable returned {_describe(result)} without {', '.join(missing)}; return a mapping or object "
             f"with {', '.join(ExactMoments._fields)}."
         )
-    mean, variance = (_read_image(_as_tensor(x, "an image of moments"), layout) for x in members[:2])
+    mean, variance = (_read_image(_as_tensor(x, "an image of moments"), layout) for x in images.values())
     if variance.shape != mean.shape:
         raise ValueError(
             f"mean and variance of a moments callable must have one shape, got {tuple(mean.shape)} and "
             f"{tuple(variance.shape)} (as CHW)."
         )
-    return ExactMoments(mean, variance, _read_alpha(members[2], mean))
+    alpha = _by_name(result, ("alpha_mean",))
+    return ExactMoments(mean, variance, None if alpha is None else _read_alpha(alpha, mean))
 
 
 def check_layout(layout: str) -> None:

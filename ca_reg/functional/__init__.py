@@ -1,6 +1,7 @@
 """The pure functions behind the modules: they hold no state, change no argument and draw only when asked to."""
 
 from ca_reg.functional.dropout import apply_dropout, draw_keep_mask, gaussian_dropout
+from ca_reg.functional.expected_losses import expected_absolute_error, expected_squared_error
 from ca_reg.functional.moments import (
     PixelMoments,
     alpha_moments,
@@ -25,6 +26,8 @@ __all__ = [
     "contributions",
     "draw_keep_mask",
     "draw_opacity_noise",
+    "expected_absolute_error",
+    "expected_squared_error",
     "first_order_variance",
     "gaussian_dropout",
     "neutral_background",

@@ -8,26 +8,34 @@ from pathlib import Path
 import ca_reg
 
 EXPECTED = {
+    "CAAttribution",
     "CAMonitor",
+    "CAPenalty",
     "CAResult",
     "CAScore",
     "CASummary",
+    "CATotalEffects",
     "ColorVariance",
     "Constant",
     "GaussianDropout",
     "LinearRamp",
+    "ListMoments",
     "MomentsFn",
     "OpacityNoise",
+    "PixelLists",
     "Reason",
     "RenderFn",
     "Rendering",
     "Schedule",
+    "SharesFn",
     "StartStop",
     "__version__",
+    "attribute",
     "color_variance",
     "functional",
     "scale_opacity",
     "summarize",
+    "total_effects",
 }
 
 

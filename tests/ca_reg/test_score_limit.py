@@ -176,8 +176,12 @@ def test_exact_without_visible_pixels_or_with_broken_colours_is_a_reason():
 
 def test_what_is_not_moments_is_refused():
     image = torch.rand(3, 4, 5)
-    with pytest.raises(TypeError, match="without variance, alpha_mean"):
+    with pytest.raises(TypeError, match="without variance"):
         read_moments({"mean": image})
+    without_alpha = {"mean": image, "variance": image}
+    assert read_moments(without_alpha).alpha_mean is None
+    with pytest.raises(TypeError, match="a score needs alpha_mean"):
+        CAScore(exact=lambda *arguments: without_alpha)(torch.rand(2), None)
     with pytest.raises(TypeError, match="without mean"):
         read_moments((image, image, image[0]))  # which is which cannot be told
     with pytest.raises(ValueError, match="one shape"):

@@ -1,0 +1,192 @@
+"""Which Gaussians co-adapt: two readings of the exact score, one value per Gaussian each.
+
+*Shares* (:func:`attribute`) add up to the score. The variance of a pixel is a sum over its splats, front to back
+(:func:`ca_reg.functional.contributions`); a share is what the factor of a Gaussian adds to what is known from those in
+front, averaged over those behind. A Gaussian that matters only together with another one in front of it has the whole
+of what they do together.
+
+*Total effects* (:func:`total_effects`) do not ask for an order. The score is linear in the variance ``v_i`` of the
+factor of every single Gaussian, so ``v_i dV/dv_i`` is exactly by how much the score would fall if this Gaussian alone
+were made certain, its factor fixed at its mean (Sobol's total index, times the variance). What several Gaussians do
+together counts for each of them: no total effect is below the share, and they add up to more than the score.
+
+Either way pixels are those of the score, and only the draws of the Gaussian itself are removed: a Gaussian that is
+deleted would also change the mean.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from ca_reg._check import check_opacity, check_opacity_range
+from ca_reg.functional import Multiplier
+from ca_reg.reason import Reason
+from ca_reg.result import CAResult
+from ca_reg.score import CAScore, ExactView
+from ca_reg.types import read_moments
+
+__all__ = ["CAAttribution", "CATotalEffects", "SharesFn", "attribute", "total_effects"]
+
+
+class SharesFn(Protocol):
+    """A renderer that attributes: ``shares_fn(opacity, view, multiplier, background, weights)``.
+
+    It takes what :class:`~ca_reg.types.MomentsFn` takes, and weights of the pixels, (H, W) in float64. For every
+    Gaussian it returns its :func:`~ca_reg.functional.contributions`, mean over RGB, summed over the pixels with these
+    weights: a tensor of shape (N,), 0 for Gaussians that the view does not see. :meth:`ca_reg.ListMoments.shares` is
+    one.
+
+    Example:
+        >>> from ca_reg.functional import contributions
+        >>> def shares_fn(
+        ...     opacity: Tensor, view: Tensor, multiplier: Multiplier, background: Tensor | None, weights: Tensor
+        ... ) -> Tensor:  # every pixel shows the same Gaussians, in the order of their index
+        ...     return contributions(opacity, view, multiplier, background=background).mean(-1) * weights.sum()
+    """
+
+    def __call__(
+        self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None, weights: Tensor, /
+    ) -> Tensor:
+        """Return the shares of a weighted sum of the variance, one per Gaussian."""
+
+
+class CAAttribution(NamedTuple):
+    """The score of a view, split over the Gaussians.
+
+    Args:
+        shares: at least 0, shape (N,), float64; they add up to ``result.value`` up to rounding. All 0 if the score has
+            no value.
+        result: the score; its ``reason`` says why it has no value.
+    """
+
+    shares: Tensor
+    result: CAResult
+
+
+class CATotalEffects(NamedTuple):
+    """By how much the score of a view would fall if a single Gaussian were certain.
+
+    Args:
+        effects: at least 0, shape (N,), float64. All 0 if the score has no value.
+        result: the score; its ``reason`` says why it has no value.
+    """
+
+    effects: Tensor
+    result: CAResult
+
+
+def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor, view: Any) -> CAAttribution:
+    """Measure a view exactly and split the score over the Gaussians.
+
+    Costs the score and one call of ``shares_fn``.
+
+    Args:
+        score: an exact one, :class:`~ca_reg.CAScore` with ``exact``, neutral or not.
+        shares_fn: of the same renderer as the moments of the score.
+        opacity: activated opacities in [0, 1], shape (N,) or (N, 1), neither dropped nor scaled.
+        view: passed on to both callables.
+
+    Returns:
+        Shares that add up to the score, and the score.
+
+    Raises:
+        TypeError: as for a call of the score.
+        ValueError: as for a call of the score, if the score is not exact, or ``shares_fn`` returns another shape.
+
+    Example:
+        A red Gaussian in front of a blue one in front of black.
+
+        >>> from ca_reg import ListMoments, PixelLists
+        >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
+        ...     both = torch.tensor([0, 1])
+        ...     return PixelLists(both, torch.zeros(2, dtype=torch.int64), opacity, torch.eye(3)[[0, 2]], 1, 1)
+        >>> moments = ListMoments(lists_fn)
+        >>> score = CAScore(exact=moments, threshold=0.5)
+        >>> shares, result = attribute(score, moments.shares, torch.tensor([0.5, 0.8]), None)
+        >>> shares, round(result.value, 6)
+        (tensor([0.0242, 0.0333], dtype=torch.float64), 0.0575)
+    """
+    result, multiplier, background = _measure(score, opacity, view, "attribute")
+    if result.reason is not Reason.OK:
+        return CAAttribution(_nothing(opacity), result)
+    weights = result.visible.to(torch.float64) / result.visible.sum()
+    with torch.no_grad():
+        shares = shares_fn(opacity.detach(), view, multiplier, background, weights)
+    if shares.shape != opacity.shape[:1]:
+        raise ValueError(
+            f"shares_fn must return one share per Gaussian, shape ({opacity.shape[0]},), got {tuple(shares.shape)}; "
+            "put zeros where the view does not see a Gaussian."
+        )
+    return CAAttribution(shares.to(torch.float64), result)
+
+
+def total_effects(score: CAScore, opacity: Tensor, view: Any) -> CATotalEffects:
+    """Measure a view exactly and find by how much the score would fall if a single Gaussian were certain.
+
+    Costs the score and a backward pass through its moments callable, which must be differentiable in the multiplier: it
+    is called with a variance per Gaussian, shape (N,), that requires grad.
+
+    Args:
+        score: an exact one, :class:`~ca_reg.CAScore` with ``exact``, neutral or not.
+        opacity: activated opacities in [0, 1], shape (N,) or (N, 1), neither dropped nor scaled.
+        view: passed on to the moments callable.
+
+    Returns:
+        The total effects, and the score.
+
+    Raises:
+        TypeError: as for a call of the score.
+        ValueError: as for a call of the score, if the score is not exact, or its moments are not differentiable.
+
+    Example:
+        As for :func:`attribute`; what the two do together now counts for the one in front as well.
+
+        >>> from ca_reg import ListMoments, PixelLists
+        >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
+        ...     both = torch.tensor([0, 1])
+        ...     return PixelLists(both, torch.zeros(2, dtype=torch.int64), opacity, torch.eye(3)[[0, 2]], 1, 1)
+        >>> total_effects(CAScore(exact=ListMoments(lists_fn), threshold=0.5), torch.tensor([0.5, 0.8]), None).effects
+        tensor([0.0275, 0.0333], dtype=torch.float64)
+    """
+    result, multiplier, background = _measure(score, opacity, view, "total_effects")
+    if result.reason is not Reason.OK:
+        return CATotalEffects(_nothing(opacity), result)
+    assert score.exact is not None
+    opacity = opacity.detach()
+    spread = opacity.new_full(opacity.shape[:1], float(multiplier.variance)).requires_grad_()
+    gradient = None
+    with torch.enable_grad():
+        answer = score.exact(opacity, view, Multiplier(multiplier.mean, spread), background)
+        variance = read_moments(answer, layout=score.layout).variance
+        if variance.requires_grad:
+            value = variance.mean(0)[result.visible.to(variance.device)].mean()
+            (gradient,) = torch.autograd.grad(value, spread, allow_unused=True)
+    if gradient is None:
+        raise ValueError(
+            "the moments callable of the score returned a variance without a gradient in multiplier.variance; it must "
+            "compute it from that tensor with autograd on (no torch.no_grad, detach or numpy in it). If it cannot, use "
+            "attribute, which takes no gradient."
+        )
+    return CATotalEffects((gradient * spread.detach()).to(torch.float64), result)
+
+
+def _measure(score: CAScore, opacity: Tensor, view: Any, name: str) -> ExactView:
+    """Call an exact score, and keep the multiplier and the background that it asked for."""
+    if score.exact is None:
+        raise ValueError(
+            f"{name} needs an exact score, got the method {score.settings.method!r}; make it with "
+            "CAScore(exact=moments_fn). A renderer without moments that can list the Gaussians of its pixels has them "
+            "by ca_reg.ListMoments."
+        )
+    check_opacity(opacity)
+    check_opacity_range(opacity)
+    with torch.no_grad():
+        return score._exact(score.exact, opacity.detach(), view)
+
+
+def _nothing(opacity: Tensor) -> Tensor:
+    """Return a zero per Gaussian."""
+    return torch.zeros(opacity.shape[0], dtype=torch.float64, device=opacity.device)

@@ -1,0 +1,126 @@
+"""Pixel losses in expectation over the random factors, from the mean and the variance of the pixel alone.
+
+Training with sampled dropout or noise minimises the expectation of the loss of one draw, with the noise of that draw in
+every gradient. With the exact moments of a pixel (:func:`~ca_reg.functional.pixel_moments`) the expectation itself can
+be minimised: of the squared error exactly, of the absolute error as far as the pixel is normally distributed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ca_reg._check import check_finite
+
+__all__ = ["expected_absolute_error", "expected_squared_error"]
+
+# Standard deviation of what rounding to 8 bits adds to a photograph: uniform over one of 255 steps.
+_ROUNDING = 1.0 / (255.0 * math.sqrt(12.0))
+
+# From here on erf is 1 in float64, and exp(-x^2) = 4e-44 is lost beside the 14 standard deviations that x stands for.
+_FAR = 10.0
+
+
+def expected_squared_error(mean: Tensor, variance: Tensor, target: Tensor) -> Tensor:
+    """Return ``E (x - t)^2 = (mean - t)^2 + variance``, pixel by pixel.
+
+    Exact for every distribution of ``x``: the bias-variance decomposition. Its average is what dropout training
+    minimises on average when the loss is the mean squared error.
+
+    Args:
+        mean: expected value of ``x``, any shape, floating point.
+        variance: its variance, at least 0, same shape.
+        target: ``t``, same shape.
+
+    Returns:
+        The expectation of every element, same shape.
+
+    Raises:
+        TypeError: if an argument is not a floating-point tensor.
+        ValueError: if the shapes differ.
+
+    Example:
+        One splat of alpha 0.8, white over black, is kept in half of the draws, so a pixel is 0 or 0.8:
+
+        >>> mean, variance, target = torch.tensor([0.4]), torch.tensor([0.16]), torch.tensor([0.7])
+        >>> expected_squared_error(mean, variance, target)  # (0.7^2 + 0.1^2) / 2
+        tensor([0.2500])
+    """
+    _check(mean, variance, target)
+    return (mean - target).square() + variance
+
+
+def expected_absolute_error(mean: Tensor, variance: Tensor, target: Tensor, *, min_std: float = _ROUNDING) -> Tensor:
+    """Return ``E |x - t|`` for a normal ``x``, pixel by pixel: the mean of the folded normal distribution.
+
+    With ``d = mean - t``, ``s^2 = variance + min_std^2``, and phi the density of the standard normal distribution,
+
+        E = s sqrt(2 / pi) exp(-d^2 / (2 s^2)) + d erf(d / (s sqrt(2)))
+        dE/dd = erf(d / (s sqrt(2))),        dE/dvariance = phi(d / s) / s
+
+    An approximation, because few splats make up a pixel, and their sum is not normal. Against the enumeration of all
+    masks of random lists of 8 splats with alphas up to 0.99, under dropout of 0.2, it is off by
+
+    ======================================= ================= =================
+    standard deviation of ``d``             0.05              0.2
+    ======================================= ================= =================
+    pixel by pixel, mean relative error     17 %              8 %
+    sum over all pixels                     +6 %              +0.5 %
+    sum of ``|d|`` instead, for comparison  -51 %             -11 %
+    ======================================= ================= =================
+
+    and in single pixels by up to a factor of 3. Whatever the distribution,
+    ``|d| <= E |x - t| <= sqrt(d^2 + variance)`` (Jensen), and the approximation lies in the same interval, with
+    ``s^2`` in place of the variance: it is never below the absolute error of the mean.
+
+    ``min_std`` keeps the gradient in the variance finite, which is ``1 / (s sqrt(2 pi))`` at ``d = 0``. It stands for a
+    normal error of that size in the target. The default is the rounding of a photograph to 8 bits, 0.29 / 255; it adds
+    at most ``min_std sqrt(2 / pi)``, 0.23 / 255, to the result, and that only where ``d`` and the variance are 0.
+
+    Args:
+        mean: expected value of ``x``, any shape, float32 or float64.
+        variance: its variance, at least 0, same shape. Not checked: looking at it would wait for the GPU.
+        target: ``t``, same shape.
+        min_std: smallest standard deviation, above 0, in the units of ``x``; its square must not underflow.
+
+    Returns:
+        The expectation of every element, same shape.
+
+    Raises:
+        TypeError: if an argument is not a floating-point tensor, or ``min_std`` not a number.
+        ValueError: if the shapes differ, or ``min_std`` is not finite or too small for the dtype.
+
+    Example:
+        The splat of :func:`expected_squared_error`. The exact value is (0.7 + 0.1) / 2 = 0.4:
+
+        >>> mean, variance, target = torch.tensor([0.4]), torch.tensor([0.16]), torch.tensor([0.7])
+        >>> expected_absolute_error(mean, variance, target)
+        tensor([0.4049])
+    """
+    _check(mean, variance, target)
+    check_finite(min_std, "min_std")
+    floor = min_std * min_std
+    if min_std <= 0 or floor < torch.finfo(variance.dtype).tiny:
+        raise ValueError(
+            f"min_std must be above 0 and its square must not underflow in {variance.dtype}, got {min_std}; "
+            "it keeps the gradient finite where the variance is 0."
+        )
+    d = mean - target
+    s = (variance + floor).sqrt()
+    # The bound changes nothing but keeps 0 * inf out of the gradient.
+    z = (d / (math.sqrt(2.0) * s)).clamp(-_FAR, _FAR)
+    return math.sqrt(2.0 / math.pi) * s * (-z.square()).exp() + d * z.erf()
+
+
+def _check(mean: Tensor, variance: Tensor, target: Tensor) -> None:
+    """Raise unless all three are floating-point tensors of one shape."""
+    from kornia.core.check import KORNIA_CHECK_IS_TENSOR
+
+    for name, x in (("mean", mean), ("variance", variance), ("target", target)):
+        KORNIA_CHECK_IS_TENSOR(x, f"{name} must be a torch tensor.")
+        if not x.is_floating_point():
+            raise TypeError(f"{name} must be a floating-point tensor, got {x.dtype}; scale images to [0, 1].")
+        if x.shape != mean.shape:
+            raise ValueError(f"{name} must have the shape of mean, {tuple(mean.shape)}, got {tuple(x.shape)}.")

@@ -1,0 +1,158 @@
+"""Dropout training without sampling: the expected render, and the exact co-adaptation as a term of the loss."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from ca_reg._check import check_finite
+from ca_reg._regularizer import Regularizer
+from ca_reg.functional import Multiplier
+from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.types import Layout, MomentsFn, check_layout, read_moments
+
+__all__ = ["CAPenalty", "PenalizedRender"]
+
+
+class PenalizedRender(NamedTuple):
+    """What :class:`CAPenalty` returns.
+
+    Args:
+        image: expected render over the random factors, shape (3, H, W).
+        variance: variance of its pixels, at least 0, shape (3, H, W).
+        penalty: weight times the mean of the variance, a scalar: add it to the loss.
+    """
+
+    image: Tensor
+    variance: Tensor
+    penalty: Tensor
+
+
+class CAPenalty(Regularizer):
+    """Render what dropout training sees on average, and penalise what it sees vary.
+
+    For the mean squared error, the expected loss of dropout training is the loss of the expected render plus the mean
+    variance of its pixels, exactly:
+
+        E mse(sample, target) = mse(image, target) + penalty        (weight 1)
+
+    so two lines replace the sampled render and its loss, and no gradient carries sampling noise:
+
+        image, variance, penalty = ca_penalty(gaussians.get_opacity, view)
+        loss = mse(image, target) + penalty
+
+    For the absolute error, the main term of the 3DGS loss, the variance enters in another way:
+    ``loss = expected_absolute_error(image, variance, target).mean()`` (:mod:`ca_reg.functional`), without ``penalty``.
+    With any other loss, ``penalty`` is a regularizer of its own, whose weight is a free choice.
+
+    ``image`` is also the render for test time, the one with all opacities multiplied by the mean of the multiplier. The
+    two are equal but for what the renderer does to large and small alphas (for a mean of at most 1, and with R the
+    range of the colours and the background): its clamp at 0.99 comes before the factor here and after it there, which
+    moves a colour by at most ``R / 99``, whatever the length of the list; its cut-off at 1/255 leaves out splats of
+    scaled opacity, ``R / 255`` at most for each. ``train()`` and ``eval()`` make no difference. No Gaussian is dropped,
+    so density control needs no masked radii.
+
+    Limits: the factors must be independent, one per Gaussian. The clamp and the cut-off of alphas that a factor changed
+    are left out, see :class:`~ca_reg.functional.Multiplier`; plain dropout is exact but for the early stop of a sampled
+    render.
+
+    Convention: opacities are activated, in [0, 1], (N,) or (N, 1), neither dropped nor scaled; images are (3, H, W).
+    The first call looks at the opacities.
+
+    Args:
+        moments_fn: the renderer, differentiable, ``moments_fn(opacity, view, multiplier, background)``; see
+            :class:`ca_reg.types.MomentsFn`.
+        multiplier: moments of the factor, such as ``Multiplier.dropout(0.2)``; or a callable that makes them from the
+            opacities of shape (N,), at every call, such as ``lambda o: Multiplier.clamped_noise(o, 0.8)``. Gradients
+            flow through it.
+        weight: factor of the penalty, at least 0, or a schedule of it.
+        layout: order of the axes of the images that ``moments_fn`` returns, ``"CHW"`` or ``"HWC"``.
+
+    Attributes:
+        weight: the factor at the present step.
+        step: the training step, set with :meth:`set_step` and saved in ``state_dict``.
+
+    Raises:
+        TypeError: if an argument is of the wrong type.
+        ValueError: if a constant ``weight`` is negative or not finite, or ``layout`` is unknown; a schedule is checked
+            at each use.
+
+    Example:
+        One white splat over black that half of the draws leave out: a pixel is 0 or 0.8.
+
+        >>> import torch
+        >>> from ca_reg.functional import alpha_moments
+        >>> def moments_fn(
+        ...     opacity: Tensor, view: None, multiplier: Multiplier, background: Tensor | None
+        ... ) -> dict[str, Tensor]:
+        ...     mean, variance = (x.expand(3, 4, 4) for x in alpha_moments(opacity, multiplier))
+        ...     return {"mean": mean, "variance": variance, "alpha_mean": mean[0]}
+        >>> ca_penalty = CAPenalty(moments_fn, Multiplier.dropout(0.5))
+        >>> image, variance, penalty = ca_penalty(torch.tensor([0.8]), None)
+        >>> torch.nn.functional.mse_loss(image, torch.full((3, 4, 4), 0.7)) + penalty  # (0.7^2 + 0.1^2) / 2
+        tensor(0.2500)
+    """
+
+    def __init__(
+        self,
+        moments_fn: MomentsFn,
+        multiplier: Multiplier | Callable[[Tensor], Multiplier],
+        *,
+        weight: float | Schedule = 1.0,
+        layout: Layout = "CHW",
+    ) -> None:
+        if not callable(moments_fn):
+            raise TypeError(
+                "moments_fn must be callable as moments_fn(opacity, view, multiplier, background), got "
+                f"{type(moments_fn).__name__}."
+            )
+        if not isinstance(multiplier, Multiplier) and not callable(multiplier):
+            raise TypeError(
+                "multiplier must be a Multiplier, such as Multiplier.dropout(0.2), or a callable that makes one from "
+                f"the opacities, got {type(multiplier).__name__}."
+            )
+        if not callable(weight):
+            check_finite(weight, "weight", minimum=0.0)
+        check_layout(layout)
+        super().__init__(as_schedule(weight))
+        self.moments_fn = moments_fn
+        self.multiplier = multiplier
+        self.layout: Layout = layout
+
+    @property
+    def weight(self) -> float:
+        """The factor of the penalty at the present step."""
+        weight = self._schedule(self.step)
+        check_finite(weight, f"weight at step {self.step}", minimum=0.0)
+        return weight
+
+    def forward(self, opacity: Tensor, view: Any, background: Tensor | None = None) -> PenalizedRender:
+        """Render the moments of one view.
+
+        Args:
+            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+            view: passed on to ``moments_fn`` as it is.
+            background: passed on likewise: None for the model's own, one colour (3,), or an image.
+
+        Returns:
+            The expected render, its variance and the penalty, all with gradients.
+
+        Raises:
+            TypeError: if ``opacity``, a multiplier or the moments are not of the right type.
+            ValueError: if a shape is wrong, or ``opacity`` looks like logits.
+        """
+        self._check(opacity)
+        multiplier = self.multiplier
+        if not isinstance(multiplier, Multiplier):
+            multiplier = multiplier(opacity.reshape(-1))
+            if not isinstance(multiplier, Multiplier):
+                raise TypeError(f"the multiplier callable must return a Multiplier, got {type(multiplier).__name__}.")
+        moments = read_moments(self.moments_fn(opacity, view, multiplier, background), layout=self.layout)
+        return PenalizedRender(moments.mean, moments.variance, self.weight * moments.variance.mean())
+
+    def extra_repr(self) -> str:
+        """Return the arguments, for ``print``."""
+        made = self.multiplier if isinstance(self.multiplier, Multiplier) else getattr(self.multiplier, "__name__", "?")
+        return f"multiplier={made}, weight={self._rate_repr()}"
