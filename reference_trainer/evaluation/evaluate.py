@@ -17,7 +17,8 @@ from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.evaluation.pictures import error_map, heat_map, save_png, side_by_side
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render import Rendering, splat
+from reference_trainer.render import Rendering, Splats, splat
+from reference_trainer.render.attribution import variance_shares
 from reference_trainer.render.moments import MomentImages, render_moments
 from reference_trainer.render.statistics import color_variance_map
 from reference_trainer.scenes.scene import Scene, View
@@ -77,8 +78,32 @@ class Model:
             multiplier: moments of the factors.
             background: instead of the model's own, shape (3,) or (3, H, W).
         """
+        return render_moments(self.splats(opacities, view), multiplier, background=self._behind(background))
+
+    def shares(
+        self, opacities: Tensor, view: View, multiplier: Multiplier, background: Tensor | None, weights: Tensor
+    ) -> Tensor:
+        """Attribute a weighted sum of the variance to the Gaussians: the shares callable of `ca_reg.attribute`.
+
+        Args:
+            opacities: activated, shape (N,).
+            view: what to render.
+            multiplier: moments of the factors.
+            background: instead of the model's own, shape (3,) or (3, H, W).
+            weights: of the pixels, shape (H, W).
+
+        Returns:
+            Shares of all Gaussians, shape (N,), float64; 0 for those outside the view.
+        """
+        splats = self.splats(opacities, view)
+        shares = torch.zeros(len(self.gaussians), dtype=torch.float64, device=opacities.device)
+        shares[splats.indices] = variance_shares(splats, multiplier, weights, background=self._behind(background))
+        return shares
+
+    def splats(self, opacities: Tensor, view: View) -> Splats:
+        """Project the model with given opacities (N,) and list it per tile."""
         model = self.gaussians
-        splats = splat(
+        return splat(
             model.means,
             model.quaternions,
             model.scales,
@@ -87,7 +112,10 @@ class Model:
             sh=model.sh,
             sh_degree=self.sh_degree,
         )
-        return render_moments(splats, multiplier, background=self.background if background is None else background)
+
+    def _behind(self, background: Tensor | None) -> Tensor:
+        """The background that was asked for, or the model's own."""
+        return self.background if background is None else background
 
     def ca_score(
         self, *, samples: int = 5, drop_rate: float | None = None, seed: int = 0, render_fn: RenderFn | None = None

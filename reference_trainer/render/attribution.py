@@ -1,0 +1,74 @@
+"""What every Gaussian contributes to the variance of a rendering under random factors."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ca_reg.functional import Multiplier
+from reference_trainer.render.footprints import pack, tile
+from reference_trainer.render.recursion import (
+    behind_tiles,
+    contrasts,
+    evaluate_terms,
+    in_front,
+    moment_block_size,
+    moments_per_splat,
+)
+from reference_trainer.render.renderer import Splats
+
+__all__ = ["variance_shares"]
+
+
+@torch.no_grad()
+def variance_shares(
+    splats: Splats, multiplier: Multiplier, weights: Tensor, *, background: Tensor | None = None
+) -> Tensor:
+    """Attribute a weighted sum of the variance over the pixels to the Gaussians; the shares add up to it.
+
+    A Gaussian's share at a pixel is its summand of the variance, `ca_reg.functional.contributions`, mean over RGB.
+
+    Args:
+        splats: of the full model, with its plain opacities.
+        multiplier: moments of the factor, as for `render_moments`.
+        weights: of the pixels, shape (H, W); 1 / count in the region of a score makes shares of the score.
+        background: as for `render_moments`.
+
+    Returns:
+        One share for every projected Gaussian (``splats.indices``), shape (M,), float64.
+
+    Raises:
+        ValueError: if the weights or the background have another shape.
+
+    Example:
+        >>> from reference_trainer.camera import Camera
+        >>> from reference_trainer.render import splat
+        >>> from reference_trainer.render.moments import render_moments
+        >>> camera = Camera(torch.eye(4), 50.0, 50.0, 8.0, 8.0, 16, 16)
+        >>> means, quaternions = torch.tensor([[0.0, 0, 1], [0.1, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]] * 2)
+        >>> splats = splat(means, quaternions, torch.full((2, 3), 0.2), torch.full((2,), 0.5), camera,
+        ...                colors=torch.tensor([[0.0, 0, 0], [1.0, 1, 1]]))
+        >>> shares = variance_shares(splats, Multiplier.dropout(0.5), torch.full((16, 16), 1 / 256))
+        >>> variance = render_moments(splats, Multiplier.dropout(0.5)).variance
+        >>> torch.allclose(shares.sum(), variance.double().mean())
+        True
+    """
+    shape = (splats.lists.height, splats.lists.width)
+    if weights.shape != shape:
+        raise ValueError(f"weights must have one value per pixel, shape {shape}, got {tuple(weights.shape)}.")
+    table = pack(splats.projection.means, splats.projection.factors, splats.opacities)
+    values = torch.nn.functional.pad(splats.colors, (0, 0, 0, 1))
+    factors = moments_per_splat(multiplier, splats)
+    behind = behind_tiles(background, splats)
+    per_pixel = tile(weights[None].to(splats.opacities), splats.lists)[:, 0]
+    sums = torch.zeros(values.shape[0], dtype=torch.float64, device=values.device)
+    for block in splats.lists.blocks(moment_block_size(table.device)):
+        terms, _ = evaluate_terms(table, values, factors, block, splats.lists)
+        scale = in_front(terms).mul_(terms.spread).mul_(per_pixel[block.tiles] / 3.0)
+        shares = torch.empty(scale.shape[:2], dtype=torch.float64, device=values.device)
+        mean = behind[block.tiles].transpose(0, 1).contiguous()
+        contrast = torch.empty_like(mean)
+        for i in contrasts(terms, mean, [contrast] * len(scale)):
+            shares[i] = (contrast.square().sum(0) * scale[i]).sum(-1, dtype=torch.float64)
+        sums.index_add_(0, block.gaussians.T.flatten(), shares.flatten())
+    return sums[:-1]
