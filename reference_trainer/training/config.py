@@ -26,6 +26,10 @@ class TrainConfig:
     """Standard deviation sigma of the multiplicative opacity noise; the paper uses up to 0.8."""
     clip_noise: bool = False
     """Clip the noise to [-sigma, sigma], as the authors' released code does; the paper does not."""
+    analytic: bool = False
+    """Train on the expectation over dropout and noise, computed exactly, instead of one random draw."""
+    ca_weight: float = 0.0
+    """With analytic: weight of the mean pixel variance, the exact co-adaptation, on top of the expected loss."""
     regularize_from: int = 0
     """First step that uses dropout and noise."""
 
@@ -85,6 +89,10 @@ class TrainConfig:
             raise ValueError(f"dropout must be in [0, 1), got {self.dropout}: 0 turns it off.")
         if self.noise < 0:
             raise ValueError(f"noise must not be negative, got {self.noise}: 0 turns it off.")
+        if self.ca_weight < 0 or (self.ca_weight > 0 and not self.analytic):
+            raise ValueError(f"ca_weight must not be negative and needs analytic=True, got {self.ca_weight}.")
+        if self.analytic and self.dropout == 0 == self.noise:
+            raise ValueError("analytic training needs something to average over: set dropout or noise.")
         for name in ("seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")

@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["photometric_loss", "ssim_map"]
+from ca_reg.functional import expected_absolute_error
+
+__all__ = ["expected_photometric_loss", "photometric_loss", "ssim_map"]
 
 _RADIUS = 5
 _SIGMA = 1.5
@@ -40,13 +42,44 @@ def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -
         >>> image.grad.shape
         torch.Size([3, 16, 16])
     """
-    if not 0 <= lambda_dssim <= 1:
-        raise ValueError(f"lambda_dssim must lie in [0, 1], got {lambda_dssim}.")
+    _check_lambda(lambda_dssim)
     similarity, error = ssim_map(image, target).mean(), (image - target).abs().mean()
     return error * (1 - lambda_dssim) + (1 - similarity) * lambda_dssim
 
 
-def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+def expected_photometric_loss(mean: Tensor, variance: Tensor, target: Tensor, lambda_dssim: float = 0.2) -> Tensor:
+    """Return what `photometric_loss` is on average over random images of this mean and variance, approximately.
+
+    The absolute error is that of normal pixels (`ca_reg.functional.expected_absolute_error`). In SSIM every local
+    moment is replaced by its expectation, and the variance counts as contrast within the window, not of the window's
+    mean, as it does where splats are smaller than the window.
+
+    Args:
+        mean: expected rendering, shape (3, H, W).
+        variance: of its pixels, at least 0, same shape.
+        target: the photograph, same shape; a constant.
+        lambda_dssim: weight of the structural term, in [0, 1].
+
+    Returns:
+        A scalar, differentiable (once) in mean and variance; without variance, `photometric_loss` but for the rounding
+        error that the photograph is given.
+
+    Raises:
+        ValueError: as `photometric_loss`.
+
+    Example:
+        >>> mean, target = torch.full((3, 16, 16), 0.5), torch.full((3, 16, 16), 0.7)
+        >>> losses = [expected_photometric_loss(mean, mean * v, target).item() for v in (0.0, 0.1)]
+        >>> losses[0] < losses[1]
+        True
+    """
+    _check_lambda(lambda_dssim)
+    similarity = ssim_map(mean, target, variance).mean()
+    error = expected_absolute_error(mean, variance, target).mean()
+    return error * (1 - lambda_dssim) + (1 - similarity) * lambda_dssim
+
+
+def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None = None) -> Tensor:
     """Return the SSIM of every pixel and channel: 11 x 11 Gaussian window, sigma 1.5, zeros beyond the border.
 
     The same quantity as `reference_trainer.evaluation.metrics.ssim` before its mean. It is written here because forward
@@ -56,9 +89,10 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     Args:
         image: a rendering, shape (C, H, W), floating point.
         target: the photograph, same shape, dtype and device; a constant.
+        variance: of a random image whose mean is ``image``, added to the variance within the window; None for none.
 
     Returns:
-        Similarities in [-1, 1] up to rounding, shape (C, H, W), differentiable (once) in ``image``.
+        Similarities in [-1, 1] up to rounding, shape (C, H, W), differentiable (once) in ``image`` and ``variance``.
 
     Raises:
         ValueError: if the images disagree or are not (C, H, W), or if ``target`` requires a gradient.
@@ -79,17 +113,26 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
         )
     if target.requires_grad:
         raise ValueError("target is a constant here, but it requires a gradient: pass target.detach().")
-    similarity: Tensor = _SSIMMap.apply(image, target)  # type: ignore[no-untyped-call]
+    similarity: Tensor = _SSIMMap.apply(image, target, variance)  # type: ignore[no-untyped-call]
     return similarity
+
+
+def _check_lambda(lambda_dssim: float) -> None:
+    """Raise unless it is a weight in [0, 1]."""
+    if not 0 <= lambda_dssim <= 1:
+        raise ValueError(f"lambda_dssim must lie in [0, 1], got {lambda_dssim}.")
 
 
 class _SSIMMap(torch.autograd.Function):
     """SSIM = a1 a2 / (b1 b2) with the hand-derived gradient in the image."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, variance: Tensor | None) -> Tensor:
         # Only the sum of the two variances enters, so four maps are blurred and not five.
-        maps = torch.stack([image, target, image * target, torch.addcmul(image * image, target, target)])
+        squares = torch.addcmul(image * image, target, target)
+        if variance is not None:
+            squares.add_(variance)
+        maps = torch.stack([image, target, image * target, squares])
         mean_x, mean_y, mean_xy, mean_squares = _blur(maps)
         product, squares = mean_x * mean_y, torch.addcmul(mean_x * mean_x, mean_y, mean_y)
         a1, a2 = 2 * product + _C1, (mean_xy - product).mul_(2).add_(_C2)
@@ -100,7 +143,7 @@ class _SSIMMap(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, Tensor | None]:
         image, target, mean_x, mean_y, a1, a2, b1, b2, similarity = ctx.saved_tensors
         weight = gradient / (b1 * b2)
         weighted = weight * similarity
@@ -110,7 +153,8 @@ class _SSIMMap(torch.autograd.Function):
         to_product = weight * a1
         # The window is symmetric and the padding is zero, so the blur is its own transpose.
         mean, squares, product = _blur(torch.stack([to_mean, to_squares, to_product]))
-        return mean.addcmul_(image, squares).addcmul_(target, product).mul_(2), None
+        to_image = mean.addcmul_(image, squares).addcmul_(target, product).mul_(2)
+        return to_image, None, squares if ctx.needs_input_grad[2] else None
 
 
 def _blur(maps: Tensor) -> Tensor:

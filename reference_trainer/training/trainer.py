@@ -18,13 +18,14 @@ from reference_trainer.model.density import DensityStatistics, decay_opacity, de
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render import Rendering
+from reference_trainer.render import Splats
 from reference_trainer.scenes.points import mean_neighbor_distance
-from reference_trainer.scenes.scene import PointCloud, Scene
+from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.expectation import render_expectation
 from reference_trainer.training.interruption import TrainingInterrupted, hold_interrupts
-from reference_trainer.training.losses import photometric_loss
+from reference_trainer.training.losses import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream, view_order
 
 __all__ = ["Trainer", "TrainingStoppedError"]
@@ -126,21 +127,18 @@ class Trainer:
         config, step = self.config, self.step
         self._control_density()
         view = self.views[view_order(config.seed, step, len(self.views))]
-        rendering = render_gaussians(
-            self.gaussians, view.camera, self.background, opacities=self._regularized(), sh_degree=self.sh_degree
-        )
-        loss = photometric_loss(rendering.image, view.image, config.lambda_dssim)
+        loss, image, splats = self._expected_loss(view) if self._is_analytic() else self._sampled_loss(view)
         value = loss.item()
         if not math.isfinite(value):
             raise TrainingStoppedError(f"the loss became {value} at step {step + 1}: lower the learning rates.")
-        if rendering.splats.indices.numel() > 0:
+        if splats.indices.numel() > 0:
             loss.backward()  # type: ignore[no-untyped-call]
-            self._count(rendering, view.camera)
+            self._count(splats, view.camera)
             self.optimizer.set_means_rate(self._means_rate(step))
             self.optimizer.step()
         self.step += 1
         with torch.no_grad():
-            mse = torch.mean((rendering.image.clamp(0, 1) - view.image) ** 2).item()
+            mse = torch.mean((image.clamp(0, 1) - view.image) ** 2).item()
         return value, mse
 
     def save(self, path: Path) -> None:
@@ -217,9 +215,29 @@ class Trainer:
             opacities = regularizer(opacities, generator=stream(self.config.seed, self.step, name, self.device))
         return opacities
 
-    def _count(self, rendering: Rendering, camera: Camera) -> None:
+    def _is_analytic(self) -> bool:
+        """Whether this step trains on the expectation over the regularizers."""
+        return self.config.analytic and self.step >= self.config.regularize_from
+
+    def _sampled_loss(self, view: View) -> tuple[Tensor, Tensor, Splats]:
+        """Loss and image of one draw of the regularizers."""
+        rendering = render_gaussians(
+            self.gaussians, view.camera, self.background, opacities=self._regularized(), sh_degree=self.sh_degree
+        )
+        return (
+            photometric_loss(rendering.image, view.image, self.config.lambda_dssim),
+            rendering.image,
+            rendering.splats,
+        )
+
+    def _expected_loss(self, view: View) -> tuple[Tensor, Tensor, Splats]:
+        """Loss and image in expectation over the regularizers."""
+        out = render_expectation(self.gaussians, view.camera, self.background, self.config, sh_degree=self.sh_degree)
+        loss = expected_photometric_loss(out.image, out.variance, view.image, self.config.lambda_dssim)
+        return loss + out.penalty, out.image, out.splats
+
+    def _count(self, splats: Splats, camera: Camera) -> None:
         """Enter the Gaussians that were drawn into the densification statistics."""
-        splats = rendering.splats
         gradient = splats.projection.means.grad
         assert gradient is not None
         drawn = splats.lists.touched
