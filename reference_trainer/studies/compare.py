@@ -27,14 +27,17 @@ TABLE = "comparison.md"
 
 
 def strategies(config: TrainConfig, *, dropout: float = 0.2, noise: float = 0.8) -> dict[str, TrainConfig]:
-    """Return the four settings of the paper's comparison: baseline, dropout, opacity noise, both.
+    """Return the four settings of the paper's comparison, and dropout and noise in expectation instead of sampled.
 
     Example:
-        >>> {name: (c.dropout, c.noise) for name, c in strategies(TrainConfig()).items()}
-        {'baseline': (0.0, 0.0), 'dropout': (0.2, 0.0), 'noise': (0.0, 0.8), 'both': (0.2, 0.8)}
+        >>> analytic = strategies(TrainConfig())["analytic-dropout"]
+        >>> analytic.dropout, analytic.noise, analytic.analytic
+        (0.2, 0.0, True)
     """
     rates = {"baseline": (0.0, 0.0), "dropout": (dropout, 0.0), "noise": (0.0, noise), "both": (dropout, noise)}
-    return {name: dataclasses.replace(config, dropout=p, noise=sigma) for name, (p, sigma) in rates.items()}
+    sampled = {name: dataclasses.replace(config, dropout=p, noise=sigma) for name, (p, sigma) in rates.items()}
+    expected = {f"analytic-{name}": dataclasses.replace(sampled[name], analytic=True) for name in ("dropout", "noise")}
+    return sampled | expected
 
 
 @dataclass(frozen=True)

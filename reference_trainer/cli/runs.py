@@ -1,24 +1,21 @@
-"""The command line ``ca-reg``: one class per command, its fields are the options."""
+"""Commands about runs: train, evaluate, render, compare. One class per command, its fields are the options."""
 
 from __future__ import annotations
 
-import argparse
-import logging
-import sys
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import PRESETS, TrainConfig
 
-__all__ = ["main"]
+__all__ = ["Compare", "Demo", "Evaluate", "Render", "Train"]
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
+Strategy = Literal["baseline", "dropout", "noise", "both", "analytic-dropout", "analytic-noise"]
 
 
 @dataclass(frozen=True)
@@ -155,7 +152,7 @@ class Compare:
     config: Config = field(default_factory=lambda: PRESETS["fsgs"])
     preset: Literal["fsgs", "inria", "binocular"] = "fsgs"
     """Schedule of a published code base; other options override it."""
-    strategies: tuple[Literal["baseline", "dropout", "noise", "both"], ...] = ("baseline", "dropout", "noise", "both")
+    strategies: tuple[Strategy, ...] = ("baseline", "dropout", "noise", "both")
     """What to compare; --dropout and --noise give the rates (0.2 and 0.8 if they are 0)."""
     seeds: int = 3
     """Number of seeds."""
@@ -172,7 +169,7 @@ class Compare:
         """Run the command."""
         from reference_trainer.studies.compare import compare, report, strategies
 
-        config = replace(self.config, dropout=0.0, noise=0.0)
+        config = replace(self.config, dropout=0.0, noise=0.0, analytic=False, ca_weight=0.0)
         every = strategies(config, dropout=self.config.dropout or 0.2, noise=self.config.noise or 0.8)
         chosen: dict[str, TrainConfig] = {name: every[name] for name in self.strategies}
         comparison = compare(
@@ -187,46 +184,3 @@ class Compare:
             say=print,
         )
         report(comparison, self.out, say=print)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run ``ca-reg``; errors that a user can mend end with one line and exit code 2, an interruption with 130."""
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    try:
-        _parse(arguments)()
-    except (ValueError, OSError, ImportError, RuntimeError) as error:
-        print(f"ca-reg: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("\nca-reg: interrupted; the same command continues where it was.", file=sys.stderr)
-        sys.exit(130)
-
-
-def _parse(arguments: Sequence[str]) -> Callable[[], None]:
-    """Return the command with its options; exits where they cannot be understood."""
-    peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
-    peek.add_argument("--preset", choices=list(PRESETS), default="fsgs")
-    preset = peek.parse_known_args(arguments)[0].preset
-    config = PRESETS[preset]
-    commands: Any = tyro.extras.subcommand_type_from_defaults(
-        {
-            "demo": Demo(),
-            "train": Train(out=Path("runs/train"), config=config, preset=preset),
-            "evaluate": Evaluate(),
-            "render": Render(run=Path("runs/train")),
-            "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
-        },
-    )
-    command: Callable[[], None] = tyro.cli(
-        commands,
-        prog="ca-reg",
-        description="Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting.",
-        args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
-    )
-    return command
-
-
-if __name__ == "__main__":
-    main()
