@@ -15,7 +15,7 @@ __all__ = ["demo"]
 def demo(
     out: Path, *, iterations: int = 1000, seeds: Sequence[int] = (0,), jobs: int = 2, say: Callable[[str], None] = print
 ) -> Comparison:
-    """Train the built-in scene with every strategy and report.
+    """Train the built-in scene with every strategy that samples, and report.
 
     Args:
         out: folder for everything; an interrupted demo continues.
@@ -26,7 +26,7 @@ def demo(
     """
     config = with_preset("fsgs", iterations=iterations, opacity_reset_every=0, densify_from=min(500, iterations // 4))
     options = SceneOptions("synthetic")
-    chosen = strategies(config)
+    chosen = {name: settings for name, settings in strategies(config).items() if not settings.analytic}
     say(f"Training the built-in scene (3 views) with {', '.join(chosen)}: {iterations} steps each, {jobs} at a time.")
     comparison = compare(options, chosen, seeds, out, jobs=jobs, monitor_every=max(1, iterations // 5), say=say)
     report(comparison, out, say=say)

@@ -52,8 +52,16 @@ def test_test_time_scale(compensate, scale):
         ("opacity_reset_every", -5),
         ("opacity_decay", 0.0),
         ("opacity_decay", 1.1),
+        ("ca_weight", -1.0),
+        ("ca_weight", 1.0),
     ],
 )
 def test_impossible_values_are_named(field, value):
     with pytest.raises(ValueError, match=f"{field} must .*{value}"):
         TrainConfig(**{field: value})
+
+
+def test_an_expectation_needs_something_random():
+    with pytest.raises(ValueError, match="set dropout or noise"):
+        TrainConfig(analytic=True)
+    assert TrainConfig(analytic=True, noise=0.1, ca_weight=2.0).ca_weight == 2.0

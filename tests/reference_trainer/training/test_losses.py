@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.evaluation.metrics import ssim
-from reference_trainer.training.losses import photometric_loss, ssim_map
+from reference_trainer.training.losses import expected_photometric_loss, photometric_loss, ssim_map
 
 
 def pair(height: int, width: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -122,3 +122,48 @@ def test_wrong_images(image, target, message):
 def test_wrong_weight(weight):
     with pytest.raises(ValueError, match="lambda_dssim"):
         photometric_loss(*pair(4, 4), weight)
+
+
+def test_a_variance_adds_to_the_contrast_within_the_window():
+    image, target = pair(9, 14)
+    variance = 0.1 * pair(9, 14, seed=5)[0]
+    offsets = torch.arange(-5, 6, dtype=torch.float64)
+    line = torch.exp(-offsets.square() / (2 * 1.5**2))
+    window = (line[:, None] * line[None] / line.sum() ** 2)[1:10, 1:10]  # around the centre, all of a 9 x 9 image
+    x, y, v = image[:, :, :9], target[:, :, :9], variance[:, :, :9]
+    mx, my = (window * x).sum((1, 2)), (window * y).sum((1, 2))
+    vx, vy = (window * x**2).sum((1, 2)) - mx**2, (window * y**2).sum((1, 2)) - my**2
+    cov = (window * x * y).sum((1, 2)) - mx * my
+    expected_v = (window * v).sum((1, 2))
+    expected = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + expected_v + vy + 9e-4))
+    torch.testing.assert_close(ssim_map(x, y, v)[:, 4, 4], expected, atol=1e-13, rtol=0)
+
+
+def test_gradient_of_the_expected_loss():
+    image, target = pair(8, 9)
+    variance = 0.1 * pair(8, 9, seed=5)[0]
+    leaves = (image.requires_grad_(), variance.requires_grad_())
+    assert torch.autograd.gradcheck(lambda x, v: expected_photometric_loss(x, v, target, 0.3), leaves)
+
+
+def test_without_variance_the_expected_loss_is_the_loss():
+    image, target = pair(20, 30)
+    expected = expected_photometric_loss(image, torch.zeros_like(image), target, 0.3)
+    # The rounding error that the photograph is given adds at most 0.23 / 255 to the absolute error of a pixel.
+    assert 0 <= (expected - photometric_loss(image, target, 0.3)).item() < 0.7 * 0.24 / 255
+
+
+def test_the_expected_loss_is_near_the_mean_over_random_images():
+    image, target = pair(60, 80)
+    variance = 0.02 * pair(60, 80, seed=5)[0]
+    generator = torch.Generator().manual_seed(1)
+    losses = torch.stack(
+        [
+            photometric_loss(image + variance.sqrt() * torch.randn(image.shape, generator=generator).double(), target)
+            for _ in range(40)
+        ]
+    )
+    # Pixels are normal here and independent, as the formula takes them; what is left is the curvature of SSIM.
+    expected = expected_photometric_loss(image, variance, target).item()
+    assert expected == pytest.approx(losses.mean().item(), rel=0.01)
+    assert abs(photometric_loss(image, target).item() / losses.mean().item() - 1) > 0.05
