@@ -6,14 +6,15 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
-from reference_trainer.render.footprints import pack, tile
+from reference_trainer.render.footprints import footprints, pack, pad, tile
 from reference_trainer.render.recursion import (
     behind_tiles,
     contrasts,
     evaluate_terms,
     in_front,
     moment_block_size,
-    moments_per_splat,
+    multiplier_rows,
+    of_entries,
 )
 from reference_trainer.render.renderer import Splats
 
@@ -57,18 +58,23 @@ def variance_shares(
     if weights.shape != shape:
         raise ValueError(f"weights must have one value per pixel, shape {shape}, got {tuple(weights.shape)}.")
     table = pack(splats.projection.means, splats.projection.factors, splats.opacities)
-    values = torch.nn.functional.pad(splats.colors, (0, 0, 0, 1))
-    factors = moments_per_splat(multiplier, splats)
+    values = pad(splats.colors)
+    factors = multiplier_rows(multiplier, splats)
     behind = behind_tiles(background, splats)
     per_pixel = tile(weights[None].to(splats.opacities), splats.lists)[:, 0]
-    sums = torch.zeros(values.shape[0], dtype=torch.float64, device=values.device)
-    for block in splats.lists.blocks(moment_block_size(table.device)):
-        terms, _ = evaluate_terms(table, values, factors, block, splats.lists)
-        scale = in_front(terms).mul_(terms.spread).mul_(per_pixel[block.tiles] / 3.0)
-        shares = torch.empty(scale.shape[:2], dtype=torch.float64, device=values.device)
-        mean = behind[block.tiles].transpose(0, 1).contiguous()
-        contrast = torch.empty_like(mean)
-        for i in contrasts(terms, mean, [contrast] * len(scale)):
-            shares[i] = (contrast.square().sum(0) * scale[i]).sum(-1, dtype=torch.float64)
-        sums.index_add_(0, block.gaussians.T.flatten(), shares.flatten())
+    sums = torch.zeros(values.shape[1], dtype=torch.float64, device=values.device)
+    for chunk in splats.lists.chunks(moment_block_size(table.device)):
+        polynomial = footprints(table, chunk, splats.lists).polynomial
+        v, f = of_entries(values, chunk), of_entries(factors, chunk)
+        shares = sums.new_empty(1, chunk.gaussians.shape[0])
+        for block in chunk.blocks:
+            terms = evaluate_terms(polynomial, v, f, block)
+            numbers = chunk.tiles[block.tiles]
+            scale = in_front(terms).mul_(terms.spread).mul_(per_pixel[numbers].T / 3.0)
+            mean = behind[numbers].permute(1, 2, 0).contiguous()
+            contrast = torch.empty_like(mean)
+            of_block = block.of(shares)[0]
+            for i in contrasts(terms, mean, [contrast] * len(scale)):
+                of_block[:, i] = (contrast.square().sum(0) * scale[i]).sum(0, dtype=torch.float64)
+        sums.index_add_(0, chunk.gaussians, shares[0])
     return sums[:-1]

@@ -5,6 +5,8 @@ Nothing of the size of the pixel-Gaussian pairs outlives a block: the backward p
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -13,19 +15,18 @@ from torch import Tensor
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from reference_trainer.render.footprints import (
     PIXELS,
-    Footprints,
     block_size,
     footprints,
-    gather,
     monomials,
     pack,
+    pad,
     table_gradient,
     tile,
     untile,
 )
-from reference_trainer.render.tiles import Block, TileLists
+from reference_trainer.render.tiles import Block, Chunk, TileLists
 
-__all__ = ["BlockAlphas", "block_alphas", "composite"]
+__all__ = ["BlockAlphas", "Workspace", "block_alphas", "composite"]
 
 
 class BlockAlphas(NamedTuple):
@@ -44,20 +45,45 @@ class BlockAlphas(NamedTuple):
     passed: Tensor
 
 
-def block_alphas(table: Tensor, block: Block, lists: TileLists) -> tuple[BlockAlphas, Footprints]:
-    """Evaluate the alphas and blend weights of a block; not differentiable, work buffers are overwritten."""
-    splats = footprints(table, block, lists)
-    pixels = monomials(table.dtype, table.device).expand(block.tiles.shape[0], PIXELS, 6)
-    raw = torch.bmm(pixels, splats.polynomial).exp2_()
-    torch.threshold_(raw, MIN_ALPHA, 0.0)
-    alpha = raw.clamp(max=MAX_ALPHA)
-    passed = 1.0 - alpha
-    transmittance = passed.cumprod(-1)
+class Workspace:
+    """Buffers of the size of a block that are used again by the next one: fresh memory costs page faults.
+
+    Args:
+        count: the number of buffers.
+        chunk: whose blocks they are for.
+        like: a tensor of their dtype and device.
+    """
+
+    def __init__(self, count: int, chunk: Chunk, like: Tensor) -> None:
+        largest = max(math.prod(block.shape) for block in chunk.blocks) * PIXELS
+        self._buffers = [like.new_empty(largest) for _ in range(count)]
+
+    def of(self, block: Block) -> list[Tensor]:
+        """Return the buffers as (T, 64, L)."""
+        tiles, length = block.shape
+        return [buffer[: tiles * PIXELS * length].view(tiles, PIXELS, length) for buffer in self._buffers]
+
+
+def block_alphas(polynomial: Tensor, block: Block, buffers: Sequence[Tensor]) -> BlockAlphas:
+    """Evaluate the alphas and blend weights of a block; not differentiable.
+
+    Args:
+        polynomial: of the chunk's entries, shape (6, E).
+        block: of the chunk.
+        buffers: four of shape (T, 64, L), which receive the result.
+    """
+    raw, weights, transmittance, passed = buffers
+    pixels = monomials(polynomial.dtype, polynomial.device).expand(block.shape[0], PIXELS, 6)
+    torch.bmm(pixels, block.of(polynomial).transpose(0, 1), out=raw)
+    torch.threshold_(raw.exp2_(), MIN_ALPHA, 0.0)
+    torch.clamp(raw, max=MAX_ALPHA, out=weights)
+    torch.sub(raw.new_ones(()), weights, out=passed)
+    torch.cumprod(passed, -1, out=transmittance)
     # A pixel ends at the first splat that would leave too little light: from there on the transmittance counts as 0, so
     # all weights are 0, and in the backward pass so is everything behind.
     torch.threshold_(transmittance, MIN_TRANSMITTANCE, 0.0)
     transmittance.div_(passed)
-    return BlockAlphas(raw, alpha.mul_(transmittance), transmittance, passed), splats
+    return BlockAlphas(raw, weights.mul_(transmittance), transmittance, passed)
 
 
 class _Composite(torch.autograd.Function):
@@ -68,10 +94,17 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, values: Tensor, lists: TileLists) -> Tensor:
-        sums = table.new_zeros(lists.lengths.shape[0], values.shape[1], PIXELS)
-        for block in lists.blocks(block_size(table.device)):
-            alphas, _ = block_alphas(table, block, lists)
-            sums[block.tiles] = torch.bmm(gather(values, block), alphas.weights.transpose(1, 2))
+        sums = table.new_zeros(lists.lengths.shape[0], values.shape[0], PIXELS)
+        for chunk in lists.chunks(block_size(table.device)):
+            polynomial = footprints(table, chunk, lists).polynomial
+            of_entries = values.index_select(1, chunk.gaussians)
+            workspace = Workspace(4, chunk, table)
+            parts = sums.new_empty(chunk.tiles.shape[0], *sums.shape[1:])
+            for block in chunk.blocks:
+                alphas = block_alphas(polynomial, block, workspace.of(block))
+                v = block.of(of_entries).transpose(0, 1)
+                torch.bmm(v, alphas.weights.transpose(1, 2), out=parts[block.tiles])
+            sums[chunk.tiles] = parts
         ctx.save_for_backward(table, values)
         ctx.lists = lists
         return untile(sums, lists)
@@ -81,21 +114,31 @@ class _Composite(torch.autograd.Function):
         table, values = ctx.saved_tensors
         lists: TileLists = ctx.lists
         upstream = tile(gradients[0], lists)
-        sums = table.new_zeros(table.shape[1], table.shape[0] + values.shape[1])
-        for block in lists.blocks(block_size(table.device)):
-            alphas, splats = block_alphas(table, block, lists)
-            g, v = upstream[block.tiles], gather(values, block)
-            # Alphas: a splat adds T_i v_i itself and dims by 1 / (1 - alpha_i) the sum of all behind it.
-            along = torch.bmm(g.transpose(1, 2), v)
-            behind = torch.mul(alphas.weights, along).cumsum_(-1)
-            behind = torch.sub(behind[..., -1:], behind)
-            along.mul_(alphas.transmittance).sub_(behind.div_(alphas.passed)).mul_(alphas.raw)
-            pixels = monomials(table.dtype, table.device).T.expand(block.tiles.shape[0], 6, PIXELS)
-            geometry = table_gradient(splats, torch.bmm(pixels, along))
-            # Values: each splat receives its weight times the pixel's gradient.
-            rows = torch.cat([geometry, torch.bmm(g, alphas.weights)], dim=1)
-            sums.index_add_(0, block.gaussians.flatten(), rows.transpose(1, 2).flatten(0, 1))
-        return sums[:, : table.shape[0]].T, sums[:, table.shape[0] :], None
+        rows = table.shape[0]
+        sums = table.new_zeros(rows + values.shape[0], table.shape[1])
+        pixels = monomials(table.dtype, table.device).T
+        for chunk in lists.chunks(block_size(table.device)):
+            splats = footprints(table, chunk, lists)
+            of_entries = values.index_select(1, chunk.gaussians)
+            of_tiles = upstream[chunk.tiles]
+            to_entries = table.new_empty(rows + values.shape[0], chunk.gaussians.shape[0])
+            workspace = Workspace(6, chunk, table)
+            for block in chunk.blocks:
+                *buffers, along, behind = workspace.of(block)
+                alphas = block_alphas(splats.polynomial, block, buffers)
+                g, v = of_tiles[block.tiles], block.of(of_entries).transpose(0, 1)
+                # Alphas: a splat adds T_i v_i itself and dims by 1 / (1 - alpha_i) the sum of all behind it.
+                torch.bmm(g.transpose(1, 2), v, out=along)
+                torch.mul(alphas.weights, along, out=behind).cumsum_(-1)
+                behind.sub_(behind[..., -1:].clone()).div_(alphas.passed)  # its negative
+                along.mul_(alphas.transmittance).add_(behind).mul_(alphas.raw)
+                to_block = block.of(to_entries).transpose(0, 1)
+                to_block[:, :rows] = torch.bmm(pixels.expand(along.shape[0], rows, PIXELS), along)
+                # Values: each splat receives its weight times the pixel's gradient.
+                to_block[:, rows:] = torch.bmm(g, alphas.weights)
+            to_entries[:rows] = table_gradient(splats, to_entries[:rows])
+            sums.index_add_(1, chunk.gaussians, to_entries)
+        return sums[:rows], sums[rows:], None
 
 
 def composite(means: Tensor, factors: Tensor, opacities: Tensor, values: Tensor, lists: TileLists) -> Tensor:
@@ -113,8 +156,7 @@ def composite(means: Tensor, factors: Tensor, opacities: Tensor, values: Tensor,
     Returns:
         The sums, shape (C, H, W).
     """
-    absent = values.new_zeros(1, values.shape[1])
     result: Tensor = _Composite.apply(  # type: ignore[no-untyped-call]
-        pack(means, factors, opacities), torch.cat([values, absent]), lists
+        pack(means, factors, opacities), pad(values), lists
     )
     return result

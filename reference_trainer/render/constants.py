@@ -28,5 +28,8 @@ TILE: Final = 8
 BLOCK_ELEMENTS_CPU: Final = 1 << 17
 """Pixel-Gaussian pairs held at once on a CPU: temporaries of 512 KiB in float32 stay in the cache."""
 
+CHUNK_ENTRIES: Final = 1 << 19
+"""List entries (a Gaussian in a tile) expanded at once: some 100 bytes each while they are composited."""
+
 BLOCK_ELEMENTS_CUDA: Final = 1 << 25
 """Pixel-Gaussian pairs held at once on a GPU: 128 MiB temporaries keep it busy and the number of launches low."""

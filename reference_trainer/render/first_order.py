@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA
-from reference_trainer.render.footprints import PIXELS, block_size, footprints, gather, monomials, pack, untile
+from reference_trainer.render.footprints import PIXELS, block_size, footprints, monomials, pack, pad, untile
 from reference_trainer.render.renderer import Splats
 
 __all__ = ["first_order_map"]
@@ -43,13 +43,15 @@ def first_order_map(splats: Splats, multiplier: Multiplier) -> Tensor:
     spread = multiplier.variance
     if isinstance(spread, Tensor):
         spread = spread[splats.indices].to(splats.colors)[:, None]
-    weights = torch.nn.functional.pad(spread * splats.colors.square(), (0, 0, 0, 1))
+    weights = pad(spread * splats.colors.square())
     sums = table.new_zeros(lists.lengths.shape[0], 3, PIXELS)
-    for block in lists.blocks(block_size(table.device)):
-        polynomial = footprints(table, block, lists).polynomial
-        pixels = monomials(table.dtype, table.device).expand(block.tiles.shape[0], PIXELS, 6)
-        alpha = torch.bmm(pixels, polynomial).exp2_()
-        torch.threshold_(alpha, MIN_ALPHA, 0.0)
-        squares = alpha.clamp_(max=MAX_ALPHA).square_()
-        sums[block.tiles] = torch.bmm(gather(weights, block), squares.transpose(1, 2))
+    for chunk in lists.chunks(block_size(table.device)):
+        polynomial = footprints(table, chunk, lists).polynomial
+        of_entries = weights.index_select(1, chunk.gaussians)
+        for block in chunk.blocks:
+            pixels = monomials(table.dtype, table.device).expand(block.shape[0], PIXELS, 6)
+            alpha = torch.bmm(pixels, block.of(polynomial).transpose(0, 1)).exp2_()
+            torch.threshold_(alpha, MIN_ALPHA, 0.0)
+            squares = alpha.clamp_(max=MAX_ALPHA).square_()
+            sums[chunk.tiles[block.tiles]] = torch.bmm(block.of(of_entries).transpose(0, 1), squares.transpose(1, 2))
     return untile(sums, lists)

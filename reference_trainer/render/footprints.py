@@ -14,16 +14,16 @@ import torch
 from torch import Tensor
 
 from reference_trainer.render.constants import BLOCK_ELEMENTS_CPU, BLOCK_ELEMENTS_CUDA, TILE
-from reference_trainer.render.tiles import Block, TileLists
+from reference_trainer.render.tiles import Chunk, TileLists
 
 __all__ = [
     "PIXELS",
     "Footprints",
     "block_size",
     "footprints",
-    "gather",
     "monomials",
     "pack",
+    "pad",
     "table_gradient",
     "tile",
     "untile",
@@ -64,7 +64,7 @@ def monomials(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 class Footprints(NamedTuple):
-    """The polynomials of a block, shape (T, 6, L), and what their derivatives need, each of shape (T, L)."""
+    """The polynomials of a chunk's entries, shape (6, E), and what their derivatives need, each of shape (E,)."""
 
     polynomial: Tensor
     dx: Tensor
@@ -76,15 +76,14 @@ class Footprints(NamedTuple):
     w2: Tensor
 
 
-def footprints(table: Tensor, block: Block, lists: TileLists) -> Footprints:
+def footprints(table: Tensor, chunk: Chunk, lists: TileLists) -> Footprints:
     """Expand log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2 around every tile's centre."""
-    rows = table.index_select(1, block.gaussians.flatten()).view(-1, *block.gaussians.shape)
-    mean_x, mean_y, l11, l21, l22, log_opacity = rows.unbind(0)
-    columns = lists.columns
-    dx = mean_x - ((block.tiles % columns) * TILE + TILE / 2)[:, None]
-    dy = mean_y - (torch.div(block.tiles, columns, rounding_mode="floor") * TILE + TILE / 2)[:, None]
+    mean_x, mean_y, l11, l21, l22, log_opacity = table.index_select(1, chunk.gaussians).unbind(0)
+    row = torch.div(chunk.tile_of, lists.columns, rounding_mode="floor")
+    dx = mean_x - ((chunk.tile_of - row * lists.columns) * TILE + TILE / 2)
+    dy = mean_y - (row * TILE + TILE / 2)
     # Squaring w1 and w2, which are small wherever alpha is not, avoids the cancellation of a dx^2 + 2 b dx dy + c dy^2.
-    w1, w2 = l11 * dx + l21 * dy, l22 * dy
+    w1, w2 = torch.addcmul(l11 * dx, l21, dy), l22 * dy
     polynomial = torch.stack(
         [
             log_opacity - _HALF * (w1 * w1 + w2 * w2),
@@ -93,23 +92,22 @@ def footprints(table: Tensor, block: Block, lists: TileLists) -> Footprints:
             -_HALF * (l11 * l11),
             -2 * _HALF * (l11 * l21),
             -_HALF * (l21 * l21 + l22 * l22),
-        ],
-        dim=1,
+        ]
     )
     return Footprints(polynomial, dx, dy, l11, l21, l22, w1, w2)
 
 
 def table_gradient(k: Footprints, sums: Tensor) -> Tensor:
-    """Carry a gradient from the polynomials of a block back to the rows of the table.
+    """Carry a gradient from the polynomials of a chunk back to the rows of the table.
 
     Args:
         k: the footprints.
-        sums: gradient with respect to ln alpha, times each monomial, summed over the tile's pixels, shape (T, 6, L).
+        sums: gradient with respect to ln alpha, times each monomial, summed over the tile's pixels, shape (6, E).
 
     Returns:
-        Gradient with respect to the rows of the table, shape (T, 6, L).
+        Gradient with respect to the rows of the table, shape (6, E).
     """
-    c, cx, cy, cxx, cxy, cyy = sums.unbind(1)
+    c, cx, cy, cxx, cxy, cyy = sums.unbind(0)
     w1 = k.l11 * cx + k.l21 * cy - k.w1 * c
     w2 = k.l22 * cy - k.w2 * c
     return torch.stack(
@@ -120,9 +118,13 @@ def table_gradient(k: Footprints, sums: Tensor) -> Tensor:
             k.w1 * cy - k.l11 * cxy - k.l21 * cyy + k.dy * w1,
             k.w2 * cy - k.l22 * cyy + k.dy * w2,
             c * _LN_2,
-        ],
-        dim=1,
+        ]
     )
+
+
+def pad(values: Tensor) -> Tensor:
+    """Return values (M, C) of M splats as rows (C, M + 1), the absent splat's being 0."""
+    return torch.nn.functional.pad(values.T, (0, 1))
 
 
 def untile(tiles: Tensor, lists: TileLists) -> Tensor:
@@ -137,9 +139,3 @@ def tile(image: Tensor, lists: TileLists) -> Tensor:
     padding = (0, lists.columns * TILE - lists.width, 0, lists.rows * TILE - lists.height)
     grid = torch.nn.functional.pad(image, padding).view(-1, lists.rows, TILE, lists.columns, TILE)
     return grid.permute(1, 3, 0, 2, 4).reshape(lists.rows * lists.columns, -1, PIXELS)
-
-
-def gather(values: Tensor, block: Block) -> Tensor:
-    """Gather values of shape (M + 1, C) into (T, C, L), those of a block's splats."""
-    rows = values.index_select(0, block.gaussians.flatten()).view(*block.gaussians.shape, -1)
-    return rows.transpose(1, 2).contiguous()

@@ -8,14 +8,16 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
-from reference_trainer.render.footprints import PIXELS, monomials, pack, table_gradient, tile, untile
+from reference_trainer.render.footprints import PIXELS, footprints, monomials, pack, pad, table_gradient, tile, untile
 from reference_trainer.render.recursion import (
+    Terms,
     behind_tiles,
     contrasts,
     evaluate_terms,
     in_front,
     moment_block_size,
-    moments_per_splat,
+    multiplier_rows,
+    of_entries,
 )
 from reference_trainer.render.renderer import Splats
 from reference_trainer.render.tiles import TileLists
@@ -74,9 +76,8 @@ def render_moments(
     if alpha:  # one more colour, white over black
         values = torch.nn.functional.pad(values, (0, 1), value=1.0)
         behind = torch.nn.functional.pad(behind, (0, 0, 0, 1))
-    absent = torch.nn.functional.pad(values, (0, 0, 0, 1))
     mean, variance = _Moments.apply(  # type: ignore[no-untyped-call]
-        table, absent, moments_per_splat(multiplier, splats), behind, splats.lists
+        table, pad(values), multiplier_rows(multiplier, splats), behind, splats.lists
     )
     if not alpha:
         return MomentImages(mean, variance, None, None)
@@ -92,67 +93,94 @@ class _Moments(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         means = behind.clone()
         variances = torch.zeros_like(means)
-        for block in lists.blocks(moment_block_size(table.device)):
-            terms, _ = evaluate_terms(table, values, factors, block, lists)
-            weights = in_front(terms).mul_(terms.spread).unbind(0)
-            mean = behind[block.tiles].transpose(0, 1).contiguous()
-            variance, contrast, weighted = torch.zeros_like(mean), torch.empty_like(mean), torch.empty_like(mean)
-            for i in contrasts(terms, mean, [contrast] * len(weights)):
-                torch.mul(contrast, weights[i], out=weighted)
-                variance.addcmul_(weighted, contrast)
-            means[block.tiles], variances[block.tiles] = mean.transpose(0, 1), variance.transpose(0, 1)
+        for chunk in lists.chunks(moment_block_size(table.device)):
+            polynomial = footprints(table, chunk, lists).polynomial
+            v, f = of_entries(values, chunk), of_entries(factors, chunk)
+            for block in chunk.blocks:
+                terms = evaluate_terms(polynomial, v, f, block)
+                numbers = chunk.tiles[block.tiles]
+                weights = in_front(terms).mul_(terms.spread).unbind(0)
+                mean = behind[numbers].permute(1, 2, 0).contiguous()
+                variance, contrast, weighted = torch.zeros_like(mean), torch.empty_like(mean), torch.empty_like(mean)
+                for i in contrasts(terms, mean, [contrast] * len(weights)):
+                    torch.mul(contrast, weights[i], out=weighted)
+                    variance.addcmul_(weighted, contrast)
+                means[numbers], variances[numbers] = mean.permute(2, 0, 1), variance.permute(2, 0, 1)
         ctx.save_for_backward(table, values, factors, behind)
         ctx.lists = lists
         return untile(means, lists), untile(variances, lists)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor | None, Tensor, None]:
         table, values, factors, behind = ctx.saved_tensors
         lists: TileLists = ctx.lists
         upstream = [tile(gradient, lists) for gradient in gradients]
-        sums = table.new_zeros(table.shape[1], 6 + values.shape[1] + 2)
+        sums = table.new_zeros(6 + values.shape[0] + 2, table.shape[1])
         to_behind = upstream[0].clone()  # of the tiles without splats; the others are overwritten
-        for block in lists.blocks(moment_block_size(table.device)):
-            terms, splats = evaluate_terms(table, values, factors, block, lists)
-            longest = terms.alpha.shape[0]
-            to_mean, to_variance = (x[block.tiles].transpose(0, 1).contiguous() for x in upstream)
-            kept = to_mean.new_empty(longest, *to_mean.shape).unbind(0)
-            weighted = torch.empty_like(to_mean)
-            # With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
-            # hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}: walked back to front, as division would fail at 0.
-            to_weight, hidden = torch.empty_like(terms.alpha), torch.zeros_like(terms.alpha)
-            weight_rows, hidden_rows = to_weight.unbind(0), hidden.unbind(0)
-            spread, shrink = terms.spread.unbind(0), terms.shrink.unbind(0)
-            for i in contrasts(terms, behind[block.tiles].transpose(0, 1).contiguous(), kept):
-                torch.mul(to_variance, kept[i], out=weighted).mul_(kept[i])
-                torch.sum(weighted, 0, out=weight_rows[i])
-                if i > 0:
-                    torch.mul(hidden_rows[i], shrink[i], out=hidden_rows[i - 1]).addcmul_(weight_rows[i], spread[i])
-            front = in_front(terms)
-            doubled = torch.mul(front, terms.spread).mul_(2.0).unbind(0)
-            to_expected = torch.empty_like(terms.alpha)
-            to_values = to_mean.new_empty(longest, *to_mean.shape[:2])
-            through = torch.empty_like(to_mean)
-            rows = zip(kept, terms.expected.unbind(0), doubled, to_expected.unbind(0), to_values.unbind(0), strict=True)
-            for contrast, expected, twice, to_row, to_value in rows:
-                torch.mul(to_mean, contrast, out=weighted)
-                torch.sum(weighted, 0, out=to_row)
-                torch.mul(to_variance, contrast, out=weighted)
-                torch.mul(to_mean, expected, out=through).addcmul_(weighted, twice)
-                torch.sum(through, -1, out=to_value)
-                to_mean.sub_(through)
-            to_behind[block.tiles] = to_mean.transpose(0, 1)
-            # expected = m alpha, spread = v alpha^2, shrink = (1 - expected)^2 + spread
-            to_shrink = hidden.mul_(front)
-            to_spread = to_weight.mul_(front).add_(to_shrink)
-            to_expected.addcmul_(to_shrink, 1.0 - terms.expected, value=-2.0)
-            to_factors = [torch.zeros_like(terms.m[..., 0])] * 2
-            if ctx.needs_input_grad[2]:
-                to_factors = [(to_expected * terms.alpha).sum(-1), (to_spread * terms.alpha.square()).sum(-1)]
-            along = to_spread.mul_(terms.alpha).mul_(2.0 * terms.v).addcmul_(to_expected, terms.m)
-            along = along.mul_(terms.raw).view(-1, PIXELS)
-            moments = torch.mm(along, monomials(table.dtype, table.device)).view(longest, -1, 6).permute(1, 2, 0)
-            geometry = table_gradient(splats, moments).permute(2, 0, 1)
-            entries = torch.cat([geometry, to_values.transpose(1, 2), torch.stack(to_factors, dim=-1)], dim=2)
-            sums.index_add_(0, block.gaussians.T.flatten(), entries.flatten(0, 1))
-        return sums[:, :6].T, sums[:, 6:-2], sums[:, -2:].T, to_behind, None
+        for chunk in lists.chunks(moment_block_size(table.device)):
+            splats = footprints(table, chunk, lists)
+            v, f = of_entries(values, chunk), of_entries(factors, chunk)
+            to_entries = table.new_zeros(sums.shape[0], chunk.gaussians.shape[0])
+            for block in chunk.blocks:
+                terms = evaluate_terms(splats.polynomial, v, f, block)
+                numbers = chunk.tiles[block.tiles]
+                mean, to_mean, to_variance = (x[numbers].permute(1, 2, 0).contiguous() for x in (behind, *upstream))
+                to_block = block.of(to_entries).transpose(1, 2)
+                _backward(terms, mean, to_mean, to_variance, to_block, factors=ctx.needs_input_grad[2])
+                to_behind[numbers] = to_mean.permute(2, 0, 1)
+            to_entries[:6] = table_gradient(splats, to_entries[:6])
+            sums.index_add_(1, chunk.gaussians, to_entries)
+        return sums[:6], sums[6:-2], sums[-2:] if ctx.needs_input_grad[2] else None, to_behind, None
+
+
+def _backward(
+    terms: Terms, mean: Tensor, to_mean: Tensor, to_variance: Tensor, to_entries: Tensor, *, factors: bool
+) -> None:
+    """Carry the gradients of a block's means and variances (C, 64, T) back to its entries.
+
+    Args:
+        terms: of the block.
+        mean: what is behind all splats; overwritten.
+        to_mean: gradient of the means; becomes that of what is behind all splats.
+        to_variance: gradient of the variances.
+        to_entries: receives the gradient of the sums of ln alpha times each monomial, of the values, and of m and v,
+            shape (6 + C + 2, L, T).
+        factors: whether the last two are needed.
+    """
+    longest = terms.alpha.shape[0]
+    kept = mean.new_empty(longest, *mean.shape).unbind(0)
+    weighted = torch.empty_like(mean)
+    # With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
+    # hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}: walked back to front, as division would fail at 0.
+    to_weight, hidden = torch.empty_like(terms.alpha), torch.zeros_like(terms.alpha)
+    weight_rows, hidden_rows = to_weight.unbind(0), hidden.unbind(0)
+    spread, shrink = terms.spread.unbind(0), terms.shrink.unbind(0)
+    for i in contrasts(terms, mean, kept):
+        torch.mul(to_variance, kept[i], out=weighted).mul_(kept[i])
+        torch.sum(weighted, 0, out=weight_rows[i])
+        if i > 0:
+            torch.mul(hidden_rows[i], shrink[i], out=hidden_rows[i - 1]).addcmul_(weight_rows[i], spread[i])
+    front = in_front(terms)
+    doubled = torch.mul(front, terms.spread).mul_(2.0).unbind(0)
+    to_expected = torch.empty_like(terms.alpha)
+    to_values = mean.new_empty(longest, mean.shape[0], mean.shape[2])
+    through = torch.empty_like(mean)
+    rows = zip(kept, terms.expected.unbind(0), doubled, to_expected.unbind(0), to_values.unbind(0), strict=True)
+    for contrast, expected, twice, to_row, to_value in rows:
+        torch.mul(to_mean, contrast, out=weighted)
+        torch.sum(weighted, 0, out=to_row)
+        torch.mul(to_variance, contrast, out=weighted)
+        torch.mul(to_mean, expected, out=through).addcmul_(weighted, twice)
+        torch.sum(through, 1, out=to_value)
+        to_mean.sub_(through)
+    # expected = m alpha, spread = v alpha^2, shrink = (1 - expected)^2 + spread
+    to_shrink = hidden.mul_(front)
+    to_spread = to_weight.mul_(front).add_(to_shrink)
+    to_expected.addcmul_(to_shrink, 1.0 - terms.expected, value=-2.0)
+    if factors:
+        to_entries[-2] = (to_expected * terms.alpha).sum(1)
+        to_entries[-1] = (to_spread * terms.alpha.square()).sum(1)
+    along = to_spread.mul_(terms.alpha).mul_(2.0 * terms.v).addcmul_(to_expected, terms.m).mul_(terms.raw)
+    pixels = monomials(along.dtype, along.device).T.expand(longest, 6, PIXELS)
+    to_entries[:6] = torch.bmm(pixels, along).transpose(0, 1)
+    to_entries[6:-2] = to_values.permute(1, 0, 2)

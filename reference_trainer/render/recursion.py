@@ -19,11 +19,20 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA
-from reference_trainer.render.footprints import PIXELS, Footprints, block_size, footprints, monomials, tile
+from reference_trainer.render.footprints import PIXELS, block_size, monomials, tile
 from reference_trainer.render.renderer import Splats
-from reference_trainer.render.tiles import Block, TileLists
+from reference_trainer.render.tiles import Block, Chunk
 
-__all__ = ["Terms", "behind_tiles", "contrasts", "evaluate_terms", "in_front", "moment_block_size", "moments_per_splat"]
+__all__ = [
+    "Terms",
+    "behind_tiles",
+    "contrasts",
+    "evaluate_terms",
+    "in_front",
+    "moment_block_size",
+    "multiplier_rows",
+    "of_entries",
+]
 
 _CPU_BLOCKS = 8  # blocks so many times larger than in compositing: a step needs many pixels to be worth its call
 
@@ -52,17 +61,31 @@ def behind_tiles(background: Tensor | None, splats: Splats) -> Tensor:
     return tile(image, splats.lists)
 
 
-def moments_per_splat(multiplier: Multiplier, splats: Splats) -> Tensor:
-    """Return mean and variance of the factor of every projected Gaussian and of the absent one, shape (2, M + 1)."""
+def multiplier_rows(multiplier: Multiplier, splats: Splats) -> Tensor:
+    """Return mean and variance of the factor, (2, 1) if all Gaussians share them.
+
+    Otherwise one column for every projected Gaussian and for the absent one, (2, M + 1).
+    """
+    moments = (multiplier.mean, multiplier.variance)
+    if not any(isinstance(x, Tensor) for x in moments):
+        return splats.opacities.new_tensor(moments)[:, None]
     rows = [
         x[splats.indices].to(splats.opacities) if isinstance(x, Tensor) else torch.full_like(splats.opacities, x)
-        for x in (multiplier.mean, multiplier.variance)
+        for x in moments
     ]
     return torch.nn.functional.pad(torch.stack(rows), (0, 1))
 
 
+def of_entries(rows: Tensor, chunk: Chunk) -> Tensor:
+    """Return rows (C, M + 1) for every entry of a chunk, (C, E); those of a shared multiplier stay (2, 1)."""
+    return rows if rows.shape[1] == 1 else rows.index_select(1, chunk.gaussians)
+
+
 class Terms(NamedTuple):
-    """What a block's recursion needs, (L, T, 64) each; ``values`` is (L, C, T, 1), ``m`` and ``v`` are (L, T, 1)."""
+    """What a block's recursion needs, (L, 64, T) each; ``values`` is (L, C, 1, T), ``m`` and ``v`` (L, 1, T) or (1,).
+
+    Tiles are the innermost axis, so that what all pixels of a tile share is broadcast along an outer one.
+    """
 
     raw: Tensor
     alpha: Tensor
@@ -74,27 +97,29 @@ class Terms(NamedTuple):
     values: Tensor
 
 
-def evaluate_terms(
-    table: Tensor, values: Tensor, factors: Tensor, block: Block, lists: TileLists
-) -> tuple[Terms, Footprints]:
-    """Evaluate the alphas of a block and the weights of the recursion."""
-    splats = footprints(table, block, lists)
-    tiles, longest = block.gaussians.shape
-    polynomial = splats.polynomial.permute(2, 0, 1).reshape(-1, 6)
-    raw = torch.mm(polynomial, monomials(table.dtype, table.device).T).exp2_().view(longest, tiles, PIXELS)
+def evaluate_terms(polynomial: Tensor, values: Tensor, factors: Tensor, block: Block) -> Terms:
+    """Evaluate the alphas of a block and the weights of the recursion.
+
+    Args:
+        polynomial: of the chunk's entries, shape (6, E).
+        values: what is composited, shape (C, E).
+        factors: mean and variance of the factor of every entry, shape (2, E), or (2, 1) if they share it.
+        block: of the chunk.
+    """
+    pixels = monomials(polynomial.dtype, polynomial.device).expand(block.shape[1], PIXELS, 6)
+    raw = torch.bmm(pixels, block.of(polynomial).permute(2, 0, 1).contiguous()).exp2_()
     torch.threshold_(raw, MIN_ALPHA, 0.0)
     alpha = raw.clamp(max=MAX_ALPHA)
-    which = block.gaussians.T.flatten()
-    m, v = factors.index_select(1, which).view(2, longest, tiles, 1)
+    m, v = factors if factors.shape[1] == 1 else block.of(factors).transpose(1, 2).contiguous()[:, :, None]
     expected = m * alpha
     spread = torch.mul(alpha, alpha).mul_(v)
     shrink = (1.0 - expected).square_().add_(spread)
-    colors = values.index_select(0, which).view(longest, tiles, -1, 1).transpose(1, 2)
-    return Terms(raw, alpha, m, v, expected, spread, shrink, colors.contiguous()), splats
+    colors = block.of(values).permute(2, 0, 1).contiguous()[:, :, None]
+    return Terms(raw, alpha, m, v, expected, spread, shrink, colors)
 
 
 def in_front(terms: Terms) -> Tensor:
-    """Return S, the product of ``shrink`` over all splats in front of each, (L, T, 64)."""
+    """Return S, the product of ``shrink`` over all splats in front of each, (L, 64, T)."""
     front = torch.empty_like(terms.shrink)
     front[0] = 1.0
     rows = front.unbind(0)
@@ -108,8 +133,8 @@ def contrasts(terms: Terms, mean: Tensor, buffers: Sequence[Tensor]) -> Iterator
 
     Args:
         terms: of the block.
-        mean: what lies behind all splats, (C, T, 64); becomes the mean of the pixel.
-        buffers: one (C, T, 64) for each splat; they may be one and the same, to be read before the next step.
+        mean: what lies behind all splats, (C, 64, T); becomes the mean of the pixel.
+        buffers: one (C, 64, T) for each splat; they may be one and the same, to be read before the next step.
     """
     values, expected = terms.values.unbind(0), terms.expected.unbind(0)
     for i in reversed(range(len(values))):

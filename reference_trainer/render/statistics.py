@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import color_variance
-from reference_trainer.render.blending import block_alphas
-from reference_trainer.render.footprints import PIXELS, block_size, pack, untile
+from reference_trainer.render.blending import Workspace, block_alphas
+from reference_trainer.render.footprints import PIXELS, block_size, footprints, pack, untile
 from reference_trainer.render.renderer import Splats
 
 __all__ = ["color_variance_map"]
@@ -39,10 +39,13 @@ def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
     table = pack(splats.projection.means, splats.projection.factors, splats.opacities)
     colors = torch.cat([splats.colors, splats.colors.new_zeros(1, 3)])
     tiles = table.new_zeros(lists.lengths.shape[0], 2, PIXELS)
-    for block in lists.blocks(block_size(table.device)):
-        weights = block_alphas(table, block, lists)[0].weights
-        of_pixels = colors[block.gaussians][:, None].expand(-1, PIXELS, -1, -1)
-        result = color_variance(weights, of_pixels)
-        tiles[block.tiles] = torch.stack([result.variance, result.covered.to(table)], dim=1)
+    for chunk in lists.chunks(block_size(table.device)):
+        polynomial = footprints(table, chunk, lists).polynomial
+        workspace = Workspace(4, chunk, table)
+        for block in chunk.blocks:
+            weights = block_alphas(polynomial, block, workspace.of(block)).weights
+            which = chunk.gaussians[block.entries].view(block.shape)
+            result = color_variance(weights, colors[which][:, None].expand(-1, PIXELS, -1, -1))
+            tiles[chunk.tiles[block.tiles]] = torch.stack([result.variance, result.covered.to(table)], dim=1)
     variance, covered = untile(tiles, lists)
     return variance, covered > 0

@@ -9,23 +9,49 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from reference_trainer.render.constants import MIN_ALPHA, TILE
+from reference_trainer.render.constants import CHUNK_ENTRIES, MIN_ALPHA, TILE
 from reference_trainer.render.projection import Projection
 
-__all__ = ["Block", "TileLists", "bin_gaussians"]
+__all__ = ["Block", "Chunk", "TileLists", "bin_gaussians"]
 
 
 @dataclass(frozen=True)
 class Block:
-    """Tiles of similar list length that are composited together.
+    """Tiles of similar list length that are composited together, as a part of a chunk.
 
     Args:
-        tiles: tile numbers, row by row over the image, shape (T,).
-        gaussians: the Gaussians of each tile, nearest first, padded with the number of Gaussians M, shape (T, L).
+        tiles: which of the chunk's tiles.
+        entries: which of the chunk's entries.
+        shape: number of tiles T and of entries of each, L.
+    """
+
+    tiles: slice
+    entries: slice
+    shape: tuple[int, int]
+
+    def of(self, rows: Tensor) -> Tensor:
+        """Return the block's part of a chunk's rows (C, E) as a view (C, T, L)."""
+        return rows[:, self.entries].view(-1, *self.shape)
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """The padded lists of some tiles, one after the other, longest first.
+
+    What depends on an entry alone is computed for a whole chunk at once, what depends on its pixels block by block.
+
+    Args:
+        tiles: tile numbers, row by row over the image, shape (n,).
+        gaussians: the Gaussian of every entry, nearest first within a tile; the number of Gaussians M is padding,
+            shape (E,).
+        tile_of: the tile number of every entry, shape (E,).
+        blocks: parts of at most so many pixel-Gaussian pairs as were asked for.
     """
 
     tiles: Tensor
     gaussians: Tensor
+    tile_of: Tensor
+    blocks: list[Block]
 
 
 @dataclass(frozen=True)
@@ -65,22 +91,47 @@ class TileLists:
         starts = (self.lengths.cumsum(0) - self.lengths)[tiles]
         return lengths.tolist(), tiles, starts
 
-    def blocks(self, elements: int) -> Iterator[Block]:
-        """Iterate over all tiles with a non-empty list, in blocks of at most ``elements`` pixel-Gaussian pairs.
+    def chunks(self, pairs: int) -> Iterator[Chunk]:
+        """Iterate over all tiles with a non-empty list, in blocks of at most ``pairs`` pixel-Gaussian pairs.
 
         A single tile whose list alone is longer makes a block of its own.
         """
         lengths, tiles, starts = self._by_length
-        device = self.gaussians.device
-        first, end = 0, next((i for i, n in enumerate(lengths) if n == 0), len(lengths))
+        end = next((i for i, n in enumerate(lengths) if n == 0), len(lengths))
+        blocks: list[tuple[int, int]] = []  # first tile and length
+        begin = first = entries = 0
         while first < end:
             longest = lengths[first]
-            last = min(end, first + max(1, elements // (TILE * TILE * longest)))
-            position = torch.arange(longest, device=device)
-            inside = position < self.lengths[tiles[first:last], None]
-            where = (starts[first:last, None] + position).clamp_(max=self.gaussians.shape[0] - 1)
-            yield Block(tiles[first:last], torch.where(inside, self.gaussians[where], self.count))
+            last = min(end, first + max(1, pairs // (TILE * TILE * longest)))
+            if entries and entries + (last - first) * longest > CHUNK_ENTRIES:
+                yield self._chunk(begin, first, blocks, tiles, starts)
+                begin, entries, blocks = first, 0, []
+            blocks.append((first, longest))
+            entries += (last - first) * longest
             first = last
+        if blocks:
+            yield self._chunk(begin, end, blocks, tiles, starts)
+
+    def _chunk(self, begin: int, end: int, parts: list[tuple[int, int]], tiles: Tensor, starts: Tensor) -> Chunk:
+        """Pad the lists of the tiles from begin to end, in order of length, to the longest of each block."""
+        blocks: list[Block] = []
+        entry = 0
+        for (first, longest), (last, _) in zip(parts, [*parts[1:], (end, 0)], strict=True):
+            size = (last - first) * longest
+            blocks.append(
+                Block(slice(first - begin, last - begin), slice(entry, entry + size), (last - first, longest))
+            )
+            entry += size
+        device = self.gaussians.device
+        counts = torch.tensor([block.shape[0] for block in blocks], device=device)
+        widths = torch.tensor([block.shape[1] for block in blocks], device=device).repeat_interleave(counts)
+        numbers = tiles[begin:end]
+        of_tile = torch.repeat_interleave(widths, output_size=entry)
+        position = torch.arange(entry, device=device) - (widths.cumsum(0) - widths)[of_tile]
+        tile_of = numbers[of_tile]
+        where = (starts[begin:end][of_tile] + position).clamp_(max=self.gaussians.shape[0] - 1)
+        inside = position < self.lengths[tile_of]
+        return Chunk(numbers, torch.where(inside, self.gaussians[where], self.count), tile_of, blocks)
 
 
 def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:

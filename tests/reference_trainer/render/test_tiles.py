@@ -4,7 +4,8 @@ import pytest
 import torch
 from oracles import random_scene
 
-from reference_trainer.render import splat
+from reference_trainer.render import render, splat
+from reference_trainer.render import tiles as tiles_module
 from reference_trainer.render.constants import MIN_ALPHA, TILE
 
 
@@ -39,21 +40,43 @@ def test_lists_hold_every_gaussian_that_counts_and_few_others(n, width, height, 
     assert torch.equal(lists.touched, listed.any(1))
 
 
-def test_blocks_cover_every_list_once_and_stay_within_their_budget():
+@pytest.mark.parametrize("entries", [50, 1 << 19])
+def test_blocks_cover_every_list_once_and_stay_within_their_budget(monkeypatch, entries):
+    monkeypatch.setattr(tiles_module, "CHUNK_ENTRIES", entries)
     scene = random_scene(300, 70, 50, seed=1)
     lists = splat(*scene[:4], scene.camera, colors=scene.colors).lists
     budget = 4000
-    seen = []
-    for block in lists.blocks(budget):
-        tiles, longest = block.gaussians.shape
-        assert tiles * longest * TILE * TILE <= budget or tiles == 1
-        for tile, row in zip(block.tiles.tolist(), block.gaussians, strict=True):
-            length = int(lists.lengths[tile])
-            start = int(lists.lengths[:tile].sum())
-            assert torch.equal(row[:length], lists.gaussians[start : start + length])
-            assert (row[length:] == lists.count).all()
-            seen.append(tile)
+    seen, chunks = [], list(lists.chunks(budget))
+    assert (len(chunks) > 1) == (entries == 50)
+    for chunk in chunks:
+        assert chunk.gaussians.numel() <= entries or len(chunk.blocks) == 1
+        assert sum(block.shape[0] * block.shape[1] for block in chunk.blocks) == chunk.gaussians.numel()
+        for block in chunk.blocks:
+            tiles, longest = block.shape
+            assert tiles * longest * TILE * TILE <= budget or tiles == 1
+            numbers = chunk.tiles[block.tiles]
+            rows, of = block.of(torch.stack([chunk.gaussians, chunk.tile_of])).unbind(0)
+            assert torch.equal(of, numbers[:, None].expand(tiles, longest))
+            for tile, row in zip(numbers.tolist(), rows, strict=True):
+                length = int(lists.lengths[tile])
+                start = int(lists.lengths[:tile].sum())
+                assert torch.equal(row[:length], lists.gaussians[start : start + length])
+                assert (row[length:] == lists.count).all()
+                seen.append(tile)
     assert sorted(seen) == torch.nonzero(lists.lengths).squeeze(1).tolist()
+
+
+def test_the_size_of_the_chunks_does_not_matter(monkeypatch):
+    scene = random_scene(200, 50, 40, seed=6)
+    images = []
+    for entries in (30, 1 << 19):
+        monkeypatch.setattr(tiles_module, "CHUNK_ENTRIES", entries)
+        leaves = [x.clone().requires_grad_() for x in scene.tensors()]
+        out = render(*leaves[:4], scene.camera, colors=leaves[4])
+        (out.image.square().sum() + out.alpha.sum()).backward()
+        images.append([out.image, out.alpha, *(x.grad for x in leaves)])
+    for one, other in zip(*images, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-13)
 
 
 def test_equal_depths_keep_the_order_of_the_gaussians():
