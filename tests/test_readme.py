@@ -3,21 +3,14 @@
 import ast
 import re
 import shlex
-from pathlib import Path
 
 import pytest
+from pages import ROOT, blocks, linked_files
 
 from reference_trainer.cli import _parse
 
-ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
-
-
-COMMANDS = [line.split("#")[0] for block in blocks("bash") for line in re.findall(r"\bca-reg .*", block)]
+README = ROOT / "README.md"
+COMMANDS = [line.split("#")[0] for block in blocks(README, "bash") for line in re.findall(r"\bca-reg .*", block)]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -25,7 +18,7 @@ def test_commands_are_understood(command):
     assert callable(_parse(shlex.split(command)[1:]))
 
 
-@pytest.mark.parametrize("code", blocks("python"))
+@pytest.mark.parametrize("code", blocks(README, "python"))
 def test_python_blocks_parse_and_their_imports_work(code):
     tree = ast.parse(code)
     imports = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
@@ -47,6 +40,6 @@ def test_two_lines_do_what_the_readme_says():
 
 
 def test_linked_files_exist():
-    links = [link for link in re.findall(r"\]\(([^)#]+)\)", README) if not link.startswith("http")]
-    assert links
-    assert not [link for link in links if not (ROOT / link).exists()]
+    files = linked_files(README)
+    assert files
+    assert not [link for link, file in files.items() if not file.exists()]
