@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-__all__ = ["ErrorRuntime", "Ranking", "Study"]
+from reference_trainer.scenes.options import SceneOptions
+
+__all__ = ["Attribution", "ErrorRuntime", "GradientNoise", "Pruning", "Ranking", "Speed", "Study"]
+
+Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
 
 
 @dataclass(frozen=True)
@@ -58,10 +62,107 @@ class Ranking:
 
 
 @dataclass(frozen=True)
+class Attribution:
+    """Which Gaussians hold the co-adaptation: shares of the exact score, as numbers, pictures and a coloured PLY."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    out: Path | None = None
+    """Folder for the results; by default <run>/attribution."""
+    split: Literal["test", "train"] = "test"
+    """Which views."""
+    drop_rate: float = 0.5
+    """Of the score."""
+    device: str = "cpu"
+    """"cpu" or "cuda"."""
+
+    def __call__(self) -> None:
+        """Run the study."""
+        from reference_trainer.studies.attribution import study_attribution
+
+        study_attribution(self.run, self.out, split=self.split, drop_rate=self.drop_rate, device=self.device, say=print)
+
+
+@dataclass(frozen=True)
+class Pruning:
+    """Prune by the shares and by opacity, equally many Gaussians: test PSNR and co-adaptation of what is left."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs that differ only in their seed."""
+    out: Path = Path("runs/pruning")
+    """Folder for the JSON, the table and the figure; what is in it is not measured again."""
+    fractions: tuple[float, ...] = (0.1, 0.2, 0.4)
+    """Parts of the Gaussians to remove."""
+    refine: int = 300
+    """Steps of further training after pruning, without densification; 0 for none."""
+    device: str = "cpu"
+    """"cpu" or "cuda"."""
+
+    def __call__(self) -> None:
+        """Run the study."""
+        from reference_trainer.studies.pruning import study_pruning
+
+        study_pruning(self.runs, self.out, fractions=self.fractions, refine=self.refine, device=self.device, say=print)
+
+
+@dataclass(frozen=True)
+class GradientNoise:
+    """What sampling masks costs the gradient of a training step, against the analytic gradient."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs."""
+    out: Path = Path("runs/gradient_noise")
+    """Folder for the JSON, the tables and the figure; what is in it is not measured again."""
+    draws: int = 64
+    """Masks at every training view, a power of two."""
+    dropout: float = 0.2
+    """Rate of the masks."""
+    device: str = "cpu"
+    """"cpu" or "cuda"."""
+
+    def __call__(self) -> None:
+        """Run the study."""
+        from reference_trainer.studies.gradient_noise import study_gradient_noise
+
+        study_gradient_noise(self.runs, self.out, draws=self.draws, dropout=self.dropout, device=self.device, say=print)
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Time, memory and error of the renderer on the standard workloads, as ratios to the machine and to a baseline."""
+
+    out: Path = Path("runs/speed")
+    """Folder for the JSON and the tables."""
+    workloads: tuple[Literal["small", "medium", "large"], ...] = ("small", "medium")
+    """"large" takes minutes, nearly all of them in the baseline."""
+    scene: Scene = field(default_factory=SceneOptions)
+    repeats: int = 7
+    """Rounds of which the medians are taken."""
+    against: Path | None = None
+    """An older speed.json; slower or less exact than that is an error."""
+    device: str = "cpu"
+    """"cpu" or "cuda"."""
+
+    def __call__(self) -> None:
+        """Run the study."""
+        from reference_trainer.studies.speed.study import study_speed
+
+        study_speed(
+            self.out,
+            workloads=self.workloads,
+            scene=self.scene,
+            repeats=self.repeats,
+            device=self.device,
+            against=self.against,
+            say=print,
+        )
+
+
+@dataclass(frozen=True)
 class Study:
     """Measure something about the method itself; see the subcommands."""
 
-    what: ErrorRuntime | Ranking
+    what: ErrorRuntime | Ranking | Attribution | Pruning | GradientNoise | Speed
 
     def __call__(self) -> None:
         """Run the study that was chosen."""

@@ -6,7 +6,9 @@ import pytest
 from reference_trainer import cli
 from reference_trainer.cli import main
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies import attribution as attribution_module
 from reference_trainer.studies import compare as compare_module
+from reference_trainer.studies import pruning as pruning_module
 from reference_trainer.studies import run as run_module
 from reference_trainer.training.config import PRESETS
 
@@ -127,6 +129,31 @@ def test_what_is_compared(given, rates, monkeypatch, tmp_path):
     assert {name: (config.dropout, config.noise) for name, config in asked["configs"].items()} == rates
     assert {config.iterations for config in asked["configs"].values()} == {7}
     assert (asked["seeds"], asked["jobs"], asked["out"]) == ([0, 1], 3, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["attribution", "r"], ("r", None, {"split": "test", "drop_rate": 0.5})),
+        (["attribution", "r", "--out", "o", "--split", "train", "--drop-rate", "0.3"],
+         ("r", "o", {"split": "train", "drop_rate": 0.3})),
+        (["pruning", "r", "s", "--out", "o"], (["r", "s"], "o", {"fractions": (0.1, 0.2, 0.4), "refine": 300})),
+        (["pruning", "r", "--fractions", "0.2", "0.5", "--refine", "0", "--out", "o"],
+         (["r"], "o", {"fractions": (0.2, 0.5), "refine": 0})),
+    ],
+)  # fmt: skip
+def test_studies_of_the_shares(arguments, expected, monkeypatch):
+    asked = []
+
+    def fake(source, out, **keywords):
+        source = [str(path) for path in source] if isinstance(source, tuple) else str(source)
+        asked.append((source, out and str(out), keywords))
+
+    monkeypatch.setattr(attribution_module, "study_attribution", fake)
+    monkeypatch.setattr(pruning_module, "study_pruning", fake)
+    main(["study", *arguments])
+    source, out, keywords = expected
+    assert asked == [(source, out, {**keywords, "device": "cpu", "say": print})]
 
 
 # Mistakes end with one line that says what to do, and exit code 2

@@ -1,0 +1,310 @@
+"""The attribution study: which Gaussians of a run hold its co-adaptation, in numbers, pictures and a coloured PLY."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ca_reg import CAResult, Reason, attribute, total_effects
+from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, Model
+from reference_trainer.evaluation.pictures import heat_map, save_png, side_by_side
+from reference_trainer.evaluation.rank_correlation import spearman
+from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.files import replacing
+from reference_trainer.model.gaussians import SH_C0, Gaussians
+from reference_trainer.model.ply import save_ply
+from reference_trainer.render import render
+from reference_trainer.scenes.scene import View
+from reference_trainer.studies.measure import of_run
+
+__all__ = [
+    "blend_weights",
+    "colored_by",
+    "concentration",
+    "mean_effects",
+    "mean_shares",
+    "share_per_weight",
+    "study_attribution",
+]
+
+# Ends of the colour scales in units of the mean. Shares grow with the size of a Gaussian, so that a picture of them
+# shows the large ones; per blend weight they show what the CA map shows, Gaussian by Gaussian.
+_SHARE_SCALE = (1.0, 100.0)
+_PER_WEIGHT_SCALE = (0.1, 10.0)
+
+_TOP = (0.001, 0.01, 0.1)
+
+_README = """\
+# Which Gaussians hold the co-adaptation
+
+{table}
+- `shares.npz`: `shares`, `total_effects` and `blend_weights`, one float64 per Gaussian in the order of the model
+  (`numpy.load`).
+- `attribution.ply`: the same Gaussians for any viewer, coloured by their share: black {low:.3g} (the mean share) or
+  less, pale yellow {high:.3g} (100 times the mean) or more.
+- `attribution_per_weight.ply`: coloured by their share per blend weight: black {low_per_weight:.3g} (a tenth of the
+  mean) or less, pale yellow {high_per_weight:.3g} (10 times the mean) or more. The mean is the score over the sum of
+  the weights. Here a Gaussian is bright that co-adapts much for what it contributes, small or large.
+- `views/`: render; CA map (black 0, pale yellow {ca_range:g} or more, grey: not covered by the score); the render with
+  the colours of either PLY.
+
+Both scales are logarithmic, from black through purple, red and orange to pale yellow, and relative to the mean of this
+model: they show where its co-adaptation lives. How much there is, the score tells.
+"""
+
+
+def mean_shares(model: Model, views: Sequence[View], *, drop_rate: float = 0.5) -> tuple[Tensor, list[CAResult]]:
+    """Split the exact score of several views over the Gaussians.
+
+    Args:
+        model: what to measure.
+        views: on the model's device.
+        drop_rate: of the score.
+
+    Returns:
+        Shares, mean over the views that have a score, shape (N,), float64, which add up to the mean of these scores;
+        and the result of every view.
+
+    Raises:
+        ValueError: if no view has a score.
+    """
+    score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
+    return _mean_over_views(lambda view: attribute(score, model.shares, opacities, view), views)
+
+
+def mean_effects(model: Model, views: Sequence[View], *, drop_rate: float = 0.5) -> Tensor:
+    """Return the total effects of the Gaussians, mean over the views that have a score, shape (N,), float64.
+
+    Args:
+        model: what to measure.
+        views: on the model's device.
+        drop_rate: of the score.
+
+    Raises:
+        ValueError: if no view has a score.
+    """
+    score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
+    return _mean_over_views(lambda view: total_effects(score, opacities, view), views)[0]
+
+
+def blend_weights(model: Model, views: Sequence[View]) -> Tensor:
+    """Return the weight with which every Gaussian enters the test-time renders, summed over all pixels and views.
+
+    The image is linear in the colours, so the weights are the gradient of its sum: no approximation.
+
+    Args:
+        model: what to measure.
+        views: on the model's device.
+
+    Returns:
+        Sums of alpha times transmittance, shape (N,), float64.
+    """
+    gaussians = model.gaussians
+    opacities = gaussians.opacities * model.opacity_scale
+    total = torch.zeros_like(opacities, dtype=torch.float64)
+    for view in views:
+        colors = torch.zeros_like(gaussians.means).requires_grad_()
+        out = render(gaussians.means, gaussians.quaternions, gaussians.scales, opacities, view.camera, colors=colors)
+        total += torch.autograd.grad(out.image[0].sum(), colors)[0][:, 0]
+    return total
+
+
+def share_per_weight(shares: Tensor, weights: Tensor) -> Tensor:
+    """Return how much Gaussians co-adapt for what they contribute.
+
+    Args:
+        shares: shape (N,), float64.
+        weights: of `blend_weights`, shape (N,).
+
+    Returns:
+        The quotients, shape (N,): 0 for a Gaussian without a share, infinite for one that only shows where others are
+        dropped.
+
+    Example:
+        >>> share_per_weight(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([4.0, 0.0, 0.0]))
+        tensor([0.2500,    inf, 0.0000])
+    """
+    return torch.where(shares > 0, shares / weights, 0.0)
+
+
+def concentration(shares: Tensor) -> dict[str, float]:
+    """Return how few Gaussians hold how much of the score.
+
+    Args:
+        shares: at least 0, not all 0, shape (N,).
+
+    Returns:
+        Under ``"top 1%"`` and the like the part of the score that this part of the Gaussians holds, the largest shares
+        first; under ``"half"`` the smallest part of the Gaussians that holds half of the score.
+
+    Example:
+        >>> shares = torch.ones(1000)
+        >>> shares[:10] = 100.0
+        >>> {name: round(part, 3) for name, part in concentration(shares).items()}
+        {'top 0.1%': 0.05, 'top 1%': 0.503, 'top 10%': 0.548, 'half': 0.01}
+    """
+    held = shares.double().sort(descending=True).values.cumsum(0)
+    held, n = held / held[-1], len(shares)
+    found = {f"top {part:.1%}".replace(".0%", "%"): held[max(1, round(part * n)) - 1].item() for part in _TOP}
+    return {**found, "half": (int((held < 0.5).sum()) + 1) / n}
+
+
+def colored_by(gaussians: Gaussians, values: Tensor, low: float, high: float) -> Gaussians:
+    """Return the same Gaussians with a colour that tells a value, the same from every direction.
+
+    Args:
+        gaussians: the model.
+        values: at least 0, may be infinite, shape (N,).
+        low: the value that gets the darkest colour, as do all below it; positive.
+        high: the value that gets the brightest colour, as do all above it. In between the scale is logarithmic.
+    """
+    along = (values.clamp(low, high) / low).log() / math.log(high / low)
+    colors = heat_map(along[None], 1.0)[:, 0].T.to(gaussians.sh_dc)
+    return dataclasses.replace(
+        gaussians, sh_dc=((colors - 0.5) / SH_C0)[:, None], sh_rest=torch.zeros_like(gaussians.sh_rest)
+    )
+
+
+def study_attribution(
+    run: Path,
+    out: Path | None = None,
+    *,
+    split: str = "test",
+    drop_rate: float = 0.5,
+    device: str = "cpu",
+    say: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Attribute the exact score of a run; write the shares, a coloured PLY, pictures and a table, and print that.
+
+    Args:
+        run: folder of the run; its last checkpoint is measured.
+        out: folder for the results; by default ``attribution`` in that of the run.
+        split: ``"train"`` or ``"test"``: which views.
+        drop_rate: of the score.
+        device: where to render.
+        say: receives the table.
+
+    Returns:
+        The content of ``attribution.json``.
+
+    Raises:
+        ValueError: if no view of the split has a score, or all scores are 0.
+        FileNotFoundError: if the folder holds no run.
+    """
+    if split not in ("train", "test"):
+        raise ValueError(f"split must be 'train' or 'test', got {split!r}.")
+    model, scene, _ = of_run(run, device)
+    out = run / "attribution" if out is None else out
+    views = [view.to(device) for view in (scene.train if split == "train" else scene.test)]
+    shares, results = mean_shares(model, views, drop_rate=drop_rate)
+    if not shares.any():
+        raise ValueError(f"the score of {run} at drop rate {drop_rate} is 0: there is nothing to attribute.")
+    effects = mean_effects(model, views, drop_rate=drop_rate)
+    weights = blend_weights(model, views)
+    values = [result.value for result in results if result.reason is Reason.OK]
+    means = {"share": shares.mean().item(), "share_per_weight": (shares.sum() / weights.sum()).item()}
+    data: dict[str, Any] = {
+        "scene": scene.name,
+        "split": split,
+        "drop_rate": drop_rate,
+        "gaussians": len(shares),
+        "views": {view.name: result.value for view, result in zip(views, results, strict=True)},
+        "score": sum(values) / len(values),
+        "sum_of_shares": shares.sum().item(),
+        "sum_of_total_effects": effects.sum().item(),
+        "held_by": concentration(shares),
+        "spearman": _correlations(model, views, shares, weights),
+        "color_scales": {
+            "share": [end * means["share"] for end in _SHARE_SCALE],
+            "share_per_weight": [end * means["share_per_weight"] for end in _PER_WEIGHT_SCALE],
+        },
+        "machine": machine(),
+    }
+    scales = data["color_scales"]
+    a, b, c = (x.cpu().numpy() for x in (shares, effects, weights))
+    with replacing(out / "shares.npz") as place, place.open("wb") as file:
+        np.savez(file, shares=a, total_effects=b, blend_weights=c)
+    colored = {
+        "attribution": colored_by(model.gaussians, shares, *scales["share"]),
+        "attribution_per_weight": colored_by(
+            model.gaussians, share_per_weight(shares, weights), *scales["share_per_weight"]
+        ),
+    }
+    for name, gaussians in colored.items():  # with the scaling baked in, as in a run's PLY for viewers
+        save_ply(gaussians, out / f"{name}.ply", bake_p=1 - model.opacity_scale, pad_to_degree=3)
+    for view, result in zip(views, results, strict=True):
+        save_png(out / "views" / f"{Path(view.name).stem}.png", _picture(model, colored.values(), view, result))
+    write_json(out / "attribution.json", data)
+    table = _table(data)
+    ends = dict(zip(("low", "high"), scales["share"], strict=True))
+    ends |= dict(zip(("low_per_weight", "high_per_weight"), scales["share_per_weight"], strict=True))
+    (out / "README.md").write_text(_README.format(table=table, ca_range=CA_PICTURE_RANGE, **ends), encoding="utf-8")
+    say(table)
+    say(f"Shares, PLYs and pictures are in {out}; README.md there says what the colours mean")
+    return data
+
+
+def _mean_over_views(
+    measure: Callable[[View], tuple[Tensor, CAResult]], views: Sequence[View]
+) -> tuple[Tensor, list[CAResult]]:
+    """Measure every view; return the mean over those that have a score, and all results."""
+    total, results = torch.zeros(()), []
+    for view in views:
+        values, result = measure(view)
+        results.append(result)
+        total = total.to(values) + values  # all 0 without a score
+    count = sum(result.reason is Reason.OK for result in results)
+    if count == 0:
+        raise ValueError(
+            f"none of the {len(views)} views has a score to attribute, because no pixel has an expected alpha above "
+            "the threshold: choose the other split, or a lower drop rate."
+        )
+    return total / count, results
+
+
+def _correlations(model: Model, views: Sequence[View], shares: Tensor, weights: Tensor) -> dict[str, float | None]:
+    """Rank correlation of the share with what else is known of a Gaussian."""
+    gaussians = model.gaussians
+    poses = [view.camera.world_to_camera.to(gaussians.means) for view in views]
+    depth = torch.stack([gaussians.means @ pose[2, :3] + pose[2, 3] for pose in poses]).mean(0)
+    known = {
+        "opacity": gaussians.opacities,
+        "largest scale": gaussians.scales.amax(1),
+        "mean depth": depth,
+        "blend weight": weights,
+    }
+    return {name: spearman(shares.tolist(), values.tolist()) for name, values in known.items()}
+
+
+@torch.no_grad()
+def _picture(model: Model, colored: Iterable[Gaussians], view: View, result: CAResult) -> Tensor:
+    """Lay the render, the CA map and the render in other colours side by side."""
+    opacities = model.gaussians.opacities * model.opacity_scale
+    ca_map = heat_map(result.variance.masked_fill(~result.visible, math.nan).float(), CA_PICTURE_RANGE)
+    models = [model, *(dataclasses.replace(model, gaussians=gaussians) for gaussians in colored)]
+    plain, *others = [each.rendering(opacities, view).image for each in models]
+    texts = [f"{low:g} to {high:g} x mean" for low, high in (_SHARE_SCALE, _PER_WEIGHT_SCALE)]
+    labels = ["render", f"exact CA {result.value * 1e3:.2f}e-3", f"share, {texts[0]}", f"share per weight, {texts[1]}"]
+    return side_by_side([plain, ca_map, *others], labels)
+
+
+def _table(data: dict[str, Any]) -> str:
+    """Return the numbers in Markdown."""
+    part, count = data["held_by"]["half"], data["gaussians"]
+    held = {name: value for name, value in data["held_by"].items() if name != "half"}
+    rows: dict[str, object] = {
+        f"score x1e-3, mean over {data['split']} views": f"{data['score'] * 1e3:.7g}",
+        "sum of the shares x1e-3": f"{data['sum_of_shares'] * 1e3:.7g}",
+        "sum of the total effects / score": data["sum_of_total_effects"] / data["score"],
+        **{f"score held by the {name} of the Gaussians": f"{value:.1%}" for name, value in held.items()},
+        "Gaussians that hold half of the score": f"{round(part * count)} of {count} ({part:.2%})",
+        **{f"rank correlation of share and {name}": value for name, value in data["spearman"].items()},
+    }
+    return markdown_table([{"quantity": name, "value": value} for name, value in rows.items()], ["quantity", "value"])

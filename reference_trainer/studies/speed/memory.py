@@ -1,0 +1,74 @@
+"""Peak memory of a rendering above its inputs."""
+
+from __future__ import annotations
+
+import gc
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import torch
+
+from reference_trainer.studies.speed.calls import SUBJECT, gradients, image
+from reference_trainer.studies.speed.workloads import WorkloadSpec
+
+__all__ = ["peak_memory"]
+
+_PROCESS = Path("/proc/self")
+
+
+def peak_memory(spec: WorkloadSpec, device: torch.device) -> dict[str, int] | None:
+    """Measure how far memory rises above the inputs during a first rendering, and during a first gradient.
+
+    On a CPU: the peak of the resident memory of a fresh process above what it had just before the first call (inputs
+    and libraries loaded). It includes what the allocator holds back between tensors, buffers of the libraries, and the
+    threads of the backward pass. On a GPU: the peak of the tensors above those of the inputs.
+
+    Args:
+        spec: of the workload.
+        device: where to render.
+
+    Returns:
+        Bytes for "forward" and "forward+backward"; None where the system does not tell (a CPU without Linux's /proc).
+    """
+    if device.type == "cuda":
+        return _in_this_process(spec, str(device), torch.get_num_threads())
+    if not (_PROCESS / "clear_refs").exists():
+        return None
+    with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(_in_this_process, spec, str(device), torch.get_num_threads()).result()
+
+
+def _in_this_process(spec: WorkloadSpec, device: str, threads: int) -> dict[str, int]:
+    """Measure here; the workload must be the first of this process."""
+    torch.set_num_threads(threads)
+    workload = spec.make().to(device)
+    before = _restart(workload.means.device)
+    image(SUBJECT, workload)
+    forward = _peak(workload.means.device)
+    # What the first rendering left behind (buffers of libraries) still counts as above the inputs.
+    _restart(workload.means.device)
+    gradients(SUBJECT, workload)
+    return {"forward": forward - before, "forward+backward": _peak(workload.means.device) - before}
+
+
+def _restart(device: torch.device) -> int:
+    """Let the peak begin at the present memory; return that, bytes."""
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        return torch.cuda.memory_allocated(device)
+    (_PROCESS / "clear_refs").write_text("5", encoding="ascii")  # 5 resets the peak (proc(5))
+    return _status("VmRSS")
+
+
+def _peak(device: torch.device) -> int:
+    """Return the peak since the last restart, bytes."""
+    return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else _status("VmHWM")
+
+
+def _status(entry: str) -> int:
+    """Return an entry of /proc/self/status, which is in KiB, as bytes."""
+    lines = (_PROCESS / "status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) << 10 for line in lines if line.startswith(f"{entry}:"))

@@ -1,0 +1,44 @@
+"""The peak of the resident memory."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from reference_trainer.studies.speed import memory
+from reference_trainer.studies.speed.memory import peak_memory
+from reference_trainer.studies.speed.workloads import WorkloadSpec
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="needs Linux's /proc")
+
+MIB = 1 << 20
+
+
+@needs_proc
+def test_the_peak_is_that_of_what_is_gone_already():
+    cpu = torch.device("cpu")
+    torch.ones(128 * MIB // 4)  # an older and higher peak
+    before = memory._restart(cpu)
+    torch.ones(64 * MIB // 4)
+    assert memory._peak(cpu) - before == pytest.approx(64 * MIB, rel=0.02)
+
+
+@pytest.mark.slow
+@needs_proc
+def test_a_fresh_process_measures_a_rendering():
+    peaks = peak_memory(WorkloadSpec(300, 64, 48, 0.05), torch.device("cpu"))
+    assert list(peaks) == ["forward", "forward+backward"]
+    assert 0 < peaks["forward"] <= peaks["forward+backward"] < 500 * MIB
+
+
+@pytest.mark.gpu
+def test_on_a_gpu_the_tensors_count():
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    peaks = peak_memory(WorkloadSpec(300, 64, 48, 0.05), torch.device("cuda"))
+    assert 0 < peaks["forward"] <= peaks["forward+backward"]
+
+
+def test_without_proc_there_is_no_number(monkeypatch, tmp_path):
+    monkeypatch.setattr(memory, "_PROCESS", tmp_path)
+    assert peak_memory(WorkloadSpec(5, 8, 8, 0.1), torch.device("cpu")) is None
