@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
-from reference_trainer.render.footprints import footprints, pack, pad, tile
+from reference_trainer.render.footprints import PIXELS, footprints, pack, pad, tile
 from reference_trainer.render.recursion import (
     behind_tiles,
     contrasts,
@@ -17,6 +17,7 @@ from reference_trainer.render.recursion import (
     of_entries,
 )
 from reference_trainer.render.renderer import Splats
+from reference_trainer.render.workspace import Workspace
 
 __all__ = ["variance_shares"]
 
@@ -67,10 +68,12 @@ def variance_shares(
         polynomial = footprints(table, chunk, splats.lists).polynomial
         v, f = of_entries(values, chunk), of_entries(factors, chunk)
         shares = sums.new_empty(1, chunk.gaussians.shape[0])
+        workspace = Workspace(6, chunk, table)
         for block in chunk.blocks:
-            terms = evaluate_terms(polynomial, v, f, block)
+            *buffers, front = workspace.of(block.shape[1], PIXELS, block.shape[0])
+            terms = evaluate_terms(polynomial, v, f, block, buffers)
             numbers = chunk.tiles[block.tiles]
-            scale = in_front(terms).mul_(terms.spread).mul_(per_pixel[numbers].T / 3.0)
+            scale = in_front(terms, front).mul_(terms.spread).mul_(per_pixel[numbers].T / 3.0)
             mean = behind[numbers].permute(1, 2, 0).contiguous()
             contrast = torch.empty_like(mean)
             of_block = block.of(shares)[0]

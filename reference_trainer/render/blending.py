@@ -5,7 +5,6 @@ Nothing of the size of the pixel-Gaussian pairs outlives a block: the backward p
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -24,9 +23,10 @@ from reference_trainer.render.footprints import (
     tile,
     untile,
 )
-from reference_trainer.render.tiles import Block, Chunk, TileLists
+from reference_trainer.render.tiles import Block, TileLists
+from reference_trainer.render.workspace import Workspace
 
-__all__ = ["BlockAlphas", "Workspace", "block_alphas", "composite"]
+__all__ = ["BlockAlphas", "block_alphas", "composite"]
 
 
 class BlockAlphas(NamedTuple):
@@ -43,25 +43,6 @@ class BlockAlphas(NamedTuple):
     weights: Tensor
     transmittance: Tensor
     passed: Tensor
-
-
-class Workspace:
-    """Buffers of the size of a block that are used again by the next one: fresh memory costs page faults.
-
-    Args:
-        count: the number of buffers.
-        chunk: whose blocks they are for.
-        like: a tensor of their dtype and device.
-    """
-
-    def __init__(self, count: int, chunk: Chunk, like: Tensor) -> None:
-        largest = max(math.prod(block.shape) for block in chunk.blocks) * PIXELS
-        self._buffers = [like.new_empty(largest) for _ in range(count)]
-
-    def of(self, block: Block) -> list[Tensor]:
-        """Return the buffers as (T, 64, L)."""
-        tiles, length = block.shape
-        return [buffer[: tiles * PIXELS * length].view(tiles, PIXELS, length) for buffer in self._buffers]
 
 
 def block_alphas(polynomial: Tensor, block: Block, buffers: Sequence[Tensor]) -> BlockAlphas:
@@ -101,7 +82,7 @@ class _Composite(torch.autograd.Function):
             workspace = Workspace(4, chunk, table)
             parts = sums.new_empty(chunk.tiles.shape[0], *sums.shape[1:])
             for block in chunk.blocks:
-                alphas = block_alphas(polynomial, block, workspace.of(block))
+                alphas = block_alphas(polynomial, block, workspace.of(block.shape[0], PIXELS, block.shape[1]))
                 v = block.of(of_entries).transpose(0, 1)
                 torch.bmm(v, alphas.weights.transpose(1, 2), out=parts[block.tiles])
             sums[chunk.tiles] = parts
@@ -124,7 +105,7 @@ class _Composite(torch.autograd.Function):
             to_entries = table.new_empty(rows + values.shape[0], chunk.gaussians.shape[0])
             workspace = Workspace(6, chunk, table)
             for block in chunk.blocks:
-                *buffers, along, behind = workspace.of(block)
+                *buffers, along, behind = workspace.of(block.shape[0], PIXELS, block.shape[1])
                 alphas = block_alphas(splats.polynomial, block, buffers)
                 g, v = of_tiles[block.tiles], block.of(of_entries).transpose(0, 1)
                 # Alphas: a splat adds T_i v_i itself and dims by 1 / (1 - alpha_i) the sum of all behind it.

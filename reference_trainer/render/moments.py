@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -21,6 +22,7 @@ from reference_trainer.render.recursion import (
 )
 from reference_trainer.render.renderer import Splats
 from reference_trainer.render.tiles import TileLists
+from reference_trainer.render.workspace import Workspace
 
 __all__ = ["MomentImages", "render_moments"]
 
@@ -96,10 +98,12 @@ class _Moments(torch.autograd.Function):
         for chunk in lists.chunks(moment_block_size(table.device)):
             polynomial = footprints(table, chunk, lists).polynomial
             v, f = of_entries(values, chunk), of_entries(factors, chunk)
+            workspace = Workspace(6, chunk, table)
             for block in chunk.blocks:
-                terms = evaluate_terms(polynomial, v, f, block)
+                *buffers, front = workspace.of(block.shape[1], PIXELS, block.shape[0])
+                terms = evaluate_terms(polynomial, v, f, block, buffers)
                 numbers = chunk.tiles[block.tiles]
-                weights = in_front(terms).mul_(terms.spread).unbind(0)
+                weights = in_front(terms, front).mul_(terms.spread).unbind(0)
                 mean = behind[numbers].permute(1, 2, 0).contiguous()
                 variance, contrast, weighted = torch.zeros_like(mean), torch.empty_like(mean), torch.empty_like(mean)
                 for i in contrasts(terms, mean, [contrast] * len(weights)):
@@ -121,12 +125,18 @@ class _Moments(torch.autograd.Function):
             splats = footprints(table, chunk, lists)
             v, f = of_entries(values, chunk), of_entries(factors, chunk)
             to_entries = table.new_zeros(sums.shape[0], chunk.gaussians.shape[0])
+            channels = values.shape[0]
+            workspace, of_channels = Workspace(10, chunk, table), Workspace(1, chunk, table, channels=channels)
             for block in chunk.blocks:
-                terms = evaluate_terms(splats.polynomial, v, f, block)
+                tiles, longest = block.shape
+                buffers = workspace.of(longest, PIXELS, tiles)
+                (kept,) = of_channels.of(longest, channels, PIXELS, tiles)
+                terms = evaluate_terms(splats.polynomial, v, f, block, buffers[:5])
                 numbers = chunk.tiles[block.tiles]
                 mean, to_mean, to_variance = (x[numbers].permute(1, 2, 0).contiguous() for x in (behind, *upstream))
                 to_block = block.of(to_entries).transpose(1, 2)
-                _backward(terms, mean, to_mean, to_variance, to_block, factors=ctx.needs_input_grad[2])
+                gradients_in = (mean, to_mean, to_variance)
+                _backward(terms, gradients_in, to_block, kept, buffers[5:], factors=ctx.needs_input_grad[2])
                 to_behind[numbers] = to_mean.permute(2, 0, 1)
             to_entries[:6] = table_gradient(splats, to_entries[:6])
             sums.index_add_(1, chunk.gaussians, to_entries)
@@ -134,38 +144,46 @@ class _Moments(torch.autograd.Function):
 
 
 def _backward(
-    terms: Terms, mean: Tensor, to_mean: Tensor, to_variance: Tensor, to_entries: Tensor, *, factors: bool
+    terms: Terms,
+    images: tuple[Tensor, Tensor, Tensor],
+    to_entries: Tensor,
+    kept: Tensor,
+    buffers: Sequence[Tensor],
+    *,
+    factors: bool,
 ) -> None:
     """Carry the gradients of a block's means and variances (C, 64, T) back to its entries.
 
     Args:
         terms: of the block.
-        mean: what is behind all splats; overwritten.
-        to_mean: gradient of the means; becomes that of what is behind all splats.
-        to_variance: gradient of the variances.
+        images: what is behind all splats (overwritten), the gradient of the means (becomes that of what is behind all
+            splats) and that of the variances.
         to_entries: receives the gradient of the sums of ln alpha times each monomial, of the values, and of m and v,
             shape (6 + C + 2, L, T).
-        factors: whether the last two are needed.
+        kept: buffer (L, C, 64, T).
+        buffers: five of shape (L, 64, T).
+        factors: whether the gradients of m and v are needed.
     """
+    mean, to_mean, to_variance = images
     longest = terms.alpha.shape[0]
-    kept = mean.new_empty(longest, *mean.shape).unbind(0)
+    to_weight, hidden, front, doubled, to_expected = buffers
+    contrast_rows = kept.unbind(0)
     weighted = torch.empty_like(mean)
     # With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
     # hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}: walked back to front, as division would fail at 0.
-    to_weight, hidden = torch.empty_like(terms.alpha), torch.zeros_like(terms.alpha)
+    hidden[-1] = 0.0
     weight_rows, hidden_rows = to_weight.unbind(0), hidden.unbind(0)
     spread, shrink = terms.spread.unbind(0), terms.shrink.unbind(0)
-    for i in contrasts(terms, mean, kept):
-        torch.mul(to_variance, kept[i], out=weighted).mul_(kept[i])
+    for i in contrasts(terms, mean, contrast_rows):
+        torch.mul(to_variance, contrast_rows[i], out=weighted).mul_(contrast_rows[i])
         torch.sum(weighted, 0, out=weight_rows[i])
         if i > 0:
             torch.mul(hidden_rows[i], shrink[i], out=hidden_rows[i - 1]).addcmul_(weight_rows[i], spread[i])
-    front = in_front(terms)
-    doubled = torch.mul(front, terms.spread).mul_(2.0).unbind(0)
-    to_expected = torch.empty_like(terms.alpha)
+    torch.mul(in_front(terms, front), terms.spread, out=doubled).mul_(2.0)
     to_values = mean.new_empty(longest, mean.shape[0], mean.shape[2])
     through = torch.empty_like(mean)
-    rows = zip(kept, terms.expected.unbind(0), doubled, to_expected.unbind(0), to_values.unbind(0), strict=True)
+    each = (terms.expected, doubled, to_expected, to_values)
+    rows = zip(contrast_rows, *(x.unbind(0) for x in each), strict=True)
     for contrast, expected, twice, to_row, to_value in rows:
         torch.mul(to_mean, contrast, out=weighted)
         torch.sum(weighted, 0, out=to_row)

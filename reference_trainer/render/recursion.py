@@ -97,7 +97,9 @@ class Terms(NamedTuple):
     values: Tensor
 
 
-def evaluate_terms(polynomial: Tensor, values: Tensor, factors: Tensor, block: Block) -> Terms:
+def evaluate_terms(
+    polynomial: Tensor, values: Tensor, factors: Tensor, block: Block, buffers: Sequence[Tensor]
+) -> Terms:
     """Evaluate the alphas of a block and the weights of the recursion.
 
     Args:
@@ -105,22 +107,23 @@ def evaluate_terms(polynomial: Tensor, values: Tensor, factors: Tensor, block: B
         values: what is composited, shape (C, E).
         factors: mean and variance of the factor of every entry, shape (2, E), or (2, 1) if they share it.
         block: of the chunk.
+        buffers: five of shape (L, 64, T), which receive the result.
     """
+    raw, alpha, expected, spread, shrink = buffers
     pixels = monomials(polynomial.dtype, polynomial.device).expand(block.shape[1], PIXELS, 6)
-    raw = torch.bmm(pixels, block.of(polynomial).permute(2, 0, 1).contiguous()).exp2_()
-    torch.threshold_(raw, MIN_ALPHA, 0.0)
-    alpha = raw.clamp(max=MAX_ALPHA)
+    torch.bmm(pixels, block.of(polynomial).permute(2, 0, 1).contiguous(), out=raw)
+    torch.threshold_(raw.exp2_(), MIN_ALPHA, 0.0)
+    torch.clamp(raw, max=MAX_ALPHA, out=alpha)
     m, v = factors if factors.shape[1] == 1 else block.of(factors).transpose(1, 2).contiguous()[:, :, None]
-    expected = m * alpha
-    spread = torch.mul(alpha, alpha).mul_(v)
-    shrink = (1.0 - expected).square_().add_(spread)
+    torch.mul(alpha, m, out=expected)
+    torch.mul(alpha, alpha, out=spread).mul_(v)
+    torch.sub(raw.new_ones(()), expected, out=shrink).square_().add_(spread)
     colors = block.of(values).permute(2, 0, 1).contiguous()[:, :, None]
     return Terms(raw, alpha, m, v, expected, spread, shrink, colors)
 
 
-def in_front(terms: Terms) -> Tensor:
-    """Return S, the product of ``shrink`` over all splats in front of each, (L, 64, T)."""
-    front = torch.empty_like(terms.shrink)
+def in_front(terms: Terms, front: Tensor) -> Tensor:
+    """Put S, the product of ``shrink`` over all splats in front of each, into a buffer (L, 64, T) and return it."""
     front[0] = 1.0
     rows = front.unbind(0)
     for nearer, factor, farther in zip(rows, terms.shrink.unbind(0), rows[1:], strict=False):

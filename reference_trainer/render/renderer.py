@@ -15,7 +15,7 @@ from reference_trainer.render.projection import Projection, project
 from reference_trainer.render.spherical_harmonics import evaluate_sh
 from reference_trainer.render.tiles import TileLists, bin_gaussians
 
-__all__ = ["Rendering", "Splats", "render", "splat"]
+__all__ = ["Rendering", "Splats", "draw", "masked", "render", "splat"]
 
 
 class Splats(NamedTuple):
@@ -34,6 +34,17 @@ class Splats(NamedTuple):
     opacities: Tensor
     colors: Tensor
     lists: TileLists
+
+
+def masked(splats: Splats, opacities: Tensor) -> Splats:
+    """Return the same view of the same Gaussians with lower opacities, without projecting and sorting them again.
+
+    Args:
+        splats: of the Gaussians with opacities at least as high.
+        opacities: activated, of all N Gaussians, shape (N,) or (N, 1); 0 leaves a Gaussian out.
+    """
+    lower = opacities.reshape(-1)[splats.indices]
+    return splats._replace(opacities=lower, lists=splats.lists.only(lower >= MIN_ALPHA))
 
 
 class Rendering(NamedTuple):
@@ -151,6 +162,17 @@ def render(
         (torch.Size([3, 32, 32]), 0.8)
     """
     splats = splat(means, quaternions, scales, opacities, camera, sh=sh, sh_degree=sh_degree, colors=colors)
+    return draw(splats, background=background, depth=depth)
+
+
+def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = False) -> Rendering:
+    """Composite Gaussians that are ready for a camera.
+
+    Args:
+        splats: from `splat` or `masked`.
+        background: colour behind everything, shape (3,); black by default.
+        depth: whether to accumulate depth as well.
+    """
     projection = splats.projection
     if projection.means.requires_grad:
         projection.means.retain_grad()

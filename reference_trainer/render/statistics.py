@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import color_variance
-from reference_trainer.render.blending import Workspace, block_alphas
+from reference_trainer.render.blending import block_alphas
 from reference_trainer.render.footprints import PIXELS, block_size, footprints, pack, untile
 from reference_trainer.render.renderer import Splats
+from reference_trainer.render.workspace import Workspace
 
 __all__ = ["color_variance_map"]
 
@@ -43,7 +44,7 @@ def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
         polynomial = footprints(table, chunk, lists).polynomial
         workspace = Workspace(4, chunk, table)
         for block in chunk.blocks:
-            weights = block_alphas(polynomial, block, workspace.of(block)).weights
+            weights = block_alphas(polynomial, block, workspace.of(block.shape[0], PIXELS, block.shape[1])).weights
             which = chunk.gaussians[block.entries].view(block.shape)
             result = color_variance(weights, colors[which][:, None].expand(-1, PIXELS, -1, -1))
             tiles[chunk.tiles[block.tiles]] = torch.stack([result.variance, result.covered.to(table)], dim=1)

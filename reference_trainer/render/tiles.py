@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -90,6 +90,21 @@ class TileLists:
         lengths, tiles = torch.sort(self.lengths, descending=True, stable=True)
         starts = (self.lengths.cumsum(0) - self.lengths)[tiles]
         return lengths.tolist(), tiles, starts
+
+    def only(self, kept: Tensor) -> TileLists:
+        """Return the lists without some Gaussians.
+
+        Args:
+            kept: whether a Gaussian stays, shape (M,) bool.
+        """
+        stays = kept[self.gaussians]
+        ends = torch.nn.functional.pad(stays.cumsum(0), (1, 0))[self.lengths.cumsum(0)]
+        return replace(
+            self,
+            gaussians=self.gaussians[stays],
+            lengths=ends.diff(prepend=ends.new_zeros(1)),
+            touched=self.touched & kept,
+        )
 
     def chunks(self, pairs: int) -> Iterator[Chunk]:
         """Iterate over all tiles with a non-empty list, in blocks of at most ``pairs`` pixel-Gaussian pairs.

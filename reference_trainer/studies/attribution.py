@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAResult, Reason, attribute, total_effects
-from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, Model
+from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
+from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import heat_map, save_png, side_by_side
 from reference_trainer.evaluation.rank_correlation import spearman
 from reference_trainer.evaluation.report import machine, markdown_table, write_json

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
-from reference_trainer.evaluation.evaluate import Model
+from reference_trainer.evaluation.model import Model
 from reference_trainer.render.first_order import first_order_map
 from reference_trainer.scenes.scene import View
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from reference_trainer.evaluation.evaluate import Model
+from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
 from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.orbit import orbit_views

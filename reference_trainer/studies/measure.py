@@ -8,7 +8,8 @@ from pathlib import Path
 
 import torch
 
-from reference_trainer.evaluation.evaluate import Evaluation, Model, PerceptualMetric, evaluate
+from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric, evaluate
+from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import save_gif, save_png
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.evaluation.trajectory import interpolate_cameras

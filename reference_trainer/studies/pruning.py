@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from reference_trainer.evaluation.evaluate import Model
 from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, mean_std, write_json
 from reference_trainer.model.density import DensityStatistics
 from reference_trainer.scenes.options import SceneOptions

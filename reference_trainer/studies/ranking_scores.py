@@ -15,8 +15,8 @@ from torch import Tensor
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier
 from ca_reg.types import read_moments
-from reference_trainer.evaluation.evaluate import Model
 from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import mean_std
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAMonitor
-from reference_trainer.evaluation.evaluate import Model, evaluate
+from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.lpips import lpips_option
 from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.model.ply import save_ply
 from reference_trainer.scenes.options import SceneOptions

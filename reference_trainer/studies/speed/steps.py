@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from kornia.metrics import ssim as kornia_ssim
 
-from reference_trainer.evaluation.evaluate import Model
+from reference_trainer.evaluation.model import Model
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.options import SceneOptions

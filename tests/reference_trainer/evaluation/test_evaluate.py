@@ -8,8 +8,9 @@ from PIL import Image
 
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier
-from reference_trainer.evaluation.evaluate import Evaluation, Model, ViewScores, evaluate
+from reference_trainer.evaluation.evaluate import Evaluation, ViewScores, evaluate
 from reference_trainer.evaluation.metrics import psnr, ssim
+from reference_trainer.evaluation.model import Model
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.render import render
 from reference_trainer.scenes.scene import Scene

@@ -10,7 +10,7 @@ from oracles import brute_force, random_scene
 from PIL import Image
 
 from ca_reg import Reason
-from reference_trainer.evaluation.evaluate import Model
+from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import write_json
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply

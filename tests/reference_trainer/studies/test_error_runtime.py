@@ -10,7 +10,7 @@ import torch
 from oracles import brute_force, random_scene
 
 from ca_reg.functional import apply_dropout, draw_keep_mask
-from reference_trainer.evaluation.evaluate import Model
+from reference_trainer.evaluation.model import Model
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.error_runtime import (

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.evaluate import Model
+from reference_trainer.evaluation.model import Model
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.scenes.scene import View

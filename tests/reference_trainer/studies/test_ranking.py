@@ -10,7 +10,7 @@ from PIL import Image
 from scipy.stats import kendalltau, spearmanr
 
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.evaluate import Model
+from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import write_json
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.scenes.scene import View

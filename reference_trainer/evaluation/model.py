@@ -1,0 +1,148 @@
+"""A trained model and the ways to render and to score it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ca_reg import CAScore, RenderFn
+from ca_reg.functional import Multiplier
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.render import Rendering, Splats, draw, masked, splat
+from reference_trainer.render.attribution import variance_shares
+from reference_trainer.render.moments import MomentImages, render_moments
+from reference_trainer.scenes.scene import View
+
+__all__ = ["MaskedRenders", "Model"]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained model and how it is to be used at test time.
+
+    Args:
+        gaussians: the parameters.
+        background: colour behind them, shape (3,).
+        dropout: the rate p that it was trained with; it decides the drop rate of the paper's CA protocol.
+        opacity_scale: what opacities are multiplied with at test time: 1 - p, or 1 for inverted dropout.
+        sh_degree: highest band of spherical harmonics to use; None for all.
+    """
+
+    gaussians: Gaussians
+    background: Tensor
+    dropout: float = 0.0
+    opacity_scale: float = 1.0
+    sh_degree: int | None = None
+
+    def render(self, opacities: Tensor, view: View) -> tuple[Tensor, Tensor]:
+        """Render a view with given opacities (N,): the render callable of `CAScore`; image (3, H, W), alpha (H, W)."""
+        out = self.rendering(opacities, view)
+        return out.image, out.alpha
+
+    def rendering(self, opacities: Tensor, view: View) -> Rendering:
+        """Render a view with given opacities (N,), with everything that the renderer tells."""
+        return render_gaussians(
+            self.gaussians, view.camera, self.background, opacities=opacities, sh_degree=self.sh_degree
+        )
+
+    def moments(
+        self, opacities: Tensor, view: View, multiplier: Multiplier, background: Tensor | None = None
+    ) -> MomentImages:
+        """Render the exact moments of a view under random factors: the moments callable of `CAScore`.
+
+        Args:
+            opacities: activated, shape (N,).
+            view: what to render.
+            multiplier: moments of the factors.
+            background: instead of the model's own, shape (3,) or (3, H, W).
+        """
+        return render_moments(self.splats(opacities, view), multiplier, background=self._behind(background))
+
+    def shares(
+        self, opacities: Tensor, view: View, multiplier: Multiplier, background: Tensor | None, weights: Tensor
+    ) -> Tensor:
+        """Attribute a weighted sum of the variance to the Gaussians: the shares callable of `ca_reg.attribute`.
+
+        Args:
+            opacities: activated, shape (N,).
+            view: what to render.
+            multiplier: moments of the factors.
+            background: instead of the model's own, shape (3,) or (3, H, W).
+            weights: of the pixels, shape (H, W).
+
+        Returns:
+            Shares of all Gaussians, shape (N,), float64; 0 for those outside the view.
+        """
+        splats = self.splats(opacities, view)
+        shares = torch.zeros(len(self.gaussians), dtype=torch.float64, device=opacities.device)
+        shares[splats.indices] = variance_shares(splats, multiplier, weights, background=self._behind(background))
+        return shares
+
+    def splats(self, opacities: Tensor, view: View) -> Splats:
+        """Project the model with given opacities (N,) and list it per tile."""
+        model = self.gaussians
+        return splat(
+            model.means,
+            model.quaternions,
+            model.scales,
+            opacities,
+            view.camera,
+            sh=model.sh,
+            sh_degree=self.sh_degree,
+        )
+
+    def _behind(self, background: Tensor | None) -> Tensor:
+        """The background that was asked for, or the model's own."""
+        return self.background if background is None else background
+
+    def ca_score(
+        self, *, samples: int = 5, drop_rate: float | None = None, seed: int = 0, render_fn: RenderFn | None = None
+    ) -> CAScore:
+        """Return the paper's CA protocol for this model.
+
+        Args:
+            samples: K.
+            drop_rate: instead of the paper's 1 - (1 - p) / 2.
+            seed: of the masks.
+            render_fn: instead of `MaskedRenders`, for a model that changes.
+        """
+        return CAScore(
+            render_fn or MaskedRenders(self), samples=samples, p=self.dropout, drop_rate=drop_rate, seed=seed
+        )
+
+    def exact_ca_score(self, *, drop_rate: float | None = None, neutral: bool = False) -> CAScore:
+        """Return the limit of the protocol for infinitely many samples, over the region of expected alpha above 0.8.
+
+        Args:
+            drop_rate: instead of the paper's 1 - (1 - p) / 2.
+            neutral: composite every pixel over its own expected colour instead of the background.
+        """
+        return CAScore(exact=self.moments, p=self.dropout, drop_rate=drop_rate, neutral=neutral)
+
+
+class MaskedRenders:
+    """The render callable of a `CAScore` over a model that does not change.
+
+    Projection, colours, tile lists and their order are made once for a view, for all Gaussians; a mask only takes
+    entries out of the lists. The images are those of `Model.render`.
+
+    Args:
+        model: what to render.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        self._view: View | None = None
+        self._splats: Splats | None = None
+
+    def __call__(self, opacities: Tensor, view: View) -> tuple[Tensor, Tensor]:
+        """Render a view with given opacities (N,); image (3, H, W), alpha (H, W)."""
+        if bool((opacities > self._model.gaussians.opacities).any()):  # the lists would be too short
+            return self._model.render(opacities, view)
+        if self._splats is None or view is not self._view:
+            self._view, self._splats = view, self._model.splats(self._model.gaussians.opacities, view)
+        out = draw(masked(self._splats, opacities), background=self._model.background)
+        return out.image, out.alpha

@@ -1,0 +1,69 @@
+"""Renders that share their projection against renders that do not, and the callables of a score against each other."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ca_reg import CAScore, Reason, attribute
+from ca_reg.functional import Multiplier
+from reference_trainer.evaluation.model import MaskedRenders, Model
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return synthetic_scene(width=40, height=30, points=300)
+
+
+@pytest.fixture(scope="module")
+def model(scene) -> Model:
+    points = scene.points
+    assert points is not None
+    generator = torch.Generator().manual_seed(0)
+    gaussians = Gaussians.from_points(points.positions, points.colors, torch.full((300,), 0.3), sh_degree=1)
+    logits = 2.0 * torch.randn(300, generator=generator)
+    rest = 0.1 * torch.randn(gaussians.sh_rest.shape, generator=generator)
+    return Model(replace(gaussians, opacity_logits=logits, sh_rest=rest), scene.background, dropout=0.2)
+
+
+def assert_equal_renders(mine, other) -> None:
+    for x, y in zip(mine, other, strict=True):
+        torch.testing.assert_close(x, y, rtol=0, atol=1e-6)
+
+
+def test_masked_renders_are_the_renders(model, scene):
+    renders = MaskedRenders(model)
+    generator = torch.Generator().manual_seed(1)
+    masks = [torch.ones(300), (torch.rand(300, generator=generator) < 0.5).float(), torch.zeros(300)]
+    for view in (scene.train[0], scene.train[1], scene.train[0]):
+        for mask in masks:
+            opacities = model.gaussians.opacities * mask
+            assert_equal_renders(renders(opacities, view), model.render(opacities, view))
+
+
+@pytest.mark.parametrize("factor", [0.3, 1.0, 3.0])
+def test_other_opacities_are_rendered_as_well(model, scene, factor):
+    opacities = (factor * model.gaussians.opacities).clamp(max=1.0)
+    assert_equal_renders(MaskedRenders(model)(opacities, scene.train[0]), model.render(opacities, scene.train[0]))
+
+
+def test_the_score_of_shared_renders_is_the_score(model, scene):
+    opacities = model.gaussians.opacities
+    shared = model.ca_score()(opacities, scene.train[0])
+    plain = CAScore(model.render, p=0.2)(opacities, scene.train[0])
+    assert shared.reason is Reason.OK
+    assert shared.value == pytest.approx(plain.value, rel=1e-5)
+    assert torch.equal(shared.visible, plain.visible)
+
+
+@pytest.mark.parametrize("neutral", [False, True])
+def test_the_shares_of_the_model_add_up_to_its_exact_score(model, scene, neutral):
+    opacities = model.gaussians.opacities
+    shares, result = attribute(model.exact_ca_score(neutral=neutral), model.shares, opacities, scene.train[0])
+    assert result.value > 0
+    assert shares.sum().item() == pytest.approx(result.value, rel=1e-5)
+    outside = model.moments(opacities, scene.train[0], Multiplier.dropout(0.5))
+    assert outside.variance.shape == (3, 30, 40)
