@@ -106,9 +106,10 @@ def splat(
         depths = means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
         indices = torch.nonzero((depths > NEAR_PLANE) & (opacities >= MIN_ALPHA)).squeeze(1)
     if indices.shape[0] < n:
-        means, quaternions, scales = means[indices], quaternions[indices], scales[indices]
-        opacities = opacities[indices]
-        sh, colors = (None if x is None else x[indices] for x in (sh, colors))
+        means, quaternions, scales, opacities = (
+            x.index_select(0, indices) for x in (means, quaternions, scales, opacities)
+        )
+        sh, colors = (None if x is None else x.index_select(0, indices) for x in (sh, colors))
     projection = project(means, quaternions, scales, camera)
     if sh is not None:
         directions = torch.nn.functional.normalize(means - camera.position, dim=-1)

@@ -137,16 +137,17 @@ class TileLists:
                 Block(slice(first - begin, last - begin), slice(entry, entry + size), (last - first, longest))
             )
             entry += size
-        device = self.gaussians.device
-        counts = torch.tensor([block.shape[0] for block in blocks], device=device)
-        widths = torch.tensor([block.shape[1] for block in blocks], device=device).repeat_interleave(counts)
-        numbers = tiles[begin:end]
-        of_tile = torch.repeat_interleave(widths, output_size=entry)
-        position = torch.arange(entry, device=device) - (widths.cumsum(0) - widths)[of_tile]
-        tile_of = numbers[of_tile]
-        where = (starts[begin:end][of_tile] + position).clamp_(max=self.gaussians.shape[0] - 1)
-        inside = position < self.lengths[tile_of]
-        return Chunk(numbers, torch.where(inside, self.gaussians[where], self.count), tile_of, blocks)
+        numbers, starts, lengths = tiles[begin:end], starts[begin:end, None], self.lengths[tiles[begin:end], None]
+        position = torch.arange(parts[0][1], device=tiles.device)
+        where, tile_of = starts.new_empty(entry), starts.new_empty(entry)
+        absent = torch.empty(entry, dtype=torch.bool, device=tiles.device)
+        for block in blocks:  # broadcasting, because gathering by entry takes several times longer
+            along = position[: block.shape[1]]
+            torch.add(starts[block.tiles], along, out=where[block.entries].view(block.shape))
+            torch.ge(along, lengths[block.tiles], out=absent[block.entries].view(block.shape))
+            tile_of[block.entries].view(block.shape).copy_(numbers[block.tiles, None])
+        gaussians = self.gaussians.index_select(0, where.clamp_(max=self.gaussians.shape[0] - 1))
+        return Chunk(numbers, gaussians.masked_fill_(absent, self.count), tile_of, blocks)
 
 
 def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
