@@ -1,7 +1,7 @@
 """Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting, in any code base.
 
 - :class:`GaussianDropout` and :class:`OpacityNoise` regularize the activated opacities on their way to the rasterizer;
-  :func:`scale_opacity` is what dropout needs at test time.
+  :func:`scale_opacity` is what dropout needs at test time, :func:`expected_opacity` what noise does.
 - :class:`CAScore` measures co-adaptation with any render callable, by sampling, or exactly if the renderer offers
   moments, for which :class:`ListMoments` makes do with per-pixel lists; :func:`attribute` and :func:`total_effects`
   tell which Gaussians it comes from. :class:`CAMonitor` logs it during training, and :func:`color_variance` is the
@@ -17,7 +17,7 @@ Importing this package loads torch and numpy only.
 
 from ca_reg import functional
 from ca_reg.attribution import CAAttribution, CATotalEffects, SharesFn, attribute, total_effects
-from ca_reg.functional import ColorVariance, color_variance, scale_opacity
+from ca_reg.functional import ColorVariance, color_variance, expected_opacity, scale_opacity
 from ca_reg.lists import ListMoments, PixelLists
 from ca_reg.modules import GaussianDropout, OpacityNoise
 from ca_reg.monitor import CAMonitor
@@ -55,6 +55,7 @@ __all__ = [
     "__version__",
     "attribute",
     "color_variance",
+    "expected_opacity",
     "functional",
     "scale_opacity",
     "summarize",

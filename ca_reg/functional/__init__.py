@@ -12,7 +12,7 @@ from ca_reg.functional.moments import (
 )
 from ca_reg.functional.multipliers import Multiplier
 from ca_reg.functional.noise import apply_opacity_noise, draw_opacity_noise, opacity_noise
-from ca_reg.functional.scaling import scale_opacity
+from ca_reg.functional.scaling import expected_opacity, scale_opacity
 from ca_reg.functional.variance import ColorVariance, color_variance
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "draw_keep_mask",
     "draw_opacity_noise",
     "expected_absolute_error",
+    "expected_opacity",
     "expected_squared_error",
     "first_order_variance",
     "gaussian_dropout",

@@ -91,6 +91,8 @@ class Evaluate:
     scene: Scene = field(default_factory=SceneOptions)
     dropout: float = 0.0
     """For a PLY: the dropout rate that it was trained with."""
+    scale_noise: bool = False
+    """For a run with noise: scale opacities by its mean, even if the run was trained without --scale-noise."""
     samples: int = 5
     """Renders per view for the CA score."""
     seed: int = 0
@@ -100,7 +102,7 @@ class Evaluate:
     device: str = "cpu"
     """"cpu" or "cuda"."""
     out: Path | None = None
-    """Folder for evaluation.json and pictures; by default <run>/evaluation."""
+    """Folder for evaluation.json and pictures; by default <run>/evaluation, or <run>/evaluation_scale_noise."""
 
     def __call__(self) -> None:
         """Run the command."""
@@ -108,8 +110,12 @@ class Evaluate:
         from reference_trainer.studies.measure import measure, of_ply, of_run
 
         if self.run is not None:
-            model, scene, default = of_run(self.run, self.device)
+            model, scene, default = of_run(self.run, self.device, scale_noise=self.scale_noise)
         elif self.ply is not None:
+            if self.scale_noise:
+                raise ValueError(
+                    "--scale-noise needs the folder of a run: a PLY does not say which noise it was trained with."
+                )
             model, scene, default = of_ply(self.ply, self.scene, dropout=self.dropout, device=self.device)
         else:
             raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE and --path SCENE.")
@@ -169,8 +175,13 @@ class Compare:
         """Run the command."""
         from reference_trainer.studies.compare import compare, report, strategies
 
-        config = replace(self.config, dropout=0.0, noise=0.0, analytic=False, ca_weight=0.0)
-        every = strategies(config, dropout=self.config.dropout or 0.2, noise=self.config.noise or 0.8)
+        config = replace(self.config, dropout=0.0, noise=0.0, analytic=False, ca_weight=0.0, scale_noise=False)
+        every = strategies(
+            config,
+            dropout=self.config.dropout or 0.2,
+            noise=self.config.noise or 0.8,
+            scale_noise=self.config.scale_noise,
+        )
         chosen: dict[str, TrainConfig] = {name: every[name] for name in self.strategies}
         comparison = compare(
             self.scene,

@@ -116,7 +116,7 @@ def evaluate(
         for index, view in enumerate(member.to(opacities.device) for member in members):
             if progress is not None:
                 progress(f"{split} {view.name}")
-            out = model.rendering(opacities * model.opacity_scale, view)
+            out = model.rendering(model.test_opacities, view)
             image = out.image.clamp(0, 1)
             ca = score(opacities, view, index=index)
             ca_half = ca if score.settings.drop_rate == 0.5 else half(opacities, view, index=index)

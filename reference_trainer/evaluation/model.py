@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAScore, RenderFn
-from ca_reg.functional import Multiplier
+from ca_reg.functional import Multiplier, expected_opacity
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render import Rendering, Splats, draw, masked, splat
@@ -29,6 +29,9 @@ class Model:
         dropout: the rate p that it was trained with; it decides the drop rate of the paper's CA protocol.
         opacity_scale: what opacities are multiplied with at test time: 1 - p, or 1 for inverted dropout.
         sh_degree: highest band of spherical harmonics to use; None for all.
+        expected_noise: sigma of the opacity noise whose mean opacities are multiplied with at test time as well; 0, as
+            in the paper, for none.
+        clip_noise: whether that noise is clipped to [-sigma, sigma].
     """
 
     gaussians: Gaussians
@@ -36,6 +39,15 @@ class Model:
     dropout: float = 0.0
     opacity_scale: float = 1.0
     sh_degree: int | None = None
+    expected_noise: float = 0.0
+    clip_noise: bool = False
+
+    @property
+    def test_opacities(self) -> Tensor:
+        """The opacities to render with at test time, shape (N,); co-adaptation is measured on the plain ones."""
+        # Training drops first. A factor of 0 or 1 commutes with the clamp: the noise has its mean at plain opacities.
+        mean = expected_opacity(self.gaussians.opacities, self.expected_noise, clip=self.clip_noise)
+        return mean * self.opacity_scale
 
     def render(self, opacities: Tensor, view: View) -> tuple[Tensor, Tensor]:
         """Render a view with given opacities (N,): the render callable of `CAScore`; image (3, H, W), alpha (H, W)."""

@@ -20,6 +20,7 @@ from reference_trainer.model.gaussians import Gaussians
 __all__ = ["PlyModel", "load_ply", "save_ply"]
 
 _SCALED = "ca_reg opacity_scaled_by"
+_FOR_RENDERING = "ca_reg opacity_for_rendering"
 _HEADER_LIMIT = 65_536  # bytes; a standard header has 1.6 kB, so more than this is not a header
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -42,14 +43,22 @@ class PlyModel:
         gaussians: the Gaussians, float32 on the CPU, exactly as stored.
         opacity_scale: the factor that is already part of the stored opacities, 1.0 if none is: a model trained with
             dropout ``p`` and saved with ``bake_p=p`` has ``1 - p`` here and must not be scaled again.
+        for_rendering: whether the file was saved with ``opacities=``: those in it are to be rendered as they are, and
+            the plain ones cannot be had from it.
     """
 
     gaussians: Gaussians
     opacity_scale: float
+    for_rendering: bool
 
 
 def save_ply(
-    gaussians: Gaussians, path: str | Path, *, bake_p: float | None = None, pad_to_degree: int | None = None
+    gaussians: Gaussians,
+    path: str | Path,
+    *,
+    bake_p: float | None = None,
+    opacities: Tensor | None = None,
+    pad_to_degree: int | None = None,
 ) -> None:
     """Write Gaussians as a binary little-endian PLY of float32, the layout of the INRIA code, for any viewer.
 
@@ -64,11 +73,13 @@ def save_ply(
         bake_p: dropout rate in [0, 1) of the training, to store the opacities scaled by ``1 - bake_p`` as rendering
             needs them, for viewers that know nothing of dropout. A header comment records the factor. None or 0
             stores the opacities as they are.
+        opacities: to store these instead, in [0, 1], shape (N,): what rendering needs where that is not one factor, as
+            after opacity noise. A header comment records that they are not the plain ones.
         pad_to_degree: store at least this degree of spherical harmonics, 0 to 3, with zeros for the missing
             coefficients; many viewers read degree 3 only.
 
     Raises:
-        ValueError: if ``bake_p`` or ``pad_to_degree`` is out of range.
+        ValueError: if ``bake_p``, ``opacities`` or ``pad_to_degree`` is out of range, or the first two are both given.
         OSError: if the file cannot be written.
 
     Example:
@@ -87,7 +98,11 @@ def save_ply(
     if pad_to_degree is not None and pad_to_degree not in (0, 1, 2, 3):
         raise ValueError(f"pad_to_degree must be 0, 1, 2 or 3, got {pad_to_degree}.")
     logits, comments = gaussians.opacity_logits.detach(), []
-    if bake_p:
+    if opacities is not None:
+        if bake_p is not None:
+            raise ValueError("bake_p scales the opacities of the Gaussians, opacities replaces them: give one of them.")
+        logits, comments = _logits(opacities.detach(), len(gaussians)), [f"comment {_FOR_RENDERING}"]
+    elif bake_p:
         # The decimal of 1 - 0.2 is written, not the neighbouring double that the subtraction gives.
         logits, comments = _scaled_logits(logits, 1 - bake_p), [f"comment {_SCALED} {round(1 - bake_p, 12)}"]
     n, rest = len(gaussians), gaussians.sh_rest.detach().transpose(1, 2)  # [N, 3, K]
@@ -113,7 +128,7 @@ def load_ply(path: str | Path) -> PlyModel:
         path: the file.
 
     Returns:
-        The Gaussians in float32, and the factor their opacities already carry.
+        The Gaussians in float32, and what their opacities already carry.
 
     Raises:
         ValueError: if the file is no such PLY, is shorter than its header says, or holds values that are not finite;
@@ -152,7 +167,17 @@ def load_ply(path: str | Path) -> PlyModel:
     bad += ["opacity_logits"] if bool(gaussians.opacity_logits.isnan().any()) else []
     if bad:
         raise ValueError(f"{path} holds values that are not finite in {', '.join(bad)}: remove those Gaussians first.")
-    return PlyModel(gaussians, _opacity_scale(comments, path))
+    return PlyModel(gaussians, _opacity_scale(comments, path), _FOR_RENDERING in comments)
+
+
+def _logits(opacities: Tensor, count: int) -> Tensor:
+    """Return the logits of so many opacities in [0, 1], in float64; infinite at the ends."""
+    if opacities.shape != (count,) or not bool(((opacities >= 0) & (opacities <= 1)).all()):
+        raise ValueError(
+            f"opacities must have shape ({count},) and values in [0, 1], activated; got shape {tuple(opacities.shape)}"
+            + (f" and values from {opacities.min():g} to {opacities.max():g}." if opacities.numel() else ".")
+        )
+    return torch.logit(opacities.double())
 
 
 def _scaled_logits(logits: Tensor, factor: float) -> Tensor:

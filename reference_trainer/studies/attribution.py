@@ -20,10 +20,10 @@ from reference_trainer.evaluation.rank_correlation import spearman
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.files import replacing
 from reference_trainer.model.gaussians import SH_C0, Gaussians
-from reference_trainer.model.ply import save_ply
 from reference_trainer.render import render
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.measure import of_run
+from reference_trainer.studies.run import save_for_viewers
 
 __all__ = [
     "blend_weights",
@@ -107,8 +107,7 @@ def blend_weights(model: Model, views: Sequence[View]) -> Tensor:
     Returns:
         Sums of alpha times transmittance, shape (N,), float64.
     """
-    gaussians = model.gaussians
-    opacities = gaussians.opacities * model.opacity_scale
+    gaussians, opacities = model.gaussians, model.test_opacities
     total = torch.zeros_like(opacities, dtype=torch.float64)
     for view in views:
         colors = torch.zeros_like(gaussians.means).requires_grad_()
@@ -239,7 +238,7 @@ def study_attribution(
         ),
     }
     for name, gaussians in colored.items():  # with the scaling baked in, as in a run's PLY for viewers
-        save_ply(gaussians, out / f"{name}.ply", bake_p=1 - model.opacity_scale, pad_to_degree=3)
+        save_for_viewers(dataclasses.replace(model, gaussians=gaussians), out / f"{name}.ply", pad_to_degree=3)
     for view, result in zip(views, results, strict=True):
         save_png(out / "views" / f"{Path(view.name).stem}.png", _picture(model, colored.values(), view, result))
     write_json(out / "attribution.json", data)
@@ -287,7 +286,7 @@ def _correlations(model: Model, views: Sequence[View], shares: Tensor, weights: 
 @torch.no_grad()
 def _picture(model: Model, colored: Iterable[Gaussians], view: View, result: CAResult) -> Tensor:
     """Lay the render, the CA map and the render in other colours side by side."""
-    opacities = model.gaussians.opacities * model.opacity_scale
+    opacities = model.test_opacities
     ca_map = heat_map(result.variance.masked_fill(~result.visible, math.nan).float(), CA_PICTURE_RANGE)
     models = [model, *(dataclasses.replace(model, gaussians=gaussians) for gaussians in colored)]
     plain, *others = [each.rendering(opacities, view).image for each in models]

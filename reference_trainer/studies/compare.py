@@ -26,7 +26,9 @@ REPORT = "comparison.json"
 TABLE = "comparison.md"
 
 
-def strategies(config: TrainConfig, *, dropout: float = 0.2, noise: float = 0.8) -> dict[str, TrainConfig]:
+def strategies(
+    config: TrainConfig, *, dropout: float = 0.2, noise: float = 0.8, scale_noise: bool = False
+) -> dict[str, TrainConfig]:
     """Return the four settings of the paper's comparison, and dropout and noise in expectation instead of sampled.
 
     Example:
@@ -35,7 +37,10 @@ def strategies(config: TrainConfig, *, dropout: float = 0.2, noise: float = 0.8)
         (0.2, 0.0, True)
     """
     rates = {"baseline": (0.0, 0.0), "dropout": (dropout, 0.0), "noise": (0.0, noise), "both": (dropout, noise)}
-    sampled = {name: dataclasses.replace(config, dropout=p, noise=sigma) for name, (p, sigma) in rates.items()}
+    sampled = {
+        name: dataclasses.replace(config, dropout=p, noise=sigma, scale_noise=scale_noise and sigma > 0)
+        for name, (p, sigma) in rates.items()
+    }
     expected = {f"analytic-{name}": dataclasses.replace(sampled[name], analytic=True) for name in ("dropout", "noise")}
     return sampled | expected
 

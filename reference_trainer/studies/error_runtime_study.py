@@ -256,10 +256,9 @@ def _of_run(run: Path, device: str) -> tuple[Model, View]:
 def _of_ply(ply: Path, device: str) -> tuple[Model, View]:
     """Return the model of a PLY over black, and a view from an orbit; it has a camera but no photograph."""
     loaded = load_ply(ply)
-    if loaded.opacity_scale != 1:
-        raise ValueError(
-            f"the opacities of {ply} are scaled by {loaded.opacity_scale:g} for viewers: give the PLY with plain ones."
-        )
+    if loaded.opacity_scale != 1 or loaded.for_rendering:
+        by = "the mean of their noise" if loaded.for_rendering else f"{loaded.opacity_scale:g}"
+        raise ValueError(f"the opacities of {ply} are scaled by {by} for viewers: give the PLY with plain ones.")
     gaussians = loaded.gaussians.to(device)
     camera = orbit_views(gaussians.means, gaussians.opacities, count=1, width=PICTURE, height=PICTURE)[0]
     nothing = torch.zeros(3, device=device)

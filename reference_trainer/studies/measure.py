@@ -25,27 +25,43 @@ __all__ = ["evaluation_table", "measure", "of_ply", "of_run", "render_run"]
 Say = Callable[[str], None]
 
 
-def of_run(run: Path, device: str = "cpu") -> tuple[Model, Scene, Path]:
+def of_run(run: Path, device: str = "cpu", *, scale_noise: bool = False) -> tuple[Model, Scene, Path]:
     """Return a run's model at its last checkpoint, its scene, and the folder for its evaluation.
+
+    Args:
+        run: folder of the run.
+        device: where to render.
+        scale_noise: scale by the mean of the noise at test time, also if the run does not; the training would have
+            been the same.
 
     Raises:
         FileNotFoundError: if the folder holds no run.
+        ValueError: if ``scale_noise`` is asked of a run without noise, or with inverted dropout.
     """
     trainer = load_run(run, device)
-    return model_of(trainer), trainer.scene, run / "evaluation"
+    if not scale_noise:
+        return model_of(trainer), trainer.scene, run / "evaluation"
+    if trainer.config.noise == 0:
+        raise ValueError(f"{run} was trained without noise, there is nothing to scale by: leave out --scale-noise.")
+    trainer.config = replace(trainer.config, scale_noise=True)
+    return model_of(trainer), trainer.scene, run / "evaluation_scale_noise"
 
 
-def of_ply(ply: Path, options: SceneOptions, *, dropout: float = 0.0, device: str = "cpu") -> tuple[Model, Scene, Path]:
+def of_ply(
+    ply: Path, options: SceneOptions, *, dropout: float = 0.0, device: str = "cpu", say: Say = print
+) -> tuple[Model, Scene, Path]:
     """Return the model of a standard 3DGS PLY, a scene for it, and the folder for its evaluation.
 
     A PLY that says that the test-time scaling is baked into its opacities says the rate as well. The scaling is undone,
-    because CA is measured on plain opacities and the evaluation scales by itself.
+    because CA is measured on plain opacities and the evaluation scales by itself. Opacities that were scaled by the
+    mean of their noise are used as they are, for CA too.
 
     Args:
         ply: the model.
         options: the scene whose cameras and photographs are used.
         dropout: the rate that the model was trained with, if the PLY does not say it.
         device: where to render.
+        say: is told if the plain opacities cannot be had.
 
     Raises:
         ValueError: if the PLY says another rate than ``dropout``, or is damaged.
@@ -53,7 +69,9 @@ def of_ply(ply: Path, options: SceneOptions, *, dropout: float = 0.0, device: st
     """
     loaded = load_ply(ply)
     gaussians, baked = loaded.gaussians, round(1.0 - loaded.opacity_scale, 12)
-    if baked > 0:
+    if loaded.for_rendering:
+        say(f"{ply} holds test-time opacities only: they are rendered as they are, and CA is that of these opacities.")
+    elif baked > 0:
         if dropout not in (0.0, baked):
             raise ValueError(f"{ply} was trained with dropout {baked:g}, not {dropout:g}: leave out --dropout.")
         plain = (gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6)
@@ -63,7 +81,7 @@ def of_ply(ply: Path, options: SceneOptions, *, dropout: float = 0.0, device: st
         gaussians=gaussians.to(device),
         background=scene.background.to(device),
         dropout=dropout,
-        opacity_scale=1.0 - dropout,
+        opacity_scale=1.0 if loaded.for_rendering else 1.0 - dropout,
     )
     return model, scene, ply.with_name(ply.stem + "_evaluation")
 
@@ -98,6 +116,7 @@ def measure(
         **result.as_dict(),
         "ca_settings": asdict(settings),
         "background": model.background.tolist(),
+        "expected_noise": model.expected_noise,
         "machine": machine(),
     }
     write_json(out / "evaluation.json", data)
@@ -149,7 +168,7 @@ def render_run(
     else:
         views = trainer.scene.test if what == "test" else trainer.scene.train
         cameras = {Path(view.name).stem: view.camera for view in views}
-    opacities = model.gaussians.opacities * model.opacity_scale
+    opacities = model.test_opacities
     images = []
     for name, camera in cameras.items():
         rendering = render_gaussians(

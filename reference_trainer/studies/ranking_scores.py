@@ -138,7 +138,7 @@ def score_view(model: Model, view: View, *, index: int) -> dict[str, float]:
     values["unconditioned"] = _average(half.variance, exact_half.visible)
     values["limit_conditioned"] = _average(exact_half.variance, half.visible)
     values["weighted_half"] = _average(exact_half.variance, moments.alpha_mean)
-    image = model.rendering(opacities * model.opacity_scale, view).image.clamp(0, 1)
+    image = model.rendering(model.test_opacities, view).image.clamp(0, 1)
     return {
         "psnr": psnr(image, view.image),
         **{name: values[name] for name in VARIANTS},

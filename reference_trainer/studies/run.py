@@ -24,7 +24,18 @@ from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["BAKED_PLY", "CHECKPOINT", "CONFIG", "PLY", "RESULTS", "load_run", "model_of", "run_experiment", "summary"]
+__all__ = [
+    "BAKED_PLY",
+    "CHECKPOINT",
+    "CONFIG",
+    "PLY",
+    "RESULTS",
+    "load_run",
+    "model_of",
+    "run_experiment",
+    "save_for_viewers",
+    "summary",
+]
 
 CONFIG = "config.json"
 CHECKPOINT = "checkpoint.pt"
@@ -42,7 +53,23 @@ def model_of(trainer: Trainer) -> Model:
         dropout=0.0 if config.compensate else config.dropout,
         opacity_scale=config.test_time_scale,
         sh_degree=trainer.sh_degree,
+        expected_noise=config.noise if config.scale_noise else 0.0,
+        clip_noise=config.clip_noise,
     )
+
+
+def save_for_viewers(model: Model, path: Path, *, pad_to_degree: int | None = None) -> None:
+    """Write a model as a PLY with its test-time opacities, marked so that nothing scales them again.
+
+    Args:
+        model: what to write.
+        path: the file.
+        pad_to_degree: as of `save_ply`.
+    """
+    if model.expected_noise > 0:
+        save_ply(model.gaussians, path, opacities=model.test_opacities, pad_to_degree=pad_to_degree)
+    else:  # one factor, which a reader can take out again
+        save_ply(model.gaussians, path, bake_p=1 - model.opacity_scale, pad_to_degree=pad_to_degree)
 
 
 def run_experiment(
@@ -60,8 +87,9 @@ def run_experiment(
     """Train on a scene and measure the result; what a former call has done already is not done again.
 
     The folder receives ``config.json``, ``checkpoint.pt``, ``ca.jsonl`` with TensorBoard events, ``point_cloud.ply``
-    with the plain opacities (after dropout also ``point_cloud_for_viewers.ply``, with the test-time scaling baked in
-    and marked), ``views/`` with pictures of every view, and ``results.json``, which marks the run as complete.
+    with the plain opacities (where those of the test are others, after dropout or with ``scale_noise``, also
+    ``point_cloud_for_viewers.ply`` with them, marked), ``views/`` with pictures of every view, and ``results.json``,
+    which marks the run as complete.
 
     Args:
         options: the scene; random initial points use the seed of ``config``.
@@ -103,8 +131,8 @@ def run_experiment(
         raise
     model = model_of(trainer)
     save_ply(model.gaussians, out / PLY)
-    if model.opacity_scale < 1:
-        save_ply(model.gaussians, out / BAKED_PLY, bake_p=1 - model.opacity_scale)
+    if model.opacity_scale < 1 or model.expected_noise > 0:
+        save_for_viewers(model, out / BAKED_PLY)
     evaluation = evaluate(model, scene, perceptual=perceptual, pictures=out / "views")
     results = {
         "scene": scene.name,
@@ -161,12 +189,15 @@ def _refuse_other_run(out: Path, settings: dict[str, Any]) -> None:
     file = out / CONFIG
     if not file.exists():
         return
-    found = json.loads(file.read_text(encoding="utf-8"))
+    # A setting that an older version did not have yet was at its default.
+    defaults = {"scene": dataclasses.asdict(SceneOptions()), "config": dataclasses.asdict(TrainConfig())}
+    text = json.loads(file.read_text(encoding="utf-8"))
+    found = {part: defaults[part] | text.get(part, {}) for part in settings}
     changed = [
-        f"{key}: {found.get(part, {}).get(key)} -> {value}"
+        f"{key}: {found[part][key]} -> {value}"
         for part, values in settings.items()
         for key, value in values.items()
-        if found.get(part, {}).get(key) != value
+        if found[part][key] != value
     ]
     if changed:
         raise ValueError(
@@ -201,8 +232,8 @@ def _train(
     score = model_of(trainer).ca_score(render_fn=render_now)
     views = {"train": trainer.views, "test": [view.to(trainer.device) for view in trainer.scene.test]}
 
-    def quality(opacity: Tensor, view: View) -> float:
-        return psnr(render_now(opacity, view)[0].clamp(0, 1), view.image)
+    def quality(opacity: Tensor, view: View) -> float:  # the monitor's own scaling knows of dropout only
+        return psnr(render_now(model_of(trainer).test_opacities, view)[0].clamp(0, 1), view.image)
 
     views = {name: group for name, group in views.items() if group}
     with CAMonitor(

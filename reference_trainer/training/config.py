@@ -26,6 +26,8 @@ class TrainConfig:
     """Standard deviation sigma of the multiplicative opacity noise; the paper uses up to 0.8."""
     clip_noise: bool = False
     """Clip the noise to [-sigma, sigma], as the authors' released code does; the paper does not."""
+    scale_noise: bool = False
+    """At test time multiply opacities by the mean of their noise, as after dropout by 1 - p; the paper does not."""
     analytic: bool = False
     """Train on the expectation over dropout and noise, computed exactly, instead of one random draw."""
     ca_weight: float = 0.0
@@ -89,6 +91,13 @@ class TrainConfig:
             raise ValueError(f"dropout must be in [0, 1), got {self.dropout}: 0 turns it off.")
         if self.noise < 0:
             raise ValueError(f"noise must not be negative, got {self.noise}: 0 turns it off.")
+        if self.scale_noise and self.noise == 0:
+            raise ValueError("scale_noise multiplies opacities by the mean of their noise: set noise, or leave it out.")
+        if self.scale_noise and self.dropout > 0 and self.compensate:
+            raise ValueError(
+                "scale_noise does not go with inverted dropout, whose survivors get noise at another opacity than the "
+                "one at test time: leave out compensate or scale_noise."
+            )
         if self.ca_weight < 0 or (self.ca_weight > 0 and not self.analytic):
             raise ValueError(f"ca_weight must not be negative and needs analytic=True, got {self.ca_weight}.")
         if self.analytic and self.dropout == 0 == self.noise:

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import ca_reg
 
 EXPECTED = {
@@ -32,16 +34,39 @@ EXPECTED = {
     "__version__",
     "attribute",
     "color_variance",
+    "expected_opacity",
     "functional",
     "scale_opacity",
     "summarize",
     "total_effects",
 }
+FUNCTIONAL = {
+    "ColorVariance",
+    "Multiplier",
+    "PixelMoments",
+    "alpha_moments",
+    "apply_dropout",
+    "apply_opacity_noise",
+    "color_variance",
+    "expected_opacity",
+    "contributions",
+    "draw_keep_mask",
+    "draw_opacity_noise",
+    "expected_absolute_error",
+    "expected_squared_error",
+    "first_order_variance",
+    "gaussian_dropout",
+    "neutral_background",
+    "opacity_noise",
+    "pixel_moments",
+    "scale_opacity",
+}
 
 
-def test_the_public_names_are_these():
-    assert set(ca_reg.__all__) == EXPECTED
-    assert all(hasattr(ca_reg, name) for name in EXPECTED)
+@pytest.mark.parametrize(("module", "names"), [(ca_reg, EXPECTED), (ca_reg.functional, FUNCTIONAL)])
+def test_the_public_names_are_these(module, names):
+    assert set(module.__all__) == names
+    assert all(hasattr(module, name) for name in names)
 
 
 def test_the_version_is_that_of_the_project_file():

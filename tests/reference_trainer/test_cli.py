@@ -41,7 +41,7 @@ def trained(tmp_path_factory):
         ([], ["demo", "train", "evaluate", "render", "compare"]),
         (["demo"], ["--iterations", "--seeds", "--jobs", "--out"]),
         (["train"], ["--out", "--path", "--views", "--preset", "--dropout", "--noise", "--opacity-decay", "--device"]),
-        (["evaluate"], ["--ply", "--path", "--dropout", "--samples", "--lpips"]),
+        (["evaluate"], ["--ply", "--path", "--dropout", "--samples", "--lpips", "--scale-noise"]),
         (["render"], ["--what", "--frames", "{test,train,flight}"]),
         (["compare"], ["--strategies", "--seeds", "--jobs", "--iterations"]),
     ],
@@ -76,6 +76,16 @@ def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
     assert len(list((trained / "render_test").glob("*.png"))) == 3
     main(["render", str(trained), "--what", "flight", "--frames", "4", "--out", str(tmp_path / "flight")])
     assert (tmp_path / "flight" / "flight.gif").exists()
+
+
+def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path):
+    main(["train", "--out", str(tmp_path / "run"), "--noise", "0.8", *SMALL])
+    main(["evaluate", str(tmp_path / "run"), "--scale-noise", "--samples", "2"])
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    found = json.loads((tmp_path / "run" / "evaluation_scale_noise" / "evaluation.json").read_text())
+    assert found["expected_noise"] == 0.8
+    assert found["mean"]["test"]["psnr"] != results["mean"]["test"]["psnr"]
+    assert "was trained without noise" in refused(["evaluate", str(trained), "--scale-noise"], capsys)
 
 
 def test_training_again_says_that_nothing_is_to_be_done(trained, capsys):
@@ -177,6 +187,8 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["evaluate", "nowhere"], "nowhere holds no run (no config.json): give the --out folder"),
         (["render", "nowhere"], "nowhere holds no run"),
         (["evaluate", "--ply", "nowhere.ply"], "nowhere.ply"),
+        (["evaluate", "--ply", "nowhere.ply", "--scale-noise"], "--scale-noise needs the folder of a run"),
+        (["train", "--scale-noise"], "scale_noise multiplies opacities by the mean of their noise: set noise"),
     ],
 )
 def test_mistakes(arguments, message, capsys, tmp_path, monkeypatch):

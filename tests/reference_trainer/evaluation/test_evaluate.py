@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 
 from ca_reg import CAScore
-from ca_reg.functional import Multiplier
+from ca_reg.functional import Multiplier, opacity_noise
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores, evaluate
 from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.evaluation.model import Model
@@ -56,6 +56,25 @@ def test_images_are_scaled_for_the_test_and_co_adaptation_is_not(tiny_scene, gau
         assert scores(scaled, quantity) != pytest.approx(scores(plain, quantity), rel=1e-3)
     assert scores(scaled, "ca") == scores(plain, "ca")
     assert all(value > 0 for value in scores(plain, "ca"))
+
+
+def test_images_get_the_expected_noise_and_co_adaptation_does_not(tiny_scene, gaussians):
+    mean = opacity_noise(gaussians.opacities.double().repeat(20_000, 1).flatten()[:, None], 0.8,
+                         generator=torch.Generator().manual_seed(1))[0].view(-1, 150).mean(0)  # fmt: skip
+    drawn = dataclasses.replace(gaussians, opacity_logits=inverse_sigmoid(mean.float()))
+    plain, scaled, sampled = (
+        evaluate(model, tiny_scene)
+        for model in (
+            Model(gaussians, tiny_scene.background),
+            Model(gaussians, tiny_scene.background, expected_noise=0.8),
+            Model(drawn, tiny_scene.background),
+        )
+    )
+    for quantity in ("psnr", "ssim", "cv"):
+        assert scores(scaled, quantity) == pytest.approx(scores(sampled, quantity), rel=2e-3)
+        assert scores(scaled, quantity) != pytest.approx(scores(plain, quantity), rel=1e-2)
+    for quantity in ("ca", "ca_half", "ca_exact"):
+        assert scores(scaled, quantity) == scores(plain, quantity)
 
 
 def test_the_drop_rate_of_the_protocol_follows_the_training(tiny_scene, gaussians):

@@ -1,11 +1,12 @@
 """Renders that share their projection against renders that do not, and the callables of a score against each other."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from ca_reg import CAScore, Reason, attribute
+from ca_reg import CAScore, GaussianDropout, OpacityNoise, Reason, attribute
 from ca_reg.functional import Multiplier
 from reference_trainer.evaluation.model import MaskedRenders, Model
 from reference_trainer.model.gaussians import Gaussians
@@ -67,3 +68,35 @@ def test_the_shares_of_the_model_add_up_to_its_exact_score(model, scene, neutral
     assert shares.sum().item() == pytest.approx(result.value, rel=1e-5)
     outside = model.moments(opacities, scene.train[0], Multiplier.dropout(0.5))
     assert outside.variance.shape == (3, 30, 40)
+
+
+@pytest.mark.parametrize("p", [0.0, 0.3])
+def test_the_test_time_image_is_the_mean_of_the_training_images(model, scene, p):
+    """Both regularizers in the order of the trainer, against one render with the expected opacities."""
+    view, generator = scene.train[0], torch.Generator().manual_seed(2)
+    logits = model.gaussians.opacity_logits + 2.0  # many opaque ones
+    model = replace(model, gaussians=replace(model.gaussians, opacity_logits=logits), opacity_scale=1.0 - p)
+    scaled = replace(model, expected_noise=0.8)
+    dropout, noise = GaussianDropout(p), OpacityNoise(0.8)
+    image, plain = (m.render(m.test_opacities, view)[0] for m in (scaled, model))
+    step = plain - image
+    # 0 where the mean is that of expected_noise, 1 where it is that of opacities without.
+    place = []
+    for _ in range(300):
+        opacities = noise(dropout(model.gaussians.opacities, generator=generator), generator=generator)
+        drawn = model.render(opacities, view)[0]
+        place.append(((drawn - image) * step).sum() / step.square().sum())
+    found = torch.stack(place)
+    error = 5 * found.std().item() / math.sqrt(len(place))  # false alarm 6e-7
+    clamp = image.max().item() / 99 * (step.abs().sum() / step.square().sum()).item()  # of alpha, over black
+    assert abs(found.mean().item()) < error + clamp < 0.4
+
+
+def test_test_time_opacities(model):
+    opacities = model.gaussians.opacities
+    assert torch.equal(model.test_opacities, opacities)
+    assert torch.equal(replace(model, opacity_scale=0.8).test_opacities, opacities * 0.8)
+    both = replace(model, opacity_scale=0.8, expected_noise=0.6, clip_noise=True)
+    mean = Multiplier.clamped_noise(opacities, 0.6, clip=True).mean
+    torch.testing.assert_close(both.test_opacities, 0.8 * mean * opacities)
+    assert both.ca_score().settings == model.ca_score().settings

@@ -124,6 +124,28 @@ def test_the_mark_is_a_comment_others_can_read(tmp_path):
     assert_equal(load_ply(tmp_path / "b.ply").gaussians, make())
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_other_opacities_are_stored_and_marked(tmp_path, dtype):
+    gaussians = make(50)
+    opacities = torch.rand(50, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
+    opacities[:2] = torch.tensor([0.0, 1.0])
+    save_ply(gaussians, tmp_path / "a.ply", opacities=opacities.requires_grad_())
+    lines, rows = read_slowly(tmp_path / "a.ply")
+    assert "comment ca_reg opacity_for_rendering" in lines
+    logits = torch.tensor([row["opacity"] for row in rows], dtype=torch.float64)
+    torch.testing.assert_close(1 / (1 + torch.exp(-logits)), opacities.detach().double(), rtol=0, atol=1e-6)
+    loaded = load_ply(tmp_path / "a.ply")
+    assert (loaded.for_rendering, loaded.opacity_scale) == (True, 1.0)
+    assert torch.equal(loaded.gaussians.opacity_logits, logits.float())
+    assert_equal(replace(loaded.gaussians, opacity_logits=gaussians.opacity_logits), gaussians)
+
+
+@pytest.mark.parametrize("bake_p", [None, 0.2])
+def test_without_other_opacities_there_is_no_such_mark(tmp_path, bake_p):
+    save_ply(make(), tmp_path / "a.ply", bake_p=bake_p)
+    assert not load_ply(tmp_path / "a.ply").for_rendering
+
+
 @pytest.mark.parametrize("layout", ["binary_little_endian", "binary_big_endian", "ascii"])
 @pytest.mark.parametrize(("kind", "code"), [("float", "f"), ("double", "d"), ("float64", "d")])
 def test_any_order_type_and_layout(tmp_path, layout, kind, code):
@@ -225,7 +247,15 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("keywords", "message"),
-    [({"bake_p": 1.0}, "bake_p"), ({"bake_p": -0.1}, "bake_p"), ({"pad_to_degree": 4}, "pad_to_degree")],
+    [
+        ({"bake_p": 1.0}, "bake_p"),
+        ({"bake_p": -0.1}, "bake_p"),
+        ({"pad_to_degree": 4}, "pad_to_degree"),
+        ({"opacities": torch.rand(6)}, r"opacities must have shape \(7,\)"),
+        ({"opacities": torch.full((7,), 1.5)}, "values from 1.5 to 1.5"),
+        ({"opacities": torch.full((7,), torch.nan)}, "values from nan to nan"),
+        ({"opacities": torch.rand(7), "bake_p": 0.2}, "give one of them"),
+    ],
 )
 def test_wrong_arguments(tmp_path, keywords, message):
     with pytest.raises(ValueError, match=message):

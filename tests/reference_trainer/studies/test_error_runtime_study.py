@@ -120,9 +120,11 @@ def test_runs_and_ply_files_are_sources(run, ball, tmp_path):
 def test_sources_that_cannot_be_told_apart_or_are_scaled_are_refused(ball, tmp_path):
     with pytest.raises(ValueError, match="two sources are called ball"):
         study_error_runtime([ball, ball], tmp_path / "out", max_samples=16, seeds=1, say=quiet)
-    save_ply(error_runtime_study.load_ply(ball).gaussians, tmp_path / "baked.ply", bake_p=0.2)
-    with pytest.raises(ValueError, match=r"baked.ply are scaled by 0\.8"):
-        study_error_runtime([tmp_path / "baked.ply"], tmp_path / "out", max_samples=16, seeds=1, say=quiet)
+    gaussians = error_runtime_study.load_ply(ball).gaussians
+    for keywords, by in (({"bake_p": 0.2}, r"0\.8"), ({"opacities": gaussians.opacities}, "the mean of their noise")):
+        save_ply(gaussians, tmp_path / "baked.ply", **keywords)
+        with pytest.raises(ValueError, match=f"baked.ply are scaled by {by}"):
+            study_error_runtime([tmp_path / "baked.ply"], tmp_path / "out", max_samples=16, seeds=1, say=quiet)
     with pytest.raises(ValueError, match="at least one model"):
         study_error_runtime([], tmp_path / "out", say=quiet)
 

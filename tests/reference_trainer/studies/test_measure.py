@@ -6,10 +6,12 @@ import torch
 from PIL import Image
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
-from reference_trainer.model.ply import save_ply
+from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.scenes.images import read_image
 from reference_trainer.studies.measure import evaluation_table, measure, of_ply, of_run, render_run
-from reference_trainer.studies.run import BAKED_PLY, PLY, run_experiment
+from reference_trainer.studies.run import BAKED_PLY, PLY, run_experiment, save_for_viewers
+from reference_trainer.training.config import TrainConfig
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +46,76 @@ def test_a_ply_without_dropout_is_used_as_it_is(options, tmp_path, run):
     model = of_run(run[0])[0]
     save_ply(model.gaussians, tmp_path / "model.ply")
     assert of_ply(tmp_path / "model.ply", options)[0].opacity_scale == 1.0
+
+
+@pytest.fixture(scope="module")
+def scaled(tmp_path_factory, options, short):
+    """The same training, evaluated with opacities times the mean of their noise."""
+    out = tmp_path_factory.mktemp("scaled")
+    return out, run_experiment(options, dataclasses.replace(short, scale_noise=True), out, monitor_every=11)
+
+
+def test_the_flag_of_the_evaluation_and_that_of_the_training_are_the_same(run, scaled, tmp_path):
+    """Also dropout and noise together: the run has both."""
+    (plain, before), (out, results) = run, scaled
+    assert (plain / PLY).read_bytes() == (out / PLY).read_bytes()
+    model, scene, default = of_run(plain, scale_noise=True)
+    assert default == plain / "evaluation_scale_noise"
+    measure(model, scene, tmp_path, say=lambda text: None)
+    found = json.loads((tmp_path / "evaluation.json").read_text())
+    assert found["views"] == results["views"]
+    assert found["expected_noise"] == 0.3
+    for one, other in zip(results["views"], before["views"], strict=True):
+        assert one["psnr"] != other["psnr"]
+        assert [one[name] for name in ("ca", "ca_half", "ca_exact")] == [
+            other[name] for name in ("ca", "ca_half", "ca_exact")
+        ]
+
+
+def test_the_monitor_and_the_pictures_use_the_same_opacities(scaled, tmp_path):
+    out, results = scaled
+    (line,) = (out / "ca.jsonl").read_text().splitlines()
+    assert json.loads(line)["psnr/test"] == pytest.approx(results["mean"]["test"]["psnr"])
+    folder = render_run(out, "test", tmp_path, say=lambda text: None)
+    for path in folder.iterdir():
+        assert path.read_bytes() == (out / "views" / "test" / path.name).read_bytes()
+
+
+def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options, tmp_path):
+    out, results = scaled
+    said: list[str] = []
+    model, scene, _ = of_ply(out / BAKED_PLY, options, dropout=0.2, say=said.append)
+    assert said == [
+        f"{out / BAKED_PLY} holds test-time opacities only: they are rendered as they are, and CA is that of these "
+        "opacities."
+    ]
+    trained = of_run(out)[0]
+    torch.testing.assert_close(model.test_opacities, trained.test_opacities, rtol=0, atol=1e-6)
+    assert model.ca_score().settings == trained.ca_score().settings
+    for view, scores in zip(scene.test, results["views"][3:], strict=True):
+        image = model.rendering(model.test_opacities, view).image.clamp(0, 1)
+        assert psnr(image, view.image) == pytest.approx(scores["psnr"], abs=1e-3)
+    save_for_viewers(of_run(run[0])[0], tmp_path / "dropout.ply")
+    assert (tmp_path / "dropout.ply").read_bytes() == (run[0] / BAKED_PLY).read_bytes()
+
+
+def test_noise_alone_has_a_ply_for_viewers_too(options, tmp_path):
+    config = TrainConfig(iterations=1, noise=0.8, clip_noise=True, scale_noise=True)
+    run_experiment(options, config, tmp_path, monitor_every=0)
+    model = of_run(tmp_path)[0]
+    assert (model.dropout, model.opacity_scale, model.expected_noise, model.clip_noise) == (0.0, 1.0, 0.8, True)
+    torch.testing.assert_close(load_ply(tmp_path / BAKED_PLY).gaussians.opacities, model.test_opacities)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"noise": 0.0}, "was trained without noise"), ({"compensate": True}, "does not go with inverted dropout")],
+)
+def test_what_cannot_be_scaled_is_refused(changes, message, options, short, tmp_path):
+    config = dataclasses.replace(short, iterations=1, **changes)
+    run_experiment(options, config, tmp_path, monitor_every=0)
+    with pytest.raises(ValueError, match=message):
+        of_run(tmp_path, scale_noise=True)
 
 
 def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):

@@ -158,6 +158,17 @@ def test_another_run_in_the_same_folder_is_refused(finished, options, short):
     assert json.loads((out / RESULTS).read_text()) == results
 
 
+def test_a_run_of_a_version_without_a_setting_was_at_its_default(finished, options, short, tmp_path):
+    shutil.copytree(finished[0], tmp_path / "run")
+    file = tmp_path / "run" / CONFIG
+    claim = json.loads(file.read_text())
+    del claim["config"]["ca_weight"]
+    file.write_text(json.dumps(claim))
+    assert run_experiment(options, short, tmp_path / "run", **EVERY) == finished[1]
+    with pytest.raises(ValueError, match=r"analytic: False -> True; ca_weight: 0\.0 -> 1\.0"):
+        run_experiment(options, dataclasses.replace(short, analytic=True, ca_weight=1.0), tmp_path / "run")
+
+
 def test_a_mistyped_scene_does_not_claim_the_folder(options, short, tmp_path):
     with pytest.raises(FileNotFoundError, match="no scene folder"):
         run_experiment(SceneOptions(str(tmp_path / "fren")), short, tmp_path / "run")

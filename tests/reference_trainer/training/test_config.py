@@ -61,6 +61,15 @@ def test_impossible_values_are_named(field, value):
         TrainConfig(**{field: value})
 
 
+def test_scaling_by_the_mean_of_the_noise_needs_noise_at_the_plain_opacities():
+    with pytest.raises(ValueError, match=r"scale_noise .* set noise"):
+        TrainConfig(scale_noise=True, dropout=0.2)
+    with pytest.raises(ValueError, match="scale_noise does not go with inverted dropout"):
+        TrainConfig(scale_noise=True, noise=0.8, dropout=0.2, compensate=True)
+    assert TrainConfig(scale_noise=True, noise=0.8, dropout=0.2).test_time_scale == 0.8
+    assert TrainConfig(scale_noise=True, noise=0.8, compensate=True).noise == 0.8
+
+
 def test_an_expectation_needs_something_random():
     with pytest.raises(ValueError, match="set dropout or noise"):
         TrainConfig(analytic=True)
