@@ -10,7 +10,7 @@ import tyro
 
 from reference_trainer.scenes.options import SceneOptions
 
-__all__ = ["Attribution", "ErrorRuntime", "GradientNoise", "Pruning", "Ranking", "Speed", "Study"]
+__all__ = ["Attribution", "ErrorRuntime", "GradientNoise", "Growth", "Pruning", "Ranking", "Speed", "Study"]
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
 
@@ -159,10 +159,39 @@ class Speed:
 
 
 @dataclass(frozen=True)
+class Growth:
+    """Time and memory of the renderer against Gaussians, pixels, and Gaussians per pixel: exponents and a formula."""
+
+    out: Path = Path("runs/growth")
+    """Folder for the JSON, the tables and the figure; what is in it is not measured again."""
+    largest: int = 1_000_000
+    """Largest number of Gaussians."""
+    repeats: int = 3
+    """Rounds of which the medians are taken."""
+    time_limit: float = 300.0
+    """Seconds that one point may take; larger ones are left out, with the reason."""
+    device: str = "cpu"
+    """"cpu" or "cuda"."""
+
+    def __call__(self) -> None:
+        """Run the study."""
+        from reference_trainer.studies.speed.growth import study_growth
+
+        study_growth(
+            self.out,
+            largest=self.largest,
+            repeats=self.repeats,
+            time_limit=self.time_limit,
+            device=self.device,
+            say=print,
+        )
+
+
+@dataclass(frozen=True)
 class Study:
     """Measure something about the method itself; see the subcommands."""
 
-    what: ErrorRuntime | Ranking | Attribution | Pruning | GradientNoise | Speed
+    what: ErrorRuntime | Ranking | Attribution | Pruning | GradientNoise | Speed | Growth
 
     def __call__(self) -> None:
         """Run the study that was chosen."""

@@ -122,7 +122,7 @@ def study(
         seconds: dict[float, float] = {}  # of one rendering and one gradient
         for x, spec in axis.points.items():
             expected = (repeats + 1 + _MEMORY_ROUNDS) * extrapolated(seconds, x)
-            point = once(f"{name} {x:g}", spec, expected)
+            point = once(f"{name} {x:.10g}", spec, expected)
             if "skipped" not in point:
                 seconds[x] = sum(point["medians"].values())
                 point["memory"] = _without(point["memory"], libraries)
@@ -177,7 +177,7 @@ def _measure(spec: WorkloadSpec, *, repeats: int, device: torch.device) -> dict[
     seconds = in_turns(calls, repeats, device)
     return {
         "per_pixel": gaussians_per_pixel(spec),
-        "counts": asdict(counts),
+        "counts": {**asdict(counts), "chunks": [list(sizes) for sizes in counts.chunks]},  # as JSON gives them back
         "seconds": seconds,
         "medians": {name: statistics.median(times) for name, times in seconds.items()},
         "formula": {name: peak._asdict() for name, peak in predict(counts).items()},

@@ -32,20 +32,19 @@ class Counts:
         strips: pairs of a Gaussian and a row of tiles that it meets, beside the image too.
         entries: pairs of a Gaussian and a tile that it meets: the lengths of all lists.
         pixels: of all tiles, that is of the picture padded to whole tiles.
-        chunk_entries: list entries of the largest chunk, padding included; at most `CHUNK_ENTRIES` or one block.
-        chunk_pixels: pixels of the tiles of the chunk that has most of them.
-        block_pairs: pixel-Gaussian pairs of the largest block; at most the block size or one tile's list times 64.
-        chunks: number of chunks.
+        chunks: of every chunk in turn its list entries, padding included (at most `CHUNK_ENTRIES` or one block), the
+            pixels of its tiles, and the pixel-Gaussian pairs of its largest block (at most the block size or one tile's
+            list times its 64 pixels).
     """
 
     gaussians: int
     strips: int
     entries: int
     pixels: int
-    chunk_entries: int
-    chunk_pixels: int
-    block_pairs: int
-    chunks: int
+    chunks: tuple[tuple[int, int, int], ...]
+
+
+_NOTHING = (0, 0, 0)
 
 
 class Phase(NamedTuple):
@@ -64,18 +63,16 @@ class Phase(NamedTuple):
     strip: float
     entry: float
     pixel: float
-    chunk: tuple[float, float, float] = (0, 0, 0)
-    earlier: tuple[float, float, float] = (0, 0, 0)
+    chunk: tuple[float, float, float] = _NOTHING
+    earlier: tuple[float, float, float] = _NOTHING
 
     def total(self, counts: Counts) -> int:
         """Return the sum for given counts, bytes."""
         c = counts
-        sizes = (c.chunk_entries, c.chunk_pixels, c.block_pairs)
-        parts = [self.gaussian * c.gaussians, self.strip * c.strips, self.entry * c.entries, self.pixel * c.pixels]
-        parts += [a * b for a, b in zip(self.chunk, sizes, strict=True)]
-        if c.chunks > 1:
-            parts += [a * b for a, b in zip(self.earlier, sizes, strict=True)]
-        return math.ceil(sum(parts))
+        fixed = self.gaussian * c.gaussians + self.strip * c.strips + self.entry * c.entries + self.pixel * c.pixels
+        chunks = c.chunks or (_NOTHING,)
+        sums = [_dot(self.chunk, x) + _dot(self.earlier, y) for x, y in zip(chunks, (_NOTHING, *chunks), strict=False)]
+        return math.ceil(fixed + max(sums))
 
 
 class Peak(NamedTuple):
@@ -88,7 +85,6 @@ class Peak(NamedTuple):
 _INDICES, _DEPTHS, _PROJECTION, _TOUCHED = 8, 4, 44, 1
 _READY = _INDICES + _PROJECTION + _TOUCHED
 _VALUES, _TABLES = 4 + 16, 24 + 16  # ones and the values beside the colours; packed and padded rows
-_DRAWN = _READY + _VALUES + _TABLES
 _LIST = 8  # the number of a Gaussian
 _TILES = 3 * 8 / PIXELS  # length, order and start of every list
 _SUMS, _IMAGE = 16, 16  # three colours and alpha, tile by tile and as an image
@@ -98,24 +94,21 @@ _TERMS = 24 + 8  # of the polynomial before they are stacked, and the row of the
 _ALPHAS, _ALONG = 4 * 4, 2 * 4  # four buffers of a block, and the two more of the backward pass
 _GRADIENTS = 40  # six of the table and four of the values
 _SAVED = 56 * 4  # what autograd keeps of the projection and of what it joins
+# Until the next chunk is as far, its names still hold the chunk before; views of its last block hold it even longer.
 _EARLIER = (_POLYNOMIAL + _OF_ENTRIES, _SUMS, _ALPHAS)
 _EARLIER_BACKWARD = (_POLYNOMIAL + _FOOTPRINTS + _OF_ENTRIES + _GRADIENTS, _SUMS, _ALPHAS + _ALONG)
 
+_DRAWING = (_READY + _VALUES + _TABLES, 0, _LIST, _SUMS + _TILES)
+_BLENDING = (_CHUNK + _POLYNOMIAL + _OF_ENTRIES, _SUMS, _ALPHAS)
 _FORWARD = {
     "projection": Phase(_INDICES + _DEPTHS + 38 * 4, 0, 0, 0),
     # Per Gaussian the sorted copy and the rows; per strip 13 vectors that live until the end; per entry strip, column,
     # tile and Gaussian, and while they are sorted the 32-bit tile, its copy, the permutation and the positions.
     "lists": Phase(_INDICES + _DEPTHS + _PROJECTION + 72, 76, 4 * 8 + 2 * 4 + 2 * 8, 0),
-    "footprints": Phase(
-        _DRAWN, 0, _LIST, _SUMS + _TILES, (_CHUNK + _FOOTPRINTS + _TERMS + _POLYNOMIAL, 0, 0), _EARLIER
-    ),
-    "blocks": Phase(
-        _DRAWN, 0, _LIST, _SUMS + _TILES, (_CHUNK + _POLYNOMIAL + _OF_ENTRIES, _SUMS, _ALPHAS), (0, _SUMS, _ALPHAS)
-    ),
-    "image": Phase(
-        _DRAWN, 0, _LIST, _SUMS + _IMAGE + _TILES, (_CHUNK + _POLYNOMIAL + _OF_ENTRIES, _SUMS, _ALPHAS)
-    ),
-}  # fmt: skip
+    "footprints": Phase(*_DRAWING, (_CHUNK + _FOOTPRINTS + _TERMS + _POLYNOMIAL, 0, 0), _EARLIER),
+    "blocks": Phase(*_DRAWING, _BLENDING, (_OF_ENTRIES, _SUMS, _ALPHAS)),
+    "image": Phase(*_DRAWING[:3], _SUMS + _IMAGE + _TILES, _BLENDING),
+}
 
 _BASE_BACKWARD = Phase(_READY + _SAVED + _GRADIENTS, 0, _LIST, _SUMS + _IMAGE + _TILES)
 _HELD = _CHUNK + _POLYNOMIAL + _FOOTPRINTS + _OF_ENTRIES + _GRADIENTS
@@ -125,7 +118,7 @@ _BACKWARD = {
         chunk=(_CHUNK + _FOOTPRINTS + _TERMS + _POLYNOMIAL, 0, 0), earlier=_EARLIER_BACKWARD
     ),
     "backward blocks": _BASE_BACKWARD._replace(
-        chunk=(_HELD, _SUMS, _ALPHAS + _ALONG), earlier=(0, 0, _ALPHAS + _ALONG)
+        chunk=(_HELD, _SUMS, _ALPHAS + _ALONG), earlier=(_OF_ENTRIES + _GRADIENTS, _SUMS, _ALPHAS + _ALONG)
     ),
     "backward geometry": _BASE_BACKWARD._replace(chunk=(_HELD + 2 * 24 + 8, _SUMS, _ALPHAS + _ALONG)),
     "backward projection": Phase(_READY + _SAVED + 64, 0, _LIST, _TILES),
@@ -138,15 +131,14 @@ PHASES: dict[str, dict[str, Phase]] = {
         **_BACKWARD,
     },
 }
-"""The formula: by "forward" and "forward+backward", then by phase. It is a bound: the largest chunk, the largest block
-and the chunk with most pixels are counted as if they came together."""
+"""The formula: by "forward" and "forward+backward", then by phase."""
 
 
 def predict(counts: Counts) -> dict[str, Peak]:
     """Return the peak of the memory above the inputs, by "forward" and "forward+backward".
 
     Example:
-        >>> peaks = predict(Counts(1000, 0, 0, 0, 0, 0, 0, 0))  # all of them beside the image
+        >>> peaks = predict(Counts(1000, 0, 0, 0, ()))  # all of them beside the image
         >>> peaks["forward"]
         Peak(bytes=164000, phase='projection')
     """
@@ -163,26 +155,30 @@ def count(workload: Workload) -> Counts:
     Example:
         >>> from reference_trainer.studies.speed.workloads import WorkloadSpec
         >>> counts = count(WorkloadSpec(20, 16, 16, 0.1).make())
-        >>> counts.gaussians, counts.pixels, counts.chunks
+        >>> counts.gaussians, counts.pixels, len(counts.chunks)
         (20, 256, 1)
     """
     w = workload
     splats = splat(w.means, w.quaternions, w.scales, w.opacities, w.camera, colors=w.colors)
-    sizes = [
-        (chunk.gaussians.shape[0], chunk.tiles.shape[0], max(math.prod(block.shape) for block in chunk.blocks))
-        for chunk in splats.lists.chunks(block_size(w.means.device))
-    ]
-    entries, tiles, lists = (max(column) for column in zip(*sizes, strict=True)) if sizes else (0, 0, 0)
     return Counts(
         gaussians=splats.indices.shape[0],
         strips=int(_rows(splats).sum()),
         entries=splats.lists.gaussians.shape[0],
         pixels=splats.lists.lengths.shape[0] * PIXELS,
-        chunk_entries=entries,
-        chunk_pixels=tiles * PIXELS,
-        block_pairs=lists * PIXELS,
-        chunks=len(sizes),
+        chunks=tuple(
+            (
+                chunk.gaussians.shape[0],
+                chunk.tiles.shape[0] * PIXELS,
+                max(math.prod(block.shape) for block in chunk.blocks) * PIXELS,
+            )
+            for chunk in splats.lists.chunks(block_size(w.means.device))
+        ),
     )
+
+
+def _dot(rates: tuple[float, float, float], sizes: tuple[int, int, int]) -> float:
+    """Multiply and sum."""
+    return sum(a * b for a, b in zip(rates, sizes, strict=True))
 
 
 def _rows(splats: Splats) -> Tensor:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from reference_trainer.evaluation.report import markdown_table
+from reference_trainer.render.footprints import PIXELS
 from reference_trainer.studies.speed.growth_memory import PHASES
 from reference_trainer.studies.speed.measure import PASSES
 
@@ -97,11 +98,12 @@ def growth_tables(report: Mapping[str, Any]) -> str:
     lines += ["", "### Exponents", "", markdown_table(rows, list(rows[0])).rstrip(), "", *_ABOUT_FITS]
     for axis in axes.values():
         lines += ["", f"### {axis['title']}", ""]
-        if rows := [_row(axis["unit"], point) for point in axis["points"] if "skipped" not in point]:
-            lines += [markdown_table(rows, list(rows[0])).rstrip()]
+        measured = [point for point in axis["points"] if "skipped" not in point]
+        for rows in ([row(axis["unit"], point) for point in measured] for row in (_row, _memory_row)):
+            lines += [markdown_table(rows, list(rows[0])).rstrip(), ""] if rows else []
         for point in axis["points"]:
             if "skipped" in point:
-                lines += ["", f"- {point['x']:g} {axis['unit']}: left out, {point['skipped']}."]
+                lines += [f"- {point['x']:.10g} {axis['unit']}: left out, {point['skipped']}."]
     rows = [
         {"phase": name, **_bytes(phase)}
         for name, phase in (PHASES[PASSES[0]] | PHASES[PASSES[1]]).items()
@@ -120,9 +122,9 @@ _ABOUT_MEMORY = (
     "- The peak is the largest phase. The phases of the forward pass are given for forward + backward, in which "
     f"autograd keeps {PHASES[PASSES[1]]['lists'].gaussian - PHASES[PASSES[0]]['lists'].gaussian:g} bytes more per "
     "Gaussian than in a forward pass alone.",
-    "- strip: a Gaussian in a row of tiles; entry: a Gaussian in a tile; pixels are those of whole tiles. Chunk and "
-    "block: of the largest. `+` is added if there is more than one chunk, because a chunk lives until the next one has "
-    "replaced it.",
+    "- strip: a Gaussian in a row of tiles; entry: a Gaussian in a tile; pixels are those of whole tiles. Chunk: the "
+    "one at work; block: its largest. `+` is added for the chunk before, which lives until the next one has replaced "
+    "it.",
     "- tensors: measured in a fresh process that maps every larger tensor on its own and so gives it back at once, "
     "less what a rendering of one Gaussian takes (buffers of the libraries). process: as the system's allocator has "
     "it, with what it holds back between tensors and with the libraries.",
@@ -195,29 +197,30 @@ def _exponents(axis: Mapping[str, Any]) -> dict[str, object]:
         fit = axis["fits"].get(name)
         row[name] = None if fit is None else f"{fit['exponent']:.2f} ± {fit['std_error']:.2f}"
         if fit is not None:
-            row["over"] = f"{fit['start']:g} to {fit['end']:g} ({fit['points']})"
+            row["over"] = f"{fit['start']:.10g} to {fit['end']:.10g} ({fit['points']})"
     return row
 
 
 def _row(unit: str, point: Mapping[str, Any]) -> dict[str, object]:
-    """Return the row of a measured point."""
+    """Return what a measured point is, and its times."""
     counts = point["counts"]
     row: dict[str, object] = {
-        unit: f"{point['x']:g}",
+        unit: f"{point['x']:.10g}",
         "at a pixel": point["per_pixel"],
-        "list, mean": counts["entries"] / (counts["pixels"] / 64),
+        "mean list": counts["entries"] / (counts["pixels"] / PIXELS),
     }
-    for name in PASSES:
-        row[f"{name}, ms"] = point["medians"][name] * 1e3
+    return row | {f"{name}, ms": point["medians"][name] * 1e3 for name in PASSES}
+
+
+def _memory_row(unit: str, point: Mapping[str, Any]) -> dict[str, object]:
+    """Return the memory of a measured point, MiB: formula, measurement, and which phase is largest."""
+    row: dict[str, object] = {unit: f"{point['x']:.10g}"}
     for name in PASSES:
         formula, measured = point["formula"][name], point["memory"]
-        tensors, process = ((measured[x] or {}).get(name) for x in ("tensors", "process"))
-        row |= {
-            f"{name}: formula, MiB": formula["bytes"] / _MIB,
-            f"{name}: tensors": None if tensors is None else tensors / _MIB,
-            f"{name}: process": None if process is None else process / _MIB,
-            f"{name}: phase": formula["phase"],
-        }
+        row[f"{name}, MiB: formula"] = formula["bytes"] / _MIB
+        for kind in ("tensors", "process"):
+            row[f"{name}: {kind}"] = None if measured[kind] is None else measured[kind][name] / _MIB
+        row[f"{name}: phase"] = formula["phase"]
     return row
 
 
