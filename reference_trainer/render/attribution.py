@@ -10,6 +10,7 @@ from reference_trainer.render.footprints import PIXELS, footprints, pack, pad, t
 from reference_trainer.render.recursion import (
     behind_tiles,
     contrasts,
+    entries_of,
     evaluate_terms,
     in_front,
     moment_block_size,
@@ -71,7 +72,7 @@ def variance_shares(
         workspace = Workspace(6, chunk, table)
         for block in chunk.blocks:
             *buffers, front = workspace.of(block.shape[1], PIXELS, block.shape[0])
-            terms = evaluate_terms(polynomial, v, f, block, buffers)
+            terms = evaluate_terms(entries_of(polynomial, v, f, block), buffers)
             numbers = chunk.tiles[block.tiles]
             scale = in_front(terms, front).mul_(terms.spread).mul_(per_pixel[numbers].T / 3.0)
             mean = behind[numbers].permute(1, 2, 0).contiguous()

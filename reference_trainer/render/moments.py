@@ -9,11 +9,23 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
-from reference_trainer.render.footprints import PIXELS, footprints, monomials, pack, pad, table_gradient, tile, untile
+from reference_trainer.render.footprints import (
+    PIXELS,
+    block_size,
+    footprints,
+    monomials,
+    pack,
+    pad,
+    table_gradient,
+    tile,
+    untile,
+)
 from reference_trainer.render.recursion import (
+    Entries,
     Terms,
     behind_tiles,
     contrasts,
+    entries_of,
     evaluate_terms,
     in_front,
     moment_block_size,
@@ -25,6 +37,10 @@ from reference_trainer.render.tiles import TileLists
 from reference_trainer.render.workspace import Workspace
 
 __all__ = ["MomentImages", "render_moments"]
+
+_FORWARD_BLOCKS = (
+    2  # blocks so many times larger than with gradients: they are worked through in slices that fit the cache
+)
 
 
 class MomentImages(NamedTuple):
@@ -95,20 +111,13 @@ class _Moments(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         means = behind.clone()
         variances = torch.zeros_like(means)
-        for chunk in lists.chunks(moment_block_size(table.device)):
+        for chunk in lists.chunks(_FORWARD_BLOCKS * moment_block_size(table.device)):
             polynomial = footprints(table, chunk, lists).polynomial
             v, f = of_entries(values, chunk), of_entries(factors, chunk)
-            workspace = Workspace(6, chunk, table)
             for block in chunk.blocks:
-                *buffers, front = workspace.of(block.shape[1], PIXELS, block.shape[0])
-                terms = evaluate_terms(polynomial, v, f, block, buffers)
                 numbers = chunk.tiles[block.tiles]
-                weights = in_front(terms, front).mul_(terms.spread).unbind(0)
                 mean = behind[numbers].permute(1, 2, 0).contiguous()
-                variance, contrast, weighted = torch.zeros_like(mean), torch.empty_like(mean), torch.empty_like(mean)
-                for i in contrasts(terms, mean, [contrast] * len(weights)):
-                    torch.mul(contrast, weights[i], out=weighted)
-                    variance.addcmul_(weighted, contrast)
+                variance = _forward(entries_of(polynomial, v, f, block), mean)
                 means[numbers], variances[numbers] = mean.permute(2, 0, 1), variance.permute(2, 0, 1)
         ctx.save_for_backward(table, values, factors, behind)
         ctx.lists = lists
@@ -131,7 +140,7 @@ class _Moments(torch.autograd.Function):
                 tiles, longest = block.shape
                 buffers = workspace.of(longest, PIXELS, tiles)
                 (kept,) = of_channels.of(longest, channels, PIXELS, tiles)
-                terms = evaluate_terms(splats.polynomial, v, f, block, buffers[:5])
+                terms = evaluate_terms(entries_of(splats.polynomial, v, f, block), buffers[:5])
                 numbers = chunk.tiles[block.tiles]
                 mean, to_mean, to_variance = (x[numbers].permute(1, 2, 0).contiguous() for x in (behind, *upstream))
                 to_block = block.of(to_entries).transpose(1, 2)
@@ -141,6 +150,30 @@ class _Moments(torch.autograd.Function):
             to_entries[:6] = table_gradient(splats, to_entries[:6])
             sums.index_add_(1, chunk.gaussians, to_entries)
         return sums[:6], sums[6:-2], sums[-2:] if ctx.needs_input_grad[2] else None, to_behind, None
+
+
+def _forward(entries: Entries, mean: Tensor) -> Tensor:
+    """Composite a block back to front, a few splats of all its tiles at a time.
+
+    Args:
+        entries: of the block.
+        mean: what is behind all splats, (C, 64, T); becomes the mean of the pixels.
+
+    Returns:
+        Their variance, shape (C, 64, T).
+    """
+    longest, tiles = entries.coefficients.shape[0], mean.shape[2]
+    rows = min(longest, max(1, block_size(mean.device) // (PIXELS * tiles)))
+    buffers = mean.new_empty(5, rows, PIXELS, tiles)
+    variance, contrast, weighted = torch.zeros_like(mean), torch.empty_like(mean), torch.empty_like(mean)
+    for last in range(longest, 0, -rows):
+        first = max(0, last - rows)
+        terms = evaluate_terms(entries.part(first, last), buffers[:, : last - first].unbind(0))
+        spread, shrink = terms.spread.unbind(0), terms.shrink.unbind(0)
+        for i in contrasts(terms, mean, [contrast] * (last - first)):
+            torch.mul(contrast, spread[i], out=weighted)
+            variance.mul_(shrink[i]).addcmul_(weighted, contrast)
+    return variance
 
 
 def _backward(

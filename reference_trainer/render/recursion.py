@@ -24,9 +24,11 @@ from reference_trainer.render.renderer import Splats
 from reference_trainer.render.tiles import Block, Chunk
 
 __all__ = [
+    "Entries",
     "Terms",
     "behind_tiles",
     "contrasts",
+    "entries_of",
     "evaluate_terms",
     "in_front",
     "moment_block_size",
@@ -97,29 +99,57 @@ class Terms(NamedTuple):
     values: Tensor
 
 
-def evaluate_terms(
-    polynomial: Tensor, values: Tensor, factors: Tensor, block: Block, buffers: Sequence[Tensor]
-) -> Terms:
-    """Evaluate the alphas of a block and the weights of the recursion.
+class Entries(NamedTuple):
+    """The entries of a block, nearest first.
+
+    Args:
+        coefficients: of the log-alphas, shape (L, 6, T).
+        values: what is composited, shape (L, C, 1, T).
+        m: mean of the factor, shape (L, 1, T), or (1,) if all entries share it.
+        v: its variance, likewise.
+    """
+
+    coefficients: Tensor
+    values: Tensor
+    m: Tensor
+    v: Tensor
+
+    def part(self, first: int, last: int) -> Entries:
+        """Return the entries from first to last, without the last."""
+        return Entries(*(x if x.ndim == 1 else x[first:last] for x in self))
+
+
+def entries_of(polynomial: Tensor, values: Tensor, factors: Tensor, block: Block) -> Entries:
+    """Gather the entries of a block.
 
     Args:
         polynomial: of the chunk's entries, shape (6, E).
         values: what is composited, shape (C, E).
         factors: mean and variance of the factor of every entry, shape (2, E), or (2, 1) if they share it.
         block: of the chunk.
+    """
+    m, v = factors if factors.shape[1] == 1 else block.of(factors).transpose(1, 2).contiguous()[:, :, None]
+    coefficients, colors = (block.of(rows).permute(2, 0, 1).contiguous() for rows in (polynomial, values))
+    return Entries(coefficients, colors[:, :, None], m, v)
+
+
+def evaluate_terms(entries: Entries, buffers: Sequence[Tensor]) -> Terms:
+    """Evaluate the alphas of entries and the weights of the recursion.
+
+    Args:
+        entries: of a block, or a part of them.
         buffers: five of shape (L, 64, T), which receive the result.
     """
     raw, alpha, expected, spread, shrink = buffers
-    pixels = monomials(polynomial.dtype, polynomial.device).expand(block.shape[1], PIXELS, 6)
-    torch.bmm(pixels, block.of(polynomial).permute(2, 0, 1).contiguous(), out=raw)
+    coefficients, values, m, v = entries
+    pixels = monomials(coefficients.dtype, coefficients.device).expand(coefficients.shape[0], PIXELS, 6)
+    torch.bmm(pixels, coefficients, out=raw)
     torch.threshold_(raw.exp2_(), MIN_ALPHA, 0.0)
     torch.clamp(raw, max=MAX_ALPHA, out=alpha)
-    m, v = factors if factors.shape[1] == 1 else block.of(factors).transpose(1, 2).contiguous()[:, :, None]
     torch.mul(alpha, m, out=expected)
     torch.mul(alpha, alpha, out=spread).mul_(v)
     torch.sub(raw.new_ones(()), expected, out=shrink).square_().add_(spread)
-    colors = block.of(values).permute(2, 0, 1).contiguous()[:, :, None]
-    return Terms(raw, alpha, m, v, expected, spread, shrink, colors)
+    return Terms(raw, alpha, m, v, expected, spread, shrink, values)
 
 
 def in_front(terms: Terms, front: Tensor) -> Tensor:
