@@ -38,9 +38,9 @@ from reference_trainer.render.workspace import Workspace
 
 __all__ = ["MomentImages", "render_moments"]
 
-_FORWARD_BLOCKS = (
-    2  # blocks so many times larger than with gradients: they are worked through in slices that fit the cache
-)
+# Without gradients blocks may be larger than with: they are worked through in slices that fit the cache.
+_FORWARD_BLOCKS = 2  # times the pairs of a block with gradients
+_SLICE_BLOCKS = 2  # times the pairs of a block of compositing
 
 
 class MomentImages(NamedTuple):
@@ -163,12 +163,13 @@ def _forward(entries: Entries, mean: Tensor) -> Tensor:
         Their variance, shape (C, 64, T).
     """
     longest, tiles = entries.coefficients.shape[0], mean.shape[2]
-    rows = min(longest, max(1, block_size(mean.device) // (PIXELS * tiles)))
-    buffers = mean.new_empty(5, rows, PIXELS, tiles)
+    rows = min(longest, max(1, _SLICE_BLOCKS * block_size(mean.device) // (PIXELS * tiles)))
+    buffers = mean.new_empty(4, rows, PIXELS, tiles)
     variance, contrast, weighted = torch.zeros_like(mean), torch.empty_like(mean), torch.empty_like(mean)
     for last in range(longest, 0, -rows):
         first = max(0, last - rows)
-        terms = evaluate_terms(entries.part(first, last), buffers[:, : last - first].unbind(0))
+        alpha, *others = buffers[:, : last - first].unbind(0)
+        terms = evaluate_terms(entries.part(first, last), (alpha, alpha, *others))
         spread, shrink = terms.spread.unbind(0), terms.shrink.unbind(0)
         for i in contrasts(terms, mean, [contrast] * (last - first)):
             torch.mul(contrast, spread[i], out=weighted)

@@ -138,7 +138,7 @@ def evaluate_terms(entries: Entries, buffers: Sequence[Tensor]) -> Terms:
 
     Args:
         entries: of a block, or a part of them.
-        buffers: five of shape (L, 64, T), which receive the result.
+        buffers: five of shape (L, 64, T), which receive the result; the first two may be one if ``raw`` is not needed.
     """
     raw, alpha, expected, spread, shrink = buffers
     coefficients, values, m, v = entries
