@@ -46,12 +46,13 @@ def group_labels(runs: Sequence[RunScores]) -> list[str]:
     """
     names = dict.fromkeys(name for run in runs for name in run.settings)
     differ = [name for name in names if len({json.dumps(run.settings.get(name)) for run in runs}) > 1]
-    return [
-        ", ".join(
-            [run.strategy, f"{run.training_views} views", *(f"{name} {run.settings.get(name)}" for name in differ)]
-        )
-        for run in runs
-    ]
+    labels = []
+    for run in runs:
+        # What is off or left to the program needs no word; the others of the scene have one.
+        said = {name: value for name in differ if (value := run.settings.get(name)) not in (False, None, "auto")}
+        words = [name if value is True else f"{name} {value}" for name, value in said.items()]
+        labels.append(", ".join([run.strategy, f"{run.training_views} views", *words]))
+    return labels
 
 
 def correlations(runs: Sequence[RunScores]) -> dict[str, dict[str, float | None]]:
