@@ -9,13 +9,13 @@ from ca_reg.functional import Multiplier
 from reference_trainer.render.footprints import PIXELS, footprints, pack, pad, tile
 from reference_trainer.render.recursion import (
     behind_tiles,
+    block_entries,
+    chunk_rows,
     contrasts,
-    entries_of,
     evaluate_terms,
     in_front,
     moment_block_size,
     multiplier_rows,
-    of_entries,
 )
 from reference_trainer.render.renderer import Splats
 from reference_trainer.render.workspace import Workspace
@@ -67,12 +67,12 @@ def variance_shares(
     sums = torch.zeros(values.shape[1], dtype=torch.float64, device=values.device)
     for chunk in splats.lists.chunks(moment_block_size(table.device)):
         polynomial = footprints(table, chunk, splats.lists).polynomial
-        v, f = of_entries(values, chunk), of_entries(factors, chunk)
+        v, f = chunk_rows(values, chunk), chunk_rows(factors, chunk)
         shares = sums.new_empty(1, chunk.gaussians.shape[0])
         workspace = Workspace(6, chunk, table)
         for block in chunk.blocks:
             *buffers, front = workspace.of(block.shape[1], PIXELS, block.shape[0])
-            terms = evaluate_terms(entries_of(polynomial, v, f, block), buffers)
+            terms = evaluate_terms(block_entries(polynomial, v, f, block), buffers)
             numbers = chunk.tiles[block.tiles]
             scale = in_front(terms, front).mul_(terms.spread).mul_(per_pixel[numbers].T / 3.0)
             mean = behind[numbers].permute(1, 2, 0).contiguous()

@@ -24,13 +24,13 @@ from reference_trainer.render.recursion import (
     Entries,
     Terms,
     behind_tiles,
+    block_entries,
+    chunk_rows,
     contrasts,
-    entries_of,
     evaluate_terms,
     in_front,
     moment_block_size,
     multiplier_rows,
-    of_entries,
 )
 from reference_trainer.render.renderer import Splats
 from reference_trainer.render.tiles import TileLists
@@ -113,11 +113,11 @@ class _Moments(torch.autograd.Function):
         variances = torch.zeros_like(means)
         for chunk in lists.chunks(_FORWARD_BLOCKS * moment_block_size(table.device)):
             polynomial = footprints(table, chunk, lists).polynomial
-            v, f = of_entries(values, chunk), of_entries(factors, chunk)
+            v, f = chunk_rows(values, chunk), chunk_rows(factors, chunk)
             for block in chunk.blocks:
                 numbers = chunk.tiles[block.tiles]
                 mean = behind[numbers].permute(1, 2, 0).contiguous()
-                variance = _forward(entries_of(polynomial, v, f, block), mean)
+                variance = _forward(block_entries(polynomial, v, f, block), mean)
                 means[numbers], variances[numbers] = mean.permute(2, 0, 1), variance.permute(2, 0, 1)
         ctx.save_for_backward(table, values, factors, behind)
         ctx.lists = lists
@@ -132,7 +132,7 @@ class _Moments(torch.autograd.Function):
         to_behind = upstream[0].clone()  # of the tiles without splats; the others are overwritten
         for chunk in lists.chunks(moment_block_size(table.device)):
             splats = footprints(table, chunk, lists)
-            v, f = of_entries(values, chunk), of_entries(factors, chunk)
+            v, f = chunk_rows(values, chunk), chunk_rows(factors, chunk)
             to_entries = table.new_zeros(sums.shape[0], chunk.gaussians.shape[0])
             channels = values.shape[0]
             workspace, of_channels = Workspace(10, chunk, table), Workspace(1, chunk, table, channels=channels)
@@ -140,12 +140,12 @@ class _Moments(torch.autograd.Function):
                 tiles, longest = block.shape
                 buffers = workspace.of(longest, PIXELS, tiles)
                 (kept,) = of_channels.of(longest, channels, PIXELS, tiles)
-                terms = evaluate_terms(entries_of(splats.polynomial, v, f, block), buffers[:5])
+                terms = evaluate_terms(block_entries(splats.polynomial, v, f, block), buffers[:5])
                 numbers = chunk.tiles[block.tiles]
                 mean, to_mean, to_variance = (x[numbers].permute(1, 2, 0).contiguous() for x in (behind, *upstream))
                 to_block = block.of(to_entries).transpose(1, 2)
-                gradients_in = (mean, to_mean, to_variance)
-                _backward(terms, gradients_in, to_block, kept, buffers[5:], factors=ctx.needs_input_grad[2])
+                images = (mean, to_mean, to_variance)
+                _backward(terms, images, to_block, kept, buffers[5:], factors=ctx.needs_input_grad[2])
                 to_behind[numbers] = to_mean.permute(2, 0, 1)
             to_entries[:6] = table_gradient(splats, to_entries[:6])
             sums.index_add_(1, chunk.gaussians, to_entries)

@@ -27,13 +27,13 @@ __all__ = [
     "Entries",
     "Terms",
     "behind_tiles",
+    "block_entries",
+    "chunk_rows",
     "contrasts",
-    "entries_of",
     "evaluate_terms",
     "in_front",
     "moment_block_size",
     "multiplier_rows",
-    "of_entries",
 ]
 
 _CPU_BLOCKS = 8  # blocks so many times larger than in compositing: a step needs many pixels to be worth its call
@@ -78,7 +78,7 @@ def multiplier_rows(multiplier: Multiplier, splats: Splats) -> Tensor:
     return torch.nn.functional.pad(torch.stack(rows), (0, 1))
 
 
-def of_entries(rows: Tensor, chunk: Chunk) -> Tensor:
+def chunk_rows(rows: Tensor, chunk: Chunk) -> Tensor:
     """Return rows (C, M + 1) for every entry of a chunk, (C, E); those of a shared multiplier stay (2, 1)."""
     return rows if rows.shape[1] == 1 else rows.index_select(1, chunk.gaussians)
 
@@ -119,7 +119,7 @@ class Entries(NamedTuple):
         return Entries(*(x if x.ndim == 1 else x[first:last] for x in self))
 
 
-def entries_of(polynomial: Tensor, values: Tensor, factors: Tensor, block: Block) -> Entries:
+def block_entries(polynomial: Tensor, values: Tensor, factors: Tensor, block: Block) -> Entries:
     """Gather the entries of a block.
 
     Args:
