@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from statistics import fmean
-from time import perf_counter
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +17,7 @@ from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.model import Model
 from reference_trainer.render.first_order import first_order_map
 from reference_trainer.scenes.scene import View
+from reference_trainer.studies.timing import in_turns, now
 
 __all__ = [
     "DOUBLE",
@@ -210,7 +210,8 @@ def error_runtime(
         DOUBLE: lambda: double.moments(precise, view, multiplier).variance,
     }
     tell(f"render, {', '.join(list(calls)[1:])}")
-    maps, seconds = _in_turns(calls, device)
+    maps = {name: call() for name, call in calls.items()}
+    seconds = in_turns(calls, ROUNDS, device)
     runs = []
     for seed in range(seeds):
         tell(f"{MONTE_CARLO}, {max_samples} renders, seed {seed}")
@@ -233,20 +234,6 @@ def error_runtime(
     )
 
 
-def _in_turns(
-    calls: Mapping[str, Callable[[], Tensor]], device: torch.device
-) -> tuple[dict[str, Tensor], dict[str, list[float]]]:
-    """Return what each call gives and the seconds that it takes, after a first round that is not timed."""
-    results = {name: call() for name, call in calls.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(ROUNDS):
-        for name, call in calls.items():
-            start = _now(device)
-            call()
-            seconds[name].append(_now(device) - start)
-    return results, seconds
-
-
 def _monte_carlo(model: Model, view: View, max_samples: int, seed: int) -> Iterator[tuple[int, float, Tensor]]:
     """Yield K = 2, 4, 8, ..., the seconds spent up to there, and the unbiased variance (3, H, W)."""
     opacities = model.gaussians.opacities
@@ -255,7 +242,7 @@ def _monte_carlo(model: Model, view: View, max_samples: int, seed: int) -> Itera
     mean = scatter = torch.zeros((), dtype=torch.float64, device=device)
     count, spent, target = 0, 0.0, 2
     while target <= max_samples:
-        start = _now(device)
+        start = now(device)
         while count < target:
             keep = draw_keep_mask(len(model.gaussians), DROP_RATE, generator=generator, device=device)
             image = model.render(apply_dropout(opacities, keep), view)[0].double()
@@ -263,13 +250,6 @@ def _monte_carlo(model: Model, view: View, max_samples: int, seed: int) -> Itera
             deviation = image - mean
             mean = mean + deviation / count
             scatter = scatter + deviation * (image - mean)
-        spent += _now(device) - start
+        spent += now(device) - start
         yield count, spent, scatter / (count - 1)
         target *= 2
-
-
-def _now(device: torch.device) -> float:
-    """Return the time at which all work given to a device is done, seconds."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return perf_counter()

@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import torch
@@ -29,6 +28,7 @@ from reference_trainer.studies.gradient_noise_moments import (
 )
 from reference_trainer.studies.gradient_noise_report import gradient_noise_figure, gradient_noise_report
 from reference_trainer.studies.run import CHECKPOINT, load_run
+from reference_trainer.studies.timing import now
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation
 from reference_trainer.training.losses import expected_photometric_loss, photometric_loss
@@ -221,9 +221,9 @@ class _Step:
         taken: tuple[list[float], list[float]] = ([], [])
         for _ in range(ROUNDS):
             for call, seconds in zip(calls, taken, strict=True):
-                start = _now(target.device)
+                start = now(target.device)
                 self._gradient(call())
-                seconds.append(_now(target.device) - start)
+                seconds.append(now(target.device) - start)
         return taken
 
     def _draw(self, generator: torch.Generator) -> Tensor:
@@ -266,10 +266,3 @@ def _check(draws: int, dropout: float) -> None:
         raise ValueError(f"draws must be a power of two of at least 4, got {draws}.")
     if not 0 < dropout < 1:
         raise ValueError(f"dropout must lie between 0 and 1, got {dropout}: without masks there is nothing to sample.")
-
-
-def _now(device: torch.device) -> float:
-    """Return the time at which all work given to a device is done, seconds."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return perf_counter()

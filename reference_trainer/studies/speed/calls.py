@@ -1,9 +1,8 @@
-"""What is timed, and the clock."""
+"""What is timed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from time import perf_counter
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from reference_trainer.render import render
 from reference_trainer.studies.speed.baseline import render_simply
 from reference_trainer.studies.speed.workloads import Workload
 
-__all__ = ["BASELINE", "SUBJECT", "Draw", "gradients", "image", "in_turns", "now"]
+__all__ = ["BASELINE", "SUBJECT", "Draw", "gradients", "image"]
 
 Draw = Callable[[Mapping[str, Tensor], Camera], Tensor]
 """From the five tensors of the Gaussians and a camera to an image (3, H, W)."""
@@ -52,36 +51,3 @@ def gradients(draw: Draw, workload: Workload) -> dict[str, Tensor]:
     leaves = {name: x.detach().requires_grad_() for name, x in workload.parameters.items()}
     loss = (draw(leaves, workload.camera) - workload.target).square().mean()
     return dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
-
-
-def in_turns(calls: Mapping[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, list[float]]:
-    """Time several calls in turns, so that a change of the machine's load meets all of them.
-
-    Args:
-        calls: by name.
-        repeats: number of timed rounds; one round before them is not timed.
-        device: whose work to wait for.
-
-    Returns:
-        Seconds of every round, by name.
-
-    Example:
-        >>> len(in_turns({"nothing": lambda: None}, 3, torch.device("cpu"))["nothing"])
-        3
-    """
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for call in calls.values():
-        call()
-    for _ in range(repeats):
-        for name, call in calls.items():
-            start = now(device)
-            call()
-            seconds[name].append(now(device) - start)
-    return seconds
-
-
-def now(device: torch.device) -> float:
-    """Return the time at which all work given to a device is done, seconds."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return perf_counter()

@@ -16,13 +16,14 @@ from typing import Any
 import torch
 
 from reference_trainer.evaluation.report import machine, write_json
-from reference_trainer.studies.speed.calls import SUBJECT, gradients, image, in_turns
+from reference_trainer.studies.speed.calls import SUBJECT, gradients, image
 from reference_trainer.studies.speed.growth_memory import count, predict
 from reference_trainer.studies.speed.growth_points import Axis, gaussians_per_pixel, growth_axes
 from reference_trainer.studies.speed.growth_report import fits, growth_figure, growth_tables
 from reference_trainer.studies.speed.measure import PASSES
 from reference_trainer.studies.speed.memory import peak_memory
 from reference_trainer.studies.speed.workloads import WorkloadSpec
+from reference_trainer.studies.timing import in_turns
 
 __all__ = ["extrapolated", "study", "study_growth"]
 

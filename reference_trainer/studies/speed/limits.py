@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 
 from reference_trainer.render.projection import project
-from reference_trainer.studies.speed.calls import in_turns
 from reference_trainer.studies.speed.workloads import Workload
+from reference_trainer.studies.timing import in_turns
 
 __all__ = ["Limits", "bounds", "covered_pairs", "measure_limits"]
 

@@ -10,12 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from reference_trainer.studies.speed.calls import BASELINE, SUBJECT, gradients, image, in_turns
+from reference_trainer.studies.speed.calls import BASELINE, SUBJECT, gradients, image
 from reference_trainer.studies.speed.limits import Limits, bounds, covered_pairs
 from reference_trainer.studies.speed.memory import peak_memory
 from reference_trainer.studies.speed.stages import STAGES, Staged, staged
 from reference_trainer.studies.speed.steps import MASKS, masked_renders
 from reference_trainer.studies.speed.workloads import WorkloadSpec
+from reference_trainer.studies.timing import in_turns
 
 __all__ = ["PASSES", "WorkloadSpeed", "measure_workload"]
 

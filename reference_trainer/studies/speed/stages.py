@@ -11,8 +11,8 @@ from reference_trainer.render.blending import composite
 from reference_trainer.render.constants import TILE
 from reference_trainer.render.projection import project
 from reference_trainer.render.tiles import bin_gaussians
-from reference_trainer.studies.speed.calls import now
 from reference_trainer.studies.speed.workloads import Workload
+from reference_trainer.studies.timing import now
 
 __all__ = ["STAGES", "Staged", "staged"]
 

@@ -13,8 +13,8 @@ from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies.speed.calls import in_turns, now
 from reference_trainer.studies.speed.workloads import Workload
+from reference_trainer.studies.timing import in_turns, now
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import photometric_loss, ssim_map
 from reference_trainer.training.trainer import Trainer

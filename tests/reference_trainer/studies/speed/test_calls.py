@@ -1,8 +1,8 @@
-"""What is timed is the same for both renderers, and taken in turns."""
+"""What is timed is the same for both renderers."""
 
 import torch
 
-from reference_trainer.studies.speed.calls import BASELINE, SUBJECT, gradients, image, in_turns
+from reference_trainer.studies.speed.calls import BASELINE, SUBJECT, gradients, image
 from reference_trainer.studies.speed.workloads import WorkloadSpec
 
 
@@ -26,10 +26,3 @@ def test_the_gradients_are_those_of_the_mean_squared_error():
         changes.append((BASELINE(parameters, workload.camera) - workload.target).square().mean())
     # The loss is quadratic in the colours: the central difference is exact.
     assert torch.allclose((changes[0] - changes[1]) / 2, gradient[3].sum(), rtol=1e-9)
-
-
-def test_calls_are_made_in_turns_and_the_first_round_is_not_timed(device):
-    made = []
-    seconds = in_turns({name: lambda name=name: made.append(name) for name in "ab"}, 3, device)
-    assert made == ["a", "b"] * 4
-    assert [len(x) for x in seconds.values()] == [3, 3]
