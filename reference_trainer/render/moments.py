@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -13,24 +12,23 @@ from reference_trainer.render.footprints import (
     PIXELS,
     block_size,
     footprints,
-    monomials,
     pack,
     pad,
     table_gradient,
     tile,
     untile,
 )
+from reference_trainer.render.moment_gradients import block_gradients
 from reference_trainer.render.recursion import (
     Entries,
-    Terms,
     behind_tiles,
     block_entries,
     chunk_rows,
     contrasts,
     evaluate_terms,
-    in_front,
     moment_block_size,
     multiplier_rows,
+    parts,
 )
 from reference_trainer.render.renderer import Splats
 from reference_trainer.render.tiles import TileLists
@@ -130,22 +128,25 @@ class _Moments(torch.autograd.Function):
         upstream = [tile(gradient, lists) for gradient in gradients]
         sums = table.new_zeros(6 + values.shape[0] + 2, table.shape[1])
         to_behind = upstream[0].clone()  # of the tiles without splats; the others are overwritten
-        for chunk in lists.chunks(moment_block_size(table.device)):
+        pairs = moment_block_size(table.device)
+        for chunk in lists.chunks(pairs):
             splats = footprints(table, chunk, lists)
             v, f = chunk_rows(values, chunk), chunk_rows(factors, chunk)
             to_entries = table.new_zeros(sums.shape[0], chunk.gaussians.shape[0])
-            channels = values.shape[0]
-            workspace, of_channels = Workspace(10, chunk, table), Workspace(1, chunk, table, channels=channels)
+            workspace = Workspace(10, chunk, table, pairs=pairs)
+            of_channels = Workspace(1, chunk, table, channels=values.shape[0], pairs=pairs)
             for block in chunk.blocks:
-                tiles, longest = block.shape
-                buffers = workspace.of(longest, PIXELS, tiles)
-                (kept,) = of_channels.of(longest, channels, PIXELS, tiles)
-                terms = evaluate_terms(block_entries(splats.polynomial, v, f, block), buffers[:5])
                 numbers = chunk.tiles[block.tiles]
                 mean, to_mean, to_variance = (x[numbers].permute(1, 2, 0).contiguous() for x in (behind, *upstream))
-                to_block = block.of(to_entries).transpose(1, 2)
-                images = (mean, to_mean, to_variance)
-                _backward(terms, images, to_block, kept, buffers[5:], factors=ctx.needs_input_grad[2])
+                entries, to_block = block_entries(splats.polynomial, v, f, block), block.of(to_entries).transpose(1, 2)
+                block_gradients(
+                    entries,
+                    (mean, to_mean, to_variance),
+                    to_block,
+                    (workspace, of_channels),
+                    pairs=pairs,
+                    factors=ctx.needs_input_grad[2],
+                )
                 to_behind[numbers] = to_mean.permute(2, 0, 1)
             to_entries[:6] = table_gradient(splats, to_entries[:6])
             sums.index_add_(1, chunk.gaussians, to_entries)
@@ -166,8 +167,7 @@ def _forward(entries: Entries, mean: Tensor) -> Tensor:
     rows = min(longest, max(1, _SLICE_BLOCKS * block_size(mean.device) // (PIXELS * tiles)))
     buffers = mean.new_empty(4, rows, PIXELS, tiles)
     variance, contrast, weighted = torch.zeros_like(mean), torch.empty_like(mean), torch.empty_like(mean)
-    for last in range(longest, 0, -rows):
-        first = max(0, last - rows)
+    for first, last in reversed(parts(longest, rows)):
         alpha, *others = buffers[:, : last - first].unbind(0)
         terms = evaluate_terms(entries.part(first, last), (alpha, alpha, *others))
         spread, shrink = terms.spread.unbind(0), terms.shrink.unbind(0)
@@ -175,64 +175,3 @@ def _forward(entries: Entries, mean: Tensor) -> Tensor:
             torch.mul(contrast, spread[i], out=weighted)
             variance.mul_(shrink[i]).addcmul_(weighted, contrast)
     return variance
-
-
-def _backward(
-    terms: Terms,
-    images: tuple[Tensor, Tensor, Tensor],
-    to_entries: Tensor,
-    kept: Tensor,
-    buffers: Sequence[Tensor],
-    *,
-    factors: bool,
-) -> None:
-    """Carry the gradients of a block's means and variances (C, 64, T) back to its entries.
-
-    Args:
-        terms: of the block.
-        images: what is behind all splats (overwritten), the gradient of the means (becomes that of what is behind all
-            splats) and that of the variances.
-        to_entries: receives the gradient of the sums of ln alpha times each monomial, of the values, and of m and v,
-            shape (6 + C + 2, L, T).
-        kept: buffer (L, C, 64, T).
-        buffers: five of shape (L, 64, T).
-        factors: whether the gradients of m and v are needed.
-    """
-    mean, to_mean, to_variance = images
-    longest = terms.alpha.shape[0]
-    to_weight, hidden, front, doubled, to_expected = buffers
-    contrast_rows = kept.unbind(0)
-    weighted = torch.empty_like(mean)
-    # With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
-    # hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}: walked back to front, as division would fail at 0.
-    hidden[-1] = 0.0
-    weight_rows, hidden_rows = to_weight.unbind(0), hidden.unbind(0)
-    spread, shrink = terms.spread.unbind(0), terms.shrink.unbind(0)
-    for i in contrasts(terms, mean, contrast_rows):
-        torch.mul(to_variance, contrast_rows[i], out=weighted).mul_(contrast_rows[i])
-        torch.sum(weighted, 0, out=weight_rows[i])
-        if i > 0:
-            torch.mul(hidden_rows[i], shrink[i], out=hidden_rows[i - 1]).addcmul_(weight_rows[i], spread[i])
-    torch.mul(in_front(terms, front), terms.spread, out=doubled).mul_(2.0)
-    to_values = mean.new_empty(longest, mean.shape[0], mean.shape[2])
-    through = torch.empty_like(mean)
-    each = (terms.expected, doubled, to_expected, to_values)
-    rows = zip(contrast_rows, *(x.unbind(0) for x in each), strict=True)
-    for contrast, expected, twice, to_row, to_value in rows:
-        torch.mul(to_mean, contrast, out=weighted)
-        torch.sum(weighted, 0, out=to_row)
-        torch.mul(to_variance, contrast, out=weighted)
-        torch.mul(to_mean, expected, out=through).addcmul_(weighted, twice)
-        torch.sum(through, 1, out=to_value)
-        to_mean.sub_(through)
-    # expected = m alpha, spread = v alpha^2, shrink = (1 - expected)^2 + spread
-    to_shrink = hidden.mul_(front)
-    to_spread = to_weight.mul_(front).add_(to_shrink)
-    to_expected.addcmul_(to_shrink, 1.0 - terms.expected, value=-2.0)
-    if factors:
-        to_entries[-2] = (to_expected * terms.alpha).sum(1)
-        to_entries[-1] = (to_spread * terms.alpha.square()).sum(1)
-    along = to_spread.mul_(terms.alpha).mul_(2.0 * terms.v).addcmul_(to_expected, terms.m).mul_(terms.raw)
-    pixels = monomials(along.dtype, along.device).T.expand(longest, 6, PIXELS)
-    to_entries[:6] = torch.bmm(pixels, along).transpose(0, 1)
-    to_entries[6:-2] = to_values.permute(1, 0, 2)

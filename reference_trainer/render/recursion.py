@@ -34,6 +34,7 @@ __all__ = [
     "in_front",
     "moment_block_size",
     "multiplier_rows",
+    "parts",
 ]
 
 _CPU_BLOCKS = 8  # blocks so many times larger than in compositing: a step needs many pixels to be worth its call
@@ -99,6 +100,16 @@ class Terms(NamedTuple):
     values: Tensor
 
 
+def parts(longest: int, rows: int) -> list[tuple[int, int]]:
+    """Cut the entries of a block into parts of so many rows, nearest first: where each begins and ends.
+
+    Example:
+        >>> parts(7, 3)
+        [(0, 3), (3, 6), (6, 7)]
+    """
+    return [(first, min(first + rows, longest)) for first in range(0, longest, rows)]
+
+
 class Entries(NamedTuple):
     """The entries of a block, nearest first.
 
@@ -152,9 +163,15 @@ def evaluate_terms(entries: Entries, buffers: Sequence[Tensor]) -> Terms:
     return Terms(raw, alpha, m, v, expected, spread, shrink, values)
 
 
-def in_front(terms: Terms, front: Tensor) -> Tensor:
-    """Put S, the product of ``shrink`` over all splats in front of each, into a buffer (L, 64, T) and return it."""
-    front[0] = 1.0
+def in_front(terms: Terms, front: Tensor, first: Tensor | float = 1.0) -> Tensor:
+    """Put S, the product of ``shrink`` over all splats in front of each, into a buffer (L, 64, T) and return it.
+
+    Args:
+        terms: of a block, or a part of it.
+        front: receives the result.
+        first: S of the first splat, shape (64, T); 1 where the list begins.
+    """
+    front[0] = first
     rows = front.unbind(0)
     for nearer, factor, farther in zip(rows, terms.shrink.unbind(0), rows[1:], strict=False):
         torch.mul(nearer, factor, out=farther)

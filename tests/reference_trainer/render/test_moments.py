@@ -3,9 +3,12 @@
 import pytest
 import torch
 from oracles import GaussianScene, random_scene
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten
 
 from ca_reg.functional import Multiplier, alpha_moments, pixel_moments
-from reference_trainer.render import render, splat
+from reference_trainer.render import moments, render, splat
+from reference_trainer.render.footprints import PIXELS
 from reference_trainer.render.moments import render_moments
 
 BACKGROUND = torch.tensor([0.3, 0.9, 0.1], dtype=torch.float64)
@@ -138,3 +141,49 @@ def test_a_background_of_another_size_is_refused():
     splats = splat(*scene[:4], scene.camera, colors=scene.colors)
     with pytest.raises(ValueError, match=r"\(3,\) or \(3, 7, 9\), got \(3, 9, 7\)"):
         render_moments(splats, Multiplier.dropout(0.5), background=backdrop(9, 7))
+
+
+@pytest.mark.parametrize("rows", [1, 7])
+def test_lists_taken_in_parts_have_the_same_gradients(rows, monkeypatch):
+    scene = random_scene(60, 19, 13, seed=7)
+    weights = torch.randn(8, 13, 19, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def gradients():
+        leaves = [x.clone().requires_grad_() for x in scene.tensors()]
+        images = render_moments(splat(*leaves[:4], scene.camera, colors=leaves[4]), per_gaussian(60))
+        (torch.cat([x.reshape(-1, 13, 19) for x in images]) * weights).sum().backward()
+        return [x.grad for x in leaves]
+
+    whole = gradients()
+    monkeypatch.setattr(moments, "moment_block_size", lambda device: rows * PIXELS)
+    for mine, other in zip(gradients(), whole, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-11, atol=1e-13)
+
+
+class LargestTensor(TorchDispatchMode):
+    """Notes the number of elements of the largest tensor that any operation returns."""
+
+    elements = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        for x in tree_flatten(result)[0]:
+            if isinstance(x, torch.Tensor):
+                self.elements = max(self.elements, x.untyped_storage().nbytes() // x.element_size())
+        return result
+
+
+def test_no_tensor_grows_with_the_pixel_gaussian_pairs_of_a_long_list(monkeypatch):
+    n, pairs = 900, 20 * PIXELS
+    scene = random_scene(n, 8, 8, seed=3, size=1.0)
+    monkeypatch.setattr(moments, "moment_block_size", lambda device: pairs)
+    monkeypatch.setattr(moments, "block_size", lambda device: pairs)
+    leaves = [x.clone().requires_grad_() for x in scene.tensors()]
+    splats = splat(*leaves[:4], scene.camera, colors=leaves[4])
+    longest = splats.lists.lengths.max()
+    assert longest > 500
+    with LargestTensor() as largest:
+        images = render_moments(splats, Multiplier.dropout(0.5))
+        images.variance.sum().backward()
+    # Either a row of 14 numbers per Gaussian, or four buffers of what is held at once.
+    assert largest.elements <= max(16 * (n + 1), 8 * pairs) < PIXELS * longest
