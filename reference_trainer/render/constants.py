@@ -13,6 +13,9 @@ DILATION: Final = 0.3
 FRUSTUM_MARGIN: Final = 1.3
 """The projection is linearised at most this many half-fields of view off the axis; the Jacobian explodes beyond."""
 
+MAX_ROUNDING: Final = 0.25
+"""Gaussians whose coordinates round to more pixels than this are refused. Own choice: images are off by some 3 %."""
+
 MAX_ALPHA: Final = 0.99
 """No splat is fully opaque, so 1 - alpha never vanishes and the backward pass may divide by it."""
 
@@ -33,3 +36,6 @@ CHUNK_ENTRIES: Final = 1 << 19
 
 BLOCK_ELEMENTS_CUDA: Final = 1 << 25
 """Pixel-Gaussian pairs held at once on a GPU: 128 MiB temporaries keep it busy and the number of launches low."""
+
+SLICE_ENTRIES: Final = 8
+"""Entries of a tile that compiled moments take at once: twice as many take twice as long to compile."""

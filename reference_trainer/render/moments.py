@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
+from reference_trainer.render.compiled import is_compiled
+from reference_trainer.render.compiled_moments import compiled_moments
 from reference_trainer.render.footprints import (
     PIXELS,
     block_size,
@@ -92,9 +94,9 @@ def render_moments(
     if alpha:  # one more colour, white over black
         values = torch.nn.functional.pad(values, (0, 1), value=1.0)
         behind = torch.nn.functional.pad(behind, (0, 0, 0, 1))
-    mean, variance = _Moments.apply(  # type: ignore[no-untyped-call]
-        table, pad(values), multiplier_rows(multiplier, splats), behind, splats.lists
-    )
+    use_compiled = is_compiled(table.device) and splats.lists.lengths.shape[0] >= 2
+    moments = compiled_moments if use_compiled else _Moments.apply
+    mean, variance = moments(table, pad(values), multiplier_rows(multiplier, splats), behind, splats.lists)
     if not alpha:
         return MomentImages(mean, variance, None, None)
     return MomentImages(mean[:3], variance[:3], mean[3], variance[3])

@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from reference_trainer.render.constants import CHUNK_ENTRIES, MIN_ALPHA, TILE
+from reference_trainer.render.constants import CHUNK_ENTRIES, MIN_ALPHA, SLICE_ENTRIES, TILE
 from reference_trainer.render.projection import Projection
 
 __all__ = ["Block", "Chunk", "TileLists", "bin_gaussians"]
@@ -17,7 +17,7 @@ __all__ = ["Block", "Chunk", "TileLists", "bin_gaussians"]
 
 @dataclass(frozen=True)
 class Block:
-    """Tiles of similar list length that are composited together, as a part of a chunk.
+    """Entries that are composited together, as a part of a chunk: equally many of each of some tiles.
 
     Args:
         tiles: which of the chunk's tiles.
@@ -45,7 +45,8 @@ class Chunk:
         gaussians: the Gaussian of every entry, nearest first within a tile; the number of Gaussians M is padding,
             shape (E,).
         tile_of: the tile number of every entry, shape (E,).
-        blocks: parts of at most so many pixel-Gaussian pairs as were asked for.
+        blocks: the parts, one after the other: whole lists of tiles of similar length (`TileLists.chunks`), or a few
+            entries of all tiles whose lists are so long (`TileLists.slices`).
     """
 
     tiles: Tensor
@@ -148,6 +149,48 @@ class TileLists:
             tile_of[block.entries].view(block.shape).copy_(numbers[block.tiles, None])
         gaussians = self.gaussians.index_select(0, where.clamp_(max=self.gaussians.shape[0] - 1))
         return Chunk(numbers, gaussians.masked_fill_(absent, self.count), tile_of, blocks)
+
+    def slices(self, entries: int) -> Iterator[Chunk]:
+        """Iterate over all tiles with a non-empty list, in blocks of the same `SLICE_ENTRIES` places of their lists.
+
+        The blocks of a chunk go from the nearest entries to the farthest. Every one has at least two tiles (the picture
+        must have as many), the second of which may hold nothing but padding.
+
+        Args:
+            entries: after so many, padding included, a chunk ends.
+        """
+        lengths, _, _ = self._by_length
+        end = next((i for i, n in enumerate(lengths) if n == 0), len(lengths))
+        begin = last = padded = 0
+        while last < end:
+            padded += -(-lengths[last] // SLICE_ENTRIES) * SLICE_ENTRIES
+            last += 1
+            if last == end or (padded >= entries and last - begin >= 2 and end - last != 1):
+                yield self._slices(begin, max(last, begin + 2))
+                begin, padded = last, 0
+
+    def _slices(self, begin: int, end: int) -> Chunk:
+        """Pad the lists of the tiles from begin to end, in order of length, and arrange them by place in the list."""
+        lengths, tiles, all_starts = self._by_length
+        numbers, starts, sizes = (x[begin:end, None] for x in (tiles, all_starts, self.lengths[tiles]))
+        blocks: list[Block] = []
+        entry, active = 0, end - begin
+        for first in range(0, lengths[begin], SLICE_ENTRIES):
+            while active > 2 and lengths[begin + active - 1] <= first:
+                active -= 1
+            count = active * SLICE_ENTRIES
+            blocks.append(Block(slice(0, active), slice(entry, entry + count), (active, SLICE_ENTRIES)))
+            entry += count
+        along = torch.arange(SLICE_ENTRIES, device=tiles.device)
+        where, tile_of = starts.new_empty(entry), starts.new_empty(entry)
+        absent = torch.empty(entry, dtype=torch.bool, device=tiles.device)
+        for place, block in enumerate(blocks):
+            position = along + place * SLICE_ENTRIES
+            torch.add(starts[block.tiles], position, out=where[block.entries].view(block.shape))
+            torch.le(sizes[block.tiles], position, out=absent[block.entries].view(block.shape))
+            tile_of[block.entries].view(block.shape).copy_(numbers[block.tiles])
+        gaussians = self.gaussians.index_select(0, where.clamp_(max=self.gaussians.shape[0] - 1))
+        return Chunk(numbers[:, 0], gaussians.masked_fill_(absent, self.count), tile_of, blocks)
 
 
 def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
