@@ -1,0 +1,110 @@
+"""Run code that says "cuda" on the CPU."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+__all__ = ["cuda_on_cpu"]
+
+
+@contextmanager
+def cuda_on_cpu() -> Iterator[None]:
+    """Let torch functions of this thread take the CPU wherever they are told to take a CUDA device.
+
+    With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
+    ``.cuda()`` of tensors and modules mean the CPU, and ``torch.cuda.Event``, ``synchronize``, ``set_device``,
+    ``current_device`` and ``reset_peak_memory_stats`` are harmless; everything is restored at the end.
+    ``torch.cuda.is_available()`` stays False.
+
+    A tensor that is moved to "cuda" is the same tensor, as on a real device if it were there already: what is written
+    into one of them in place is written into the other.
+
+    Not covered: ``torch.load(map_location="cuda")``, ``torch.Generator("cuda")``, CUDA streams, and other threads.
+
+    Example:
+        >>> with cuda_on_cpu():
+        ...     torch.zeros(2, device="cuda").cuda()
+        tensor([0., 0.])
+    """
+    if torch.cuda.is_available():
+        yield
+        return
+    originals = {name: getattr(torch.cuda, name) for name in _STAND_INS}
+    try:
+        for name, value in _STAND_INS.items():
+            setattr(torch.cuda, name, value)
+        with _CudaMeansCpu():
+            yield
+    finally:
+        for name, value in originals.items():
+            setattr(torch.cuda, name, value)
+
+
+class _CudaMeansCpu(TorchFunctionMode):
+    """Replaces CUDA devices among the arguments of torch functions by the CPU."""
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: tuple[type, ...],
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        if func is Tensor.cuda:
+            return args[0]
+        return func(*map(_on_cpu, args), **{name: _on_cpu(value) for name, value in (kwargs or {}).items()})
+
+
+def _on_cpu(value: Any) -> Any:
+    """Return the CPU for a CUDA device or its name, and anything else as it is."""
+    if isinstance(value, str):
+        return "cpu" if value.partition(":")[0] == "cuda" else value
+    if isinstance(value, torch.device) and value.type == "cuda":
+        return torch.device("cpu")
+    return value
+
+
+class _Event:
+    """A point in time, as ``torch.cuda.Event`` marks it; on a CPU all work before it is done."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._time = 0.0
+
+    def record(self, stream: Any = None) -> None:
+        """Mark now."""
+        self._time = time.perf_counter()
+
+    def elapsed_time(self, end: _Event) -> float:
+        """Milliseconds until another event."""
+        return 1e3 * (end._time - self._time)
+
+    def query(self) -> bool:
+        """Whether the work is done."""
+        return True
+
+    def synchronize(self) -> None:
+        """Wait for nothing."""
+
+    def wait(self, stream: Any = None) -> None:
+        """Wait for nothing."""
+
+
+def _nothing() -> Callable[..., None]:
+    """Return a new function that does nothing; dynamo refuses the same object under two names of torch."""
+    return lambda *args, **kwargs: None
+
+
+_STAND_INS: dict[str, Any] = {
+    "Event": _Event,
+    "current_device": lambda: 0,
+    "reset_peak_memory_stats": _nothing(),
+    "set_device": _nothing(),
+    "synchronize": _nothing(),
+}

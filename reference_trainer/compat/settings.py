@@ -1,0 +1,89 @@
+"""The settings of a rasterizer call, and the camera that they describe."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+
+__all__ = ["GaussianRasterizationSettings", "camera_of"]
+
+TOLERANCE = 1e-3  # of the entries of a projection matrix that went through single precision twice
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """What the rasterizers of the INRIA family are told about a view: the fields of all variants.
+
+    Convention: matrices act on row vectors (``x_world @ viewmatrix``), so they are the transposes of the textbook's.
+
+    Args:
+        image_height: pixels.
+        image_width: pixels.
+        tanfovx: tangent of half the horizontal field of view.
+        tanfovy: tangent of half the vertical field of view.
+        bg: background colour, shape (3,).
+        scale_modifier: factor on every scale.
+        viewmatrix: world to camera, shape (4, 4).
+        projmatrix: world to clip space, shape (4, 4).
+        sh_degree: highest band of spherical harmonics to use.
+        campos: camera centre, shape (3,); not read, the view matrix has it too.
+        prefiltered: not read; it only lets the CUDA code stop at a culled Gaussian.
+        debug: not read.
+        confidence: factor on the gradients of every Gaussian, shape (N, 1) (FSGS, CoR-GS).
+        antialiasing: of newer INRIA versions; only False is supported.
+    """
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool = False
+    debug: bool = False
+    confidence: Tensor | None = None
+    antialiasing: bool = False
+
+
+def camera_of(settings: GaussianRasterizationSettings) -> Camera:
+    """Return the camera of a rasterizer call.
+
+    The principal point is the projection matrix's: the picture's centre in the INRIA code, elsewhere in some forks.
+
+    Raises:
+        ValueError: if the projection matrix is no pinhole camera with the fields of view of the settings.
+
+    Example:
+        >>> lens = torch.tensor([[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 1, 1], [0, 0, -0.01, 0]])
+        >>> camera = camera_of(GaussianRasterizationSettings(
+        ...     24, 32, 0.5, 0.5, torch.zeros(3), 1.0, torch.eye(4), lens, 0, torch.zeros(3)))
+        >>> camera.fx, camera.fy, camera.cx, camera.cy
+        (32.0, 24.0, 16.0, 12.0)
+    """
+    width, height = int(settings.image_width), int(settings.image_height)
+    view = settings.viewmatrix.detach().double()
+    lens = torch.linalg.solve(view, settings.projmatrix.detach().double())[:, [0, 1, 3]]
+    shift_x, shift_y = lens[2, :2].tolist()
+    expected = lens.new_tensor([[1 / settings.tanfovx, 0, 0], [0, 1 / settings.tanfovy, 0], [shift_x, shift_y, 1]])
+    if not torch.allclose(lens, torch.nn.functional.pad(expected, (0, 0, 0, 1)), rtol=TOLERANCE, atol=TOLERANCE):
+        raise ValueError(
+            "viewmatrix^-1 projmatrix must be a pinhole camera with the fields of view tanfovx="
+            f"{settings.tanfovx} and tanfovy={settings.tanfovy}; its columns x, y and w are {lens.tolist()}. "
+            "Both matrices must be transposed (for row vectors), as the INRIA code passes them."
+        )
+    return Camera(
+        world_to_camera=settings.viewmatrix.detach().T,
+        fx=width / (2 * settings.tanfovx),
+        fy=height / (2 * settings.tanfovy),
+        cx=0.5 * width * (1 + shift_x),
+        cy=0.5 * height * (1 + shift_y),
+        width=width,
+        height=height,
+    )

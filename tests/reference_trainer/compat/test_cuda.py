@@ -1,0 +1,95 @@
+"""Code that says "cuda", on a machine without."""
+
+import pytest
+import torch
+
+from reference_trainer.compat.cuda import _STAND_INS, cuda_on_cpu
+
+without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="with a CUDA device nothing is mapped")
+CUDA = torch.device("cuda:0")
+
+
+@without_cuda
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: torch.zeros(2, 3, device="cuda"),
+        lambda: torch.tensor([1.0], device="cuda:0"),
+        lambda: torch.rand(3, device=CUDA),
+        lambda: torch.zeros_like(torch.ones(2), dtype=torch.float32, requires_grad=True, device="cuda"),
+        lambda: torch.ones(2).new_zeros(3, device="cuda"),
+        lambda: torch.ones(2).cuda(),
+        lambda: torch.ones(2).cuda(0, non_blocking=True),
+        lambda: torch.ones(2).to("cuda"),
+        lambda: torch.ones(2).to(CUDA, torch.float64),
+        lambda: torch.ones(2).to(device="cuda", dtype=torch.float64),
+        lambda: torch.nn.Linear(2, 2).cuda().weight,
+        lambda: torch.nn.Linear(2, 2).to("cuda").weight,
+        lambda: torch.nn.Linear(2, 2, device="cuda").weight,
+        lambda: torch.nn.Parameter(torch.ones(2).cuda().requires_grad_(True)),
+    ],
+)
+def test_cuda_means_the_cpu_within_the_block_only(make):
+    with cuda_on_cpu():
+        assert make().device.type == "cpu"
+    with pytest.raises((RuntimeError, AssertionError)):
+        make()
+
+
+@without_cuda
+def test_other_arguments_are_left_alone(generator):
+    state = generator.get_state()
+    with cuda_on_cpu():
+        drawn = torch.rand(4, generator=generator)
+        assert torch.zeros(2, dtype=torch.float64, device="meta").device.type == "meta"
+        assert torch.einsum("ij,j->i", torch.eye(2), torch.ones(2)).tolist() == [1, 1]
+    generator.set_state(state)
+    assert torch.equal(drawn, torch.rand(4, generator=generator))
+
+
+@without_cuda
+def test_torch_cuda_is_restored_also_after_an_error():
+    before = {name: getattr(torch.cuda, name) for name in dir(torch.cuda)}
+
+    def fail():
+        with cuda_on_cpu():
+            assert torch.cuda.Event is not before["Event"]
+            raise KeyError("theirs")
+
+    with pytest.raises(KeyError, match="theirs"):
+        fail()
+    assert {name: getattr(torch.cuda, name) for name in dir(torch.cuda)} == before
+
+
+@without_cuda
+def test_housekeeping_is_harmless():
+    with cuda_on_cpu():
+        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        torch.cuda.set_device(torch.device("cuda:0"))
+        start.record()
+        torch.cuda.synchronize()
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+        torch.cuda.manual_seed_all(0)
+        end.record()
+        end.synchronize()
+        end.wait()
+        assert end.query()
+        assert 0 <= start.elapsed_time(end) < 60_000
+        assert torch.cuda.memory_allocated() == 0
+        assert torch.zeros(1, device=torch.device("cuda", torch.cuda.current_device())).device.type == "cpu"
+        assert not torch.cuda.is_available()
+
+
+def test_no_stand_in_serves_two_names():
+    # Dynamo, which optimizers import, keeps a table of torch's functions and fails on one object with two rules.
+    assert len({id(value) for value in _STAND_INS.values()}) == len(_STAND_INS)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_with_a_device_nothing_changes():
+    before = torch.cuda.Event
+    with cuda_on_cpu():
+        assert torch.cuda.Event is before
+        assert torch.zeros(1, device="cuda").is_cuda

@@ -1,0 +1,139 @@
+"""Installing and removing the stand-ins, and a repository in the INRIA style that trains with them."""
+
+import runpy
+import sys
+from types import ModuleType
+
+import pytest
+import torch
+from oracles import random_scene
+
+from reference_trainer.compat import install, stand_in, uninstall
+
+NAMES = ("diff_gaussian_rasterization", "simple_knn", "simple_knn._C")
+
+RENDERER = """
+import math
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
+
+def render(view, model, background):
+    screen = torch.zeros_like(model["xyz"], requires_grad=True, device="cuda") + 0
+    screen.retain_grad()
+    settings = GaussianRasterizationSettings(
+        image_height=view["height"], image_width=view["width"], tanfovx=view["tanfovx"], tanfovy=view["tanfovy"],
+        bg=background, scale_modifier=1.0, viewmatrix=view["view"], projmatrix=view["full"], sh_degree=0,
+        campos=view["centre"], prefiltered=False, debug=False)
+    rasterizer = GaussianRasterizer(raster_settings=settings)
+    image, radii = rasterizer(
+        means3D=model["xyz"], means2D=screen, shs=None, colors_precomp=torch.sigmoid(model["color"]),
+        opacities=torch.sigmoid(model["opacity"]), scales=torch.exp(model["scaling"]),
+        rotations=torch.nn.functional.normalize(model["rotation"]), cov3D_precomp=None)
+    return {"render": image, "viewspace_points": screen, "visibility_filter": radii > 0, "radii": radii}
+"""
+
+TRAIN = """
+import torch
+from gaussian_renderer import render
+from simple_knn._C import distCUDA2
+
+torch.cuda.set_device(torch.device("cuda:0"))
+start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+points, target = POINTS.cuda(), TARGET.to("cuda")
+n = len(points)
+scaling = torch.log(torch.sqrt(torch.clamp_min(distCUDA2(points), 1e-7)))[..., None].repeat(1, 3)
+rotation = torch.zeros((n, 4), device="cuda")
+rotation[:, 0] = 1
+model = {"xyz": points, "scaling": scaling, "rotation": rotation, "color": torch.zeros((n, 3), device="cuda"),
+         "opacity": torch.zeros((n, 1), device="cuda")}
+model = {name: torch.nn.Parameter(x.requires_grad_(True)) for name, x in model.items()}
+optimizer = torch.optim.Adam(model.values(), lr=0.02)
+losses, seen = [], torch.zeros(n, device="cuda")
+for _ in range(12):
+    start.record()
+    out = render(VIEW, model, torch.zeros(3, device="cuda"))
+    loss = (out["render"] - target).abs().mean()
+    loss.backward()
+    end.record()
+    seen[out["visibility_filter"]] += out["viewspace_points"].grad[out["visibility_filter"], :2].norm(dim=-1)
+    optimizer.step()
+    optimizer.zero_grad(set_to_none=True)
+    losses.append(loss.item())
+torch.cuda.synchronize()
+torch.cuda.empty_cache()
+"""
+
+
+@pytest.fixture
+def repository(tmp_path, settings_of, monkeypatch):
+    """A repository in the INRIA style, which has never heard of a CPU."""
+    (tmp_path / "gaussian_renderer").mkdir()
+    (tmp_path / "gaussian_renderer" / "__init__.py").write_text(RENDERER)
+    (tmp_path / "train.py").write_text(TRAIN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    sys.modules.pop("gaussian_renderer", None)
+
+
+def _given(settings_of):
+    """What the script's scene loader would load."""
+    scene = random_scene(60, 24, 18, seed=2).to(torch.float32)
+    settings = settings_of(scene.camera)
+    view = {"height": 18, "width": 24, "tanfovx": settings.tanfovx, "tanfovy": settings.tanfovy}
+    view |= {"view": settings.viewmatrix, "full": settings.projmatrix, "centre": settings.campos}
+    return {"POINTS": scene.means, "TARGET": torch.full((3, 18, 24), 0.6), "VIEW": view}
+
+
+def test_an_unmodified_script_trains(repository, settings_of):
+    before = dict(sys.modules)
+    with stand_in(repository) as modules:
+        assert modules == NAMES
+        result = runpy.run_path(str(repository / "train.py"), init_globals=_given(settings_of), run_name="__main__")
+    assert result["losses"][-1] < 0.7 * result["losses"][0]
+    assert (result["seen"] > 0).any()
+    assert not set(NAMES) & set(sys.modules)
+    assert all(sys.modules.get(name) is module for name, module in before.items())
+
+
+def test_everything_is_restored_after_an_error(repository):
+    def fail():
+        with stand_in(repository):
+            raise KeyError("theirs")
+
+    with pytest.raises(KeyError, match="theirs"):
+        fail()
+    assert not set(NAMES) & set(sys.modules)
+    with stand_in(repository) as modules:
+        assert set(modules) <= set(sys.modules)
+
+
+def test_a_package_that_is_imported_already_is_left_alone(repository, monkeypatch):
+    real = ModuleType("simple_knn")
+    monkeypatch.setitem(sys.modules, "simple_knn", real)
+    with pytest.raises(RuntimeError, match="simple_knn is imported already"), stand_in(repository):
+        pass
+    assert sys.modules["simple_knn"] is real
+    assert "diff_gaussian_rasterization" not in sys.modules
+
+
+def test_install_and_uninstall(repository):
+    assert install(repository) == NAMES
+    try:
+        import diff_gaussian_rasterization as module
+
+        assert module is sys.modules["diff_gaussian_rasterization"]
+        with pytest.raises(RuntimeError, match="uninstall"):
+            install(repository)
+    finally:
+        uninstall()
+    assert not set(NAMES) & set(sys.modules)
+    uninstall()
+    assert install(repository, outputs=4) == NAMES
+    uninstall()
+
+
+def test_the_modules_are_found_like_installed_ones(repository):
+    from importlib.util import find_spec
+
+    with stand_in(repository):
+        assert all(find_spec(name).name == name for name in NAMES)

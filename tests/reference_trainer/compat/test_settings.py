@@ -1,0 +1,43 @@
+"""The camera read from a settings tuple, against the INRIA code's own path from the world to a pixel."""
+
+import pytest
+import torch
+from oracles import random_scene
+
+from reference_trainer.compat.settings import camera_of
+
+
+def test_the_camera_takes_points_where_the_matrices_take_them(settings_of):
+    scene = random_scene(50, 40, 24, seed=1)
+    settings = settings_of(scene.camera)
+    camera = camera_of(settings)
+    points = scene.means[5:]
+    clip = torch.cat([points, torch.ones(len(points), 1).double()], dim=1) @ settings.projmatrix
+    size = torch.tensor([40.0, 24.0]).double()
+    integer_centres = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) * 0.5
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    ours = torch.stack([camera.fx * local[:, 0], camera.fy * local[:, 1]], dim=1) / local[:, 2:]
+    ours = ours + torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
+    torch.testing.assert_close(ours - 0.5, integer_centres, rtol=0, atol=1e-9)
+    torch.testing.assert_close(camera.position, settings.campos)
+
+
+def test_in_single_precision_the_centre_stays_the_centre(settings_of):
+    pose = torch.eye(4)
+    pose[:3, 3] = torch.tensor([40.0, -30.0, 70.0])
+    camera = random_scene(1, 500, 300, seed=1).camera
+    exact = type(camera)(pose, 400.0, 400.0, 250.0, 150.0, 500, 300)
+    found = camera_of(settings_of(exact))
+    assert abs(found.cx - 250) < 1e-3
+    assert abs(found.cy - 150) < 1e-3
+
+
+@pytest.mark.parametrize("mistake", ["transposed", "field of view"])
+def test_matrices_that_disagree_are_refused(settings_of, mistake):
+    settings = settings_of(random_scene(1, 40, 24, seed=1).camera)
+    if mistake == "transposed":
+        settings = settings._replace(viewmatrix=settings.viewmatrix.T, projmatrix=settings.projmatrix.T)
+    else:
+        settings = settings._replace(tanfovx=1.1 * settings.tanfovx)
+    with pytest.raises(ValueError, match="pinhole camera"):
+        camera_of(settings)
