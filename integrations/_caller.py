@@ -1,0 +1,59 @@
+"""What the `render` function that called the rasterizer was asked for.
+
+The tensors do not tell a viewer's render from a training render, nor whose field they are. The variables of the calling
+function do, in every code base of the family and whatever was imported when; they are read and nothing else.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from types import FrameType
+from typing import Any
+
+__all__ = ["calling_render", "find_instance", "is_viewer", "own_dropout", "own_noise"]
+
+_OUTWARD = 8  # frames to search: torch.nn.Module puts two between the rasterizer and its caller
+_VIEWER_CAMERA = "MiniCam"  # made by network_gui alone, from what the viewer sent
+
+
+def calling_render() -> Mapping[str, Any]:
+    """Return the variables of the nearest calling function named render..., else of the nearest foreign one."""
+    frame: FrameType | None = sys._getframe(1)
+    foreign: list[FrameType] = []
+    while frame is not None and len(foreign) < _OUTWARD:
+        module = frame.f_globals.get("__name__", "")
+        if module.rpartition(".")[0] != __package__ and module.partition(".")[0] != "torch":
+            if frame.f_code.co_name.startswith("render"):
+                return dict(frame.f_locals)
+            foreign.append(frame)
+        frame = frame.f_back
+    return dict(foreign[0].f_locals) if foreign else {}
+
+
+def find_instance(variables: Mapping[str, Any], classes: tuple[type, ...]) -> Any:
+    """Return the first variable that is an instance of one of the classes, else None."""
+    return next((x for x in variables.values() if isinstance(x, classes)), None)
+
+
+def is_viewer(variables: Mapping[str, Any]) -> bool:
+    """Whether a viewer asked for the render: such renders are made with gradients on, before that of the training."""
+    return any(type(x).__name__ == _VIEWER_CAMERA for x in variables.values())
+
+
+def own_dropout(variables: Mapping[str, Any]) -> str | None:
+    """Say which dropout of its own the calling render applies to the opacities, and how to switch it off; or None."""
+    factor = variables.get("dropout_factor") or 0.0
+    if factor > 0:
+        return f"dropout_factor={factor:g}; switch it off with --dropout_factor 0"
+    if variables.get("is_train") and "iteration" in variables:
+        return "is_train=True, DropGaussian's own dropout; leave out GaussianDropout (--dropout) here"
+    return None
+
+
+def own_noise(variables: Mapping[str, Any]) -> str | None:
+    """Say which opacity noise of its own the calling render adds, and how to switch it off; or None."""
+    sigma = variables.get("sigma_noise") or 0.0
+    if sigma > 0 and variables.get("train", True):
+        return f"sigma_noise={sigma:g}; switch it off with --sigma_noise 0"
+    return None

@@ -1,0 +1,145 @@
+"""The rasterizers of the INRIA family: where they are, what their calls look like, what they return."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "MODULES",
+    "ForwardCall",
+    "check_installed",
+    "find_radii",
+    "forward_signature",
+    "rasterizer_class",
+    "rasterizer_classes",
+    "white_alpha",
+]
+
+MODULES = ("diff_gaussian_rasterization", "diff_gaussian_rasterization_abs")
+_CLASS = "GaussianRasterizer"
+
+
+class ForwardCall:
+    """One call of ``GaussianRasterizer.forward``, whose arguments may be changed before it is made.
+
+    Args:
+        forward: the method that does the work.
+        bound: its arguments by name, the rasterizer itself among them.
+    """
+
+    def __init__(self, forward: Callable[..., Any], bound: inspect.BoundArguments) -> None:
+        self.forward = forward
+        self.rasterizer = next(iter(bound.arguments.values()))
+        self.arguments = bound.arguments
+        self._bound = bound
+
+    def __call__(self) -> Any:
+        """Rasterize."""
+        return self.forward(*self._bound.args, **self._bound.kwargs)
+
+
+def check_installed() -> None:
+    """Raise ImportError unless one of the rasterizers is there; does not import it."""
+    for name in MODULES:
+        if name in sys.modules or find_spec(name) is not None:
+            return
+    raise ImportError(
+        f"none of the rasterizers {', '.join(MODULES)} is installed. Install the one in the submodules of your code "
+        "base (it needs CUDA), pass your own class as rasterizer=..., or run the code base without CUDA: "
+        "python -m ca_reg.integrations.run --cpu train.py ..."
+    )
+
+
+def rasterizer_class(module: ModuleType) -> type | None:
+    """Return the rasterizer of a module, None if it has none."""
+    found = getattr(module, _CLASS, None)
+    return found if isinstance(found, type) else None
+
+
+def rasterizer_classes() -> list[type]:
+    """Import the installed rasterizers and return their classes.
+
+    Raises:
+        ImportError: if there are none.
+    """
+    check_installed()
+    modules = [import_module(name) for name in MODULES if name in sys.modules or find_spec(name) is not None]
+    return list(dict.fromkeys(found for found in map(rasterizer_class, modules) if found is not None))
+
+
+def forward_signature(rasterizer: type) -> inspect.Signature:
+    """Return the signature of a rasterizer's forward.
+
+    Raises:
+        TypeError: if it has not the arguments of the family.
+    """
+    forward = getattr(rasterizer, "forward", None)
+    signature = inspect.signature(forward) if callable(forward) else inspect.Signature()
+    missing = [name for name in ("means3D", "opacities") if name not in signature.parameters]
+    if missing:
+        raise TypeError(
+            f"{rasterizer.__qualname__}.forward{signature} has no argument {' or '.join(missing)}, so it is no "
+            "GaussianRasterizer of the INRIA family; pass the class of your code base as rasterizer=..."
+        )
+    return signature
+
+
+def find_radii(returned: Any, count: int) -> int:
+    """Return which member of a rasterizer's tuple holds the radii, told by type and shape.
+
+    Args:
+        returned: (color, radii), (color, radii, depth, alpha), (color, radii, per-Gaussian weights), ...
+        count: number of Gaussians N. Radii are integers of shape (N,), or (N, 2) where the axes have radii each.
+
+    Raises:
+        TypeError: if no tuple came.
+        ValueError: if none or several of its members can be the radii.
+    """
+    if not isinstance(returned, tuple):
+        raise TypeError(f"the rasterizer returned {type(returned).__name__}, expected a tuple with colours and radii.")
+    found = [
+        i
+        for i, x in enumerate(returned)
+        if isinstance(x, Tensor)
+        and not (x.is_floating_point() or x.dtype == torch.bool)
+        and x.shape in ((count,), (count, 2))
+    ]
+    if len(found) != 1:
+        shapes = ", ".join(f"{x.dtype} {tuple(x.shape)}" if isinstance(x, Tensor) else str(type(x)) for x in returned)
+        raise ValueError(
+            f"the rasterizer returned ({shapes}) for {count} Gaussians, expected exactly one integer tensor of shape "
+            f"({count},), the radii: without them dropped Gaussians cannot be hidden from densification."
+        )
+    return found[0]
+
+
+def white_alpha(call: ForwardCall) -> Tensor:
+    """Measure the accumulated alpha (H, W) of a call: all colours 1 over a background of 0, opacities as they are."""
+    settings = call.rasterizer.raster_settings
+    opacities: Tensor = call.arguments["opacities"]
+    before = dict(call.arguments)
+    call.rasterizer.raster_settings = settings._replace(bg=torch.zeros_like(settings.bg))
+    # "dc" holds the first band where a rasterizer takes it apart from the others.
+    call.arguments.update({name: None for name in ("shs", "dc") if name in before})
+    call.arguments["colors_precomp"] = opacities.new_ones(opacities.shape[0], 3)
+    try:
+        with torch.no_grad():
+            returned = call()
+    finally:
+        call.rasterizer.raster_settings = settings
+        call.arguments.clear()
+        call.arguments.update(before)
+    size = (3, settings.image_height, settings.image_width)
+    white = [x for x in returned if isinstance(x, Tensor) and tuple(x.shape) == size]
+    if len(white) != 1:
+        raise ValueError(f"the rasterizer returned {len(white)} images of shape {size} where one was expected.")
+    return white[0].mean(0)

@@ -1,0 +1,66 @@
+"""What a hook did: how many renders it changed, and why it left the others alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+__all__ = ["Skip", "Tally"]
+
+
+class Skip(str, Enum):
+    """Why a render was left alone."""
+
+    FURTHER_VIEW = "further render in the same iteration (scope main)"
+    CONSTANT_OPACITY = "opacities that are not trained, such as a depth render with constant ones"
+    DETACHED_MEANS = "positions that are not trained, such as a depth render for the opacities"
+    RATE_ZERO = "training render at a step where the rate is 0"
+    NOTHING_TO_SCALE = "test render of a regularizer that scales nothing"
+    SCORE = "render of a co-adaptation score"
+
+
+@dataclass
+class Tally:
+    """Counts of rasterizer calls.
+
+    Args:
+        regularized: training renders whose opacities were dropped or perturbed.
+        scaled: renders without gradients, or for a viewer, with the test-time opacities.
+        skipped: renders left alone, by the reason.
+        first_step: of the regularized renders; None if there were none.
+        last_step: of the regularized renders; None if there were none.
+    """
+
+    regularized: int = 0
+    scaled: int = 0
+    skipped: Counter[Skip] = field(default_factory=Counter)
+    first_step: int | None = None
+    last_step: int | None = None
+
+    def count_regularized(self, step: int) -> None:
+        """Count a regularized render of a step."""
+        self.regularized += 1
+        self.first_step = step if self.first_step is None else self.first_step
+        self.last_step = step
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the counts for JSON."""
+        skipped = {reason.name.lower(): count for reason, count in self.skipped.items()}
+        return {
+            "regularized": self.regularized,
+            "scaled": self.scaled,
+            "skipped": skipped,
+            "first_step": self.first_step,
+            "last_step": self.last_step,
+        }
+
+    def lines(self) -> list[str]:
+        """Return the counts in words, a line each."""
+        steps = "" if self.first_step is None else f", steps {self.first_step} to {self.last_step}"
+        lines = [f"{self.regularized} renders regularized{steps}", f"{self.scaled} renders scaled for evaluation"]
+        lines += [f"{count} renders left alone: {reason.value}" for reason, count in self.skipped.most_common()]
+        if not self.regularized + self.scaled:
+            lines.append("NOTHING was regularized or scaled")
+        return lines

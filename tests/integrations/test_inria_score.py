@@ -1,0 +1,101 @@
+"""The score of INRIA-style models: opacities from outside, alpha from wherever it is."""
+
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+from inria_fake import PIPE, Model, make_rasterizer, make_render
+
+from ca_reg import CAScore, GaussianDropout
+from ca_reg.integrations.inria import RasterizerHook
+from ca_reg.integrations.inria_score import render_fn
+from reference_trainer.render import render as reference_render
+
+FORMS = ["plain", "inverse-depth", "weights", "depth-alpha"]
+BACKGROUND = torch.tensor([0.3, 0.1, 0.7])
+
+
+def reference(model):
+    """The same renders without any of the family's interfaces."""
+
+    def render(opacity, camera):
+        arguments = model.get_xyz, model.get_rotation, model.get_scaling, opacity, camera
+        out = reference_render(*arguments, colors=model.get_features, background=BACKGROUND)
+        return out.image, out.alpha
+
+    return render
+
+
+@pytest.mark.parametrize(("form", "named"), [*((form, False) for form in FORMS), ("depth-alpha", True)])
+def test_the_score_is_that_of_the_plain_renderer(form, named):
+    model, rasterizer = Model(), make_rasterizer(form)
+    fn = render_fn(make_render(rasterizer, named), model, PIPE, BACKGROUND, rasterizer=rasterizer)
+    forward = vars(rasterizer)["forward"]
+    opacity = model.get_opacity.detach()
+    result, expected = (CAScore(f, samples=4, threshold=0.1)(opacity, model.camera) for f in (fn, reference(model)))
+    assert expected.value > 0
+    torch.testing.assert_close(result.variance, expected.variance, rtol=1e-4, atol=1e-9)
+    assert torch.equal(result.visible, expected.visible)
+    assert vars(rasterizer)["forward"] is forward
+
+
+@pytest.mark.parametrize(("form", "calls"), [("plain", 6), ("inverse-depth", 6), ("weights", 6), ("depth-alpha", 4)])
+def test_the_second_pass_stops_once_the_alpha_is_known(form, calls):
+    """Three renders: twice as many passes, or one more if a member of the tuple proves to be the alpha."""
+    model, rasterizer, count = Model(), make_rasterizer(form), []
+    forward = rasterizer.forward
+
+    def counted(
+        self,
+        means3D,
+        means2D,
+        opacities,
+        shs=None,
+        colors_precomp=None,
+        scales=None,
+        rotations=None,
+        cov3D_precomp=None,
+    ):
+        count.append(1)
+        return forward(self, means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+
+    rasterizer.forward = counted
+    fn = render_fn(make_render(rasterizer), model, PIPE, BACKGROUND, rasterizer=rasterizer)
+    for factor in (0.0, 0.5, 1.0):  # the first picture is empty: depth and alpha are the same
+        opacity = factor * model.get_opacity.detach()
+        torch.testing.assert_close(fn(opacity, model.camera)[1], reference(model)(opacity, model.camera)[1])
+    assert len(count) == calls + (form == "depth-alpha")
+
+
+def test_an_installed_hook_does_not_touch_scores_nor_lose_its_place(monkeypatch):
+    model, rasterizer = Model(), make_rasterizer()
+    render = make_render(rasterizer)
+    opacity = model.get_opacity.detach()
+    expected = reference(model)(opacity, model.camera)
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer) as hook:
+        hook.step(1)
+        image, alpha = render_fn(render, model, PIPE, BACKGROUND, rasterizer=rasterizer)(opacity, model.camera)
+        assert hook.tally.regularized + hook.tally.scaled == 0
+        render(model.camera, model, PIPE, BACKGROUND)
+        assert hook.tally.regularized == 1
+    torch.testing.assert_close(image, expected[0])
+    torch.testing.assert_close(alpha, expected[1])
+
+
+def test_installed_rasterizers_are_found(monkeypatch):
+    model, rasterizer = Model(), make_rasterizer()
+    monkeypatch.setitem(sys.modules, "diff_gaussian_rasterization", SimpleNamespace(GaussianRasterizer=rasterizer))
+    fn = render_fn(make_render(rasterizer), model, PIPE, BACKGROUND)
+    assert fn(model.get_opacity.detach(), model.camera).alpha.shape == (24, 32)
+
+
+def test_what_cannot_be_scored_is_said():
+    model, rasterizer = Model(), make_rasterizer()
+    opacity = model.get_opacity.detach()
+    other = render_fn(make_render(make_rasterizer()), model, PIPE, BACKGROUND, rasterizer=rasterizer)
+    with pytest.raises(RuntimeError, match="0 times, expected once"):
+        other(opacity, model.camera)
+    fn = render_fn(make_render(rasterizer), model, PIPE, BACKGROUND, rasterizer=rasterizer)
+    with pytest.raises(ValueError, match="rasterizes 60 Gaussians, but 59 opacities"):
+        fn(opacity[1:], model.camera)

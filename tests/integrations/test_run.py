@@ -1,0 +1,213 @@
+"""The launcher, on a small code base with the family's layout that is written for the test."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import textwrap
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from ca_reg.integrations.run import main
+
+FILES = {
+    "diff_gaussian_rasterization.py": """
+        from inria_fake import make_rasterizer
+
+        GaussianRasterizer = make_rasterizer()
+    """,
+    "scene/__init__.py": "from scene.gaussian_model import GaussianModel\n",
+    "scene/gaussian_model.py": """
+        from inria_fake import Model
+
+        class GaussianModel(Model):
+            def update_learning_rate(self, iteration):
+                self.rate = 1e-3
+    """,
+    "gaussian_renderer/__init__.py": """
+        from diff_gaussian_rasterization import GaussianRasterizer
+        from inria_fake import make_render
+
+        render = make_render(GaussianRasterizer)
+    """,
+    "train.py": """
+        import random
+        import sys
+
+        import torch
+        from gaussian_renderer import render
+        from scene import GaussianModel
+
+        def training(iterations):
+            gaussians = GaussianModel()
+            background = torch.zeros(3)
+            for iteration in range(1, iterations + 1):
+                gaussians.update_learning_rate(iteration)
+                package = render(gaussians.camera, gaussians, None, background)
+                render(gaussians.camera, gaussians, None, background)  # a second view
+                print("seen", int((package["radii"] > 0).sum()), torch.rand(1).item())
+            with torch.no_grad():
+                render(gaussians.camera, gaussians, None, background)
+
+        if __name__ == "__main__":
+            torch.manual_seed(0)
+            print("argv", sys.argv[1:], "path", sys.path[0], "file", __file__)
+            training(int(sys.argv[1]))
+            if sys.argv[2:] == ["--fail"]:
+                raise ValueError("a failure of their own")
+            if sys.argv[2:] == ["--interrupt"]:
+                raise KeyboardInterrupt
+            sys.exit(3 if sys.argv[2:] == ["--exit"] else 0)
+    """,
+}
+
+
+@pytest.fixture
+def repository(tmp_path, monkeypatch):
+    """A code base, with the state of the interpreter put back after the test."""
+    for name, text in FILES.items():
+        path = tmp_path / "repository" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(textwrap.dedent(text))
+    for name in ("argv", "path", "meta_path"):
+        monkeypatch.setattr(sys, name, list(getattr(sys, name)))
+    sys.path.insert(0, "")  # python -m puts the present folder there
+    modules = set(sys.modules)
+    yield tmp_path / "repository"
+    for name in set(sys.modules) - modules:
+        if name.partition(".")[0] in ("scene", "gaussian_renderer", "diff_gaussian_rasterization"):
+            del sys.modules[name]
+
+
+def launch(*arguments):
+    with pytest.raises(SystemExit) as ended:
+        main([str(x) for x in arguments])
+    return ended.value.code
+
+
+def seen(out):
+    return [int(line.split()[1]) for line in out.splitlines() if line.startswith("seen")]
+
+
+def draws(out):
+    return [line.split()[2] for line in out.splitlines() if line.startswith("seen")]
+
+
+def test_a_script_is_regularized_and_the_report_says_how(repository, tmp_path, capsys):
+    script, report = repository / "train.py", tmp_path / "report.json"
+    assert launch(script, 3) == 0
+    plain = capsys.readouterr()
+    assert "the script ran plain" in plain.err
+    for name in [m for m in sys.modules if m.partition(".")[0] in ("scene", "gaussian_renderer")]:
+        del sys.modules[name]
+    assert launch("--dropout", 0.5, "--start", 2, "--report", report, script, 3) == 0
+    regularized = capsys.readouterr()
+    written = json.loads(report.read_text())
+    assert written["renders"] == {
+        "regularized": 2,
+        "scaled": 1,
+        "skipped": {"further_view": 3, "rate_zero": 1},
+        "first_step": 2,
+        "last_step": 3,
+    }
+    assert (written["dropout"], written["arguments"], written["ended"]) == (0.5, ["3"], "exit 0")
+    assert "[ca_reg] 2 renders regularized, steps 2 to 3" in regularized.err
+    assert "[ca_reg] 3 renders left alone: further render in the same iteration (scope main)" in regularized.err
+    before, after = seen(plain.out), seen(regularized.out)
+    assert after[0] == before[0]
+    assert all(a < 0.8 * b for a, b in zip(after[1:], before[1:], strict=True))
+    assert draws(plain.out) == draws(regularized.out)  # the script's own random numbers
+
+
+def test_the_script_sees_what_python_would_show_it(repository, capsys):
+    script = repository / "train.py"
+    launch("--seed", 4, "--scope", "all", script, 1, "--seed", 7, "--dropout", "theirs")
+    line = capsys.readouterr().out.splitlines()[0]
+    assert line == f"argv ['1', '--seed', '7', '--dropout', 'theirs'] path {repository} file {script}"
+
+
+def test_a_ramp_and_noise(repository, tmp_path, capsys):
+    report = tmp_path / "report.json"
+    launch("--noise", 0.8, "--ramp", 10, "--scope", "all", "--report", report, repository / "train.py", 2)
+    assert json.loads(report.read_text())["renders"]["regularized"] == 4
+
+
+@pytest.mark.parametrize(
+    ("flag", "error", "ended"),
+    [
+        ("--fail", ValueError, "ValueError: a failure of their own"),
+        ("--interrupt", KeyboardInterrupt, "KeyboardInterrupt"),
+        ("--exit", SystemExit, "exit 3"),
+    ],
+)
+def test_the_report_comes_however_the_script_ends(repository, tmp_path, capsys, flag, error, ended):
+    report = tmp_path / "report.json"
+    with pytest.raises(error) as raised:
+        main(["--dropout", "0.5", "--report", str(report), str(repository / "train.py"), "1", flag])
+    assert getattr(raised.value, "code", 3) == 3
+    assert json.loads(report.read_text())["ended"] == ended
+    assert "1 renders regularized" in capsys.readouterr().err
+
+
+def test_a_script_that_does_not_render_is_told_so(repository, capsys):
+    (repository / "other.py").write_text("print('done')\n")
+    main(["--dropout", "0.2", str(repository / "other.py")])
+    assert "NOTHING was regularized or scaled" in capsys.readouterr().err
+
+
+def test_without_cuda_the_stand_in_comes_first(repository, capsys, monkeypatch):
+    asked = []
+
+    @contextmanager
+    def stand_in(repository: Path, outputs: int | None = None):
+        asked.append((repository, outputs))
+        from inria_fake import make_rasterizer
+
+        module = ModuleType("diff_gaussian_rasterization")
+        module.GaussianRasterizer = make_rasterizer("plain")
+        sys.modules[module.__name__] = module
+        try:
+            yield (module.__name__,)
+        finally:
+            del sys.modules[module.__name__]
+
+    fake = ModuleType("reference_trainer.compat")
+    fake.stand_in = stand_in
+    monkeypatch.setitem(sys.modules, "reference_trainer.compat", fake)
+    (repository / "diff_gaussian_rasterization.py").unlink()
+    assert launch("--cpu", "--outputs", 2, "--dropout", 0.5, repository / "train.py", 1) == 0
+    assert asked == [(repository, 2)]
+    assert "1 renders regularized" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.py"], "there is no script nowhere.py"),
+        (["--dropout", "1.5", "SCRIPT"], r"p must be in \[0, 1\)"),
+        (["--noise", "-1", "SCRIPT"], "sigma must be finite and at least 0"),
+        (["--dropout", "0.2", "--ramp", "0", "SCRIPT"], "end_step must come after start_step"),
+        (["--outputs", "2", "SCRIPT"], "which --cpu asks for"),
+        (["--report", "nowhere/x.json", "SCRIPT"], "there is no folder"),
+        (["--drop", "0.2", "SCRIPT"], "unrecognized arguments|no script"),
+    ],
+)
+def test_wrong_options_are_refused_before_anything_runs(repository, capsys, arguments, message):
+    code = launch(*[str(repository / "train.py") if x == "SCRIPT" else x for x in arguments])
+    captured = capsys.readouterr()
+    assert code == 2
+    assert captured.out == ""
+    assert re.search(message, captured.err)
+
+
+def test_the_module_is_a_program_whose_exit_code_is_the_scripts(repository):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, "-m", "ca_reg.integrations.run", "--dropout", "0.5", "train.py", "1", "--exit"]
+    done = subprocess.run(command, cwd=repository, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 3
+    assert f"argv ['1', '--exit'] path {repository}" in done.stdout
+    assert "1 renders regularized, steps 1 to 1" in done.stderr
