@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from torch import Tensor
 
 from reference_trainer.camera import Camera
@@ -19,6 +22,7 @@ def render_gaussians(
     opacities: Tensor | None = None,
     sh_degree: int | None = None,
     depth: bool = False,
+    renderer: Callable[..., Any] = render,
 ) -> Rendering:
     """Render a model.
 
@@ -29,6 +33,7 @@ def render_gaussians(
         opacities: activated opacities (N,) to use instead of the model's own, such as regularized ones.
         sh_degree: highest band of spherical harmonics to use; all by default.
         depth: whether to accumulate depth as well.
+        renderer: with the arguments of `render`, such as gsplat's; what it returns is returned.
 
     Example:
         >>> import torch
@@ -37,7 +42,7 @@ def render_gaussians(
         >>> render_gaussians(gaussians, camera, torch.zeros(3)).image.shape
         torch.Size([3, 16, 16])
     """
-    return render(
+    out: Rendering = renderer(
         gaussians.means,
         gaussians.quaternions,
         gaussians.scales,
@@ -48,3 +53,4 @@ def render_gaussians(
         background=background,
         depth=depth,
     )
+    return out

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.studies.speed.calls import BASELINE, SUBJECT, gradients, image
+from reference_trainer.studies.speed.gsplat import gsplat_calls
 from reference_trainer.studies.speed.limits import Limits, bounds, covered_pairs
 from reference_trainer.studies.speed.memory import peak_memory
 from reference_trainer.studies.speed.stages import STAGES, Staged, staged
@@ -61,6 +62,7 @@ class WorkloadSpeed:
     def ratios(self) -> dict[str, float]:
         """Return times in units of others that were taken in turns with them: medians of the quotients per round."""
         pairs = {f"{x} / baseline": (x, f"baseline {x}") for x in PASSES}
+        pairs |= {f"{x} / gsplat": (x, f"gsplat {x}") for x in PASSES if f"gsplat {x}" in self.seconds}
         pairs[f"score of {MASKS} / {MASKS} renders"] = (f"score of {MASKS}", f"{MASKS} renders")
         return {
             name: statistics.median(a / b for a, b in zip(self.seconds[x], self.seconds[y], strict=True))
@@ -113,6 +115,7 @@ def measure_workload(spec: WorkloadSpec, limits: Limits, *, repeats: int, device
         f"baseline {PASSES[1]}": lambda: gradients(BASELINE, workload),
         "stages": lambda: runs.append(staged(workload)),
         **masked_renders(workload),
+        **gsplat_calls(workload),
     }
     seconds = in_turns(calls, repeats, device)
     return WorkloadSpeed(

@@ -102,6 +102,7 @@ def _times(workloads: Mapping[str, Any]) -> list[dict[str, object]]:
                     "ms": w["medians"][x] * 1e3,
                     "baseline ms": w["medians"][f"baseline {x}"] * 1e3,
                     "vs baseline": w["ratios"][f"{x} / baseline"],
+                    **_gsplat(w, x),
                     "vs exp": w["ratios_to_limits"][f"{x} / exp bound"],
                     "vs copy": w["ratios_to_limits"][f"{x} / copy bound"],
                     "M pairs/s": w["pairs_per_second"][x] / 1e6,
@@ -109,6 +110,13 @@ def _times(workloads: Mapping[str, Any]) -> list[dict[str, object]]:
                 }
             )
     return rows
+
+
+def _gsplat(w: Mapping[str, Any], x: str) -> dict[str, object]:
+    """Return the columns of gsplat, if it was there."""
+    if f"{x} / gsplat" not in w["ratios"]:
+        return {}
+    return {"gsplat ms": w["medians"][f"gsplat {x}"] * 1e3, "vs gsplat": w["ratios"][f"{x} / gsplat"]}
 
 
 def _stages(name: str, w: Mapping[str, Any]) -> dict[str, object]:

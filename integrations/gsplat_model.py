@@ -1,0 +1,199 @@
+"""A gsplat model as a renderer and as per-pixel lists: what the co-adaptation score asks for."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ca_reg import PixelLists
+
+from .gsplat import load_gsplat, unregularized
+
+__all__ = ["GsplatModel", "GsplatView"]
+
+_TILE = 16
+_ALL = 2**31 - 1  # batches of Gaussians per tile: all of them
+
+
+class GsplatView(NamedTuple):
+    """A camera in gsplat's terms.
+
+    Convention: OpenCV camera, half-pixel centres.
+
+    Args:
+        viewmat: world to camera, shape (4, 4).
+        K: intrinsics, pixels, shape (3, 3).
+        width: of the image.
+        height: of the image.
+    """
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class GsplatModel:
+    """Gaussians that gsplat renders, but for their opacities. Needs a CUDA device.
+
+    ``CAScore(model.render)`` samples; ``CAScore(exact=ListMoments(model.lists))`` is exact and needs gsplat 1.5 or
+    newer. Both leave a regularizer that wraps or replaces ``gsplat.rasterization`` out of the way.
+
+    Args:
+        means: world coordinates, shape (N, 3).
+        quats: orientation, wxyz, shape (N, 4).
+        scales: standard deviations, activated, shape (N, 3).
+        colors: RGB, shape (N, 3), or with ``sh_degree`` the spherical harmonics, shape (N, K, 3).
+        sh_degree: highest band to evaluate; None for colours.
+        background: colour behind everything, shape (3,); None for black.
+        near_plane: as in ``gsplat.rasterization``.
+        eps2d: as in ``gsplat.rasterization``.
+        antialiased: whether the model was trained with ``rasterize_mode="antialiased"``.
+
+    Example:
+        >>> from ca_reg import CAScore, ListMoments
+        >>> model = GsplatModel(means, quats, scales, sh, sh_degree=3)  # doctest: +SKIP
+        >>> view = GsplatView(viewmat, K, 1008, 756)  # doctest: +SKIP
+        >>> CAScore(model.render, p=0.2)(opacities, view).value  # doctest: +SKIP
+        >>> CAScore(exact=ListMoments(model.lists), p=0.2)(opacities, view).value  # doctest: +SKIP
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    colors: Tensor
+    sh_degree: int | None = None
+    background: Tensor | None = None
+    near_plane: float = 0.01
+    eps2d: float = 0.3
+    antialiased: bool = False
+
+    def render(self, opacity: Tensor, view: GsplatView) -> tuple[Tensor, Tensor]:
+        """Render a view with these opacities: the render callable of :class:`~ca_reg.CAScore`.
+
+        Args:
+            opacity: activated, shape (N,) or (N, 1).
+            view: the camera.
+
+        Returns:
+            Image (3, H, W) and accumulated alpha (H, W).
+
+        Raises:
+            ImportError: if gsplat is missing.
+            RuntimeError: if the Gaussians are not on a CUDA device.
+        """
+        colors, alphas, _ = unregularized(load_gsplat(self.means.device).rasterization)(
+            **self._camera(view),
+            means=self.means,
+            quats=self.quats,
+            scales=self.scales,
+            opacities=opacity.reshape(-1),
+            colors=self.colors,
+            near_plane=self.near_plane,
+            eps2d=self.eps2d,
+            sh_degree=self.sh_degree,
+            packed=False,
+            backgrounds=None if self.background is None else self.background[None],
+            rasterize_mode="antialiased" if self.antialiased else "classic",
+        )
+        return colors[0].permute(2, 0, 1), alphas[0, ..., 0]
+
+    def lists(self, opacity: Tensor, view: GsplatView) -> PixelLists:
+        """List what every pixel composites, without an early stop: what :class:`~ca_reg.ListMoments` needs.
+
+        Differentiable in everything but the choice of the pairs, as the rasterizer is.
+
+        Args:
+            opacity: activated, shape (N,) or (N, 1).
+            view: the camera.
+
+        Raises:
+            ImportError: if gsplat is missing.
+            RuntimeError: if the Gaussians are not on a CUDA device.
+        """
+        gsplat = load_gsplat(self.means.device)
+        camera = self._camera(view)
+        flat = opacity.reshape(-1)
+        radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(
+            **camera,
+            means=self.means,
+            covars=None,
+            quats=self.quats,
+            scales=self.scales,
+            eps2d=self.eps2d,
+            near_plane=self.near_plane,
+            packed=False,
+            calc_compensations=self.antialiased,
+            opacities=flat,
+        )
+        opacities = flat[None] * compensations if self.antialiased else flat[None]
+        with torch.no_grad():
+            gaussians, pixels = _pairs(gsplat, radii, means2d, depths, conics, opacities, view)
+        x, y = means2d[0, gaussians].unbind(-1)
+        dx, dy = x - (pixels % view.width + 0.5), y - (pixels // view.width + 0.5)
+        xx, xy, yy = conics[0, gaussians].unbind(-1)
+        falloff = torch.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
+        alphas = (opacities[0, gaussians] * falloff).clamp(max=_largest_alpha(flat.device))
+        return PixelLists(
+            gaussians, pixels, alphas, self._colors(gsplat, view), view.height, view.width, self.background
+        )
+
+    def _camera(self, view: GsplatView) -> dict[str, Any]:
+        """The arguments that all of gsplat's functions name alike, for one camera."""
+        return {"viewmats": view.viewmat[None], "Ks": view.K[None], "width": view.width, "height": view.height}
+
+    def _colors(self, gsplat: Any, view: GsplatView) -> Tensor:
+        """Colours towards a view, (N, 3)."""
+        if self.sh_degree is None:
+            return self.colors
+        harmonics = gsplat.spherical_harmonics
+        if "viewmats" in inspect.signature(harmonics).parameters:  # 1.6 takes the camera, 1.5 the directions
+            values = harmonics(self.sh_degree, means=self.means, viewmats=view.viewmat[None], coeffs=self.colors)[0]
+        else:
+            center = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+            values = harmonics(self.sh_degree, dirs=self.means - center, coeffs=self.colors)
+        colors: Tensor = (values + 0.5).clamp(min=0.0)
+        return colors
+
+
+def _pairs(
+    gsplat: Any, radii: Tensor, means2d: Tensor, depths: Tensor, conics: Tensor, opacities: Tensor, view: GsplatView
+) -> tuple[Tensor, Tensor]:
+    """Return Gaussian and pixel of every alpha of at least 1/255, nearest first at every pixel, shapes (P,)."""
+    columns, rows = -(-view.width // _TILE), -(-view.height // _TILE)
+    _, intersections, order = gsplat.isect_tiles(
+        means2d, radii, depths, tile_size=_TILE, tile_width=columns, tile_height=rows
+    )
+    offsets = gsplat.isect_offset_encode(intersections, 1, columns, rows)  # of 1 image, n_cameras before 1.5.3
+    gaussians, pixels, _ = gsplat.rasterize_to_indices_in_range(
+        range_start=0,
+        range_end=_ALL,
+        # gsplat ends a pixel at a transmittance of 1e-4. Infinite light never ends, and the lists must be complete.
+        transmittances=torch.full((1, view.height, view.width), torch.inf, device=means2d.device),
+        means2d=means2d,
+        conics=conics,
+        opacities=opacities,
+        image_width=view.width,
+        image_height=view.height,
+        tile_size=_TILE,
+        isect_offsets=offsets.reshape(1, rows, columns),
+        flatten_ids=order,
+    )
+    return gaussians.long(), pixels.long()
+
+
+@functools.lru_cache
+def _largest_alpha(device: torch.device) -> float:
+    """The clamp of this gsplat (0.999 up to 1.5, then 0.99), read off an opaque splat over the centre of a pixel."""
+    one, eye = torch.ones(1, 3, device=device), torch.eye(4, device=device)
+    intrinsics = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]], device=device)
+    model = GsplatModel(one * eye[2, :3], eye[:1], one, one)
+    with torch.no_grad():
+        _, alpha = model.render(one[0, :1], GsplatView(eye, intrinsics, 1, 1))
+    return float(alpha)

@@ -1,0 +1,177 @@
+"""Rendering by gsplat's CUDA kernels, where there are some, in place of this package's own renderer.
+
+Same arguments, same kind of result, and the same constants where gsplat lets them be chosen: near plane and dilation.
+Three are its own: alpha is clamped at 0.999 before gsplat 1.6, no gradient passes a clamped alpha, and the projection
+is linearised up to a margin beyond the picture's borders, which differs where the principal point is off the middle.
+There are no moments: analytic training and exact scores use this package's renderer.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.constants import DILATION, NEAR_PLANE
+
+__all__ = ["DrawnLists", "Ellipses", "GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
+
+
+class Ellipses(NamedTuple):
+    """Projected Gaussians, as much of `Projection` as density control reads.
+
+    Args:
+        means: pixel coordinates, shape (M, 2); keeps its gradient.
+        radii: three standard deviations of the longer axis, rounded up, pixels, shape (M,).
+    """
+
+    means: Tensor
+    radii: Tensor
+
+
+class DrawnLists(NamedTuple):
+    """As much of `TileLists` as density control reads.
+
+    Args:
+        touched: whether a Gaussian is in any list, shape (M,) bool.
+    """
+
+    touched: Tensor
+
+
+class GsplatSplats(NamedTuple):
+    """What density control reads of `Splats`, under the same names.
+
+    Args:
+        indices: which of the N Gaussians lie in view, shape (M,).
+        projection: their ellipses.
+        lists: which of them were drawn.
+    """
+
+    indices: Tensor
+    projection: Ellipses
+    lists: DrawnLists
+
+
+class GsplatRendering(NamedTuple):
+    """A rendered view, with the fields of `Rendering`.
+
+    Args:
+        image: colours over the background, not clamped, shape (3, H, W).
+        alpha: accumulated alpha, shape (H, W).
+        depth: sum of weight times camera depth, not divided by alpha, shape (H, W); None unless asked for.
+        splats: what was drawn.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    depth: Tensor | None
+    splats: GsplatSplats
+
+
+def load_gsplat_render(device: torch.device | str) -> Callable[..., GsplatRendering]:
+    """Return a function with the arguments of `render` that draws with gsplat.
+
+    Args:
+        device: where the Gaussians are.
+
+    Raises:
+        RuntimeError: if the device is not a CUDA device, or there is none.
+        ImportError: if gsplat is missing.
+    """
+    if torch.device(device).type != "cuda":
+        raise RuntimeError(
+            f"the gsplat renderer draws on CUDA devices only, and the device is {str(device)!r}: train with --device "
+            "cuda, or with --renderer torch, which runs anywhere."
+        )
+    if not torch.cuda.is_available():
+        raise RuntimeError("the gsplat renderer needs a CUDA device, and torch finds none: use --renderer torch.")
+    try:
+        import gsplat
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            "the gsplat renderer needs gsplat: pip install 'ca_reg[gsplat]', or use --renderer torch."
+        ) from error
+    return functools.partial(render_by, gsplat.rasterization)
+
+
+def render_by(
+    rasterization: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]],
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    *,
+    sh: Tensor | None = None,
+    sh_degree: int | None = None,
+    colors: Tensor | None = None,
+    background: Tensor | None = None,
+    depth: bool = False,
+) -> GsplatRendering:
+    """Render 3D Gaussians with a rasterization; differentiable in every tensor but the background.
+
+    Convention: as `render`.
+
+    Args:
+        rasterization: ``gsplat.rasterization``, version 1.5 or newer.
+        means: world coordinates, shape (N, 3).
+        quaternions: orientation, need not be normalised, shape (N, 4).
+        scales: standard deviations along the axes, positive, shape (N, 3).
+        opacities: activated, in [0, 1], shape (N,) or (N, 1).
+        camera: the view.
+        sh: spherical-harmonic coefficients, shape (N, K, 3), or
+        sh_degree: highest band to evaluate; all of ``sh`` by default.
+        colors: colours, shape (N, 3).
+        background: colour behind everything, shape (3,); black by default.
+        depth: whether to accumulate depth as well.
+
+    Raises:
+        TypeError: if the Gaussians are not float32, the only kind that gsplat knows.
+        ValueError: if not exactly one of ``sh`` and ``colors`` is given.
+    """
+    if (sh is None) == (colors is None):
+        raise ValueError("give either sh (N, K, 3) or colors (N, 3), not both and not neither.")
+    if means.dtype != torch.float32:
+        raise TypeError(f"the gsplat renderer knows float32 only, got {means.dtype}: use the torch renderer.")
+    if sh is not None and sh_degree is None:
+        sh_degree = math.isqrt(sh.shape[1]) - 1
+    intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
+    images, alphas, info = rasterization(
+        means=means,
+        quats=quaternions,
+        scales=scales,
+        opacities=opacities.reshape(-1),
+        colors=colors if sh is None else sh,
+        viewmats=camera.world_to_camera.to(means)[None],
+        Ks=means.new_tensor(intrinsics)[None],
+        width=camera.width,
+        height=camera.height,
+        near_plane=NEAR_PLANE,
+        eps2d=DILATION,
+        sh_degree=None if sh is None else sh_degree,
+        packed=True,  # the projected means of M Gaussians, as the gradient is wanted, not those of a batch of views
+        backgrounds=None if background is None else background.to(means)[None],
+        render_mode="RGB+D" if depth else "RGB",
+    )
+    if info["means2d"].requires_grad:
+        info["means2d"].retain_grad()
+    image = images[0].permute(2, 0, 1)
+    splats = GsplatSplats(
+        indices=info["gaussian_ids"].long(),
+        projection=Ellipses(info["means2d"], _radii(info["conics"].detach())),
+        lists=DrawnLists(info["tiles_per_gauss"] > 0),
+    )
+    return GsplatRendering(image[:3], alphas[0, ..., 0], image[3] if depth else None, splats)
+
+
+def _radii(conics: Tensor) -> Tensor:
+    """Three standard deviations of the longer axis, rounded up: gsplat's own radii follow the opacity instead."""
+    xx, xy, yy = conics.unbind(-1)  # of the inverse covariance
+    largest = (0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)) / (xx * yy - xy * xy)
+    return torch.ceil(3.0 * largest.sqrt())

@@ -1,0 +1,35 @@
+"""Training with the renderer that is chosen, through a stand-in for gsplat."""
+
+import dataclasses
+import functools
+
+import pytest
+import torch
+from gsplat_stand_in import rasterization
+
+from reference_trainer.render.gsplat import render_by
+from reference_trainer.training import trainer as module
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.trainer import Trainer
+
+
+def test_a_run_with_gsplat_is_the_run_with_the_own_renderer(tiny_scene, busy, monkeypatch):
+    monkeypatch.setattr(module, "load_gsplat_render", lambda device: functools.partial(render_by, rasterization))
+    ours, theirs = Trainer(tiny_scene, busy), Trainer(tiny_scene, dataclasses.replace(busy, renderer="gsplat"))
+    for trainer in (ours, theirs):
+        trainer.train(until=4)  # up to the first densification
+    seen = ours.statistics.steps > 0
+    assert seen.any()
+    torch.testing.assert_close(theirs.statistics.gradient_sum, ours.statistics.gradient_sum, rtol=1e-3, atol=1e-6)
+    before = len(theirs.gaussians)
+    theirs.train()
+    assert (theirs.step, len(theirs.gaussians) != before) == (busy.iterations, True)
+
+
+def test_the_choice_is_checked(tiny_scene):
+    with pytest.raises(RuntimeError, match="--renderer torch"):
+        Trainer(tiny_scene, TrainConfig(renderer="gsplat"))
+    with pytest.raises(ValueError, match="'torch' or 'gsplat', got 'cuda'"):
+        TrainConfig(renderer="cuda")
+    with pytest.raises(ValueError, match="analytic training needs the moments of the torch renderer"):
+        TrainConfig(renderer="gsplat", analytic=True, dropout=0.2)
