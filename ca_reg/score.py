@@ -29,7 +29,7 @@ from ca_reg.types import (
     read_rendering,
 )
 
-__all__ = ["CAScore"]
+__all__ = ["CAScore", "view_position"]
 
 
 class ExactView(NamedTuple):
@@ -201,9 +201,10 @@ class CAScore:
         Args:
             opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
             view: passed on to the callables as it is.
-            index: position of the view among all views; by default the number of updates since the last reset. When
-                the views are split over ranks, give the position in the whole set, so that every view gets masks of
-                its own and the result does not depend on the number of ranks.
+            index: position of the view among all views, which gives every view masks of its own. By default the views
+                are counted from the last reset on, and over ranks as if dealt out in turn, as
+                :class:`torch.utils.data.DistributedSampler` does without shuffling: the result then is that of a single
+                process. Give the position in the whole set if they are split in another way.
 
         Returns:
             The result of this view.
@@ -212,7 +213,7 @@ class CAScore:
             TypeError: as for a call of the score.
             ValueError: as for a call of the score.
         """
-        result = self(opacity, view, index=self._updates if index is None else index)
+        result = self(opacity, view, index=view_position(self._updates) if index is None else index)
         self._tally.add(result)
         self._updates += 1
         return result
@@ -329,6 +330,13 @@ class CAScore:
             reason=reason,
             **asdict(replace(self.settings, samples=total.count)),
         )
+
+
+def view_position(count: int, group: dist.ProcessGroup | None = None) -> int:
+    """Return the position among the views of all ranks of the one that comes after ``count`` others on this rank."""
+    if not (dist.is_available() and dist.is_initialized()):
+        return count
+    return dist.get_rank(group) + dist.get_world_size(group) * count
 
 
 def _mean(variance: Tensor, visible: Tensor) -> tuple[float, Reason]:

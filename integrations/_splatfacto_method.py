@@ -1,0 +1,56 @@
+"""The classes and the method that need nerfstudio; imported by `ca_reg.integrations.nerfstudio` alone."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, field
+
+from nerfstudio.models import splatfacto
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from ca_reg.integrations._splatfacto import CoAdaptation
+
+__all__ = ["SplatfactoCAModel", "SplatfactoCAModelConfig", "make_method"]
+
+if not hasattr(splatfacto, "rasterization"):
+    raise ImportError("its splatfacto does not call gsplat.rendering.rasterization; nerfstudio 1.1.1 and newer does")
+
+
+@dataclass
+class SplatfactoCAModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
+    """Splatfacto with dropout, opacity noise and the co-adaptation score."""
+
+    _target: type = field(default_factory=lambda: SplatfactoCAModel)
+    dropout: float = 0.2
+    """share of the Gaussians left out of each training step; evaluation scales the opacities by 1 - dropout"""
+    opacity_noise: float = 0.0
+    """standard deviation of the relative noise on the opacities in training; the paper uses 0.8"""
+    scale_noise: bool = False
+    """whether evaluation renders with the mean of the noisy opacities, which the paper does not"""
+    ca_samples: int = 5
+    """renders per evaluation image for the co-adaptation score; 0 leaves it out"""
+
+
+class SplatfactoCAModel(CoAdaptation, SplatfactoModel):  # type: ignore[misc]
+    """Splatfacto with regularized opacities and the co-adaptation score; see :class:`SplatfactoCAModelConfig`."""
+
+    config: SplatfactoCAModelConfig
+    holder = splatfacto
+
+
+def make_method() -> MethodSpecification:
+    """Return splatfacto's own method with the model exchanged, and nothing else."""
+    # Not at the top: nerfstudio loads this while it imports that module, after it has filled the dictionary.
+    from nerfstudio.configs.method_configs import method_configs
+
+    config = deepcopy(method_configs["splatfacto"])
+    config.method_name = "splatfacto-ca"
+    plain = vars(config.pipeline.model)
+    config.pipeline.model = SplatfactoCAModelConfig(**{**plain, "_target": SplatfactoCAModel})
+    return MethodSpecification(config, "Splatfacto with Gaussian dropout, opacity noise and the co-adaptation score")
+
+
+# Saved runs name their classes by module; the public one is where they stay.
+for _class in (SplatfactoCAModelConfig, SplatfactoCAModel):
+    _class.__module__ = "ca_reg.integrations.nerfstudio"

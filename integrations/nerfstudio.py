@@ -1,0 +1,57 @@
+"""`splatfacto-ca`, a method of nerfstudio: splatfacto with dropout, opacity noise and the co-adaptation score.
+
+Nothing has to be imported: where both packages are installed, ``ns-train splatfacto-ca --data ...`` trains it, with
+``--pipeline.model.dropout``, ``--pipeline.model.opacity-noise``, ``--pipeline.model.scale-noise`` and
+``--pipeline.model.ca-samples`` beside the options of splatfacto. Evaluation images are logged with ``ca``,
+``ca_std_error`` and ``ca_visible``, the share of the pixels that count; where that is 0, ``ca`` is nan.
+
+The score is the paper's, with half of the Gaussians that training left, except that splatfacto clamps its colours.
+Exported PLY files hold the opacities as trained; viewers other than nerfstudio's have to scale them by 1 - dropout.
+
+The names of this module are made when they are asked for:
+
+- ``splatfacto_ca``: the ``MethodSpecification``. nerfstudio loads it in every ``ns-train``, whatever the method, and an
+  exception would end that; so where it cannot be had this is an :class:`Unavailable`, which nerfstudio reports in one
+  line and goes on.
+- ``SplatfactoCAModel``, ``SplatfactoCAModelConfig``: for methods of one's own. Where they cannot be had, asking for one
+  raises an ImportError.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["SplatfactoCAModel", "SplatfactoCAModelConfig", "Unavailable", "splatfacto_ca"]  # noqa: F822
+
+
+class Unavailable:
+    """Stands in for the method where it cannot be had; its text says why.
+
+    Args:
+        error: what happened.
+    """
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    def __repr__(self) -> str:
+        text = (
+            "splatfacto-ca (which needs nerfstudio 1.1.1 or newer with its gsplat, the extra nerfstudio of ca_reg: "
+            f"{type(self.error).__name__}: {self.error})"
+        )
+        # nerfstudio prints this by rich, which takes square brackets for markup and raises if they do not match.
+        return text.replace("[", "(").replace("]", ")")
+
+
+def __getattr__(name: str) -> Any:
+    if name not in ("SplatfactoCAModel", "SplatfactoCAModelConfig", "splatfacto_ca"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        from ca_reg.integrations import _splatfacto_method
+
+        return _splatfacto_method.make_method() if name == "splatfacto_ca" else getattr(_splatfacto_method, name)
+    except Exception as error:  # whatever an incompatible nerfstudio comes up with
+        unavailable = Unavailable(error)
+        if name == "splatfacto_ca":
+            return unavailable
+        raise ImportError(f"{name} belongs to {unavailable}") from error

@@ -1,0 +1,156 @@
+"""The co-adaptation score as a metric of torchmetrics: it resets, syncs over ranks and joins a MetricCollection."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from itertools import count
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ca_reg import CAScore, CASummary, RenderFn
+from ca_reg.result import ViewTally
+from ca_reg.score import view_position
+
+__all__ = ["CAScoreMetric"]
+
+
+class _NoTorchmetrics:
+    """Stands in for the base class where torchmetrics is missing, so that this module can be imported."""
+
+    def __init__(self, **_: Any) -> None:
+        raise ImportError("CAScoreMetric needs torchmetrics; install it with: pip install 'ca_reg[torchmetrics]'")
+
+
+_Metric: Any
+try:
+    from torchmetrics import Metric as _Metric
+except ImportError:
+    _Metric = _NoTorchmetrics
+
+_numbers = count()
+
+
+class CAScoreMetric(_Metric):  # type: ignore[misc]
+    """The mean co-adaptation score of the views seen since the last reset, as a torchmetrics metric.
+
+    ``update(opacity, view)`` measures one view, ``forward`` does so and returns its score, ``compute`` returns the mean
+    over views and ranks as a scalar, which Lightning's ``self.log`` and a ``MetricCollection`` take as they take any
+    other; ``summary`` returns the same mean with its standard error, its reason and the number of views without a
+    value. Such views have no share in the mean; without any view that has a value it is nan.
+
+    In a collection call by name, ``collection.update(preds=..., target=..., opacity=..., view=...)``: every metric
+    takes the arguments that it knows. A copy of the metric measures the same model, which is not copied. A sampler that
+    repeats views to give all ranks equally many makes them count twice, as for any metric.
+
+    Convention: ``opacity`` is activated, in [0, 1], (N,) or (N, 1), and neither scaled nor dropped.
+
+    Args:
+        score: a render callable for the paper's protocol, or a :class:`ca_reg.CAScore` with other settings, such as an
+            exact one. What the score itself has counted is neither used nor changed.
+        kwargs: passed on to ``torchmetrics.Metric``, such as ``process_group``, ``sync_on_compute``.
+
+    Attributes:
+        score: the score that measures the views.
+        sums: the state, summed over ranks: values, squared standard errors, views, views without visible pixels, views
+            that are not finite; (5,) float64. Not in ``state_dict`` unless ``persistent(True)`` is called.
+
+    Raises:
+        ImportError: if torchmetrics is missing; it comes with ``ca_reg[torchmetrics]``.
+        TypeError: if ``score`` is neither.
+
+    Example:
+        >>> from torchmetrics import MetricCollection
+        >>> def render_fn(opacity: Tensor, view: float) -> tuple[Tensor, Tensor]:
+        ...     return (view * opacity[:48]).view(3, 4, 4), torch.ones(4, 4)
+        >>> more = CAScoreMetric(CAScore(render_fn, samples=9))
+        >>> metrics = MetricCollection({"ca": CAScoreMetric(render_fn), "more": more})
+        >>> for view in (0.2, 0.4):
+        ...     metrics.update(opacity=torch.ones(50), view=view)
+        >>> sorted(metrics.compute())
+        ['ca', 'more']
+        >>> metrics["ca"].summary().views
+        2
+    """
+
+    is_differentiable = False
+    higher_is_better = False
+    full_state_update = False
+    plot_lower_bound = 0.0
+    sums: Tensor
+
+    def __init__(self, score: CAScore | RenderFn, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.score = score if isinstance(score, CAScore) else CAScore(score)
+        self.add_state("sums", default=ViewTally().sums, dist_reduce_fx="sum")
+        # A collection lets metrics of equal state share their updates, and scores are small enough to look equal to
+        # its allclose, or are all empty at first. Two digits, because it compares with a relative tolerance.
+        digits = torch.tensor(divmod(next(_numbers), 4096), dtype=torch.float64)
+        self.add_state("identity", default=digits, dist_reduce_fx="max")
+
+    def forward(self, opacity: Tensor, view: Any, *, index: int | None = None) -> Tensor:
+        """Measure one view, count it, and return its score as a scalar; arguments as for :meth:`update`."""
+        # The base class resets for the time of the call, and with it the count of the updates.
+        index = self._position(self.update_count) if index is None else index
+        value: Tensor = super().forward(opacity, view, index=index)
+        return value
+
+    def update(self, opacity: Tensor, view: Any, *, index: int | None = None) -> None:
+        """Measure one view and count it.
+
+        Args:
+            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+            view: passed on to the render callable as it is.
+            index: position of the view among all views, as for :meth:`ca_reg.CAScore.update`.
+
+        Raises:
+            TypeError: as for a call of the score.
+            ValueError: as for a call of the score.
+        """
+        tally = ViewTally()
+        tally.add(self.score(opacity, view, index=self._position(self.update_count - 1) if index is None else index))
+        self.sums = self.sums + tally.sums.to(self.sums)
+
+    def compute(self) -> Tensor:
+        """Return the mean over the views of all ranks, a scalar; on several ranks every rank must call this."""
+        return torch.tensor(self._summarize().value, dtype=self.sums.dtype, device=self.sums.device)
+
+    def summary(self) -> CASummary:
+        """Return the same mean with all that is known about it; on several ranks every rank must call this."""
+        with self.sync_context(dist_sync_fn=self.dist_sync_fn, should_sync=self.sync_on_compute):
+            return self._summarize()
+
+    def plot(self, val: Tensor | Sequence[Tensor] | None = None, ax: Any = None) -> Any:
+        """Draw one value or a sequence of them, by default the present mean.
+
+        Args:
+            val: what ``forward`` or ``compute`` returned, or a list of such.
+            ax: matplotlib axes to draw on; a new figure by default.
+
+        Returns:
+            The figure and the axes.
+
+        Raises:
+            ModuleNotFoundError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
+        """
+        return self._plot(val, ax)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> CAScoreMetric:
+        # clone() copies deeply, and the render callable may be a method of the model.
+        memo[id(self.score)] = self.score
+        twin = type(self).__new__(type(self))
+        memo[id(self)] = twin
+        twin.__setstate__(deepcopy(self.__getstate__(), memo))
+        return twin
+
+    def _position(self, before: int) -> int:
+        """Return the position of the view that comes after ``before`` others on this rank."""
+        return view_position(before, self.process_group)
+
+    def _summarize(self) -> CASummary:
+        """Read the state."""
+        tally = ViewTally()
+        tally.sums = self.sums.cpu()
+        return tally.summary(self.score.settings)
