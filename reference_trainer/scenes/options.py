@@ -1,14 +1,19 @@
-"""How a scene is to be loaded, as one value: what the command line asks for and what workers receive."""
+"""Which views are to be used, as one value: what the command line asks for and what workers receive."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from torch import Tensor
+
+from reference_trainer.camera import Camera
 from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes.orbit import World, orbit_views
 from reference_trainer.scenes.scene import Scene
 
-__all__ = ["SceneOptions"]
+__all__ = ["OrbitOptions", "SceneOptions"]
 
 
 @dataclass(frozen=True)
@@ -56,4 +61,37 @@ class SceneOptions:
             background=self.background,
             allow_test_points=self.allow_test_points,
             seed=seed,
+        )
+
+
+@dataclass(frozen=True)
+class OrbitOptions:
+    """Cameras around a model that comes without a scene.
+
+    Example:
+        >>> import torch
+        >>> [camera.width for camera in OrbitOptions(cameras=2, size=64).views(torch.eye(3), torch.ones(3))]
+        [64, 64]
+    """
+
+    cameras: int = 8
+    """Without a scene: number of cameras on the orbit."""
+    size: int = 384
+    """Without a scene: width and height of the pictures, pixels."""
+    world: World = "y-down"
+    """Without a scene: the vertical axis. COLMAP worlds are mostly y-down, Blender and nerfstudio z-up."""
+    arc: float = 360.0
+    """Without a scene: degrees of the circle that the cameras cover; in a y-down world +z is the middle of it."""
+
+    def views(self, means: Tensor, opacities: Tensor) -> list[Camera]:
+        """Place the cameras around Gaussians; arguments and errors are those of `orbit_views`."""
+        return orbit_views(
+            means,
+            opacities,
+            count=self.cameras,
+            width=self.size,
+            height=self.size,
+            fill=0.8,  # what the quantiles of the bounding sphere leave out, such as a plant's highest leaf, shows too
+            world=self.world,
+            arc=math.radians(self.arc),
         )

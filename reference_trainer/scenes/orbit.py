@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -10,13 +12,35 @@ from torch.nn.functional import normalize
 
 from reference_trainer.camera import Camera
 
-__all__ = ["orbit_views"]
+__all__ = ["BoundingSphere", "World", "bounding_sphere", "orbit_views"]
+
+World = Literal["y-down", "y-up", "z-up", "z-down", "x-up", "x-down"]
+"""Which axis of the world is vertical, and which way it points."""
 
 ELEVATION = math.radians(20)
 """Height of the cameras over the horizon of the centre: objects are mostly looked at from a little above."""
 
 INSIDE = 0.98
 """Share of the opacity that the picture must hold; stray Gaussians far away would make the object tiny otherwise."""
+
+SURROUNDINGS = 3.0
+"""Where `INSIDE` of the opacity reaches this many times further from the median point than half of it, the model is a
+place with surroundings and no object: objects have 1.6 to 1.9 (a plant, a mesh, lego), a capture of a room 5 (fern)."""
+
+
+@dataclass(frozen=True)
+class BoundingSphere:
+    """The part of a model that is to be looked at.
+
+    Args:
+        center: world coordinates, shape (3,), float64.
+        radius: in units of the world.
+        surroundings: whether it is the middle of a place, such as a room, and not an object as a whole.
+    """
+
+    center: Tensor
+    radius: float
+    surroundings: bool
 
 
 def orbit_views(
@@ -27,16 +51,19 @@ def orbit_views(
     width: int,
     height: int,
     field_of_view: float = math.radians(45),
+    fill: float = 1.0,
+    world: World = "y-down",
+    arc: float = 2 * math.pi,
 ) -> list[Camera]:
     """Place cameras on a circle around a model, all looking at its centre.
 
-    The centre is that of the box between the quantiles 1 - `INSIDE` and `INSIDE` of each coordinate, and the radius is
-    the quantile `INSIDE` of the distances from it, all weighted by opacity, so that a few stray Gaussians move neither.
-    The sphere of this centre and radius fills the shorter side of the picture. The first camera looks along +z, the
-    others follow at equal angles towards the side of +x.
+    The `bounding_sphere` takes the share ``fill`` of the shorter side of the picture. In a y-down world the first
+    camera of a full circle looks along +z, the others follow at equal angles towards the side of +x; an arc is centred
+    on that first camera and has a camera at both ends.
 
-    Convention: OpenCV world, y down and z forward, as captures mostly have it: a PLY does not say where up is, and the
-    axes of inertia do not tell it either (a plant is longest along it, a table shortest). The cameras are OpenCV too.
+    Convention: the world is y down and z forward (OpenCV) unless told otherwise, as captures mostly have it: a PLY does
+    not say where up is, and the axes of inertia do not tell it either (a plant is longest along it, a table shortest).
+    Blender and nerfstudio have z up. The cameras are OpenCV.
     The renderer does not draw what is nearer than 0.2: models with a radius below about 0.13 must be enlarged first.
 
     Args:
@@ -46,6 +73,10 @@ def orbit_views(
         width: image width, pixels.
         height: image height, pixels.
         field_of_view: along the shorter side of the picture, radians, in (0, pi).
+        fill: diameter of the sphere as a share of the shorter side, in (0, 1].
+        world: the vertical axis.
+        arc: angle between the first and the last camera, radians, in (0, 2 pi]; a full circle has no camera twice. A
+            model that was captured from one side (LLFF scenes) looks sensible on a small arc only.
 
     Returns:
         The cameras, with float32 poses on the device of the means.
@@ -62,6 +93,47 @@ def orbit_views(
     """
     if count < 1 or not 0 < field_of_view < math.pi:
         raise ValueError(f"expected count >= 1 and field_of_view in (0, pi) radians, got {count} and {field_of_view}.")
+    if not 0 < fill <= 1 or not 0 < arc <= 2 * math.pi or world not in get_args(World):
+        raise ValueError(
+            f"expected fill in (0, 1], arc in (0, 2 pi] and world one of {', '.join(get_args(World))}; got {fill}, "
+            f"{arc} and {world!r}."
+        )
+    sphere = bounding_sphere(means, opacities)
+    center, half_angle = sphere.center, math.atan(fill * math.tan(0.5 * field_of_view))
+    distance = sphere.radius / math.sin(half_angle)
+    focal = 0.5 * min(width, height) / math.tan(0.5 * field_of_view)
+    level, lift = distance * math.cos(ELEVATION), distance * math.sin(ELEVATION)
+    full = arc > 2 * math.pi * (1 - 1e-9)
+    start, step = (0.0, arc / count) if full else (-0.5 * arc if count > 1 else 0.0, arc / max(1, count - 1))
+    axes = _axes(world).to(center)
+    cameras = []
+    for turn in (start + step * i for i in range(count)):
+        offset = center.new_tensor([level * math.sin(turn), -lift, -level * math.cos(turn)])
+        pose = _look_at(center + axes @ offset, center, axes[:, 1])
+        cameras.append(Camera(pose.float(), focal, focal, width / 2, height / 2, width, height))
+    return cameras
+
+
+def bounding_sphere(means: Tensor, opacities: Tensor) -> BoundingSphere:
+    """Find where the Gaussians of a model are; a few stray ones do not matter.
+
+    Of an object, the centre is that of the box between the quantiles 1 - `INSIDE` and `INSIDE` of each coordinate, and
+    the radius the quantile `INSIDE` of the distances from it. Of a place with `SURROUNDINGS`, where that sphere would
+    be the room, the centre is the median and the radius twice that of half of the opacity. All is weighted by opacity.
+
+    Args:
+        means: world coordinates, finite, shape (N, 3).
+        opacities: activated, in [0, 1], shape (N,) or (N, 1).
+
+    Raises:
+        ValueError: if the shapes do not match, or the Gaussians that are not transparent do not span a volume, because
+            there are none or they lie on one point.
+
+    Example:
+        >>> sphere = bounding_sphere(torch.tensor([[1.0, 0, 0], [3.0, 0, 0]]), torch.ones(2))
+        >>> sphere.center.tolist(), sphere.radius, sphere.surroundings
+        ([2.0, 0.0, 0.0], 1.0, False)
+    """
     n = means.shape[0]
     if means.shape != (n, 3) or opacities.shape not in ((n,), (n, 1)):
         raise ValueError(
@@ -71,21 +143,25 @@ def orbit_views(
     points, weights = means.detach().double(), opacities.detach().double().reshape(n)
     if not bool(weights.sum() > 0):
         raise ValueError(f"there is nothing to look at: {n} Gaussians with a total opacity of 0.")
+    median = torch.stack([_quantile(axis, weights, 0.5) for axis in points.unbind(1)])
+    near, far = (float(_quantile((points - median).norm(dim=1), weights, share)) for share in (0.5, INSIDE))
+    if near > 0 and far > SURROUNDINGS * near:
+        return BoundingSphere(median, 2 * near, surroundings=True)
     center = torch.stack(
         [(_quantile(axis, weights, 1 - INSIDE) + _quantile(axis, weights, INSIDE)) / 2 for axis in points.unbind(1)]
     )
     radius = float(_quantile((points - center).norm(dim=1), weights, INSIDE))
     if not radius > 0:
         raise ValueError(f"the {n} Gaussians span no volume: {INSIDE:.0%} of the opacity lie on one point.")
-    distance = radius / math.sin(0.5 * field_of_view)
-    focal = 0.5 * min(width, height) / math.tan(0.5 * field_of_view)
-    level, lift = distance * math.cos(ELEVATION), distance * math.sin(ELEVATION)
-    cameras = []
-    for turn in (2 * math.pi * i / count for i in range(count)):
-        offset = center.new_tensor([level * math.sin(turn), -lift, -level * math.cos(turn)])
-        pose = _look_at(center + offset, center)
-        cameras.append(Camera(pose.float(), focal, focal, width / 2, height / 2, width, height))
-    return cameras
+    return BoundingSphere(center, radius, surroundings=False)
+
+
+def _axes(world: World) -> Tensor:
+    """Return the rotation whose columns are right, down and forward of the first camera in this world."""
+    vertical, sign = "xyz".index(world[0]), 1.0 if world.endswith("down") else -1.0
+    down = torch.eye(3, dtype=torch.float64)[vertical] * sign
+    right = torch.eye(3, dtype=torch.float64)[1 if vertical == 0 else 0]
+    return torch.stack([right, down, torch.linalg.cross(right, down)], dim=1)
 
 
 def _quantile(values: Tensor, weights: Tensor, share: float) -> Tensor:
@@ -95,10 +171,9 @@ def _quantile(values: Tensor, weights: Tensor, share: float) -> Tensor:
     return ordered[torch.searchsorted(held, share * held[-1])]
 
 
-def _look_at(position: Tensor, target: Tensor) -> Tensor:
-    """Return the view matrix (4, 4) of a camera that looks at a target with -y of the world upright."""
+def _look_at(position: Tensor, target: Tensor, down: Tensor) -> Tensor:
+    """Return the view matrix (4, 4) of a camera that looks at a target, upright."""
     forward = normalize(target - position, dim=0)
-    down = position.new_tensor([0.0, 1.0, 0.0])
     right = normalize(torch.linalg.cross(down, forward), dim=0)
     pose = torch.eye(4, dtype=position.dtype, device=position.device)
     pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])

@@ -1,8 +1,8 @@
-"""Measure and draw what has been trained before: runs of this program and anyone's PLY files."""
+"""Measure a model on a scene, and draw what has been trained before."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -13,14 +13,11 @@ from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import save_gif, save_png
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.evaluation.trajectory import interpolate_cameras
-from reference_trainer.model.gaussians import inverse_sigmoid
-from reference_trainer.model.ply import load_ply
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.studies.run import load_run, model_of
 
-__all__ = ["evaluation_table", "measure", "of_ply", "of_run", "render_run"]
+__all__ = ["evaluation_table", "measure", "of_run", "render_run"]
 
 Say = Callable[[str], None]
 
@@ -47,45 +44,6 @@ def of_run(run: Path, device: str = "cpu", *, scale_noise: bool = False) -> tupl
     return model_of(trainer), trainer.scene, run / "evaluation_scale_noise"
 
 
-def of_ply(
-    ply: Path, options: SceneOptions, *, dropout: float = 0.0, device: str = "cpu", say: Say = print
-) -> tuple[Model, Scene, Path]:
-    """Return the model of a standard 3DGS PLY, a scene for it, and the folder for its evaluation.
-
-    A PLY that says that the test-time scaling is baked into its opacities says the rate as well. The scaling is undone,
-    because CA is measured on plain opacities and the evaluation scales by itself. Opacities that were scaled by the
-    mean of their noise are used as they are, for CA too.
-
-    Args:
-        ply: the model.
-        options: the scene whose cameras and photographs are used.
-        dropout: the rate that the model was trained with, if the PLY does not say it.
-        device: where to render.
-        say: is told if the plain opacities cannot be had.
-
-    Raises:
-        ValueError: if the PLY says another rate than ``dropout``, or is damaged.
-        FileNotFoundError: if the PLY or the scene is missing.
-    """
-    loaded = load_ply(ply)
-    gaussians, baked = loaded.gaussians, round(1.0 - loaded.opacity_scale, 12)
-    if loaded.for_rendering:
-        say(f"{ply} holds test-time opacities only: they are rendered as they are, and CA is that of these opacities.")
-    elif baked > 0:
-        if dropout not in (0.0, baked):
-            raise ValueError(f"{ply} was trained with dropout {baked:g}, not {dropout:g}: leave out --dropout.")
-        plain = (gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6)
-        gaussians, dropout = replace(gaussians, opacity_logits=inverse_sigmoid(plain)), baked
-    scene = options.load()
-    model = Model(
-        gaussians=gaussians.to(device),
-        background=scene.background.to(device),
-        dropout=dropout,
-        opacity_scale=1.0 if loaded.for_rendering else 1.0 - dropout,
-    )
-    return model, scene, ply.with_name(ply.stem + "_evaluation")
-
-
 def measure(
     model: Model,
     scene: Scene,
@@ -94,6 +52,7 @@ def measure(
     samples: int = 5,
     seed: int = 0,
     perceptual: PerceptualMetric | None = None,
+    about: Mapping[str, object] | None = None,
     say: Say = print,
 ) -> Evaluation:
     """Measure a model on a scene; write ``evaluation.json``, ``evaluation.md`` and pictures, and print the table.
@@ -105,6 +64,7 @@ def measure(
         samples: K of the CA score.
         seed: of its masks.
         perceptual: a perceptual metric.
+        about: what a PLY says of itself, for the JSON file; None for a run, which has a file of its own.
         say: receives the table and the progress.
     """
     result = evaluate(
@@ -113,6 +73,7 @@ def measure(
     settings = model.ca_score(samples=samples, seed=seed).settings
     data = {
         "scene": scene.name,
+        **({} if about is None else {"ply": dict(about)}),
         **result.as_dict(),
         "ca_settings": asdict(settings),
         "background": model.background.tolist(),

@@ -7,7 +7,7 @@ import torch
 
 from reference_trainer.model.ply import load_ply
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.scenes.orbit import orbit_views
+from reference_trainer.scenes.orbit import bounding_sphere, orbit_views
 
 CENTER = torch.tensor([3.0, -2.0, 5.0])
 
@@ -75,6 +75,54 @@ def test_neither_a_few_far_gaussians_nor_many_transparent_ones_move_the_cameras(
 
 
 @pytest.mark.parametrize(
+    ("world", "up"),
+    [
+        ("y-down", [0, -1, 0]),
+        ("y-up", [0, 1, 0]),
+        ("z-up", [0, 0, 1]),
+        ("z-down", [0, 0, -1]),
+        ("x-up", [1, 0, 0]),
+        ("x-down", [-1, 0, 0]),
+    ],
+)
+def test_up_is_up_in_every_world(world, up):
+    """Cameras look down from above, and what is higher in the world is higher in the picture."""
+    top = CENTER + torch.tensor(up, dtype=torch.float32)
+    for camera in orbit_views(shell(), torch.ones(4000), count=3, width=50, height=50, world=world):
+        assert camera.forward @ (top - CENTER) == pytest.approx(-math.sin(math.radians(20)), abs=1e-5)
+        (column, row), (top_column, top_row) = pixels(camera, torch.stack([CENTER, top])).tolist()
+        assert top_row < row - 5
+        assert top_column == pytest.approx(column, abs=0.2)
+        assert torch.linalg.det(camera.world_to_camera[:3, :3]) > 0
+
+
+@pytest.mark.parametrize(("count", "angles"), [(1, [0]), (2, [-30, 30]), (3, [-30, 0, 30]), (4, [-30, -10, 10, 30])])
+def test_an_arc_is_centred_on_the_first_camera_of_the_circle(count, angles):
+    cameras = orbit_views(shell(), torch.ones(4000), count=count, width=9, height=9, arc=math.radians(60))
+    found = [math.degrees(math.atan2(-camera.forward[0], camera.forward[2])) for camera in cameras]
+    assert found == pytest.approx(angles, abs=1e-3)
+
+
+@pytest.mark.parametrize("fill", [0.3, 0.8])
+def test_the_sphere_fills_that_share(fill):
+    points = shell()
+    (camera,) = orbit_views(points, torch.ones(4000), count=1, width=100, height=100, fill=fill)
+    seen = pixels(camera, points) - 50
+    assert seen.norm(dim=1).quantile(0.98).item() == pytest.approx(50 * fill, rel=0.06)
+
+
+def test_of_a_place_the_middle_is_looked_at():
+    """A shell of radius 2 in a room 15 times as large, which holds a third of the Gaussians."""
+    room = CENTER + 15 * (shell(2000) - CENTER)
+    alone = bounding_sphere(shell(), torch.ones(4000))
+    placed = bounding_sphere(torch.cat([shell(), room]), torch.ones(6000))
+    assert (alone.surroundings, placed.surroundings) == (False, True)
+    assert alone.radius == pytest.approx(2, rel=0.01)
+    assert placed.radius == pytest.approx(4, rel=0.15)  # twice the median distance, and the median is at the shell
+    assert (placed.center - CENTER).norm() < 0.3
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"count": 0}, "count >= 1"),
@@ -82,6 +130,9 @@ def test_neither_a_few_far_gaussians_nor_many_transparent_ones_move_the_cameras(
         ({"opacities": torch.zeros(4000)}, "total opacity of 0"),
         ({"opacities": torch.ones(5)}, r"got \(4000, 3\) and \(5,\)"),
         ({"means": torch.ones(4000, 3)}, "lie on one point"),
+        ({"fill": 1.01}, r"fill in \(0, 1\]"),
+        ({"arc": 0.0}, r"arc in \(0, 2 pi\]"),
+        ({"world": "up"}, "one of y-down, y-up, z-up, z-down, x-up, x-down; got .* and 'up'"),
     ],
 )
 def test_what_cannot_be_looked_at_is_refused(change, message):

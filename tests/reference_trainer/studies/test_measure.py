@@ -6,53 +6,11 @@ import torch
 from PIL import Image
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
-from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.model.ply import load_ply, save_ply
+from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.images import read_image
-from reference_trainer.studies.measure import evaluation_table, measure, of_ply, of_run, render_run
-from reference_trainer.studies.run import BAKED_PLY, PLY, run_experiment, save_for_viewers
+from reference_trainer.studies.measure import evaluation_table, measure, of_run, render_run
+from reference_trainer.studies.run import BAKED_PLY, PLY, run_experiment
 from reference_trainer.training.config import TrainConfig
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory, options, short):
-    out = tmp_path_factory.mktemp("run")
-    return out, run_experiment(options, short, out, monitor_every=0)
-
-
-def test_a_baked_ply_is_not_scaled_twice(run, options):
-    """Three ways to the image of the test: baked and marked, plain with the rate, and the checkpoint."""
-    out, _ = run
-    baked, scene, folder = of_ply(out / BAKED_PLY, options)  # it says its rate itself
-    plain, _, _ = of_ply(out / PLY, options, dropout=0.2)
-    trained, _, _ = of_run(out)
-    assert folder == out / "point_cloud_for_viewers_evaluation"
-    assert baked.dropout == trained.dropout == 0.2
-    torch.testing.assert_close(baked.gaussians.opacities, trained.gaussians.opacities, rtol=0, atol=2e-6)
-    with pytest.raises(ValueError, match=r"was trained with dropout 0\.2, not 0\.5"):
-        of_ply(out / BAKED_PLY, options, dropout=0.5)
-    for view in scene.test:
-        images = [
-            model.rendering(model.gaussians.opacities * model.opacity_scale, view).image
-            for model in (baked, plain, trained)
-        ]
-        torch.testing.assert_close(images[0], images[2], rtol=0, atol=1e-5)
-        assert torch.equal(images[1], images[2])
-        unscaled = trained.rendering(trained.gaussians.opacities, view).image
-        assert (unscaled - images[2]).abs().max() > 1e-3
-
-
-def test_a_ply_without_dropout_is_used_as_it_is(options, tmp_path, run):
-    model = of_run(run[0])[0]
-    save_ply(model.gaussians, tmp_path / "model.ply")
-    assert of_ply(tmp_path / "model.ply", options)[0].opacity_scale == 1.0
-
-
-@pytest.fixture(scope="module")
-def scaled(tmp_path_factory, options, short):
-    """The same training, evaluated with opacities times the mean of their noise."""
-    out = tmp_path_factory.mktemp("scaled")
-    return out, run_experiment(options, dataclasses.replace(short, scale_noise=True), out, monitor_every=11)
 
 
 def test_the_flag_of_the_evaluation_and_that_of_the_training_are_the_same(run, scaled, tmp_path):
@@ -79,24 +37,6 @@ def test_the_monitor_and_the_pictures_use_the_same_opacities(scaled, tmp_path):
     folder = render_run(out, "test", tmp_path, say=lambda text: None)
     for path in folder.iterdir():
         assert path.read_bytes() == (out / "views" / "test" / path.name).read_bytes()
-
-
-def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options, tmp_path):
-    out, results = scaled
-    said: list[str] = []
-    model, scene, _ = of_ply(out / BAKED_PLY, options, dropout=0.2, say=said.append)
-    assert said == [
-        f"{out / BAKED_PLY} holds test-time opacities only: they are rendered as they are, and CA is that of these "
-        "opacities."
-    ]
-    trained = of_run(out)[0]
-    torch.testing.assert_close(model.test_opacities, trained.test_opacities, rtol=0, atol=1e-6)
-    assert model.ca_score().settings == trained.ca_score().settings
-    for view, scores in zip(scene.test, results["views"][3:], strict=True):
-        image = model.rendering(model.test_opacities, view).image.clamp(0, 1)
-        assert psnr(image, view.image) == pytest.approx(scores["psnr"], abs=1e-3)
-    save_for_viewers(of_run(run[0])[0], tmp_path / "dropout.ply")
-    assert (tmp_path / "dropout.ply").read_bytes() == (run[0] / BAKED_PLY).read_bytes()
 
 
 def test_noise_alone_has_a_ply_for_viewers_too(options, tmp_path):

@@ -1,0 +1,83 @@
+"""Tell whether the cameras of a scene see a model that was trained elsewhere: both must be in one frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
+from reference_trainer.scenes.scene import Scene
+
+__all__ = ["check_frame"]
+
+NEARLY_NONE = 0.01
+"""Share of the Gaussians, below which cameras are said not to see a model: stray ones are everywhere."""
+
+
+def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[str]:
+    """Count the Gaussians in the pictures of a scene's cameras, before anything is rendered.
+
+    Gaussians count by their centres: at least 0.2 in front of the camera, where the renderer begins, and inside the
+    picture. Those of an opacity below 1/255 are never drawn and do not count.
+
+    Args:
+        gaussians: the model.
+        scene: its cameras, of both splits.
+        name: of the model, for the messages.
+
+    Returns:
+        Doubts: one line about the cameras that see less than 1 %, nothing if all see more.
+
+    Raises:
+        ValueError: if all cameras together see less than 1 %; the message says where the model and the cameras are.
+    """
+    drawn = gaussians[gaussians.opacities >= MIN_ALPHA]
+    count, means = len(drawn), drawn.means
+    if not count:
+        raise ValueError(
+            f"{name}: none of the {len(gaussians):,} Gaussians has an opacity of 1/255, all are invisible."
+        )
+    views = [*scene.train, *scene.test]
+    inside = torch.stack([_inside(means, view.camera) for view in views])
+    seen = int(inside.any(0).sum())
+    if seen < NEARLY_NONE * count:
+        behind = int(torch.stack([_depth(means, view.camera) < NEAR_PLANE for view in views]).all(0).sum())
+        center = means.double().median(0).values
+        reach = (means - center).norm(dim=1).kthvalue(-(-98 * count // 100)).values  # without the stray ones
+        rig = torch.stack([view.camera.position for view in views]).double()
+        forward = torch.stack([view.camera.forward for view in views]).double().mean(0)
+        raise ValueError(
+            f"the cameras of {scene.name} do not see {name}: of {count:,} Gaussians, {seen:,} ({seen / count:.2%}) are "
+            f"in any of the {len(views)} pictures, {behind:,} are behind all cameras. The model lies around "
+            f"{_text(center)} within {reach:.3g}; the cameras stand around {_text(rig.mean(0))} within "
+            f"{(rig - rig.mean(0)).norm(dim=1).max():.3g} and look towards {_text(forward)} on average. Both must be "
+            "in one frame: give the files that the model was trained with (see --format: COLMAP, LLFF and Blender "
+            "files of one scene may differ in their frame), or leave out the scene for cameras on an orbit."
+        )
+    blind = [view.name for view, n in zip(views, inside.sum(1).tolist(), strict=True) if n < NEARLY_NONE * count]
+    if not blind:
+        return []
+    return [f"{len(blind)} of {len(views)} cameras see less than {NEARLY_NONE:.0%} of {name}: {', '.join(blind)}."]
+
+
+def _depth(means: Tensor, camera: Camera) -> Tensor:
+    """Return the distance along the viewing direction, shape (N,)."""
+    pose = camera.world_to_camera.to(means)
+    return means @ pose[2, :3] + pose[2, 3]
+
+
+def _inside(means: Tensor, camera: Camera) -> Tensor:
+    """Whether centres lie in the picture and in front of the near plane, shape (N,)."""
+    pose = camera.world_to_camera.to(means)
+    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return (z >= NEAR_PLANE) & (column >= 0) & (column <= camera.width) & (row >= 0) & (row <= camera.height)
+
+
+def _text(point: Tensor) -> str:
+    """Return a point for a message."""
+    return f"({', '.join(f'{x:.3g}' for x in point.tolist())})"

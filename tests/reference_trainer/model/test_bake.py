@@ -1,0 +1,52 @@
+import math
+import struct
+
+import pytest
+import torch
+
+from reference_trainer.model.bake import bake_ply
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.ply import load_ply, save_ply
+
+
+@pytest.fixture
+def plain(tmp_path):
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(6, 3, generator=generator)
+    save_ply(Gaussians.from_points(points, points, torch.full((6,), 0.1), sh_degree=1, opacity=0.7), tmp_path / "a.ply")
+    return tmp_path / "a.ply"
+
+
+def test_only_the_opacities_change_and_a_comment_says_so(plain, tmp_path):
+    bake_ply(plain, tmp_path / "b.ply", dropout=0.3)
+    header, body = (tmp_path / "b.ply").read_bytes().split(b"end_header\n")
+    assert b"comment ca_reg opacity_scaled_by 0.7\n" in header
+    names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property")]
+    values = struct.unpack(f"<{6 * len(names)}f", body)
+    logits = values[names.index("opacity") :: len(names)]
+    assert [1 / (1 + math.exp(-x)) for x in logits] == pytest.approx([0.7 * 0.7] * 6, rel=1e-6)
+    before, after = load_ply(plain).gaussians, load_ply(tmp_path / "b.ply").gaussians
+    for (name, one), (_, other) in zip(before.named(), after.named(), strict=True):
+        assert name == "opacity_logits" or torch.equal(one, other)
+
+
+def test_nothing_is_scaled_twice_or_overwritten(plain, tmp_path):
+    baked = tmp_path / "b.ply"
+    bake_ply(plain, baked, dropout=0.2)
+    with pytest.raises(ValueError, match=r"scaled by 0\.8 already"):
+        bake_ply(baked, tmp_path / "c.ply", dropout=0.2)
+    content = baked.read_bytes()
+    with pytest.raises(FileExistsError, match="exists already"):
+        bake_ply(plain, baked, dropout=0.5)
+    assert baked.read_bytes() == content
+    gaussians = load_ply(plain).gaussians
+    save_ply(gaussians, tmp_path / "noise.ply", opacities=gaussians.opacities * 0.5)
+    with pytest.raises(ValueError, match="mean of their noise already"):
+        bake_ply(tmp_path / "noise.ply", tmp_path / "c.ply", dropout=0.2)
+    assert not (tmp_path / "c.ply").exists()
+
+
+@pytest.mark.parametrize("dropout", [0.0, 1.0, -0.1, math.nan])
+def test_no_rate(plain, tmp_path, dropout):
+    with pytest.raises(ValueError, match=r"in \(0, 1\)"):
+        bake_ply(plain, tmp_path / "b.ply", dropout=dropout)

@@ -1,0 +1,221 @@
+"""A PLY on a scene and on an orbit: what it says of itself, scales, frames, and what is written."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+import torch
+from PIL import Image
+
+from reference_trainer.evaluation.cameras import CameraEvaluation, CameraScores
+from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.ply import save_ply
+from reference_trainer.scenes.options import OrbitOptions
+from reference_trainer.studies.measure import of_run
+from reference_trainer.studies.run import BAKED_PLY, PLY, save_for_viewers
+from reference_trainer.studies.score_ply import camera_table, of_ply, score_ply, score_ply_on_orbit
+
+FEW = OrbitOptions(cameras=2, size=40)
+
+
+def ball(n=300, radius=1.0, degree=0, opacity=0.9):
+    """Coloured Gaussians on a sphere."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1) * radius
+    colors = torch.rand(n, 3, generator=generator)
+    return Gaussians.from_points(points, colors, torch.full((n,), 0.15 * radius), sh_degree=degree, opacity=opacity)
+
+
+def orbit(gaussians, tmp_path, name, **keywords):
+    """Save and score; returns the scores and what was said."""
+    said: list[str] = []
+    save_ply(gaussians, tmp_path / f"{name}.ply")
+    result = score_ply_on_orbit(tmp_path / f"{name}.ply", FEW, tmp_path / name, say=said.append, **keywords)
+    return result, said
+
+
+def test_a_baked_ply_is_not_scaled_twice(run, options):
+    """Three ways to the image of the test: baked and marked, plain with the rate, and the checkpoint."""
+    out, _ = run
+    scene = options.load()
+    baked, facts = of_ply(out / BAKED_PLY, background=scene.background)  # it says its rate itself
+    plain, _ = of_ply(out / PLY, background=scene.background, dropout=0.2)
+    trained, _, _ = of_run(out)
+    assert (facts.opacity_scale, facts.for_rendering, facts.dropout) == (0.8, False, 0.2)
+    assert "0.8 baked in, taken out for CA; dropout rate of the training: 0.2" in str(facts)
+    assert baked.dropout == trained.dropout == 0.2
+    torch.testing.assert_close(baked.gaussians.opacities, trained.gaussians.opacities, rtol=0, atol=2e-6)
+    with pytest.raises(ValueError, match=r"was trained with dropout 0\.2, not 0\.5"):
+        of_ply(out / BAKED_PLY, background=scene.background, dropout=0.5)
+    for view in scene.test:
+        images = [
+            model.rendering(model.gaussians.opacities * model.opacity_scale, view).image
+            for model in (baked, plain, trained)
+        ]
+        torch.testing.assert_close(images[0], images[2], rtol=0, atol=1e-5)
+        assert torch.equal(images[1], images[2])
+        unscaled = trained.rendering(trained.gaussians.opacities, view).image
+        assert (unscaled - images[2]).abs().max() > 1e-3
+
+
+def test_a_ply_without_dropout_is_used_as_it_is(tmp_path, run):
+    model = of_run(run[0])[0]
+    save_ply(model.gaussians, tmp_path / "model.ply")
+    assert of_ply(tmp_path / "model.ply", background=torch.zeros(3))[0].opacity_scale == 1.0
+
+
+def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options, tmp_path):
+    out, results = scaled
+    scene = options.load()
+    model, facts = of_ply(out / BAKED_PLY, background=scene.background, dropout=0.2)
+    assert "those of the test, used as they are, for CA too" in str(facts)
+    trained = of_run(out)[0]
+    torch.testing.assert_close(model.test_opacities, trained.test_opacities, rtol=0, atol=1e-6)
+    assert model.ca_score().settings == trained.ca_score().settings
+    for view, scores in zip(scene.test, results["views"][3:], strict=True):
+        image = model.rendering(model.test_opacities, view).image.clamp(0, 1)
+        assert psnr(image, view.image) == pytest.approx(scores["psnr"], abs=1e-3)
+    save_for_viewers(of_run(run[0])[0], tmp_path / "dropout.ply")
+    assert (tmp_path / "dropout.ply").read_bytes() == (run[0] / BAKED_PLY).read_bytes()
+
+
+@pytest.mark.parametrize(("band", "used"), [(None, 0), (1, 1), (2, 2)])
+def test_the_bands_that_are_used(tmp_path, band, used):
+    gaussians = ball(n=4, degree=2)
+    if band is not None:
+        gaussians.sh_rest[3, {1: 2, 2: 3}[band], 0] = 0.1  # the last coefficient of band 1, the first of band 2
+    save_ply(gaussians, tmp_path / "a.ply", pad_to_degree=3)
+    facts = of_ply(tmp_path / "a.ply", background=torch.zeros(3))[1]
+    assert (facts.gaussians, facts.sh_degree, facts.sh_degree_used) == (4, 3, used)
+    assert f"SH degree 3 (bands above {used} are zero); opacities: plain" in str(facts)
+
+
+@pytest.mark.parametrize("dropout", [-0.1, 1.0, math.nan])
+def test_a_rate_that_is_none(tmp_path, dropout):
+    with pytest.raises(ValueError, match=r"in \[0, 1\)"):
+        of_ply(tmp_path / "any.ply", background=torch.zeros(3), dropout=dropout)
+
+
+def test_a_file_without_gaussians(tmp_path):
+    save_ply(ball()[torch.zeros(300, dtype=torch.bool)], tmp_path / "none.ply")
+    with pytest.raises(ValueError, match="holds no Gaussian"):
+        score_ply_on_orbit(tmp_path / "none.ply", FEW, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_written_for_an_orbit(tmp_path):
+    result, said = orbit(ball(), tmp_path, "ball", dropout=0.2, samples=3, seed=4)
+    data = json.loads((tmp_path / "ball" / "evaluation.json").read_text())
+    assert data["ply"] == {"gaussians": 300, "sh_degree": 0, "sh_degree_used": 0, "opacity_scale": 1.0,
+                           "for_rendering": False, "dropout": 0.2}  # fmt: skip
+    assert data["ca_settings"]["samples"] == 3
+    assert data["ca_settings"]["seed"] == 4
+    assert data["ca_settings"]["drop_rate"] == pytest.approx(0.6)  # 1 - (1 - 0.2) / 2
+    assert data["orbit"]["radius"] == pytest.approx(1, rel=0.1)
+    assert data["orbit"]["enlarged"] == 1
+    assert data["mean"]["ca_exact"] == pytest.approx(sum(v.ca_exact for v in result.views) / 2)
+    assert [view["ca"] for view in data["views"]] == [view.ca for view in result.views]
+    assert (tmp_path / "ball" / "evaluation.md").read_text().endswith(said[1])
+    with Image.open(tmp_path / "ball" / "views" / "001.png") as picture:
+        assert picture.size == (40, 40)
+
+
+def test_a_baked_and_a_plain_ply_have_the_same_scores(tmp_path):
+    plain, _ = orbit(ball(), tmp_path, "plain", dropout=0.2)
+    save_ply(ball(), tmp_path / "baked.ply", bake_p=0.2)
+    baked = score_ply_on_orbit(tmp_path / "baked.ply", FEW, tmp_path / "baked", say=lambda text: None)
+    unscaled, _ = orbit(ball(), tmp_path, "unscaled")
+    for name in ("ca", "ca_exact", "ca_neutral", "cv", "covered"):
+        assert baked.mean(name) == pytest.approx(plain.mean(name), rel=1e-4)
+    assert unscaled.mean("covered") > 1.01 * plain.mean("covered")
+    assert unscaled.mean("ca_exact") != pytest.approx(plain.mean("ca_exact"), rel=0.01)  # drop rate 1/2, not 0.6
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_the_size_of_the_world_does_not_matter(tmp_path, factor):
+    """Also in front of the near plane, which would cut a model of a millimetre away."""
+    one, _ = orbit(ball(), tmp_path, "one")
+    other, _ = orbit(ball(radius=factor), tmp_path, "other")
+    for name in ("ca", "ca_exact", "cv", "visible", "covered"):
+        assert other.mean(name) == pytest.approx(one.mean(name), rel=2e-3)
+
+
+def test_the_background(tmp_path):
+    dark = dataclasses.replace(ball(opacity=0.8), sh_dc=ball().sh_dc - 1)
+    black, _ = orbit(dark, tmp_path, "black")
+    white, _ = orbit(dark, tmp_path, "white", background="white")
+    assert white.mean("ca_neutral") == pytest.approx(black.mean("ca_neutral"), rel=1e-4)
+    assert white.mean("ca_exact") != pytest.approx(black.mean("ca_exact"), rel=0.05)
+    with pytest.raises(ValueError, match="one of black, white, got 'auto'"):
+        orbit(ball(), tmp_path, "auto", background="auto")
+
+
+def test_a_place_is_told_from_an_object(tmp_path):
+    room = ball(n=200, radius=20.0)
+    both = Gaussians(**{name: torch.cat([x, dict(room.named())[name]]) for name, x in ball(n=300).named()})
+    assert len(orbit(ball(), tmp_path, "object")[1]) == 3
+    said = orbit(both, tmp_path, "place")[1]
+    assert "a place and not an object" in said[1]
+    assert len(said) == 4
+    save_ply(both, tmp_path / "arc.ply")
+    said = []
+    score_ply_on_orbit(tmp_path / "arc.ply", dataclasses.replace(FEW, arc=40.0), tmp_path / "arc", say=said.append)
+    assert len(said) == 3
+
+
+def test_a_ply_on_its_scene(run, options, tmp_path):
+    out, results = run
+    said: list[str] = []
+    score_ply(out / PLY, options, tmp_path, dropout=0.2, say=said.append)
+    found = json.loads((tmp_path / "evaluation.json").read_text())
+    assert found["views"] == results["views"]
+    assert found["ply"]["dropout"] == 0.2
+    assert said[-1] == f"Scores and pictures are in {tmp_path}"
+
+
+def test_a_model_that_fits_no_photograph(tmp_path, options):
+    """It is in the pictures, so only the photographs can tell."""
+    points = options.load().points
+    right = Gaussians.from_points(points.positions, points.colors, torch.full((len(points.positions),), 0.05),
+                                  sh_degree=0, opacity=0.9)  # fmt: skip
+    wrong = dataclasses.replace(right, sh_dc=-right.sh_dc)  # a negative
+    heard = {}
+    for name, gaussians in (("right", right), ("wrong", wrong)):
+        save_ply(gaussians, tmp_path / f"{name}.ply")
+        heard[name] = []
+        score_ply(tmp_path / f"{name}.ply", options, tmp_path / name, samples=2, say=heard[name].append)
+    assert "a picture of one colour" in heard["wrong"][-1]
+    assert not any("one colour" in text for text in heard["right"])
+
+
+def test_a_ply_in_another_frame_is_refused_before_anything_is_written(tmp_path, options):
+    save_ply(dataclasses.replace(ball(), means=ball().means + 1e4), tmp_path / "far.ply")
+    with pytest.raises(ValueError, match="the cameras of synthetic do not see"):
+        score_ply(tmp_path / "far.ply", options, say=lambda text: None)
+    assert [path.name for path in tmp_path.iterdir()] == ["far.ply"]
+
+
+def test_the_table_has_one_row_per_camera_and_the_mean():
+    views = [CameraScores(f"{i}", 1e-3 + i * 1e-3, 1e-4, 2e-3, 3e-3, 0.01, 0.5, 0.6, "") for i in range(2)]
+    views.append(CameraScores("2", math.nan, math.nan, math.nan, math.nan, math.nan, 0.0, 0.0, "no pixel counts"))
+    cells = [
+        [x.strip() for x in line.strip("|").split("|")] for line in camera_table(CameraEvaluation(views)).splitlines()
+    ]
+    assert cells[0] == ["view", "ca x1e-3", "ca_std_error x1e-3", "ca_exact x1e-3", "ca_neutral x1e-3", "cv", "visible",
+                        "covered"]  # fmt: skip
+    assert cells[2] == ["0", "1", "0.1", "2", "3", "0.01", "0.5", "0.6"]
+    assert cells[4][:2] == ["2", "n/a"]
+    assert cells[5][:5] == ["mean", "1.5", "0.1", "2", "3"]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "count"), [("plant_20k_sh3zero", 20_000), ("spot_10k_mesh2splat_sh3zero", 10_000)])
+def test_models_of_other_people(name, count, data_root, tmp_path):
+    result = score_ply_on_orbit(data_root / "splats" / f"{name}.ply", FEW, tmp_path, say=lambda text: None)
+    data = json.loads((tmp_path / "evaluation.json").read_text())
+    assert (data["ply"]["gaussians"], data["ply"]["sh_degree_used"]) == (count, 0)
+    for view in result.views:
+        assert 0.1 < view.covered < 0.4  # all of it in the picture, and not tiny
+        assert 0 < view.ca_neutral < view.ca_exact  # the background can only add to the mean of a dark one
