@@ -12,7 +12,8 @@ from typing import Any
 
 import tyro
 
-from reference_trainer.cli.runs import Compare, Demo, Evaluate, Render, Train
+from reference_trainer.cli.ply import Bake
+from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
 from reference_trainer.training.config import PRESETS
 
@@ -40,12 +41,14 @@ def _parse(arguments: Sequence[str]) -> Callable[[], None]:
     peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
     peek.add_argument("--preset", choices=list(PRESETS), default="fsgs")
     preset = peek.parse_known_args(arguments)[0].preset
-    config = PRESETS[preset]
+    config, given = PRESETS[preset], given_fields(arguments)
     commands: Any = tyro.extras.subcommand_type_from_defaults(
         {
             "demo": Demo(),
-            "train": Train(out=Path("runs/train"), config=config, preset=preset),
+            "plan": Plan(config=config, preset=preset, given=given),
+            "train": Train(out=Path("runs/train"), config=config, preset=preset, given=given),
             "evaluate": Evaluate(),
+            "bake": Bake(ply=tyro.MISSING, dropout=tyro.MISSING),
             "render": Render(run=Path("runs/train")),
             "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
             "study": Study(tyro.MISSING),

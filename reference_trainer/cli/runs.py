@@ -1,21 +1,36 @@
-"""Commands about runs: train, evaluate, render, compare. One class per command, its fields are the options."""
+"""Commands about runs: plan, train, evaluate, render, compare. One class per command, its fields are the options."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.training.config import PRESETS, TrainConfig
 
-__all__ = ["Compare", "Demo", "Evaluate", "Render", "Train"]
+__all__ = ["Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
+Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="")]
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
+Given = Annotated[frozenset[str], tyro.conf.Suppress]  # filled in from the command line itself, see given_fields
 Strategy = Literal["baseline", "dropout", "noise", "both", "analytic-dropout", "analytic-noise"]
+
+
+def given_fields(arguments: Sequence[str]) -> frozenset[str]:
+    """Return the fields of `TrainConfig` that a command line sets, be it to their default.
+
+    Example:
+        >>> sorted(given_fields(["train", "--sh-degree", "3", "--densify_every=100", "--no-analytic"]))
+        ['analytic', 'densify_every', 'sh_degree']
+    """
+    words = {word.partition("=")[0].removeprefix("--").replace("-", "_") for word in arguments if word[:2] == "--"}
+    return frozenset(f.name for f in fields(TrainConfig) if words & {f.name, f"no_{f.name}"})
 
 
 @dataclass(frozen=True)
@@ -55,6 +70,9 @@ class Train:
     config: Config = field(default_factory=lambda: PRESETS["fsgs"])
     preset: Literal["fsgs", "inria", "binocular"] = "fsgs"
     """Schedule of a published code base; other options override it."""
+    auto: bool = True
+    """Leave out what the scene does not need, as `ca-reg plan` says; what other options or the preset set stays."""
+    given: Given = frozenset()
     device: str = "cpu"
     """"cpu" or "cuda"."""
     monitor_every: int = 500
@@ -70,6 +88,8 @@ class Train:
             self.scene,
             self.config,
             self.out,
+            auto=self.auto,
+            given=self.given,
             device=self.device,
             monitor_every=self.monitor_every,
             lpips=self.lpips,
@@ -81,14 +101,55 @@ class Train:
 
 
 @dataclass(frozen=True)
+class Plan:
+    """Say what training will use of a scene and what it leaves out, with the reasons; trains nothing."""
+
+    folder: Annotated[str | None, tyro.conf.Positional] = None
+    """Scene folder, or "synthetic"; the same as --path."""
+    scene: Scene = field(default_factory=SceneOptions)
+    config: Config = field(default_factory=lambda: PRESETS["fsgs"])
+    preset: Literal["fsgs", "inria", "binocular"] = "fsgs"
+    """Schedule of a published code base; other options override it."""
+    given: Given = frozenset()
+    out: Path | None = None
+    """JSON file for the plan; by default none is written."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.evaluation.report import markdown_table, write_json
+        from reference_trainer.training.plan import make_plan
+
+        logging.getLogger("reference_trainer.scenes.load").setLevel(logging.INFO)  # how far lens distortion goes
+        options = self.scene if self.folder is None else replace(self.scene, path=self.folder)
+        plan = make_plan(options.load(seed=self.config.seed), self.config, given=self.given)
+        print(markdown_table(plan.rows(), ["item", "decision", "change", "reason"]))
+        if self.out is not None:
+            write_json(self.out, plan.as_dict())
+            print(f"The plan is in {self.out}.")
+
+
+@dataclass(frozen=True)
+class PlyScene(SceneOptions):
+    """The scene of a PLY, if it has one."""
+
+    path: Annotated[str, tyro.conf.arg(aliases=("--scene",))] = "orbit"
+    """For a PLY: scene folder, "synthetic" for the built-in scene, or "orbit" for cameras around the model."""
+
+
+@dataclass(frozen=True)
 class Evaluate:
-    """Measure a run, or any 3DGS PLY, on the views of a scene: PSNR, SSIM, LPIPS, CA, CV, per view and mean."""
+    """Measure a run, or any 3DGS PLY: PSNR, SSIM, LPIPS, CA, CV, per view and mean, on the views of a scene.
+
+    A PLY without a scene is measured from cameras on an orbit around it: CA (protocol, exact, and exact without the
+    background) and CV.
+    """
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of a run of `ca-reg train`."""
     ply: Path | None = None
-    """A standard 3DGS PLY instead of a run; give its scene with --path."""
-    scene: Scene = field(default_factory=SceneOptions)
+    """A standard 3DGS PLY instead of a run, with its scene or without."""
+    scene: Annotated[PlyScene, tyro.conf.arg(name="")] = field(default_factory=PlyScene)
+    orbit: Orbit = field(default_factory=OrbitOptions)
     dropout: float = 0.0
     """For a PLY: the dropout rate that it was trained with."""
     scale_noise: bool = False
@@ -102,25 +163,40 @@ class Evaluate:
     device: str = "cpu"
     """"cpu" or "cuda"."""
     out: Path | None = None
-    """Folder for evaluation.json and pictures; by default <run>/evaluation, or <run>/evaluation_scale_noise."""
+    """Folder for the results; by default <run>/evaluation, <run>/evaluation_scale_noise or <ply>_evaluation."""
 
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.evaluation.lpips import lpips_option
-        from reference_trainer.studies.measure import measure, of_ply, of_run
+        from reference_trainer.studies.measure import measure, of_run
+        from reference_trainer.studies.score_ply import score_ply, score_ply_on_orbit
 
+        if self.run is not None and self.ply is not None:
+            raise ValueError(f"give the folder of a run or --ply FILE, not both: got {self.run} and {self.ply}.")
         if self.run is not None:
             model, scene, default = of_run(self.run, self.device, scale_noise=self.scale_noise)
-        elif self.ply is not None:
-            if self.scale_noise:
-                raise ValueError(
-                    "--scale-noise needs the folder of a run: a PLY does not say which noise it was trained with."
-                )
-            model, scene, default = of_ply(self.ply, self.scene, dropout=self.dropout, device=self.device)
-        else:
-            raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE and --path SCENE.")
-        perceptual = lpips_option(self.lpips, device=self.device)
-        measure(model, scene, self.out or default, samples=self.samples, seed=self.seed, perceptual=perceptual)
+            perceptual = lpips_option(self.lpips, device=self.device)
+            measure(model, scene, self.out or default, samples=self.samples, seed=self.seed, perceptual=perceptual)
+            return
+        if self.ply is None:
+            raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE (and --path SCENE).")
+        if self.scale_noise:
+            raise ValueError(
+                "--scale-noise needs the folder of a run: a PLY does not say which noise it was trained with."
+            )
+        shared: dict[str, Any] = {
+            "dropout": self.dropout, "samples": self.samples, "seed": self.seed, "device": self.device
+        }  # fmt: skip
+        if self.scene.path != "orbit":
+            perceptual = lpips_option(self.lpips, device=self.device)
+            score_ply(self.ply, self.scene, self.out, perceptual=perceptual, **shared)
+            return
+        if self.lpips is not None or replace(self.scene, background="auto") != PlyScene():
+            raise ValueError(
+                "without photographs there is neither --lpips nor any option of a scene but --background: give --path."
+            )
+        background = "black" if self.scene.background == "auto" else self.scene.background
+        score_ply_on_orbit(self.ply, self.orbit, self.out, background=background, **shared)
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,26 @@ from typing import Annotated, Literal
 import tyro
 
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.training.config import TrainConfig
 
-__all__ = ["Attribution", "ErrorRuntime", "GradientNoise", "Growth", "Pruning", "Ranking", "Speed", "Study"]
+__all__ = [
+    "Attribution",
+    "ErrorRuntime",
+    "GradientNoise",
+    "Growth",
+    "Plan",
+    "Pruning",
+    "Ranking",
+    "Speed",
+    "Stability",
+    "Study",
+]
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
+Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
+Alternative = Literal[
+    "SH degree 0", "SH degree 1", "initial size 1/2", "initial size 1/4", "no densification", "no opacity reset"
+]
 
 
 @dataclass(frozen=True)
@@ -188,10 +204,57 @@ class Growth:
 
 
 @dataclass(frozen=True)
+class Plan:
+    """What every item of the plan is worth: short trainings with it on and off; time, memory, quality."""
+
+    scene: Scene = field(default_factory=SceneOptions)
+    config: Config = field(default_factory=TrainConfig)
+    out: Path = Path("runs/plan")
+    """Folder for the JSON and the table; what is in it is not trained again."""
+    steps: int = 1_000
+    """Steps of each training; the schedule of --iterations is shortened alike."""
+    seeds: int = 3
+    """Number of seeds."""
+    alternatives: tuple[Alternative, ...] = ()
+    """Changes to try besides those of the plan."""
+    device: str = "cpu"
+    """"cpu" or "cuda"."""
+
+    def __call__(self) -> None:
+        """Run the study."""
+        from reference_trainer.studies.plan import study_plan
+
+        study_plan(
+            self.scene,
+            self.out,
+            config=self.config,
+            iterations=self.steps,
+            seeds=self.seeds,
+            alternatives=self.alternatives,
+            device=self.device,
+            say=print,
+        )
+
+
+@dataclass(frozen=True)
+class Stability:
+    """Extreme cases against float64 and exact arithmetic: which are right, refused, or limits, and from where on."""
+
+    out: Path = Path("runs/stability")
+    """Folder for the JSON, the tables and the picture."""
+
+    def __call__(self) -> None:
+        """Run the study."""
+        from reference_trainer.studies.stability.study import study_stability
+
+        study_stability(self.out, say=print)
+
+
+@dataclass(frozen=True)
 class Study:
     """Measure something about the method itself; see the subcommands."""
 
-    what: ErrorRuntime | Ranking | Attribution | Pruning | GradientNoise | Speed | Growth
+    what: ErrorRuntime | Ranking | Attribution | Pruning | GradientNoise | Speed | Growth | Plan | Stability
 
     def __call__(self) -> None:
         """Run the study that was chosen."""

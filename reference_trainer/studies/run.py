@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,14 @@ from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.plan import Plan, make_plan
 from reference_trainer.training.trainer import Trainer
 
 __all__ = [
     "BAKED_PLY",
     "CHECKPOINT",
     "CONFIG",
+    "PLAN",
     "PLY",
     "RESULTS",
     "load_run",
@@ -38,6 +40,7 @@ __all__ = [
 ]
 
 CONFIG = "config.json"
+PLAN = "plan.json"
 CHECKPOINT = "checkpoint.pt"
 PLY = "point_cloud.ply"
 BAKED_PLY = "point_cloud_for_viewers.ply"
@@ -77,6 +80,8 @@ def run_experiment(
     config: TrainConfig,
     out: Path,
     *,
+    auto: bool = False,
+    given: Collection[str] = (),
     device: torch.device | str = "cpu",
     monitor_every: int = 500,
     checkpoint_every: int = 500,
@@ -86,15 +91,19 @@ def run_experiment(
 ) -> dict[str, Any]:
     """Train on a scene and measure the result; what a former call has done already is not done again.
 
-    The folder receives ``config.json``, ``checkpoint.pt``, ``ca.jsonl`` with TensorBoard events, ``point_cloud.ply``
-    with the plain opacities (where those of the test are others, after dropout or with ``scale_noise``, also
-    ``point_cloud_for_viewers.ply`` with them, marked), ``views/`` with pictures of every view, and ``results.json``,
-    which marks the run as complete.
+    The folder receives ``config.json`` with the settings that are trained with, with ``auto`` also ``plan.json`` with
+    the reasons for those that were not asked for, ``checkpoint.pt``, ``ca.jsonl`` with TensorBoard events,
+    ``point_cloud.ply`` with the plain opacities (where those of the test are others, after dropout or with
+    ``scale_noise``, also ``point_cloud_for_viewers.ply`` with them, marked), ``views/`` with pictures of every view,
+    and ``results.json``, which marks the run as complete.
 
     Args:
         options: the scene; random initial points use the seed of ``config``.
         config: all settings of the training.
         out: folder of this run.
+        auto: leave out what the scene does not need (`make_plan`). A run that is continued keeps the plan it began
+            with, or goes on without one if it began without.
+        given: with ``auto``, fields of ``config`` that the plan must not change although they are at their default.
         device: where to train.
         monitor_every: steps between measurements of CA and PSNR; 0 for none.
         checkpoint_every: steps between checkpoints.
@@ -111,17 +120,26 @@ def run_experiment(
         TrainingInterrupted: on Ctrl-C, after a checkpoint has been saved; a second Ctrl-C does not wait for it.
     """
     perceptual = lpips_option(lpips, device=device)
-    settings = dataclasses.asdict(config)
-    claim = {"scene": dataclasses.asdict(options.absolute()), "config": settings}
-    _refuse_other_run(out, claim)
+    begun = (out / CONFIG).exists()
+    if auto and begun and (out / PLAN).exists():
+        config = Plan.from_dict(json.loads((out / PLAN).read_text(encoding="utf-8"))).applied(config, given=given)
+    if begun:
+        _refuse_other_run(out, _claim(options, config))
     if (out / RESULTS).exists():
         say(f"{out}: complete, nothing to do")
         return _results(out)
     scene = options.load(seed=config.seed)
+    if auto and not begun:
+        plan = make_plan(scene, config, given=given)
+        config = plan.applied(config, given=given)
+        write_json(out / PLAN, plan.as_dict())
+        _tell(plan, out, say)
+    elif not begun:
+        (out / PLAN).unlink(missing_ok=True)  # of a run that ended before it had begun
     checkpoint = out / CHECKPOINT
     resumed = checkpoint.exists()
     trainer = Trainer.load(checkpoint, scene, device) if resumed else Trainer(scene, config, device)
-    write_json(out / CONFIG, claim)  # not earlier: a mistyped scene must not claim the folder
+    write_json(out / CONFIG, _claim(options, config))  # not earlier: a mistyped scene must not claim the folder
     if resumed:
         say(f"{out}: continues from step {trainer.step}")
     try:
@@ -136,7 +154,7 @@ def run_experiment(
     evaluation = evaluate(model, scene, perceptual=perceptual, pictures=out / "views")
     results = {
         "scene": scene.name,
-        "config": settings,
+        "config": dataclasses.asdict(config),
         "seconds": trainer.seconds,
         **evaluation.as_dict(),
         "machine": machine(),
@@ -184,14 +202,24 @@ def _results(out: Path) -> dict[str, Any]:
     return results
 
 
+def _claim(options: SceneOptions, config: TrainConfig) -> dict[str, Any]:
+    """Return the content of ``config.json``."""
+    return {"scene": dataclasses.asdict(options.absolute()), "config": dataclasses.asdict(config)}
+
+
+def _tell(plan: Plan, out: Path, say: Callable[[str], None]) -> None:
+    """Say what the plan changes."""
+    changing = [row for row in plan.rows() if row["change"] != "-"]
+    for row in changing:
+        say(f"plan: {row['item']} {row['decision']} ({row['change']}): {row['reason']}")
+    say(f"plan: {len(changing)} settings changed, reasons in {out / PLAN}; --no-auto trains exactly as asked")
+
+
 def _refuse_other_run(out: Path, settings: dict[str, Any]) -> None:
     """Refuse a folder that holds a run with other settings."""
-    file = out / CONFIG
-    if not file.exists():
-        return
     # A setting that an older version did not have yet was at its default.
     defaults = {"scene": dataclasses.asdict(SceneOptions()), "config": dataclasses.asdict(TrainConfig())}
-    text = json.loads(file.read_text(encoding="utf-8"))
+    text = json.loads((out / CONFIG).read_text(encoding="utf-8"))
     found = {part: defaults[part] | text.get(part, {}) for part in settings}
     changed = [
         f"{key}: {found[part][key]} -> {value}"

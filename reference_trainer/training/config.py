@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 __all__ = ["PRESETS", "TrainConfig", "with_preset"]
 
@@ -35,6 +36,9 @@ class TrainConfig:
     regularize_from: int = 0
     """First step that uses dropout and noise."""
 
+    renderer: Literal["torch", "gsplat"] = "torch"
+    """What draws in training: "torch", this package's renderer, or "gsplat", which needs it and a CUDA device."""
+
     sh_degree: int = 3
     """Degree of the spherical harmonics of the colours, 0 to 3."""
     sh_every: int = 500
@@ -55,6 +59,10 @@ class TrainConfig:
     color_rate: float = 2.5e-3
     """Learning rate of the constant colour; the other bands get a twentieth."""
 
+    initial_points: Literal["all", "seen"] = "all"
+    """Points to start from: all, or those whose Gaussian has a pixel in a training view."""
+    initial_scale: float = 1.0
+    """Size of the initial Gaussians, as a fraction of the distance to their neighbours."""
     initial_opacity: float = 0.1
     """Opacity of the initial Gaussians."""
     densify_from: int = 500
@@ -102,12 +110,18 @@ class TrainConfig:
             raise ValueError(f"ca_weight must not be negative and needs analytic=True, got {self.ca_weight}.")
         if self.analytic and self.dropout == 0 == self.noise:
             raise ValueError("analytic training needs something to average over: set dropout or noise.")
+        if self.renderer not in ("torch", "gsplat"):
+            raise ValueError(f"renderer must be 'torch' or 'gsplat', got {self.renderer!r}.")
+        if self.analytic and self.renderer != "torch":
+            raise ValueError("analytic training needs the moments of the torch renderer: leave out renderer.")
         for name in ("seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
         if self.sh_every < 1:
             raise ValueError(f"sh_every must be at least 1, got {self.sh_every}: set sh_degree=0 for constant colours.")
-        for name in ("means_rate", "means_rate_final"):
+        if self.initial_points not in ("all", "seen"):
+            raise ValueError(f"initial_points must be all or seen, got {self.initial_points!r}.")
+        for name in ("means_rate", "means_rate_final", "initial_scale"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
         for name in ("initial_opacity", "opacity_reset"):

@@ -18,12 +18,13 @@ from reference_trainer.model.density import DensityStatistics, decay_opacity, de
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render import Splats
-from reference_trainer.scenes.points import mean_neighbor_distance
-from reference_trainer.scenes.scene import PointCloud, Scene, View
+from reference_trainer.render import NotFiniteError, Splats, render
+from reference_trainer.render.gsplat import GsplatSplats, load_gsplat_render
+from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation
+from reference_trainer.training.initial import initial_gaussians
 from reference_trainer.training.interruption import TrainingInterrupted, hold_interrupts
 from reference_trainer.training.losses import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream, view_order
@@ -46,9 +47,12 @@ class Trainer:
     Attributes:
         step: the number of steps taken.
         seconds: wall-clock time that they took.
+        renderer: what draws the draws of the regularizers.
 
     Raises:
         ValueError: if the scene has no initial points.
+        ImportError: if gsplat is to draw, and is missing.
+        RuntimeError: if gsplat is to draw on something else than a CUDA device.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
@@ -59,11 +63,10 @@ class Trainer:
     """
 
     def __init__(self, scene: Scene, config: TrainConfig, device: torch.device | str = "cpu") -> None:
-        if scene.points is None:
-            raise ValueError(f"scene {scene.name!r} has no initial points: load it with points='random'.")
         self.scene = scene
         self.config = config
         self.device = torch.device(device)
+        self.renderer = render if config.renderer == "torch" else load_gsplat_render(self.device)
         self.step = 0
         self.seconds = 0.0
         self.views = [view.to(self.device) for view in scene.train]
@@ -71,7 +74,7 @@ class Trainer:
         start = config.regularize_from
         self.dropout = GaussianDropout(StartStop(config.dropout, start), compensate=config.compensate)
         self.noise = OpacityNoise(StartStop(config.noise, start), clip=config.clip_noise)
-        self.optimizer = GaussianOptimizer(self._initial(scene.points), self._rates())
+        self.optimizer = GaussianOptimizer(initial_gaussians(scene, config).to(self.device), self._rates())
         self.statistics = DensityStatistics.zeros(len(self.gaussians), self.device)
 
     @property
@@ -127,7 +130,10 @@ class Trainer:
         config, step = self.config, self.step
         self._control_density()
         view = self.views[view_order(config.seed, step, len(self.views))]
-        loss, image, splats = self._expected_loss(view) if self._is_analytic() else self._sampled_loss(view)
+        try:
+            loss, image, splats = self._expected_loss(view) if self._is_analytic() else self._sampled_loss(view)
+        except NotFiniteError as error:
+            raise TrainingStoppedError(f"step {step + 1} has nothing to render: {error}") from error
         value = loss.item()
         if not math.isfinite(value):
             raise TrainingStoppedError(f"the loss became {value} at step {step + 1}: lower the learning rates.")
@@ -178,17 +184,6 @@ class Trainer:
         trainer.statistics = DensityStatistics(**state["statistics"])
         return trainer
 
-    def _initial(self, points: PointCloud) -> Gaussians:
-        """Make one round Gaussian per point, as wide as the distance to its neighbours."""
-        start = Gaussians.from_points(
-            points.positions,
-            points.colors,
-            mean_neighbor_distance(points.positions),
-            sh_degree=self.config.sh_degree,
-            opacity=self.config.initial_opacity,
-        )
-        return start.to(self.device)
-
     def _rates(self) -> LearningRates:
         config = self.config
         return LearningRates(
@@ -222,7 +217,12 @@ class Trainer:
     def _sampled_loss(self, view: View) -> tuple[Tensor, Tensor, Splats]:
         """Loss and image of one draw of the regularizers."""
         rendering = render_gaussians(
-            self.gaussians, view.camera, self.background, opacities=self._regularized(), sh_degree=self.sh_degree
+            self.gaussians,
+            view.camera,
+            self.background,
+            opacities=self._regularized(),
+            sh_degree=self.sh_degree,
+            renderer=self.renderer,
         )
         return (
             photometric_loss(rendering.image, view.image, self.config.lambda_dssim),
@@ -236,7 +236,7 @@ class Trainer:
         loss = expected_photometric_loss(out.image, out.variance, view.image, self.config.lambda_dssim)
         return loss + out.penalty, out.image, out.splats
 
-    def _count(self, splats: Splats, camera: Camera) -> None:
+    def _count(self, splats: Splats | GsplatSplats, camera: Camera) -> None:
         """Enter the Gaussians that were drawn into the densification statistics."""
         gradient = splats.projection.means.grad
         assert gradient is not None
@@ -255,7 +255,7 @@ class Trainer:
         until = config.iterations if config.densify_until is None else config.densify_until
         every = config.densify_every
         if every and config.densify_from < step <= until and step % every == 0:
-            # The renderer leaves out what is not a number, so the loss alone would not tell.
+            # The renderer would tell, but only after pruning has taken for faint what is not a number.
             if not all(bool(x.isfinite().all()) for _, x in self.gaussians.named()):
                 raise TrainingStoppedError(
                     f"Gaussians became nan or infinite by step {step}: lower the learning rates."

@@ -7,11 +7,12 @@ import pytest
 
 from reference_trainer import cli
 from reference_trainer.cli import main
-from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.studies import attribution as attribution_module
 from reference_trainer.studies import compare as compare_module
 from reference_trainer.studies import pruning as pruning_module
 from reference_trainer.studies import run as run_module
+from reference_trainer.studies import score_ply as score_module
 from reference_trainer.training.config import PRESETS
 
 SMALL = ["--downscale", "8", "--iterations", "3", "--monitor-every", "2"]
@@ -40,10 +41,12 @@ def trained(tmp_path_factory):
 @pytest.mark.parametrize(
     ("command", "options"),
     [
-        ([], ["demo", "train", "evaluate", "render", "compare"]),
+        ([], ["demo", "train", "evaluate", "bake", "render", "compare"]),
         (["demo"], ["--iterations", "--seeds", "--jobs", "--out"]),
         (["train"], ["--out", "--path", "--views", "--preset", "--dropout", "--noise", "--opacity-decay", "--device"]),
-        (["evaluate"], ["--ply", "--path", "--dropout", "--samples", "--lpips", "--scale-noise"]),
+        (["evaluate"], ["--ply", "--path", "--scene", "--dropout", "--samples", "--lpips", "--scale-noise"]),
+        (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
+        (["bake"], ["PATH", "--dropout", "--out"]),
         (["render"], ["--what", "--frames", "{test,train,flight}"]),
         (["compare"], ["--strategies", "--seeds", "--jobs", "--iterations"]),
     ],
@@ -69,8 +72,8 @@ def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
     assert evaluation["ca_settings"]["samples"] == 3
     assert evaluation["mean"]["test"]["psnr"] == results["mean"]["test"]["psnr"]
 
-    main(["evaluate", "--ply", str(trained / "point_cloud.ply"), "--dropout", "0.2", "--downscale", "8", "--out",
-          str(tmp_path / "p")])  # fmt: skip
+    main(["evaluate", "--ply", str(trained / "point_cloud.ply"), "--dropout", "0.2", "--scene", "synthetic",
+          "--downscale", "8", "--out", str(tmp_path / "p")])  # fmt: skip
     of_ply = json.loads((tmp_path / "p" / "evaluation.json").read_text())
     assert of_ply["views"] == results["views"]
 
@@ -88,6 +91,39 @@ def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path
     assert found["expected_noise"] == 0.8
     assert found["mean"]["test"]["psnr"] != results["mean"]["test"]["psnr"]
     assert "was trained without noise" in refused(["evaluate", str(trained), "--scale-noise"], capsys)
+
+
+@pytest.mark.parametrize("flag", ["--path", "--scene"])
+def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch):
+    asked: list = []
+    monkeypatch.setattr(score_module, "score_ply", lambda *given, **named: asked.append((given, named)))
+    monkeypatch.setattr(score_module, "score_ply_on_orbit", lambda *given, **named: asked.append((given, named)))
+    main(["evaluate", "--ply", "a.ply", flag, "garden", "--images", "images_8", "--views", "12", "--dropout", "0.1"])
+    main(["evaluate", "--ply", "a.ply", "--cameras", "3", "--size", "64", "--world", "z-up", "--arc", "90",
+          "--background", "white", "--samples", "7", "--seed", "1", "--out", "o"])  # fmt: skip
+    ((ply, scene, out), named), ((other, orbit, folder), others) = asked
+    assert (str(ply), scene.path, scene.images, scene.views, out) == ("a.ply", "garden", "images_8", 12, None)
+    assert named == {"dropout": 0.1, "samples": 5, "seed": 0, "device": "cpu", "perceptual": None}
+    assert (str(other), orbit, str(folder)) == ("a.ply", OrbitOptions(3, 64, "z-up", 90.0), "o")
+    assert others == {"dropout": 0.0, "samples": 7, "seed": 1, "device": "cpu", "background": "white"}
+
+
+def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):
+    small = ["--cameras", "1", "--size", "24", "--samples", "2"]
+    main(["bake", str(trained / "point_cloud.ply"), "--dropout", "0.2", "--out", str(tmp_path / "baked.ply")])
+    assert "baked.ply: opacities are scaled by 0.8, and marked so" in plain(capsys.readouterr().out)
+    main(["evaluate", "--ply", str(tmp_path / "baked.ply"), *small])
+    out = capsys.readouterr().out
+    assert "0.8 baked in, taken out for CA; dropout rate of the training: 0.2" in out
+    assert "| mean |" in out
+    ply = str(trained / "point_cloud.ply")
+    main(["evaluate", "--ply", ply, "--dropout", "0.2", "--out", str(tmp_path / "p"), *small])
+    one, other = (
+        json.loads((tmp_path / folder / "evaluation.json").read_text()) for folder in ("baked_evaluation", "p")
+    )
+    assert one["mean"]["covered"] > 0
+    for name in ("covered", "cv"):  # after three steps nothing is opaque enough for CA
+        assert one["mean"][name] == pytest.approx(other["mean"][name], rel=1e-4)
 
 
 def test_training_again_says_that_nothing_is_to_be_done(trained, capsys):
@@ -189,6 +225,12 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["evaluate", "nowhere"], "nowhere holds no run (no config.json): give the --out folder"),
         (["render", "nowhere"], "nowhere holds no run"),
         (["evaluate", "--ply", "nowhere.ply"], "nowhere.ply"),
+        (["evaluate", "run", "--ply", "a.ply"], "not both: got run and a.ply"),
+        (["evaluate", "--ply", "a.ply", "--downscale", "8"], "without photographs there is neither"),
+        (["evaluate", "--ply", "a.ply", "--lpips", "installed"], "give --path"),
+        (["evaluate", "--ply", "a.ply", "--background", "red"], "background must be one of black, white, got 'red'"),
+        (["bake", "nowhere.ply", "--dropout", "0.2"], "nowhere.ply"),
+        (["bake", "a.ply", "--dropout", "0"], "--dropout is the rate of the training, in (0, 1); got 0"),
         (["evaluate", "--ply", "nowhere.ply", "--scale-noise"], "--scale-noise needs the folder of a run"),
         (["train", "--scale-noise"], "scale_noise multiplies opacities by the mean of their noise: set noise"),
     ],

@@ -44,6 +44,8 @@ def test_test_time_scale(compensate, scale):
         ("lambda_dssim", 1.5),
         ("means_rate", 0.0),
         ("means_rate_final", -1e-6),
+        ("initial_points", "some"),
+        ("initial_scale", 0.0),
         ("initial_opacity", 1.0),
         ("initial_opacity", 0.0),
         ("densify_from", -1),

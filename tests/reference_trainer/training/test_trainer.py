@@ -99,12 +99,17 @@ def test_a_second_ctrl_c_does_not_wait(tiny_scene, monkeypatch):
     assert trainer.step == 0
 
 
-def test_gaussians_that_are_not_numbers_stop_at_the_next_densification(tiny_scene):
+@pytest.mark.parametrize(
+    ("steps", "said"), [(3, "step 4 has nothing to render: means must be finite"), (4, "nan or infinite by step 4")]
+)
+def test_gaussians_that_are_not_numbers_stop_before_anything_is_pruned(tiny_scene, steps, said):
     trainer = Trainer(tiny_scene, TrainConfig(iterations=9, densify_from=1, densify_every=4))
+    trainer.train(until=steps)
     with torch.no_grad():
         trainer.gaussians.means[5, 1] = math.nan
-    with pytest.raises(TrainingStoppedError, match="nan or infinite by step 4"):
+    with pytest.raises(TrainingStoppedError, match=said):
         trainer.train()
+    assert len(trainer.gaussians) == 150
 
 
 def test_checkpoints_of_another_scene_are_refused(tiny_scene, busy, tmp_path):

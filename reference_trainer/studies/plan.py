@@ -1,0 +1,202 @@
+"""What every item of the plan is worth: the same short training with the item on and off, over several seeds."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from reference_trainer.evaluation.evaluate import evaluate
+from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies.plan_parts import parts_of_a_step
+from reference_trainer.studies.run import model_of
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.plan import Plan, make_plan
+from reference_trainer.training.trainer import Trainer
+
+__all__ = ["ALTERNATIVES", "plan_table", "shortened", "study_plan", "variants"]
+
+AS_ASKED = "as asked"
+WHOLE_PLAN = "the whole plan"
+
+ALTERNATIVES: dict[str, dict[str, Any]] = {
+    "SH degree 0": {"sh_degree": 0},
+    "SH degree 1": {"sh_degree": 1},
+    "initial size 1/2": {"initial_scale": 0.5},
+    "initial size 1/4": {"initial_scale": 0.25},
+    "no densification": {"densify_every": 0},
+    "no opacity reset": {"opacity_reset_every": 0},
+}
+"""What a plan could change, whether or not it does."""
+
+
+def shortened(config: TrainConfig, iterations: int) -> TrainConfig:
+    """Return the settings with fewer steps, their schedule of bands, densification and resets moved forward alike.
+
+    Example:
+        >>> shortened(TrainConfig(), 1000).opacity_reset_from
+        667
+    """
+    factor = iterations / config.iterations
+    return dataclasses.replace(
+        config,
+        iterations=iterations,
+        sh_every=max(1, round(config.sh_every * factor)),
+        densify_from=round(config.densify_from * factor),
+        opacity_reset_from=round(config.opacity_reset_from * factor),
+    )
+
+
+def variants(plan: Plan, config: TrainConfig, alternatives: Sequence[str] = ()) -> dict[str, TrainConfig]:
+    """Return the settings to compare: as asked, each item of the plan alone, all of them, and alternatives.
+
+    Args:
+        plan: of a scene.
+        config: what was asked for.
+        alternatives: keys of `ALTERNATIVES`.
+
+    Raises:
+        ValueError: if there is no such alternative.
+
+    Example:
+        >>> list(variants(Plan(()), TrainConfig(), ["no densification"]))
+        ['as asked', 'no densification']
+    """
+    unknown = sorted(set(alternatives) - set(ALTERNATIVES))
+    if unknown:
+        raise ValueError(f"there are no alternatives {unknown}; choose of {', '.join(ALTERNATIVES)}.")
+    changing = [item for item in plan.items if item.changes]
+    chosen = {AS_ASKED: config} | {item.name: Plan((item,)).applied(config) for item in changing}
+    if len(changing) > 1:
+        chosen[WHOLE_PLAN] = plan.applied(config)
+    found = {name: dataclasses.replace(config, **ALTERNATIVES[name]) for name in alternatives}
+    return chosen | {name: of for name, of in found.items() if of not in chosen.values()}
+
+
+def study_plan(
+    options: SceneOptions,
+    out: Path,
+    *,
+    config: TrainConfig,
+    iterations: int = 1_000,
+    seeds: int = 3,
+    alternatives: Sequence[str] = (),
+    device: str = "cpu",
+    say: Callable[[str], None] = print,
+) -> list[dict[str, Any]]:
+    """Train a scene with every item of its plan on and off and write ``plan_study.json`` and ``plan_study.md``.
+
+    Every training has a fresh process, one after the other; what is in the folder is not trained again.
+
+    Args:
+        options: the scene.
+        out: folder of the study.
+        config: what is asked for, in the length that the plan is made for.
+        iterations: steps of each training; the schedule is shortened alike.
+        seeds: number of seeds.
+        alternatives: keys of `ALTERNATIVES` to try besides.
+        device: where to train.
+        say: receives a line about every training, and the table.
+
+    Returns:
+        One record per training.
+    """
+    plan = make_plan(options.load(seed=config.seed), config)
+    chosen = {name: shortened(of, iterations) for name, of in variants(plan, config, alternatives).items()}
+    records: list[dict[str, Any]] = []
+    for seed in range(seeds):
+        for name, of in chosen.items():
+            file = out / name.replace("/", "_").replace(" ", "_") / f"seed_{seed}.json"
+            settings = dataclasses.replace(of, seed=seed)
+            if not file.exists():
+                threads = torch.get_num_threads()
+                with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
+                    record = pool.submit(_train, options, settings, device, threads, name == AS_ASKED).result()
+                write_json(file, {"variant": name, **record})
+            records.append(json.loads(file.read_text(encoding="utf-8")))
+            if records[-1]["config"] != dataclasses.asdict(settings):
+                raise ValueError(f"{file} holds a training with other settings: give another folder, or delete it.")
+            say(f"{name}, seed {seed}: {records[-1]['psnr']:.2f} dB, {records[-1]['cpu_seconds']:.0f} s of processors")
+    table = plan_table(records)
+    write_json(out / "plan_study.json", {"plan": plan.as_dict(), "trainings": records, "machine": machine()})
+    (out / "plan_study.md").write_text(table, encoding="utf-8")
+    say(table)
+    return records
+
+
+def plan_table(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return the table of the study: per variant mean and deviation over the seeds, differences within a seed.
+
+    Args:
+        records: what `study_plan` returns.
+    """
+    base = {record["config"]["seed"]: record for record in records if record["variant"] == AS_ASKED}
+    columns = {
+        "test PSNR": ("psnr", 1.0),
+        "test SSIM": ("ssim", 1.0),
+        "test CA x1e-3": ("ca", 1e-3),
+        "Gaussians": ("gaussians", 1.0),
+        "processor seconds": ("cpu_seconds", 1.0),
+        "peak memory, MiB": ("peak_bytes", 2.0**20),
+    }
+    rows: list[dict[str, object]] = []
+    for name in dict.fromkeys(record["variant"] for record in records):
+        of = [record for record in records if record["variant"] == name]
+        gains = [_known(record, "psnr") - _known(base[record["config"]["seed"]], "psnr") for record in of]
+        difference = "" if name == AS_ASKED else ", ".join(f"{gain:+.2f}" for gain in gains)
+        measured = {
+            column: format_mean_std([_known(record, key) for record in of], unit=unit)
+            for column, (key, unit) in columns.items()
+        }
+        rows.append({"variant": name, "seeds": len(of), "PSNR, difference in each seed": difference, **measured})
+    table = markdown_table(rows, list(rows[0]))
+    parts = next((record["parts"] for record in base.values() if record.get("parts")), None)
+    if parts is None:
+        return table
+    step = parts["step"]
+    left = [{"part": name, "ms": 1e3 * s, "% of a step": 100 * s / step} for name, s in parts.items()]
+    return table + "\n" + markdown_table(left, ["part", "ms", "% of a step"])
+
+
+def _known(record: Mapping[str, Any], key: str) -> float:
+    """Return a number of a record; JSON has null for one that does not exist."""
+    return math.nan if record[key] is None else float(record[key])
+
+
+def _train(options: SceneOptions, config: TrainConfig, device: str, threads: int, with_parts: bool) -> dict[str, Any]:
+    """Do one training in a process of its own."""
+    torch.set_num_threads(threads)
+    scene = options.load(seed=config.seed)
+    trainer = Trainer(scene, config, device)
+    start = time.process_time()
+    trainer.train()
+    seconds, peak = time.process_time() - start, _peak_bytes()
+    found = evaluate(model_of(trainer), dataclasses.replace(scene, train=() if scene.test else scene.train))
+    split = "test" if scene.test else "train"
+    return {
+        "config": dataclasses.asdict(config),
+        "cpu_seconds": seconds,
+        "seconds": trainer.seconds,
+        "peak_bytes": peak,
+        "gaussians": len(trainer.gaussians),
+        **{name: found.mean(split, name) for name in ("psnr", "ssim", "ca", "ca_exact")},
+        "parts": parts_of_a_step(trainer) if with_parts and config.seed == 0 else None,
+    }
+
+
+def _peak_bytes() -> int:
+    """Return the largest memory that this process has held so far, libraries included; bytes."""
+    import resource
+    import sys
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak << 10  # bytes on macOS, KiB elsewhere

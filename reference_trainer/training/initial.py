@@ -1,0 +1,73 @@
+"""Where training starts: which of the scene's points become Gaussians, and how large these are."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.scenes.points import mean_neighbor_distance
+from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.training.config import TrainConfig
+
+__all__ = ["drawn_by_any", "initial_gaussians", "pixels_of"]
+
+
+def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
+    """Make one round Gaussian per point, as wide as the distance to its neighbours times ``config.initial_scale``.
+
+    Args:
+        scene: with its initial points.
+        config: says which points to take and how large and how opaque the Gaussians are.
+
+    Raises:
+        ValueError: if the scene has no points, or none that is asked for.
+
+    Example:
+        >>> from reference_trainer.scenes import synthetic_scene
+        >>> scene = synthetic_scene(width=16, height=12, points=50)
+        >>> len(initial_gaussians(scene, TrainConfig()))
+        50
+    """
+    if scene.points is None:
+        raise ValueError(f"scene {scene.name!r} has no initial points: load it with points='random'.")
+    start = Gaussians.from_points(
+        scene.points.positions,
+        scene.points.colors,
+        mean_neighbor_distance(scene.points.positions) * config.initial_scale,
+        sh_degree=config.sh_degree,
+        opacity=config.initial_opacity,
+    )
+    if config.initial_points == "all":
+        return start
+    seen = drawn_by_any(start, scene.train)
+    if not bool(seen.any()):
+        raise ValueError(
+            f"no initial Gaussian of scene {scene.name!r} has a pixel in a training view: give other points."
+        )
+    return start[seen]
+
+
+@torch.no_grad()
+def drawn_by_any(gaussians: Gaussians, views: tuple[View, ...]) -> Tensor:
+    """Return which Gaussians have a pixel in some view, shape (N,), bool. The others never receive a gradient."""
+    drawn = torch.zeros(len(gaussians), dtype=torch.bool)
+    for view in views:
+        splats = render_gaussians(gaussians, view.camera, torch.zeros(3), sh_degree=0).splats
+        drawn[splats.indices[splats.lists.touched]] = True
+    return drawn
+
+
+def pixels_of(positions: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Return column and row of the pixel of every point, clamped to the picture, and whether the picture holds it."""
+    pose = camera.world_to_camera.to(positions)
+    x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    within = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return (
+        column.nan_to_num().clamp(0, camera.width - 1).long(),
+        row.nan_to_num().clamp(0, camera.height - 1).long(),
+        within,
+    )

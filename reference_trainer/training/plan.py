@@ -1,0 +1,124 @@
+"""What training uses of a scene and what it leaves out, decided from what is seen in the scene before it begins."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.plan_rules import RULES, Finding
+
+__all__ = ["Plan", "PlanItem", "make_plan"]
+
+
+@dataclass(frozen=True)
+class PlanItem:
+    """One thing that training could use.
+
+    Args:
+        name: what it is about.
+        decision: whether training uses it, uses less of it, or leaves it out.
+        reason: why, with the numbers seen in the scene.
+        changes: fields of `TrainConfig` that carry the decision out; empty where nothing has to change.
+    """
+
+    name: str
+    decision: Literal["used", "reduced", "left out"]
+    reason: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The decisions about one scene; plain data that is stored with the run.
+
+    Example:
+        >>> plan = Plan((PlanItem("SH bands", "reduced", "3 views", {"sh_degree": 0}),))
+        >>> plan.applied(TrainConfig(dropout=0.2)) == TrainConfig(dropout=0.2, sh_degree=0)
+        True
+        >>> Plan.from_dict(plan.as_dict()) == plan
+        True
+    """
+
+    items: tuple[PlanItem, ...]
+
+    def applied(self, config: TrainConfig, *, given: Collection[str] = ()) -> TrainConfig:
+        """Return the settings with the changes of all items, except of the fields that somebody has ``given``."""
+        kept = _kept(config, given)
+        changes = {name: value for item in self.items for name, value in item.changes.items() if name not in kept}
+        return dataclasses.replace(config, **changes)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data, for JSON."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Plan:
+        """Restore what `as_dict` returned.
+
+        Raises:
+            ValueError: if it is something else.
+        """
+        try:
+            return cls(tuple(PlanItem(**item) for item in data["items"]))
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"expected a plan (plan.json of a run), got other data: {error}.") from error
+
+    def rows(self) -> list[dict[str, object]]:
+        """Return one row per item, for a table with the columns item, decision, change and reason."""
+        return [
+            {
+                "item": item.name,
+                "decision": item.decision,
+                "change": ", ".join(f"{name}={value}" for name, value in item.changes.items()) or "-",
+                "reason": item.reason,
+            }
+            for item in self.items
+        ]
+
+
+def make_plan(scene: Scene, config: TrainConfig, *, given: Collection[str] = ()) -> Plan:
+    """Look at a scene and decide what its training needs.
+
+    A choice of the user always wins: fields of ``config`` that differ from the defaults of `TrainConfig` (a preset's
+    among them) and the fields in ``given`` are never changed.
+
+    Args:
+        scene: photographs, cameras and initial points.
+        config: what was asked for.
+        given: names of fields that were asked for explicitly, even if at their default.
+
+    Raises:
+        ValueError: if ``given`` names something that is not a field of `TrainConfig`, or the scene has no points.
+
+    Example:
+        >>> from reference_trainer.scenes import synthetic_scene
+        >>> plan = make_plan(synthetic_scene(width=32, height=24, points=100), TrainConfig())
+        >>> {item.name: item.decision for item in plan.items}["depth output"]
+        'left out'
+    """
+    unknown = set(given) - {f.name for f in dataclasses.fields(TrainConfig)}
+    if unknown:
+        raise ValueError(f"given must name fields of TrainConfig, got {sorted(unknown)}.")
+    if scene.points is None:
+        raise ValueError(f"scene {scene.name!r} has no initial points: load it with points='random'.")
+    kept = _kept(config, given)
+    return Plan(tuple(_item(rule(scene, config), config, kept) for rule in RULES))
+
+
+def _kept(config: TrainConfig, given: Collection[str]) -> set[str]:
+    """Fields that the plan must not touch."""
+    default = vars(TrainConfig())
+    return {*given, *(name for name, value in vars(config).items() if value != default[name])}
+
+
+def _item(finding: Finding, config: TrainConfig, kept: Collection[str]) -> PlanItem:
+    """Turn a finding into a decision: what the user asked for stays."""
+    asked = {name: getattr(config, name) for name in finding.changes if name in kept}
+    if not asked:
+        return PlanItem(finding.name, finding.decision, finding.reason, finding.changes)
+    chosen = ", ".join(f"{name}={value}" for name, value in asked.items())
+    return PlanItem(finding.name, "used", f"asked for ({chosen}); the plan alone: {finding.reason}")

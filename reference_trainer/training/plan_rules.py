@@ -1,0 +1,177 @@
+"""The rules of the plan, each about one thing that training could use; docs/performance.md has what each is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from reference_trainer.scenes.scene import PointCloud, Scene
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.initial import drawn_by_any, initial_gaussians, pixels_of
+
+__all__ = ["RULES", "Finding"]
+
+
+class Finding(NamedTuple):
+    """What a rule would do: name, decision, the reason with the numbers seen, and the changed fields of the config."""
+
+    name: str
+    decision: Literal["used", "reduced", "left out"]
+    reason: str
+    changes: Mapping[str, Any] = {}
+
+
+def sh_bands(scene: Scene, config: TrainConfig) -> Finding:
+    """Bands of spherical harmonics: those that begin after the last step would stay 0.
+
+    Lower degrees for few views save time, but were not shown to be as good.
+    """
+    name, reached = "SH bands", (config.iterations - 1) // config.sh_every
+    if config.sh_degree == 0:
+        return Finding(name, "left out", "asked for (sh_degree=0)")
+    if reached < config.sh_degree:
+        reason = f"bands above degree {reached} would begin after the last step, {config.iterations}, and stay 0"
+        return Finding(name, "reduced" if reached else "left out", reason, {"sh_degree": reached})
+    seen = int(_views_per_point(scene).median())
+    sees = f"the median point is seen by {seen} of {len(scene.train)} training views"
+    return Finding(name, "used", f"{sees}; lower degrees are not known to end as well")
+
+
+def alpha_masks(scene: Scene, config: TrainConfig) -> Finding:
+    """Alpha masks: the pictures lie on the background already."""
+    masks = [view.alpha for view in scene.train if view.alpha is not None]
+    if not masks:
+        return Finding("alpha masks", "left out", "by construction: no training picture has one")
+    empty = sum(float((alpha == 0).float().mean()) for alpha in masks) / len(masks)
+    reason = f"by construction: the pictures, {empty:.0%} of them empty, lie on the background already"
+    return Finding("alpha masks", "left out", reason)
+
+
+def background(scene: Scene, config: TrainConfig) -> Finding:
+    """The background is added behind the Gaussians, whatever its colour: it costs next to nothing."""
+    colour = ", ".join(f"{value:g}" for value in scene.background.tolist())
+    return Finding("background", "used", f"({colour}) behind everything; adding it takes less than 1% of a step")
+
+
+def depth_output(scene: Scene, config: TrainConfig) -> Finding:
+    """No loss looks at depth."""
+    return Finding("depth output", "left out", "by construction: no loss looks at depth, so it is not accumulated")
+
+
+def distortion(scene: Scene, config: TrainConfig) -> Finding:
+    """Cameras are pinholes once they are loaded."""
+    return Finding("lens distortion", "left out", "by construction: cameras are pinholes; the loader says how far off")
+
+
+def densification(scene: Scene, config: TrainConfig) -> Finding:
+    """Clones and splits."""
+    name, points = "densification", _points(scene)
+    until = config.iterations if config.densify_until is None else min(config.densify_until, config.iterations)
+    if config.densify_every == 0:
+        return Finding(name, "left out", "asked for (densify_every=0)")
+    if until <= config.densify_from:
+        return Finding(name, "left out", f"by construction: it would begin at step {config.densify_from} of {until}")
+    pixels = sum(view.camera.width * view.camera.height for view in scene.train) / len(scene.train)
+    reason = f"{len(points.positions)} initial points are {len(points.positions) / pixels:.2f} per pixel of a view"
+    return Finding(name, "used", f"{reason}; detail comes from clones and splits")
+
+
+def opacity_reset(scene: Scene, config: TrainConfig) -> Finding:
+    """Lowering all opacities."""
+    name, first = "opacity reset", config.opacity_reset_from
+    until = config.iterations if config.densify_until is None else min(config.densify_until, config.iterations)
+    if config.opacity_reset_every == 0:
+        return Finding(name, "left out", "asked for (opacity_reset_every=0)")
+    if first >= until:
+        return Finding(name, "left out", f"by construction: the first would be at step {first} of {until}")
+    return Finding(name, "used", f"first at step {first} of {config.iterations}")
+
+
+def dropped(scene: Scene, config: TrainConfig) -> Finding:
+    """Dropped Gaussians."""
+    name = "dropped Gaussians"
+    if config.dropout == 0 or config.analytic:
+        return Finding(name, "left out", "by construction: training draws no masks")
+    reason = f"by construction: {config.dropout:.0%} of the Gaussians are neither projected nor sorted in a step"
+    return Finding(name, "left out", reason)
+
+
+def unseen(scene: Scene, config: TrainConfig) -> Finding:
+    """Initial Gaussians that have no pixel in a training view: they would stay as they are and fog the test views."""
+    name = "Gaussians outside every view"
+    start = initial_gaussians(scene, replace(config, initial_points="all"))
+    outside = len(start) - int(drawn_by_any(start, scene.train).sum())
+    counts = f"{outside} of {len(start)} initial Gaussians have no pixel in a training view"
+    if outside == 0:
+        return Finding(name, "left out", f"by construction: {counts}")
+    return Finding(name, "left out", f"{counts}: no gradient ever reaches them", {"initial_points": "seen"})
+
+
+def saturated(scene: Scene, config: TrainConfig) -> Finding:
+    """Pixels at the end of the range of the photograph."""
+    share = sum(float((view.image >= 1).all(0).float().mean()) for view in scene.train) / len(scene.train)
+    reason = f"{share:.1%} of the pixels are white; without them nothing would tell how bright these places are"
+    return Finding("saturated pixels", "used", reason)
+
+
+def ssim_windows(scene: Scene, config: TrainConfig) -> Finding:
+    """Parts of the picture where photograph and background are the same."""
+    colour = scene.background[:, None, None]
+    busy = [(view.image != colour).any(0) for view in scene.train]
+    share = sum(float(part.any(1).float().mean() * part.any(0).float().mean()) for part in busy) / len(busy)
+    if config.lambda_dssim == 0:
+        return Finding("SSIM windows without change", "left out", "by construction: lambda_dssim is 0")
+    reason = (
+        f"the box around what differs from the background is {share:.0%} of a picture; cutting it out gains nothing"
+    )
+    return Finding("SSIM windows without change", "used", reason)
+
+
+def moments(scene: Scene, config: TrainConfig) -> Finding:
+    """Exact mean and variance over masks."""
+    if config.analytic:
+        return Finding("moments", "used", "asked for (analytic): every step trains on the expectation")
+    return Finding("moments", "left out", "by construction: a step needs none; the monitor measures at its own steps")
+
+
+def initial_size(scene: Scene, config: TrainConfig) -> Finding:
+    """The size of initial points. Distances between random points say nothing about a surface, and pile them up."""
+    name, points = "size of initial points", _points(scene)
+    size = f"as wide as {config.initial_scale:g} x the distance to their neighbours"
+    if points.source != "random":
+        return Finding(name, "used", f"{len(points.positions)} measured points, {size}")
+    reason = f"{len(points.positions)} random points, {size}; smaller ones make the first steps faster"
+    return Finding(name, "used", f"{reason}, but are not known to end as well")
+
+
+RULES: tuple[Callable[[Scene, TrainConfig], Finding], ...] = (
+    sh_bands,
+    alpha_masks,
+    background,
+    depth_output,
+    distortion,
+    densification,
+    opacity_reset,
+    dropped,
+    unseen,
+    saturated,
+    ssim_windows,
+    moments,
+    initial_size,
+)
+"""All rules, in the order of the table."""
+
+
+def _points(scene: Scene) -> PointCloud:
+    """The initial points, which `make_plan` has made sure of."""
+    assert scene.points is not None
+    return scene.points
+
+
+def _views_per_point(scene: Scene) -> Tensor:
+    """Number of training views whose picture holds a point, shape (N,)."""
+    return torch.stack([pixels_of(_points(scene).positions, view.camera)[2] for view in scene.train]).sum(0)

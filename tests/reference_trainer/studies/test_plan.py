@@ -1,0 +1,118 @@
+import dataclasses
+import json
+from typing import get_args
+
+import pytest
+
+from reference_trainer.cli import studies as commands
+from reference_trainer.studies import plan as plan_module
+from reference_trainer.studies.plan import ALTERNATIVES, plan_table, shortened, study_plan, variants
+from reference_trainer.studies.plan_parts import parts_of_a_step
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.plan import Plan, PlanItem
+from reference_trainer.training.trainer import Trainer
+
+TWO = Plan(
+    (
+        PlanItem("bands", "left out", "few views", {"sh_degree": 0}),
+        PlanItem("depth", "left out", "by construction"),
+        PlanItem("size", "reduced", "random", {"initial_scale": 0.5}),
+    )
+)
+
+
+class Here:
+    """A pool that works in this process."""
+
+    def __init__(self, **keywords):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
+
+    def submit(self, function, *arguments):
+        self.result = lambda: function(*arguments)
+        return self
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory, options, short):
+    out, said = tmp_path_factory.mktemp("plan"), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan_module, "ProcessPoolExecutor", Here)
+        records = study_plan(
+            options, out, config=short, iterations=4, seeds=2, alternatives=["no densification"], say=said.append
+        )
+    return out, records, said
+
+
+def test_every_changing_item_is_tried_alone_and_with_the_others():
+    tried = variants(TWO, TrainConfig(), ["initial size 1/2", "SH degree 1"])
+    assert list(tried) == ["as asked", "bands", "size", "the whole plan", "SH degree 1"]  # 1/2 is there as "size"
+    assert tried["bands"] == TrainConfig(sh_degree=0)
+    assert tried["the whole plan"] == TrainConfig(sh_degree=0, initial_scale=0.5)
+
+
+def test_an_unknown_alternative_names_the_known_ones():
+    with pytest.raises(ValueError, match=r"no alternatives \['no sun'\]; choose of SH degree 0"):
+        variants(TWO, TrainConfig(), ["no sun"])
+
+
+def test_the_command_offers_the_same_alternatives():
+    assert get_args(commands.Alternative) == tuple(ALTERNATIVES)
+
+
+def test_a_shortened_schedule_keeps_its_proportions():
+    config = shortened(TrainConfig(iterations=3_000), 300)
+    assert (config.iterations, config.sh_every, config.densify_from, config.opacity_reset_from) == (300, 50, 50, 200)
+    assert shortened(TrainConfig(iterations=500), 500) == TrainConfig(iterations=500)
+
+
+def test_the_study_trains_what_it_says(studied):
+    out, records, said = studied
+    assert [(record["variant"], record["config"]["seed"]) for record in records] == [
+        (name, seed) for seed in (0, 1) for name in ("as asked", "SH bands", "no densification")
+    ]
+    assert [record["config"]["sh_degree"] for record in records] == [3, 2, 3] * 2
+    assert [record["config"]["densify_every"] for record in records] == [4, 4, 0] * 2
+    assert all(record["cpu_seconds"] > 0 and record["peak_bytes"] > 2**20 for record in records)
+    assert [record["parts"] is not None for record in records] == [True] + [False] * 5
+    assert records == json.loads((out / "plan_study.json").read_text())["trainings"]
+    assert (out / "plan_study.md").read_text() == said[-1] == plan_table(records)
+
+
+def test_a_second_call_trains_nothing(studied, options, short, monkeypatch):
+    out, records, _ = studied
+    monkeypatch.setattr(plan_module, "_train", lambda *a: pytest.fail("trained again"))
+    again = study_plan(
+        options, out, config=short, iterations=4, seeds=2, alternatives=["no densification"], say=lambda text: None
+    )
+    assert again == records
+    with pytest.raises(ValueError, match="other settings"):
+        study_plan(options, out, config=dataclasses.replace(short, noise=0.1), iterations=4, say=lambda text: None)
+
+
+def test_differences_are_taken_within_a_seed():
+    def record(variant: str, seed: int, psnr: float) -> dict:
+        rest = dict.fromkeys(("ssim", "gaussians", "cpu_seconds", "peak_bytes"), 0.0) | {"ca": None}
+        return {"variant": variant, "config": {"seed": seed}, "psnr": psnr, **rest}
+
+    rows = plan_table(
+        [record("as asked", 0, 20.0), record("x", 0, 21.0), record("as asked", 1, 10.0), record("x", 1, 9.5)]
+    ).splitlines()
+    assert "+1.00, -0.50" in rows[3]
+    assert "| 15.0 ± 7.1 |" in rows[2]
+
+
+def test_more_work_takes_longer_and_the_model_stays(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=1, sh_every=1))
+    before = trainer.gaussians.map(lambda x: x.detach().clone())
+    parts = parts_of_a_step(trainer, repeats=3)
+    assert parts["step"] > 0
+    assert parts["exact moments added"] > 0
+    for (name, x), (_, y) in zip(before.named(), trainer.gaussians.named(), strict=True):
+        assert x.equal(y), name
+        assert y.grad is None, name

@@ -1,0 +1,83 @@
+import json
+import logging
+
+import pytest
+
+from reference_trainer.cli import main
+from reference_trainer.cli.runs import given_fields
+from reference_trainer.scenes import load
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies import run as run_module
+from reference_trainer.training.plan import Plan
+
+
+@pytest.fixture
+def asked(monkeypatch) -> dict:
+    """What `ca-reg train` asks of the run."""
+    found: dict = {}
+
+    def stop(options, config, out, **keywords):
+        found.update(keywords, config=config)
+        raise ValueError("stopped here")
+
+    monkeypatch.setattr(run_module, "run_experiment", stop)
+    return found
+
+
+def test_plan_prints_every_item_and_writes_it(capsys, tmp_path):
+    main(["plan", "synthetic", "--downscale", "8", "--out", str(tmp_path / "plan.json")])
+    said = capsys.readouterr().out
+    plan = Plan.from_dict(json.loads((tmp_path / "plan.json").read_text()))
+    assert len(plan.items) > 10
+    for item in plan.items:
+        assert f"| {item.name} | {item.decision} |" in said
+        assert item.reason in said
+
+
+def test_the_scene_may_be_given_either_way(monkeypatch):
+    loaded: list[SceneOptions] = []
+    monkeypatch.setattr(SceneOptions, "load", lambda self, **k: loaded.append(self) or (_ for _ in ()).throw(OSError))
+    for arguments in (["garden"], ["--path", "garden"], []):
+        with pytest.raises(SystemExit):
+            main(["plan", *arguments, "--views", "5"])
+    assert [(options.path, options.views) for options in loaded] == [("garden", 5), ("garden", 5), ("synthetic", 5)]
+
+
+def test_an_option_at_its_default_is_still_the_users(capsys):
+    arguments = ["plan", "--downscale", "8", "--iterations", "400"]
+    main(arguments)
+    assert "sh_degree=0" in capsys.readouterr().out
+    main([*arguments, "--sh-degree", "3"])
+    assert "asked for (sh_degree=3)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "auto", "given"),
+    [
+        ([], True, set()),
+        (["--no-auto"], False, set()),
+        (["--auto", "--sh_degree=3", "--no-analytic"], True, {"sh_degree", "analytic"}),
+        (["--preset", "binocular", "--seed", "4"], True, {"seed"}),
+    ],
+)
+def test_train_passes_on_what_was_given(asked, options, auto, given):
+    with pytest.raises(SystemExit):
+        main(["train", *options])
+    assert asked["auto"] is auto
+    assert asked["given"] == given
+
+
+def test_a_value_is_not_an_option():
+    assert given_fields(["train", "--out", "seed", "--lpips", "noise"]) == frozenset()
+
+
+def test_plan_lets_the_loader_say_how_far_distortion_goes(tiny_scene, monkeypatch, caplog):
+    monkeypatch.setattr(load.logger, "level", logging.WARNING)  # and is put back after the test
+
+    def loading(self, **keywords):
+        load.logger.info("corners move by 3 pixels")
+        return tiny_scene
+
+    monkeypatch.setattr(SceneOptions, "load", loading)
+    main(["plan", "garden"])
+    assert caplog.messages == ["corners move by 3 pixels"]

@@ -1,0 +1,153 @@
+import dataclasses
+import json
+import re
+
+import pytest
+import torch
+
+from reference_trainer.scenes.scene import PointCloud, Scene
+from reference_trainer.training import trainer as trainer_module
+from reference_trainer.training.config import PRESETS, TrainConfig, with_preset
+from reference_trainer.training.plan import Plan, PlanItem, make_plan
+from reference_trainer.training.trainer import Trainer
+
+SHORT = TrainConfig(iterations=400)  # ends before the first band of spherical harmonics begins
+
+
+def items(scene: Scene, config: TrainConfig, **keywords) -> dict[str, PlanItem]:
+    return {item.name: item for item in make_plan(scene, config, **keywords).items}
+
+
+def test_every_item_has_a_reason_and_changes_only_fields_that_exist(tiny_scene):
+    plan = make_plan(tiny_scene, TrainConfig())
+    assert len({item.name for item in plan.items}) == len(plan.items)
+    for item in plan.items:
+        assert item.reason
+        assert item.decision in ("used", "reduced", "left out")
+        assert set(item.changes) <= set(vars(TrainConfig()))
+
+
+def test_a_plan_survives_json(tiny_scene):
+    plan = make_plan(tiny_scene, SHORT)
+    assert any(item.changes for item in plan.items)
+    assert Plan.from_dict(json.loads(json.dumps(plan.as_dict()))) == plan
+    with pytest.raises(ValueError, match=r"expected a plan \(plan.json of a run\)"):
+        Plan.from_dict({"items": [{"title": "SH bands"}]})
+
+
+def test_the_user_wins_by_another_value_or_by_naming_the_field(tiny_scene):
+    assert make_plan(tiny_scene, SHORT).applied(SHORT).sh_degree == 0
+    for asked, given in ((dataclasses.replace(SHORT, sh_degree=2), ()), (SHORT, ("sh_degree",))):
+        plan = make_plan(tiny_scene, asked, given=given)
+        assert plan.applied(asked, given=given) == asked
+        item = items(tiny_scene, asked, given=given)["SH bands"]
+        assert item.decision == "used"
+        assert item.reason.startswith(f"asked for (sh_degree={asked.sh_degree})")
+
+
+def test_a_stored_plan_yields_to_what_is_given_later(tiny_scene):
+    plan = make_plan(tiny_scene, SHORT)
+    assert plan.applied(SHORT) != SHORT
+    assert plan.applied(SHORT, given=["sh_degree"]) == SHORT
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_what_a_preset_sets_stays(tiny_scene, preset):
+    config = with_preset(preset, iterations=400)
+    applied = make_plan(tiny_scene, config).applied(config)
+    default = vars(TrainConfig())
+    for name, value in vars(config).items():
+        if value != default[name]:
+            assert getattr(applied, name) == value, name
+
+
+def test_given_must_name_fields(tiny_scene):
+    with pytest.raises(ValueError, match=r"fields of TrainConfig, got \['sh'\]"):
+        make_plan(tiny_scene, TrainConfig(), given=["sh"])
+
+
+def test_a_scene_without_points_says_what_to_do(tiny_scene):
+    with pytest.raises(ValueError, match="load it with points='random'"):
+        make_plan(dataclasses.replace(tiny_scene, points=None), TrainConfig())
+
+
+@pytest.mark.parametrize(("iterations", "degree"), [(1, 0), (500, 0), (501, 1), (1_500, 2), (1_501, 3), (9_000, 3)])
+def test_bands_that_never_begin_are_left_out(tiny_scene, iterations, degree):
+    config = TrainConfig(iterations=iterations)
+    assert make_plan(tiny_scene, config).applied(config).sh_degree == degree
+
+
+def test_bands_that_never_begin_make_no_difference(tiny_scene):
+    """To the bit: what is left out stays 0 in the other run."""
+    whole = TrainConfig(iterations=8, sh_every=4, densify_from=2, densify_every=3, densify_gradient=1e-4, dropout=0.2)
+    planned = make_plan(tiny_scene, whole).applied(whole)
+    assert planned == dataclasses.replace(whole, sh_degree=1)
+    three, one = Trainer(tiny_scene, whole), Trainer(tiny_scene, planned)
+    three.train()
+    one.train()
+    parameters, expected = dict(one.gaussians.named()), dict(three.gaussians.named())
+    assert len(one.gaussians) > 150
+    assert not expected["sh_rest"][:, 3:].any()
+    expected["sh_rest"] = expected["sh_rest"][:, :3]
+    assert expected["sh_rest"].any()
+    for name, x in parameters.items():
+        assert torch.equal(x, expected[name]), name
+
+
+def test_points_behind_all_cameras_are_left_out(tiny_scene):
+    points = tiny_scene.points
+    behind = torch.tensor([[0.0, 0.0, -40.0]]) + torch.arange(3.0)[:, None]
+    both = PointCloud(torch.cat([points.positions, behind]), torch.cat([points.colors, torch.zeros(3, 3)]), "both")
+    item = items(dataclasses.replace(tiny_scene, points=both), TrainConfig())["Gaussians outside every view"]
+    assert "3 of 153" in item.reason
+    assert item.changes == {"initial_points": "seen"}
+    assert not items(tiny_scene, TrainConfig())["Gaussians outside every view"].changes
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "said"),
+    [
+        ("densification", TrainConfig(densify_every=0), r"asked for"),
+        ("densification", TrainConfig(iterations=400), r"begin at step 500 of 400"),
+        ("opacity reset", TrainConfig(iterations=2_000), r"first would be at step 2001 of 2000"),
+        ("opacity reset", TrainConfig(opacity_reset_every=0), r"asked for"),
+        ("dropped Gaussians", TrainConfig(dropout=0.2), r"20% .* neither projected nor sorted"),
+        ("dropped Gaussians", TrainConfig(), r"draws no masks"),
+        ("moments", TrainConfig(), r"a step needs none"),
+        ("SSIM windows without change", TrainConfig(lambda_dssim=0.0), r"lambda_dssim is 0"),
+    ],
+)
+def test_left_out_by_construction(tiny_scene, name, config, said):
+    item = items(tiny_scene, config)[name]
+    assert (item.decision, item.changes) == ("left out", {})
+    assert re.search(said, item.reason)
+
+
+def test_a_step_renders_no_depth_and_no_dropped_gaussian(tiny_scene, monkeypatch):
+    """The two claims about what a step computes, seen at the renderer's own output."""
+    seen = []
+    original = trainer_module.render_gaussians
+
+    def watched(gaussians, *args, opacities, **keywords):
+        rendering = original(gaussians, *args, opacities=opacities, **keywords)
+        seen.append((rendering, opacities.detach()))
+        return rendering
+
+    monkeypatch.setattr(trainer_module, "render_gaussians", watched)
+    Trainer(tiny_scene, TrainConfig(iterations=3, dropout=0.5)).train()
+    assert len(seen) == 3
+    for rendering, opacities in seen:
+        assert rendering.depth is None
+        assert 0 < int((opacities == 0).sum()) < len(opacities)
+        assert bool((opacities[rendering.splats.indices] > 0).all())
+        assert len(rendering.splats.projection.means) == len(rendering.splats.indices)
+
+
+def test_a_step_computes_no_moments_unless_it_trains_on_them(tiny_scene, monkeypatch):
+    calls = []
+    original = trainer_module.render_expectation
+    monkeypatch.setattr(trainer_module, "render_expectation", lambda *a, **k: calls.append(1) or original(*a, **k))
+    Trainer(tiny_scene, TrainConfig(iterations=2, dropout=0.2)).train()
+    assert not calls
+    Trainer(tiny_scene, TrainConfig(iterations=2, dropout=0.2, analytic=True)).train()
+    assert len(calls) == 2
