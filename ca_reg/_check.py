@@ -34,7 +34,7 @@ def check_opacity_range(opacity: Tensor, upper: float = 1.0) -> None:
     if opacity.numel() == 0:
         return
     low, high = (float(x) for x in torch.aminmax(opacity.detach()))
-    if not (low >= 0.0 and high <= upper):
+    if not (low >= 0.0 and high <= upper and math.isfinite(high)):
         raise ValueError(
             f"opacity must be activated, in [0, {upper:g}], got values from {low:g} to {high:g}; "
             "pass torch.sigmoid(logits), what the rasterizer receives, not the raw parameter."

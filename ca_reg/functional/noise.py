@@ -74,8 +74,8 @@ def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:
     """
     check_opacity(opacity)
     check_per_gaussian(noise, opacity, "noise")
-    factor = 1.0 + noise.to(opacity.dtype).view_as(opacity)
-    return (opacity * factor).clamp(0.0, 1.0)
+    # In the wider dtype of the two, and rounded once: 1 + noise has 8 bits in bfloat16.
+    return (opacity * (1.0 + noise.view_as(opacity))).clamp(0.0, 1.0).to(opacity.dtype)
 
 
 def opacity_noise(

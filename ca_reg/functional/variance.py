@@ -46,7 +46,7 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
 
     Raises:
         TypeError: if an argument is not a tensor.
-        ValueError: if the shapes do not match or a weight is negative or NaN.
+        ValueError: if the shapes do not match, a weight is negative, or one or a colour is NaN or infinite.
 
     Example:
         >>> weights = torch.tensor([[0.5, 0.5], [0.3, 0.0], [0.0, 0.0]])
@@ -64,13 +64,19 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
             f"colors must have the shape of weights and a last axis of 3, {(*weights.shape, 3)}, "
             f"got {tuple(colors.shape)}; expand the colours if the pixels share them."
         )
-    if not bool((weights >= 0).all()):
-        raise ValueError("weights must be at least 0, got a negative or NaN one; pass alpha_i T_i of every splat.")
+    if not bool(((weights >= 0) & weights.isfinite()).all()):
+        raise ValueError(
+            "weights must be finite and at least 0, got one that is negative, NaN or infinite; pass alpha_i T_i of "
+            "every splat."
+        )
 
     total = weights.sum(-1)
     covered = total > 0
     share = (weights / torch.where(covered, total, 1.0)[..., None])[..., None]
     mean = (share * colors).sum(-2, keepdim=True)
     variance = (share * (colors - mean).square()).sum(-2).mean(-1)
+    # What is not finite in the colours reaches the variance, also with a weight of 0: the small map tells of the large.
+    if not bool(variance.isfinite().all()) and not bool(colors.isfinite().all()):
+        raise ValueError("colors must be finite, got NaN or infinity.")
     reason = Reason.OK if bool(covered.any()) else Reason.EMPTY
     return ColorVariance(variance[covered].mean(), variance, covered, reason)

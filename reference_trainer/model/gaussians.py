@@ -72,8 +72,19 @@ class Gaussians:
             distances: standard deviation of each Gaussian, positive, shape (N,).
             sh_degree: degree of the colour's spherical harmonics, 0 to 3.
             opacity: opacity of each, in (0, 1).
+
+        Raises:
+            ValueError: if a position or colour is not finite, a distance not positive and finite, the opacity not in
+                (0, 1), or as the class does.
         """
         n = positions.shape[0]
+        for name, x in (("positions", positions), ("colors", colors)):
+            if not bool(x.isfinite().all()):
+                raise ValueError(f"{name} must be finite, got nan or infinity.")
+        if not bool(((distances > 0) & distances.isfinite()).all()):
+            raise ValueError("distances must be positive and finite: the logarithm of 0 can not be trained.")
+        if not 0.0 < opacity < 1.0:
+            raise ValueError(f"opacity must be in (0, 1), got {opacity}: its logit would be infinite.")
         quaternions = positions.new_zeros(n, 4)
         quaternions[:, 0] = 1.0
         return cls(
@@ -95,7 +106,10 @@ class Gaussians:
 
     @property
     def opacities(self) -> Tensor:
-        """Activated opacities in [0, 1], shape (N,): what every `ca_reg` regularizer works on."""
+        """Activated opacities in [0, 1], shape (N,): what every `ca_reg` regularizer works on.
+
+        In float32 their gradient is off by more than 1 % for logits above 13, and 0 above 17, where they are 1.
+        """
         return torch.sigmoid(self.opacity_logits)
 
     @property

@@ -12,6 +12,8 @@ from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
 
 __all__ = ["Projection", "project", "rotation_matrices"]
 
+_NO_DIRECTION = 1e-30  # a quaternion well below this is taken for 0
+
 
 class Projection(NamedTuple):
     """Projected Gaussians.
@@ -43,7 +45,7 @@ class Projection(NamedTuple):
 def rotation_matrices(quaternions: Tensor) -> Tensor:
     """Turn quaternions into rotation matrices.
 
-    Convention: wxyz; they are normalised here.
+    Convention: wxyz; they are normalised here, whatever their norm. That of 0 is the identity, with a gradient of 0.
 
     Args:
         quaternions: shape (N, 4).
@@ -60,7 +62,9 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 
 def _rotations(quaternions: Tensor) -> Tensor:
     """Turn quaternions (N, 4) into rotation matrices (3, 3, N): long last axes are several times faster on a CPU."""
-    w, x, y, z = torch.nn.functional.normalize(quaternions.T, dim=0).unbind(0)
+    # Divided by the largest component first: the squares of the norm would overflow from 1e19 on, or underflow.
+    largest = quaternions.detach().abs().amax(1).clamp_(min=_NO_DIRECTION)
+    w, x, y, z = torch.nn.functional.normalize(quaternions.T / largest, dim=0).unbind(0)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -100,15 +104,15 @@ def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) 
     row_y = (camera.fy / z) * (down - slope_y.clamp(-limit_y, limit_y) * forward)
     axes = _rotations(quaternions) * scales.T
     row_x, row_y = (row_x[:, None] * axes).sum(0), (row_y[:, None] * axes).sum(0)
-    square_x, square_y = (row_x * row_x).sum(0), (row_y * row_y).sum(0)
-    xx, xy, yy = square_x + DILATION, (row_x * row_y).sum(0), square_y + DILATION
-    # The determinant as a sum of squares (Cauchy-Binet): xx yy - xy^2 would cancel for needles.
-    cross = torch.linalg.cross(row_x, row_y, dim=0)
-    determinant = (cross * cross).sum(0) + DILATION * (square_x + square_y) + DILATION**2
-    root = torch.sqrt(yy * determinant)
+    xx, xy, yy = (row_x * row_x).sum(0) + DILATION, (row_x * row_y).sum(0), (row_y * row_y).sum(0) + DILATION
+    # The determinant as a sum of squares (Cauchy-Binet): xx yy - xy^2 would cancel for needles. Divided by yy before it
+    # is squared: the squares of the squares of the scales would overflow from a million scene sizes on.
+    l22 = torch.rsqrt(yy)
+    cross = torch.linalg.cross(row_x, row_y * l22, dim=0)
+    l11 = torch.rsqrt((cross * cross).sum(0) + DILATION * (xx + yy - DILATION) * (l22 * l22))
     return Projection(
         means=torch.stack([camera.fx * slope_x + camera.cx, camera.fy * slope_y + camera.cy], dim=-1),
-        factors=torch.stack([yy / root, -xy / root, torch.rsqrt(yy)], dim=-1),
+        factors=torch.stack([l11, -xy * (l22 * l22) * l11, l22], dim=-1),
         covariances=torch.stack([xx, xy, yy], dim=-1),
         depths=z,
     )

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.blending import composite
+from reference_trainer.render.checks import check_background, check_projection
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.projection import Projection, project
 from reference_trainer.render.spherical_harmonics import evaluate_sh
@@ -43,7 +44,7 @@ def masked(splats: Splats, opacities: Tensor) -> Splats:
         splats: of the Gaussians with opacities at least as high.
         opacities: activated, of all N Gaussians, shape (N,) or (N, 1); 0 leaves a Gaussian out.
     """
-    lower = opacities.reshape(-1)[splats.indices]
+    lower = opacities.reshape(-1)[splats.indices].to(splats.opacities.dtype)
     return splats._replace(opacities=lower, lists=splats.lists.only(lower >= MIN_ALPHA))
 
 
@@ -90,34 +91,56 @@ def splat(
         colors: colours instead of ``sh``, shape (N, 3).
 
     Raises:
-        ValueError: if not exactly one of ``sh`` and ``colors`` is given, or the opacities have another shape.
+        TypeError: if a tensor is not floating point.
+        ValueError: if not exactly one of ``sh`` and ``colors`` is given, the opacities have another shape, or the world
+            coordinates are too large for their precision, see `MAX_ROUNDING`.
+        NotFiniteError: if an input that decides about the view is nan or infinite. What is behind the camera, or
+            dropped, may be so but for its place and opacity.
     """
     if (sh is None) == (colors is None):
         raise ValueError("give either sh (N, K, 3) or colors (N, 3), not both and not neither.")
     n = means.shape[0]
     if opacities.shape not in ((n,), (n, 1)):
         raise ValueError(f"opacities must have shape ({n},) or ({n}, 1), got {tuple(opacities.shape)}.")
-    opacities = opacities.reshape(n)
-    camera = camera.to(means.device, means.dtype)
+    named = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities.reshape(n)}
+    degree = 0
     if sh is not None:
         degree = math.isqrt(sh.shape[1]) - 1 if sh_degree is None else sh_degree
-        sh = sh[:, : (degree + 1) ** 2]
+        named["sh"] = sh[:, : (degree + 1) ** 2]
+    elif colors is not None:
+        named["colors"] = colors
+    inputs = {name: _working(name, x, means.dtype) for name, x in named.items()}
+    # Mixed precision would move means by pixels: its products have 8 bits.
+    with torch.autocast(means.device.type, enabled=False):
+        return _splat(inputs, camera.to(means.device, inputs["means"].dtype), degree)
+
+
+def _working(name: str, x: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return an input in the precision of the work: float64 if the means are, else float32."""
+    if not x.is_floating_point():
+        raise TypeError(f"{name} must be a floating-point tensor, got {x.dtype}; convert it with .float().")
+    return x.to(torch.float64 if dtype == torch.float64 else torch.float32)
+
+
+def _splat(inputs: dict[str, Tensor], camera: Camera, degree: int) -> Splats:
+    """Cull, project, colour and list Gaussians in one precision, that of the camera."""
     with torch.no_grad():
-        depths = means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
-        indices = torch.nonzero((depths > NEAR_PLANE) & (opacities >= MIN_ALPHA)).squeeze(1)
-    if indices.shape[0] < n:
-        means, quaternions, scales, opacities = (
-            x.index_select(0, indices) for x in (means, quaternions, scales, opacities)
-        )
-        sh, colors = (None if x is None else x.index_select(0, indices) for x in (sh, colors))
-    projection = project(means, quaternions, scales, camera)
-    if sh is not None:
-        directions = torch.nn.functional.normalize(means - camera.position, dim=-1)
-        colors = evaluate_sh(sh, directions, degree)
-    assert colors is not None
+        depths = inputs["means"] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+        culled_by = depths.sum() + inputs["opacities"].sum()
+        indices = torch.nonzero((depths > NEAR_PLANE) & (inputs["opacities"] >= MIN_ALPHA)).squeeze(1)
+    drawn = inputs
+    if indices.shape[0] < depths.shape[0]:
+        drawn = {name: x.index_select(0, indices) for name, x in inputs.items()}
+    projection = project(drawn["means"], drawn["quaternions"], drawn["scales"], camera)
+    if "sh" in drawn:
+        directions = torch.nn.functional.normalize(drawn["means"] - camera.position, dim=-1)
+        colors = evaluate_sh(drawn["sh"], directions, degree)
+    else:
+        colors = drawn["colors"]
+    check_projection(projection, colors, culled_by, inputs, camera)
     with torch.no_grad():
-        lists = bin_gaussians(projection, opacities, camera.width, camera.height)
-    return Splats(indices, projection, opacities, colors, lists)
+        lists = bin_gaussians(projection, drawn["opacities"], camera.width, camera.height)
+    return Splats(indices, projection, drawn["opacities"], colors, lists)
 
 
 def render(
@@ -135,7 +158,8 @@ def render(
 ) -> Rendering:
     """Render 3D Gaussians; differentiable in every tensor.
 
-    Convention: OpenCV camera, half-pixel centres, wxyz quaternions; the constants of the INRIA rasterizer.
+    Convention: OpenCV camera, half-pixel centres, wxyz quaternions; the constants of the INRIA rasterizer. The work is
+    done in float64 if the means are, else in float32: also for float16 and bfloat16 inputs, and inside torch.autocast.
 
     Args:
         means: world coordinates, shape (N, 3).
@@ -153,7 +177,7 @@ def render(
         Image, accumulated alpha, depth if asked for, and the splats.
 
     Raises:
-        ValueError: if not exactly one of ``sh`` and ``colors`` is given, or a shape is wrong.
+        TypeError, ValueError, NotFiniteError: as `splat`; the last also for the background.
 
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
@@ -177,10 +201,15 @@ def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = Fals
     projection = splats.projection
     if projection.means.requires_grad:
         projection.means.retain_grad()
+    if background is not None:
+        check_background(background)
     columns = [splats.colors, torch.ones_like(splats.opacities)[:, None]]
     if depth:
         columns.append(projection.depths[:, None])
-    sums = composite(projection.means, projection.factors, splats.opacities, torch.cat(columns, dim=1), splats.lists)
+    with torch.autocast(splats.opacities.device.type, enabled=False):
+        sums = composite(
+            projection.means, projection.factors, splats.opacities, torch.cat(columns, dim=1), splats.lists
+        )
     image, alpha = sums[:3], sums[3]
     if background is not None:
         image = image + (1 - alpha) * background.to(image)[:, None, None]

@@ -392,3 +392,29 @@ def test_wrong_arguments_are_refused(change, error, message):
     good = {"alphas": torch.rand(4, 5), "colors": torch.rand(4, 5, 3), "multiplier": Multiplier.dropout(0.2)}
     with pytest.raises(error, match=message):
         pixel_moments(**(good | change))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("function", [pixel_moments, contributions, neutral_background, first_order_variance])
+def test_colours_that_are_not_finite_are_refused_in_the_padding_too(function, bad):
+    alphas, colors, _ = lists(3, 5)
+    alphas[1, 4], colors[1, 4, 2] = 0.0, bad
+    with pytest.raises(ValueError, match="colors must be finite"):
+        function(alphas, colors, Multiplier.dropout(0.3))
+
+
+def test_a_background_that_is_not_finite_is_refused():
+    alphas, colors, _ = lists(3, 5)
+    with pytest.raises(ValueError, match="background must be finite"):
+        pixel_moments(alphas, colors, Multiplier.dropout(0.3), background=torch.tensor([0.0, math.nan, 0.0]).double())
+
+
+def test_finite_colours_whose_sum_overflows_are_no_mistake():
+    alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[3e38], [3e38]])
+    assert pixel_moments(alphas, colors, Multiplier.dropout(0.5)).mean.item() == pytest.approx(0.4375 * 3e38)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_short_dtypes_are_refused(dtype):
+    with pytest.raises(TypeError, match=r"float32 or float64, got torch\.b?float16; convert it with \.float"):
+        alpha_moments(torch.full((5,), 0.5, dtype=dtype), Multiplier.dropout(0.5))

@@ -66,3 +66,21 @@ def test_indexing_takes_the_same_rows_of_everything(index):
 def test_wrong_shapes_are_named(name, shape):
     with pytest.raises(ValueError, match=f"{name} must"):
         Gaussians(**dict(some().named()) | {name: torch.zeros(shape)})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"positions": torch.tensor([[0.0, float("nan"), 0.0]])}, "positions must be finite"),
+        ({"colors": torch.tensor([[0.0, float("inf"), 0.0]])}, "colors must be finite"),
+        ({"distances": torch.zeros(1)}, "distances must be positive"),
+        ({"distances": torch.tensor([float("nan")])}, "distances must be positive"),
+        ({"distances": torch.tensor([float("inf")])}, "distances must be positive"),
+        ({"opacity": 1.0}, r"opacity must be in \(0, 1\), got 1.0"),
+        ({"opacity": float("nan")}, "opacity must be in"),
+    ],
+)
+def test_points_without_finite_parameters_are_refused(change, message):
+    good = {"positions": torch.zeros(1, 3), "colors": torch.zeros(1, 3), "distances": torch.ones(1), "sh_degree": 0}
+    with pytest.raises(ValueError, match=message):
+        Gaussians.from_points(**good | change)

@@ -85,3 +85,45 @@ def test_quaternion_length_does_not_matter_and_rotations_are_orthonormal():
     # wxyz: a quarter turn about z takes x to y.
     turn = rotation_matrices(torch.tensor([[1.0, 0, 0, 1.0]], dtype=torch.float64))[0]
     torch.testing.assert_close(turn @ torch.tensor([1.0, 0, 0]).double(), torch.tensor([0.0, 1, 0]).double())
+
+
+@pytest.mark.parametrize("norm", [1e-35, 1e-21, 1e-13, 1e13, 1e20, 1e37])
+def test_the_norm_of_a_quaternion_does_not_matter(norm):
+    # The square of 1e20 overflows float32, that of 1e-21 underflows: both had been taken for no rotation at all.
+    unit = torch.tensor([[0.5, -0.5, 0.7, 0.1]], dtype=torch.float64)
+    unit /= unit.norm()
+    scaled = (unit * norm).float().requires_grad_()
+    w, x, y, z = (scaled.detach().double() / norm)[0].tolist()
+    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    expected = torch.eye(3).double() + (2 * w * skew + 2 * skew @ skew) / (w * w + x * x + y * y + z * z)
+    rotation = rotation_matrices(scaled)[0]
+    torch.testing.assert_close(rotation.double(), expected, rtol=0, atol=1e-6)
+    rotation[0, 1].backward()
+    exact = unit.clone().requires_grad_()
+    rotation_matrices(exact)[0, 0, 1].backward()
+    torch.testing.assert_close(scaled.grad.double() * norm, exact.grad, rtol=1e-5, atol=1e-6)
+
+
+def test_a_quaternion_of_zero_is_no_rotation_and_gets_no_gradient():
+    zero = torch.zeros(1, 4, requires_grad=True)
+    rotation = rotation_matrices(zero)
+    assert torch.equal(rotation[0], torch.eye(3))
+    (rotation * torch.arange(9.0).view(3, 3)).sum().backward()
+    assert torch.equal(zero.grad, torch.zeros(1, 4))
+
+
+def test_gradients_of_gaussians_of_a_million_scene_sizes_do_not_overflow():
+    # The determinant of their covariance is 1e25 and more; its product with a variance had no float32.
+    camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 38.0, 15.0, 12.7, 32, 24)
+    g = torch.Generator().manual_seed(0)
+    means = torch.rand(20, 3, generator=g) + torch.tensor([-0.5, -0.5, 2.0])
+    quaternions, scales = torch.randn(20, 4, generator=g), 1e6 * (0.1 + torch.rand(20, 3, generator=g))
+    weights = torch.randn(20, 3, generator=g)
+    results = {}
+    for dtype in (torch.float32, torch.float64):
+        leaves = [x.to(dtype, copy=True).requires_grad_() for x in (means, quaternions, scales)]
+        factors = project(*leaves, camera).factors
+        (factors * weights.to(dtype)).sum().backward()
+        results[dtype] = [factors.detach(), *(x.grad for x in leaves)]
+    for ours, exact in zip(results[torch.float32], results[torch.float64], strict=True):
+        assert (ours.double() - exact).norm() < 1e-5 * exact.norm()

@@ -126,3 +126,34 @@ def test_errors_name_the_problem():
         render(*scene[:4], scene.camera)
     with pytest.raises(ValueError, match=r"\(4,\) or \(4, 1\)"):
         render(*scene[:3], scene.opacities[:2], scene.camera, colors=scene.colors)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_short_inputs_are_rendered_in_float32_and_their_gradients_come_back_short(dtype, device):
+    scene = random_scene(60, 30, 20, seed=4).to(dtype, device)
+    camera = scene.camera.to(dtype=torch.float64)
+    leaves = [x.clone().requires_grad_() for x in scene.tensors()]
+    out = render(*leaves[:4], camera, colors=leaves[4])
+    assert out.image.dtype == torch.float32
+    exact = [x.detach().double().requires_grad_() for x in leaves]
+    image = render(*exact[:4], camera, colors=exact[4]).image
+    assert ((out.image.double() - image).abs() > 2e-4).double().mean() <= 0.005
+    out.image.sum().backward()
+    image.sum().backward()
+    for short, long in zip(leaves, exact, strict=True):
+        assert short.grad.dtype == dtype
+        assert (short.grad.double() - long.grad).norm() < 0.01 * long.grad.norm()
+
+
+def test_mixed_precision_changes_nothing(device):
+    scene = random_scene(60, 30, 20, seed=4).to(torch.float32, device)
+    plain = render(*scene[:4], scene.camera, colors=scene.colors).image
+    with torch.autocast(device.type, dtype=torch.bfloat16):
+        cast = render(*scene[:4], scene.camera, colors=scene.colors).image
+    assert torch.equal(plain, cast)
+
+
+def test_tensors_of_whole_numbers_are_refused():
+    scene = random_scene(6, 8, 8, seed=0)
+    with pytest.raises(TypeError, match=r"scales must be a floating-point tensor, got torch.int64; .*\.float"):
+        render(*scene[:2], scene.scales.long(), scene.opacities, scene.camera, colors=scene.colors)

@@ -1,0 +1,80 @@
+"""What the renderer refuses to draw: numbers that are not finite, and places that the precision cannot hold.
+
+A nan would not be seen otherwise: a Gaussian whose depth is nan is not in front of the camera, and is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.constants import MAX_ROUNDING
+from reference_trainer.render.projection import Projection
+
+__all__ = ["NotFiniteError", "check_background", "check_projection"]
+
+
+class NotFiniteError(ValueError):
+    """An input of the renderer is nan or infinite, or what it projects to is."""
+
+
+@torch.no_grad()
+def check_projection(
+    projection: Projection, colors: Tensor, culled_by: Tensor, inputs: Mapping[str, Tensor], camera: Camera
+) -> None:
+    """Raise unless all numbers are finite and the world is not too far from its origin for their precision.
+
+    A sum is not finite if one of its summands is not. So this costs four sums and, on a GPU, one wait; only where
+    something is wrong are the inputs looked at one by one.
+
+    Args:
+        projection: M projected Gaussians.
+        colors: of them, shape (M, 3).
+        culled_by: sum of the depths and opacities of all N Gaussians, which decide about who is drawn, a scalar.
+        inputs: the tensors as they were given, N Gaussians first, by name.
+        camera: the view.
+
+    Raises:
+        NotFiniteError: if an input is nan or infinite, or so large that the projection is; names it.
+        ValueError: if the rounding of the coordinates moves Gaussians by more than `MAX_ROUNDING`.
+    """
+    results = (projection.means, projection.covariances, colors)
+    # One wait for the GPU: at what share of its mean depth the scene lies from the origin of the world.
+    share = camera.position.abs().amax() / projection.depths.mean()
+    total, share = torch.stack([sum((x.sum() for x in results), culled_by), share.to(culled_by)]).tolist()
+    if not abs(total) < float("inf"):
+        _refuse(results, inputs, camera)
+    rounding = 0.5 * torch.finfo(colors.dtype).eps * share * max(camera.fx, camera.fy)
+    if rounding > MAX_ROUNDING:
+        raise ValueError(
+            f"the camera is {camera.position.abs().max().item():.3g} from the world's origin, where {colors.dtype} "
+            f"rounds by {rounding:.2g} pixels of this view, and loses small training steps: subtract a common offset, "
+            "such as the mean camera position, from the means and from all cameras, or use float64."
+        )
+
+
+def check_background(background: Tensor) -> None:
+    """Raise `NotFiniteError` unless the colour behind everything is finite."""
+    if not bool(background.isfinite().all()):
+        raise NotFiniteError(f"background must be finite, got {background.tolist()}.")
+
+
+def _refuse(results: tuple[Tensor, ...], inputs: Mapping[str, Tensor], camera: Camera) -> None:
+    """Raise and say what is not finite; return if nothing is but the sum, which has overflowed."""
+    for name, x in inputs.items():
+        bad = ~x.isfinite().reshape(x.shape[0], -1).all(1)
+        if bool(bad.any()):
+            first = int(bad.nonzero()[0])
+            raise NotFiniteError(
+                f"{name} must be finite, got nan or infinity in {int(bad.sum())} of {x.shape[0]} Gaussians, the first "
+                f"is number {first}. If training made them, lower the learning rates."
+            )
+    if not all(bool(x.isfinite().all()) for x in results):
+        raise NotFiniteError(
+            f"Gaussians project to nan or infinity, from finite inputs: their scales go up to "
+            f"{inputs['scales'].abs().max().item():.3g}, the camera has fx={camera.fx:.3g}, fy={camera.fy:.3g}, "
+            f"cx={camera.cx:.3g}, cy={camera.cy:.3g}."
+        )

@@ -1,0 +1,214 @@
+"""Cases of opacity, depth order, masks, noise, colours and precision of the inputs."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from ca_reg import CAScore
+from ca_reg.functional import Multiplier, expected_opacity, pixel_moments
+from reference_trainer.camera import Camera
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.studies.stability.case import Case, Probe, decades, of_scene, single
+from reference_trainer.studies.stability.quantities import Quantities, reference_quantities, scene_quantities
+from reference_trainer.studies.stability.scenes import PARAMETERS, base_scene, stack
+
+__all__ = ["blend_cases"]
+
+_OPACITY, _BLEND, _RANDOM, _COLOR, _DTYPE = "opacity", "blending", "dropout and noise", "colours", "precision"
+_OPACITIES = {"0": 0.0, "1e-8": 1e-8, "1/255 + 1e-6": 1 / 255 + 1e-6, "1 - 1e-7": 1 - 1e-7, "1": 1.0}
+_LOGITS = (1.0, 10.0, 20.0, 50.0, 100.0)
+_STACKS = (0.01, 0.5, 0.95)
+_RATES = {"0": 0.0, "1e-6": 1e-6, "0.999": 0.999, "1 - 1e-7": 1 - 1e-7}
+_SIGMAS = (1e-6, 1e-3, 0.05, 0.8, 1.0, 10.0)
+_HDR = {"white to HDR background": 0.0, "white to HDR colours and background": 1.0}
+_SQUARES = "variances are squares, which overflow float32: the score says NOT_FINITE"
+
+
+def blend_cases() -> list[Case]:
+    """Return the cases: magnitudes are numbers of Gaussians or of renders, standard deviations or colours."""
+    return [
+        *(single(_OPACITY, f"opacities {name}", partial(_opacities, x)) for name, x in _OPACITIES.items()),
+        Case(
+            _OPACITY, "opacity logits", _logits, _LOGITS, until=10.0,
+            note="the gradient, o (1 - o), loses its digits and is 0 from 17 on: 1 is the next float32",
+        ),
+        Case(
+            _OPACITY, "opacity logits, negative", lambda x: _logits(-x), _LOGITS, until=50.0,
+            note="below 1e-38 there is no float32",
+        ),
+        *(Case(_BLEND, f"Gaussians on one pixel, opacity {o}", partial(_stacked, o), decades(0, 4)) for o in _STACKS),
+        Case(
+            _BLEND, "Gaussians on one pixel, opacity 1", partial(_stacked, 1.0), decades(0, 3), until=1.0,
+            note="two alphas of 0.99 leave 1e-4 of the light, just where a pixel ends: rounding decides on the second",
+        ),
+        single(_BLEND, "equal depths", _one_plane),
+        Case(_BLEND, "copies of one Gaussian, turned camera", _copies, (2.0, 7.0, 33.0, 300.0)),
+        Case(_BLEND, "depths that differ by 1 / x", _close_depths, decades(0, 7)),
+        single(_BLEND, "no Gaussian", _nothing),
+        single(_RANDOM, "all dropped", lambda: _masked(torch.zeros(24, dtype=torch.bool))),
+        single(_RANDOM, "one left", lambda: _masked(torch.arange(24) == 5)),
+        single(_RANDOM, "none dropped", lambda: _masked(torch.ones(24, dtype=torch.bool))),
+        *(single(_RANDOM, f"drop rate {name}", partial(_rate, x)) for name, x in _RATES.items()),
+        Case(_RANDOM, "sigma of the opacity noise", _noise, _SIGMAS),
+        single(_RANDOM, "opacity noise of sigma 0", partial(_noise, 0.0)),
+        Case(_RANDOM, "renders K of a score", _renders, (2.0, 100.0, 10_000.0)),
+        single(_RANDOM, "K = 1", partial(_renders, 1.0), refused="the variance of one render"),
+        single(_RANDOM, "no visible pixel: no score, but a reason", _faint),
+        single(_COLOR, "black background", partial(_colored, 0.0, 0.0)),
+        *(
+            Case(_COLOR, name, partial(_colored, x), decades(0, 30, 3), until=1e18, beyond="overflow", note=_SQUARES)
+            for name, x in _HDR.items()
+        ),
+        single(_DTYPE, "float16 inputs", lambda: of_scene(base_scene(), dtype=torch.float16)),
+        single(_DTYPE, "bfloat16 inputs", lambda: of_scene(base_scene(), dtype=torch.bfloat16)),
+        single(_DTYPE, "moments of lists in float16", _short_lists, refused="its checks"),
+        single(_DTYPE, "torch.autocast to bfloat16", _autocast),
+    ]  # fmt: skip
+
+
+def _opacities(value: float) -> Probe:
+    scene = base_scene()
+    return of_scene(scene.with_(opacities=torch.full_like(scene.opacities, value)))
+
+
+def _logits(value: float) -> Probe:
+    """Compare opacities and their gradient with the closed forms: float64 itself rounds the latter to 0."""
+
+    def measured() -> Quantities:
+        points, logits = torch.zeros(1, 3), torch.tensor([value], requires_grad=True)
+        model = Gaussians.from_points(points, points, torch.ones(1), sh_degree=0)
+        opacities = dataclasses.replace(model, opacity_logits=logits).opacities
+        (gradient,) = torch.autograd.grad(opacities.sum(), logits)
+        return {"alpha": opacities.detach(), "d opacities": gradient}
+
+    tail = math.exp(-abs(value))
+    opacity = (1.0 if value >= 0 else tail) / (1.0 + tail)
+    exact = {"alpha": opacity, "d opacities": tail / (1.0 + tail) ** 2}
+    return Probe(measured, lambda: {name: torch.tensor([x], dtype=torch.float64) for name, x in exact.items()})
+
+
+def _stacked(opacity: float, count: float) -> Probe:
+    return of_scene(stack(int(count), opacity))
+
+
+def _one_plane() -> Probe:
+    """Put all Gaussians at one depth: they are drawn in their own order."""
+    camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 38.0, 15.0, 12.7, 32, 24)
+    scene = base_scene(camera=camera)
+    return of_scene(scene.with_(means=torch.cat([scene.means[:, :2], torch.full((24, 1), 3.0).double()], dim=1)))
+
+
+def _copies(count: float) -> Probe:
+    """Draw one Gaussian many times, in many colours: rounding must not change the order of equal depths."""
+    n = int(count)
+    scene = base_scene(n)
+    same = {name: getattr(scene, name)[:1].expand(n, -1) for name in ("means", "quaternions", "scales")}
+    return of_scene(scene.with_(**same, opacities=torch.full((n,), 0.3, dtype=torch.float64)))
+
+
+def _close_depths(x: float) -> Probe:
+    return of_scene(stack(24, 0.5, spacing=1.0 / x))
+
+
+def _nothing() -> Probe:
+    """Compare an empty model with its background."""
+    scene = base_scene()
+    empty = scene.with_(**{name: getattr(scene, name)[:0] for name in PARAMETERS})
+    image = scene.background.float().double()[:, None, None].expand(3, 24, 32)
+    known = dict.fromkeys(("image", "mean", "dropout", "noise"), image)
+    known |= {"alpha": torch.zeros_like(image[0]), "variance": torch.zeros_like(image)}
+    known["CA"] = torch.tensor([math.nan], dtype=torch.float64)
+    return Probe(lambda: {k: v for k, v in scene_quantities(empty, torch.float32).items() if k in known}, lambda: known)
+
+
+def _masked(keep: Tensor) -> Probe:
+    scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
+    left = scene.with_(opacities=scene.opacities * keep)
+    return Probe(
+        lambda: {"dropout": scene_quantities(scene, torch.float32, keep=keep)["dropout"]},
+        lambda: {"dropout": reference_quantities(left)["image"]},
+    )
+
+
+def _rate(rate: float) -> Probe:
+    """Vary the drop rate of the draw, of the moments and of the score."""
+    scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
+    return Probe(
+        lambda: scene_quantities(scene, torch.float32, rate=rate),
+        lambda: scene_quantities(scene, torch.float64, rate=rate),
+    )
+
+
+def _noise(sigma: float) -> Probe:
+    """Vary sigma of the draw; moments and mean opacities of the clamped noise, of faint to opaque Gaussians, too."""
+    scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
+    grid = torch.cat([torch.logspace(-8, -1, 8), torch.linspace(0.2, 1.0, 9), 1 - torch.logspace(-7, -2, 6)])
+
+    def compute(dtype: torch.dtype) -> Quantities:
+        opacity = grid.to(dtype, copy=True).requires_grad_()
+        multiplier = Multiplier.clamped_noise(opacity.detach(), sigma)
+        mean = expected_opacity(opacity, sigma)
+        result = {"noise": scene_quantities(scene, dtype, sigma=sigma)["noise"], "mean": mean.detach()}
+        result["variance"] = torch.as_tensor(multiplier.variance)
+        (result["d opacities"],) = torch.autograd.grad(mean.sum(), opacity)
+        return result
+
+    return Probe(lambda: compute(torch.float32), lambda: compute(torch.float64))
+
+
+def _renders(count: float) -> Probe:
+    """Score a bright wall of ten layers: the variance of K renders is small beside their squares."""
+    opacity = torch.linspace(0.3, 0.9, 10)
+
+    def score(dtype: torch.dtype) -> Quantities:
+        colors = 100.0 + torch.linspace(0, 1, 10, dtype=dtype)
+
+        def render_fn(opacity: Tensor, view: None) -> tuple[Tensor, Tensor]:
+            opacity = opacity.to(dtype)
+            passed = torch.cumprod(1 - opacity, 0)
+            weights = opacity * torch.cat([passed.new_ones(1), passed[:-1]])
+            image = (weights * colors).sum() + passed[-1] * 100.0
+            return image.expand(3, 2, 2), torch.ones_like(image).expand(2, 2)
+
+        result = CAScore(render_fn, samples=int(count))(opacity, None)
+        return {"CA": torch.tensor([result.value, result.std_error if count > 2 else 0.0], dtype=torch.float64)}
+
+    return Probe(lambda: score(torch.float32), lambda: score(torch.float64))
+
+
+def _faint() -> Probe:
+    scene = base_scene()
+    return of_scene(scene.with_(opacities=torch.full_like(scene.opacities, 0.01)))
+
+
+def _colored(share: float, background: float) -> Probe:
+    """Vary the background, and with a share of 1 the colours with it."""
+    scene = base_scene()
+    behind = torch.full_like(scene.background, background)
+    return of_scene(scene.with_(background=behind, colors=scene.colors * (background if share else 1.0)))
+
+
+def _short_lists() -> Probe:
+    alphas, colors = torch.full((500,), 0.02), torch.linspace(0, 1, 500)[:, None]
+
+    def moments(dtype: torch.dtype) -> Quantities:
+        mean, variance = pixel_moments(alphas.to(dtype), colors.to(dtype), Multiplier.dropout(0.5))
+        return {"mean": mean, "variance": variance}
+
+    return Probe(lambda: moments(torch.float16), lambda: moments(torch.float64))
+
+
+def _autocast() -> Probe:
+    """Run everything as inside a mixed-precision training step."""
+    probe = of_scene(base_scene())
+
+    def measured() -> Quantities:
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            return probe.measured()
+
+    return Probe(measured, probe.reference)

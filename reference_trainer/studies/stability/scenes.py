@@ -1,0 +1,96 @@
+"""The small scene that every case of the stability study pushes to an extreme."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+
+__all__ = ["PARAMETERS", "StressScene", "base_scene", "camera_of", "stack"]
+
+PARAMETERS = ("means", "quaternions", "scales", "opacities", "colors")
+"""The tensors of the Gaussians, by the names that the renderer gives them."""
+
+_SEED = 20
+_DISTANCE = 3.0  # from the camera to the centre of the scene, whose half width is 1
+
+
+@dataclass(frozen=True)
+class StressScene:
+    """Gaussians, a camera and a background.
+
+    Args:
+        means: world coordinates, shape (N, 3).
+        quaternions: wxyz, shape (N, 4).
+        scales: standard deviations, shape (N, 3).
+        opacities: activated, shape (N,).
+        colors: RGB, shape (N, 3).
+        background: shape (3,).
+        camera: the view.
+    """
+
+    means: Tensor
+    quaternions: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    background: Tensor
+    camera: Camera
+
+    def with_(self, **changes: object) -> StressScene:
+        """Return the scene with some fields replaced."""
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+    def to(self, dtype: torch.dtype, *, camera: torch.dtype | None = None) -> StressScene:
+        """Return the scene in another dtype, the pose of the camera in a dtype of its own if one is given."""
+        tensors = {x.name: getattr(self, x.name).to(dtype) for x in fields(self) if x.name != "camera"}
+        return StressScene(**tensors, camera=self.camera.to(dtype=camera or dtype))
+
+
+def camera_of(width: int = 32, height: int = 24, *, focal: float = 40.0, distance: float = _DISTANCE) -> Camera:
+    """Return a turned camera that looks at the origin from a distance, float64."""
+    skew = torch.tensor([[0, -0.1, 0.2], [0.1, 0, -0.3], [-0.2, 0.3, 0]], dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.linalg.matrix_exp(skew)
+    pose[2, 3] = distance
+    return Camera(pose, focal, 0.95 * focal, 0.47 * width, 0.53 * height, width, height)
+
+
+def base_scene(n: int = 24, *, camera: Camera | None = None, seed: int = _SEED) -> StressScene:
+    """Draw n ordinary Gaussians around the origin, float64.
+
+    Args:
+        n: number of them.
+        camera: the view, by default 32 x 24 pixels from a distance of 3.
+        seed: of the draw.
+
+    Example:
+        >>> base_scene(5).means.shape
+        torch.Size([5, 3])
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    return StressScene(
+        means=uniform(-0.8, 0.8, n, 3),
+        quaternions=torch.randn(n, 4, generator=generator, dtype=torch.float64),
+        scales=0.15 * torch.exp(uniform(-0.7, 0.7, n, 3)),
+        opacities=uniform(0.2, 0.9, n),
+        colors=uniform(0.0, 1.0, n, 3),
+        background=torch.tensor([0.1, 0.3, 0.2], dtype=torch.float64),
+        camera=camera or camera_of(),
+    )
+
+
+def stack(n: int, opacity: float, *, spacing: float = 1e-3) -> StressScene:
+    """Put n Gaussians behind each other on the axis of an 8 x 8 camera: all of them reach all pixels."""
+    scene = base_scene(n, camera=Camera(torch.eye(4, dtype=torch.float64), 20.0, 20.0, 4.0, 4.0, 8, 8))
+    means = torch.zeros(n, 3, dtype=torch.float64)
+    means[:, 2] = 2.0 + spacing * torch.arange(n, dtype=torch.float64)
+    opacities = torch.full((n,), opacity, dtype=torch.float64)
+    return scene.with_(means=means, scales=scene.scales + 0.5, opacities=opacities)

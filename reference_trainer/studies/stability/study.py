@@ -1,0 +1,72 @@
+"""The stability study: judge every case, write, and fail if one ends as nobody foresaw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.studies.stability.blends import blend_cases
+from reference_trainer.studies.stability.case import Case
+from reference_trainer.studies.stability.figure import stability_figure
+from reference_trainer.studies.stability.geometry import geometry_cases
+from reference_trainer.studies.stability.inputs import input_cases
+from reference_trainer.studies.stability.judge import judge
+from reference_trainer.studies.stability.report import stability_tables, verdict_record
+
+__all__ = ["all_cases", "study_stability"]
+
+REPORT, TABLE, FIGURE = "stability.json", "stability.md", "stability.png"
+
+Say = Callable[[str], None]
+
+
+def all_cases() -> list[Case]:
+    """Return all cases: shape, place and camera; opacities, masks, colours and precision; bad input."""
+    return [*geometry_cases(), *blend_cases(), *input_cases()]
+
+
+def study_stability(out: Path, *, cases: Sequence[Case] | None = None, say: Say = print) -> dict[str, Any]:
+    """Push the renderer and the functions of `ca_reg` to extremes, and say where they end and how.
+
+    Writes ``stability.json``, ``stability.md`` and ``stability.png``. It takes about half a minute.
+
+    Args:
+        out: folder for the results.
+        cases: what to judge; `all_cases` by default.
+        say: receives the progress and the tables.
+
+    Returns:
+        The content of ``stability.json``.
+
+    Raises:
+        ValueError: if there is no case.
+        RuntimeError: if a case ends in another way than it should; lists them, after everything is written.
+    """
+    cases = all_cases() if cases is None else cases
+    if not cases:
+        raise ValueError("expected at least 1 case, got none.")
+    start, records = perf_counter(), []
+    for i, case in enumerate(cases):
+        if i == 0 or case.family != cases[i - 1].family:
+            say(case.family)
+        records.append(verdict_record(judge(case)))
+    report = {
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "machine": machine(),
+        "seconds": perf_counter() - start,
+        "points": sum(len(record["points"]) for record in records),
+        "cases": records,
+    }
+    write_json(out / REPORT, report)
+    text = stability_tables(report)
+    (out / TABLE).write_text(text, encoding="utf-8")
+    stability_figure(report, out / FIGURE)
+    say(text)
+    say(f"numbers, tables and picture: {out / REPORT}, {out / TABLE}, {out / FIGURE}")
+    if defects := [f"  {x['family']}: {x['name']}" for x in records if x["ending"] == "defect"]:
+        raise RuntimeError(f"{len(defects)} cases do not end as they should:\n" + "\n".join(defects))
+    return report

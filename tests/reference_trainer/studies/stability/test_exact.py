@@ -1,0 +1,43 @@
+"""Decimal arithmetic against brute force with autograd in float64, where float64 is not in doubt."""
+
+import pytest
+import torch
+from oracles import brute_force
+
+from reference_trainer.studies.stability.exact import exact_images
+from reference_trainer.studies.stability.quantities import IMAGES, loss_weights
+from reference_trainer.studies.stability.scenes import PARAMETERS, base_scene, camera_of
+
+
+def test_image_and_gradients_equal_brute_force():
+    scene = base_scene(3, camera=camera_of(4, 3, focal=5.0))
+    exact = exact_images(scene)
+    assert set(exact) == set(IMAGES)
+    leaves = [getattr(scene, name).clone().requires_grad_() for name in PARAMETERS]
+    sums, alpha = brute_force(*leaves, scene.camera)
+    image = sums + (1 - alpha) * scene.background[:, None, None]
+    (torch.cat([image, alpha[None]]) * loss_weights(scene.camera)).sum().backward()
+    torch.testing.assert_close(exact["image"], image.detach(), rtol=0, atol=1e-14)
+    torch.testing.assert_close(exact["alpha"], alpha.detach(), rtol=0, atol=1e-14)
+    for name, x in zip(PARAMETERS, leaves, strict=True):
+        torch.testing.assert_close(exact[f"d {name}"], x.grad, rtol=1e-11, atol=1e-12)
+
+
+def test_splats_behind_the_near_plane_and_below_the_cut_are_left_out():
+    scene = base_scene(3, camera=camera_of(3, 2, focal=5.0))
+    means, opacities = scene.means.clone(), scene.opacities.clone()
+    means[0] -= 4 * scene.camera.forward
+    opacities[1] = 0.003
+    scene = scene.with_(means=means, opacities=opacities)
+    _, alpha = brute_force(*(getattr(scene, name) for name in PARAMETERS), scene.camera)
+    exact = exact_images(scene)
+    torch.testing.assert_close(exact["alpha"], alpha, rtol=0, atol=1e-14)
+    assert alpha.max() > 0.1
+    assert torch.equal(exact["d colors"][:2], torch.zeros(2, 3).double())
+
+
+@pytest.mark.parametrize("opacities", [(0.995, 0.1), (0.98, 0.98, 0.98)])
+def test_opacities_that_are_clamped_or_end_a_pixel_are_refused(opacities):
+    scene = base_scene(len(opacities)).with_(opacities=torch.tensor(opacities).double())
+    with pytest.raises(ValueError, match="neither clamp an alpha nor end a pixel"):
+        exact_images(scene)
