@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from ca_reg._log import read_log
 from ca_reg.monitor import LOG_NAME
 from ca_reg.result import new_axes
 
@@ -32,7 +32,7 @@ def read_dynamics(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[np.floa
 
     Raises:
         FileNotFoundError: if there is no log.
-        ValueError: if it holds no complete line.
+        ValueError: if it holds no complete line, or a damaged one.
 
     Example:
         >>> import tempfile
@@ -47,12 +47,7 @@ def read_dynamics(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[np.floa
     file = file / LOG_NAME if file.is_dir() else file
     if not file.exists():
         raise FileNotFoundError(f"there is no log of a CAMonitor at {file}; give the file or the log_dir it was given.")
-    records: list[dict[str, Any]] = []
-    for line in file.read_text(encoding="utf-8").splitlines():
-        try:
-            records.append(json.loads(line))
-        except ValueError:  # the line that a running or killed process has not finished
-            continue
+    records = [record for _, record in read_log(file)]
     if not records:
         raise ValueError(f"{file} holds no measurement yet; a CAMonitor writes the first at a multiple of `every`.")
     records.sort(key=lambda record: record["step"])

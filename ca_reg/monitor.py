@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ca_reg._check import check_count, check_opacity
+from ca_reg._log import read_log
 from ca_reg.functional import scale_opacity
 from ca_reg.result import summarize
 from ca_reg.score import CAScore
@@ -60,7 +61,8 @@ class CAMonitor:
 
     Raises:
         TypeError: if ``views`` is not a mapping or an argument is of the wrong type.
-        ValueError: if there are no views, a group is empty, or ``every`` or ``resume_step`` is out of range.
+        ValueError: if there are no views, a group is empty, ``every`` or ``resume_step`` is out of range, or a line of
+            the log to resume is damaged.
 
     Example:
         >>> import tempfile
@@ -185,14 +187,10 @@ def _keep_lines(path: Path, resume_step: int | None) -> int:
     kept: list[str] = []
     last = -1
     if resume_step is not None and path.exists():
-        for line in path.read_text(encoding="utf-8").splitlines():
-            try:
-                step = int(json.loads(line)["step"])
-            except ValueError:  # a run that was killed may leave half a line behind
-                continue
-            if step <= resume_step:
+        for line, record in read_log(path):
+            if record["step"] <= resume_step:
                 kept.append(line + "\n")
-                last = max(last, step)
+                last = max(last, record["step"])
     partial = path.with_suffix(".tmp")
     partial.write_text("".join(kept), encoding="utf-8")
     partial.replace(path)  # never a moment without the log on disk

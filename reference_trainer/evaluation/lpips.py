@@ -21,6 +21,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from reference_trainer.tensor_files import load_tensors
+
 __all__ = ["LPIPS", "LPIPS_HINT", "load_lpips", "lpips_option"]
 
 LPIPS_HINT = (
@@ -119,13 +121,16 @@ def load_lpips(weights: str | Path | None = None, *, device: torch.device | str 
         return None
     if not path.is_file():
         raise FileNotFoundError(f"the LPIPS weights {path} do not exist. {LPIPS_HINT}")
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load raises a different class for each way a file can be wrong
-        raise ValueError(f"{path} is not a PyTorch file of plain weights: {error}") from error
+    state = load_tensors(path, what="a PyTorch file of plain weights")
     if not isinstance(state, Mapping):
         raise ValueError(f"{path} holds a {type(state).__name__}, expected a state dict. {LPIPS_HINT}")
-    return LPIPS(state, device)
+    for name, x in state.items():
+        if not (isinstance(name, str) and isinstance(x, Tensor) and bool(x.isfinite().all())):
+            raise ValueError(f"{path} must hold finite tensors by name, but {name!r} is none. {LPIPS_HINT}")
+    try:
+        return LPIPS(state, device)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def lpips_option(choice: str | None, *, device: torch.device | str = "cpu") -> LPIPS | None:

@@ -28,6 +28,9 @@ _TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
+_OTHER_LINES = ("ply", "format", "obj_info", "end_header")  # of a header, besides those that are read
+_COMPRESSED = (".spz", ".splat", ".ksplat", ".sog")
+_CONVERT = "its values are rounded; give the PLY that it was made from, or convert it to one first (SuperSplat does)"
 _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -122,7 +125,9 @@ def save_ply(
 def load_ply(path: str | Path) -> PlyModel:
     """Read Gaussians from a 3DGS PLY file: binary of either byte order or ASCII, properties in any order and type.
 
-    Normals and unknown properties are ignored. Spherical harmonics may have any degree from 0 to 3.
+    Normals and unknown properties are ignored. Spherical harmonics may have any degree from 0 to 3. The 3D filter of
+    Mip-Splatting changes scales and opacities, so a file with one is refused rather than drawn without it; compressed
+    files are refused as well.
 
     Args:
         path: the file.
@@ -137,15 +142,23 @@ def load_ply(path: str | Path) -> PlyModel:
     """
     path = Path(path)
     with path.open("rb") as file:
-        layout, count, properties, comments = _read_header(file, path)
+        if path.suffix.lower() in _COMPRESSED:
+            raise ValueError(f"{path} is a compressed format: {_CONVERT}.")
+        header = _read_header(file, path)
+        count, properties = header.count, header.properties
         rest = [f"f_rest_{index}" for index in range(sum(name.startswith("f_rest_") for name in properties))]
         required = (*_MEANS, *_DC, *rest, "opacity", *_SCALES, *_ROTATIONS)
         missing = [name for name in required if name not in properties]
         if missing:
             raise ValueError(f"{path} is not a 3D Gaussian Splatting PLY: its vertices lack {', '.join(missing)}.")
+        if "filter_3D" in properties:
+            raise ValueError(
+                f"{path} has scales and opacities that need its filter_3D (Mip-Splatting): give the fused PLY, which "
+                "create_fused_ply.py of that code base writes."
+            )
         if len(rest) not in (0, 9, 24, 45):
             raise ValueError(f"{path} has {len(rest)} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45.")
-        rows = _read_rows(file, path, layout, count, properties)
+        rows = _read_rows(file, path, header)
 
     def columns(names: tuple[str, ...] | list[str]) -> Tensor:
         table = np.empty((count, len(names)), dtype=np.float32)
@@ -167,7 +180,7 @@ def load_ply(path: str | Path) -> PlyModel:
     bad += ["opacity_logits"] if bool(gaussians.opacity_logits.isnan().any()) else []
     if bad:
         raise ValueError(f"{path} holds values that are not finite in {', '.join(bad)}: remove those Gaussians first.")
-    return PlyModel(gaussians, _opacity_scale(comments, path), _FOR_RENDERING in comments)
+    return PlyModel(gaussians, _opacity_scale(header.comments, path), _FOR_RENDERING in header.comments)
 
 
 def _logits(opacities: Tensor, count: int) -> Tensor:
@@ -188,8 +201,19 @@ def _scaled_logits(logits: Tensor, factor: float) -> Tensor:
     return opaque + math.log(factor) - denominator
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, dict[str, str], list[str]]:
-    """Return the format, the number of vertices, their properties with numpy types, and the comments."""
+@dataclass(frozen=True)
+class _Header:
+    """The format, the number of vertices, their properties with numpy types, comments, and if there is nothing else."""
+
+    layout: str
+    count: int
+    properties: dict[str, str]
+    comments: list[str]
+    alone: bool
+
+
+def _read_header(file: BinaryIO, path: Path) -> _Header:
+    """Read everything up to the first vertex."""
     lines: list[str] = []
     while not lines or lines[-1] != "end_header":
         raw = file.readline(_HEADER_LIMIT)
@@ -208,7 +232,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, dict[str, str], 
                 comments.append(line.removeprefix("comment").strip())
             case ["element", name, number]:
                 elements.append(name)
-                if name == "vertex" and number.isdecimal():
+                if name == "vertex" and number.isdecimal() and len(number) < 19:
                     count = int(number)
             case ["property", kind, name] if elements[-1:] == ["vertex"]:
                 if kind not in _TYPES or name in properties:
@@ -216,15 +240,22 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, dict[str, str], 
                 properties[name] = _TYPES[kind]
             case ["property", "list", *_] if elements[-1:] == ["vertex"]:
                 raise ValueError(f"{path}: vertices with list properties ('{line}') are not Gaussians.")
+            case ["property", *_] if elements[-1:] != ["vertex"]:
+                pass
+            case [keyword, *_] if keyword not in _OTHER_LINES:
+                raise ValueError(f"{path}: the header line '{line[:80]}' is not one of a PLY file.")
+    if "chunk" in elements:
+        raise ValueError(f"{path} is a compressed PLY: {_CONVERT}.")
     if layout not in (*_BYTE_ORDERS, "ascii"):
         raise ValueError(f"{path}: the format must be {', '.join(_BYTE_ORDERS)} or ascii (1.0), got '{layout}'.")
-    if elements[:1] != ["vertex"] or count < 0:
-        raise ValueError(f"{path}: the first element must be 'vertex' with a count, got {elements[:1] or 'none'}.")
-    return layout, count, properties, comments
+    if elements[:1] != ["vertex"] or "vertex" in elements[1:] or count < 0:
+        raise ValueError(f"{path}: the first element must be 'vertex' with a count, got {elements[:8] or 'none'}.")
+    return _Header(layout, count, properties, comments, alone=len(elements) == 1)
 
 
-def _read_rows(file: BinaryIO, path: Path, layout: str, count: int, properties: dict[str, str]) -> NDArray[np.void]:
+def _read_rows(file: BinaryIO, path: Path, header: _Header) -> NDArray[np.void]:
     """Read the vertices as a structured array; the file's size is compared first, so a false count costs nothing."""
+    layout, count, properties = header.layout, header.count, header.properties
     available = os.fstat(file.fileno()).st_size - file.tell()
     binary = layout != "ascii"
     kinds = {name: _BYTE_ORDERS[layout] + kind if binary else "f8" for name, kind in properties.items()}
@@ -235,12 +266,24 @@ def _read_rows(file: BinaryIO, path: Path, layout: str, count: int, properties: 
             f"{path} is cut short: {count} vertices need {needed} bytes after the header, {available} are there."
         )
     if binary:
+        if header.alone and available >= needed + dtype.itemsize:
+            raise ValueError(f"{path} announces {count} vertices, {needed} bytes, but {available} follow the header.")
         return np.frombuffer(file.read(needed), dtype=dtype, count=count)
+    table, line = np.empty((count, len(properties))), b"\n"
     try:
-        rows = [tuple(map(float, file.readline().split())) for _ in range(count)]
-        return np.array(rows, dtype=dtype)
+        for row in table:
+            line = file.readline()
+            words = line.split()
+            if len(words) != len(row):
+                raise ValueError(f"got {len(words)}")
+            row[:] = np.array(words, np.float64)
+        if not line.endswith(b"\n"):
+            raise ValueError("the last line has no end")
     except ValueError as error:
         raise ValueError(f"{path}: the vertex lines do not hold {len(properties)} numbers each: {error}.") from error
+    if header.alone and file.read().strip():
+        raise ValueError(f"{path} announces {count} vertices, but more lines follow them.")
+    return table.view(dtype)[:, 0]
 
 
 def _opacity_scale(comments: list[str], path: Path) -> float:

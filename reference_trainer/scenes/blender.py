@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 
 from reference_trainer.camera import Camera
+from reference_trainer.json_files import read_json
 from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.images import IMAGE_SUFFIXES, image_size, path_inside
 
@@ -40,12 +40,14 @@ def read_transforms(path: str | Path) -> list[Frame]:
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         entries = content["frames"]
+        if not isinstance(entries, list):
+            raise TypeError(f"frames must be a list, got a {type(entries).__name__}")
         frames = [_frame(path, content, entry) for entry in entries]
     except FileNotFoundError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, OSError) as error:
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{path} is not a valid transforms file: {reason}") from error
     if len({frame.name for frame in frames}) != len(frames):
@@ -56,6 +58,8 @@ def read_transforms(path: str | Path) -> list[Frame]:
 def _frame(path: Path, content: dict[str, Any], entry: dict[str, Any]) -> Frame:
     """Build one frame from its entry."""
     file = path_inside(path.parent, entry["file_path"])
+    if file == path.parent:
+        raise ValueError(f"file_path {entry['file_path']!r} names the scene folder itself, not an image.")
     if file.suffix.lower() not in IMAGE_SUFFIXES:
         file = file.with_name(file.name + ".png")
     width, height = (int(content["w"]), int(content["h"])) if "w" in content else image_size(file)
@@ -75,6 +79,9 @@ def _frame(path: Path, content: dict[str, Any], entry: dict[str, Any]) -> Frame:
         width=width,
         height=height,
     )
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    if not all(map(math.isfinite, intrinsics)):
+        raise ValueError(f"focal lengths and principal point must be finite, got fx, fy, cx, cy = {intrinsics}.")
     name = file.relative_to(path.parent).with_suffix("").as_posix()
     return Frame(name, file, camera)
 

@@ -49,6 +49,14 @@ class _Cursor:
         self.at += count * dtype.itemsize
         return values
 
+    def finish(self) -> None:
+        """Refuse what is left: a count that is too small would otherwise pass for a smaller scene."""
+        if self.at != len(self.data):
+            raise ValueError(
+                f"{self.path} is damaged or not a COLMAP file: {len(self.data) - self.at} bytes are left after the "
+                "announced number of records."
+            )
+
     def text(self, what: str) -> str:
         end = self.data.find(b"\0", self.at)
         if end < 0:
@@ -67,7 +75,10 @@ def read_cameras_binary(path: Path) -> dict[int, ColmapCamera]:
             raise ValueError(f"{path}: camera {number} has the unknown camera model {model_id}.")
         model = CAMERA_MODELS[model_id]
         parameters = cursor.take(f"{model.parameters}d", "the parameters of a camera")
+        if number in cameras:
+            raise ValueError(f"{path} has camera {number} twice.")
         cameras[number] = ColmapCamera(number, model, width, height, parameters)
+    cursor.finish()
     return cameras
 
 
@@ -82,6 +93,7 @@ def read_images_binary(path: Path) -> list[ColmapImage]:
         matrix = ColmapImage.pose(tuple(pose[:4]), tuple(pose[4:]))
         xy, points = keypoints["xy"].astype(np.float64), keypoints["point"].astype(np.int64)
         images.append(ColmapImage(int(number), name, int(camera_id), matrix, xy, points))
+    cursor.finish()
     return images
 
 
@@ -96,6 +108,7 @@ def read_points_binary(path: Path) -> ColmapPoints:
         colors.append((red, green, blue))
         track = cursor.array(_TRACK, cursor.count(_TRACK.itemsize, "track elements"), "a track")
         tracks.append(track["image"].astype(np.int64))
+    cursor.finish()
     return ColmapPoints(
         np.array(ids, np.int64).reshape(-1),
         np.array(positions, np.float64).reshape(-1, 3),

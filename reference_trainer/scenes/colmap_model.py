@@ -144,6 +144,9 @@ class ColmapImage:
         world_to_camera: its pose, shape (4, 4), float64.
         keypoints: its 2D features, pixels, shape (K, 2), float64.
         point_ids: number of the 3D point of each feature, -1 for none, shape (K,), int64.
+
+    Raises:
+        ValueError: if a feature has no finite position.
     """
 
     id: int
@@ -153,6 +156,10 @@ class ColmapImage:
     keypoints: NDArray[np.float64]
     point_ids: NDArray[np.int64]
 
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.keypoints).all():
+            raise ValueError(f"image {self.id} ({self.name!r}) has features without a finite position.")
+
     @staticmethod
     def pose(qvec: tuple[float, ...], tvec: tuple[float, ...]) -> NDArray[np.float64]:
         """Build the view matrix (4, 4) from COLMAP's quaternion, wxyz, and translation.
@@ -161,8 +168,9 @@ class ColmapImage:
             ValueError: if they are not finite, or the quaternion is zero.
         """
         q = np.array(qvec)
-        norm = np.linalg.norm(q)
-        if not (np.isfinite(q).all() and np.isfinite(tvec).all() and norm > 0):
+        with np.errstate(over="ignore"):  # becomes infinite, which is refused
+            norm = np.linalg.norm(q)
+        if not (np.isfinite(tvec).all() and 0 < norm < np.inf):
             raise ValueError(f"the pose must be a finite non-zero quaternion and translation, got {qvec} and {tvec}.")
         w, x, y, z = q / norm
         matrix = np.eye(4)
@@ -211,7 +219,7 @@ class ColmapModel:
         points: the points; there may be none.
 
     Raises:
-        ValueError: if an image has a camera that is not there, or two images have one name.
+        ValueError: if an image has a camera that is not there, or two images have one name or number.
     """
 
     cameras: dict[int, ColmapCamera]
@@ -226,6 +234,8 @@ class ColmapModel:
                 )
         if len({image.name for image in self.images}) != len(self.images):
             raise ValueError("two images have the same name.")
+        if len({image.id for image in self.images}) != len(self.images):
+            raise ValueError("two images have the same number.")
 
     def seen_by(self) -> frozenset[str]:
         """Return the names of the images that the points come from.

@@ -15,6 +15,7 @@ from torch import Tensor
 __all__ = ["composite", "image_size", "list_images", "match_images", "path_inside", "read_image", "resize_image"]
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
+LARGEST_IMAGE = 100_000_000  # pixels: a few bytes can announce any number, and each takes 16 bytes of memory
 
 
 def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
@@ -32,12 +33,20 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is not an image, is damaged, or has more than 8 bits per channel.
+        ValueError: if the file is not an image, is damaged, has more than 8 bits per channel or more than 100 million
+            pixels.
     """
     with _opened(path) as file:
-        if file.mode.startswith(("I", "F")):
-            raise ValueError(f"{path} has pixel mode {file.mode}; convert it to 8 bits per channel first.")
-        has_alpha = file.mode in ("RGBA", "LA", "PA") or "transparency" in file.info
+        mode, width, height = file.mode, file.width, file.height
+        file.verify()  # compares a PNG's checksums, which decoding does not
+    if mode.startswith(("I", "F")):
+        raise ValueError(f"{path} has pixel mode {mode}; convert it to 8 bits per channel first.")
+    if width * height > LARGEST_IMAGE:
+        raise ValueError(f"{path} has {width}x{height} pixels, more than {LARGEST_IMAGE}; make it smaller first.")
+    with _opened(path) as file:
+        if file.format == "TIFF":
+            _check_strips(file)
+        has_alpha = mode in ("RGBA", "LA", "PA") or "transparency" in file.info
         pixels = np.array(file.convert("RGBA" if has_alpha else "RGB"))
     channels = torch.from_numpy(pixels).permute(2, 0, 1).to(torch.float32) / 255
     return channels[:3].contiguous(), channels[3].contiguous() if has_alpha else None
@@ -64,8 +73,16 @@ def _opened(path: str | Path) -> Iterator[Any]:
     try:
         with Image.open(path) as file:
             yield file
-    except (OSError, SyntaxError, EOFError) as error:  # Pillow's UnidentifiedImageError is an OSError
+    except Exception as error:  # each of Pillow's decoders has its own
         raise ValueError(f"{path} is not a readable image: {error}") from error
+
+
+def _check_strips(file: Any) -> None:
+    """Refuse a TIFF whose strips do not fill it: it would come out black there."""
+    extents = [tile[1] or (0, 0, *file.size) for tile in file.tile]
+    filled = sum((right - left) * (bottom - top) for left, top, right, bottom in extents)
+    if filled < file.width * file.height:
+        raise ValueError(f"it holds {filled} of its {file.width}x{file.height} pixels")
 
 
 def composite(image: Tensor, alpha: Tensor, background: Tensor) -> Tensor:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.lib import format as npy
+from numpy.typing import NDArray
 
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.frames import Frame
@@ -35,28 +38,51 @@ def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.")
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{path} is not a NumPy array of numbers: {error}") from error
-    if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows.astype(np.float64)).all():
-        raise ValueError(f"{path} must hold finite numbers of shape (N, 17), got shape {rows.shape}.")
+    rows = _rows(path)
     files = list_images(folder)
     if len(files) != len(rows):
         raise ValueError(f"{path} has {len(rows)} poses but {folder} has {len(files)} images; each needs one.")
     frames = []
-    for file, row in zip(files, rows.astype(np.float64), strict=True):
-        matrix = row[:15].reshape(3, 5)
-        height, width, focal = matrix[:, 4].tolist()
-        down, right, back = matrix[:, 0], matrix[:, 1], matrix[:, 2]
-        rotation = np.stack([right, down, -back])  # rows: the OpenCV axes in world coordinates
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-            raise ValueError(f"{path}: the pose of {file.name} is not a rotation: {matrix[:, :3].tolist()}.")
-        pose = np.eye(4)
-        pose[:3, :3] = rotation
-        pose[:3, 3] = -rotation @ matrix[:, 3]
-        camera = Camera(
-            torch.from_numpy(pose), focal, focal, width / 2, height / 2, width=round(width), height=round(height)
-        )
-        frames.append(Frame(file.name, file, camera, bounds=(float(row[15]), float(row[16]))))
+    for file, row in zip(files, rows, strict=True):
+        try:
+            frames.append(Frame(file.name, file, _camera(row), bounds=(float(row[15]), float(row[16]))))
+        except ValueError as error:
+            raise ValueError(f"{path}: the row of {file.name} is no camera: {error}") from error
     return frames
+
+
+def _rows(path: Path) -> NDArray[np.float64]:
+    """Read the array; its announced size is compared with the file's before anything is allocated for it."""
+    file = io.BytesIO(path.read_bytes())  # reading from the file itself would allocate whatever length the header has
+    try:
+        version = npy.read_magic(file)
+        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, columns_first, dtype = read_header(file)
+    except Exception as error:  # numpy evaluates the header as Python literals, with as many kinds of errors
+        raise ValueError(f"{path} is not a NumPy array of numbers: {error}") from error
+    data = file.read()
+    if len(shape) != 2 or shape[1] != 17 or dtype.kind not in "fiu":
+        raise ValueError(f"{path} must hold finite numbers of shape (N, 17), got shape {shape} of {dtype}.")
+    if len(data) != shape[0] * 17 * dtype.itemsize:
+        raise ValueError(f"{path} is damaged: {shape[0]} rows of 17 {dtype} do not make {len(data)} bytes.")
+    with np.errstate(over="ignore"):  # becomes infinite, which is reported
+        rows = np.frombuffer(data, dtype).reshape(shape, order="F" if columns_first else "C").astype(np.float64)
+    if not np.isfinite(rows).all():
+        raise ValueError(f"{path} must hold finite numbers; some of its {rows.size} are not.")
+    return rows
+
+
+def _camera(row: NDArray[np.float64]) -> Camera:
+    """Build the camera of one row."""
+    matrix = row[:15].reshape(3, 5)
+    height, width, focal = matrix[:, 4].tolist()
+    down, right, back = matrix[:, 0], matrix[:, 1], matrix[:, 2]
+    rotation = np.stack([right, down, -back])  # rows: the OpenCV axes in world coordinates
+    with np.errstate(all="ignore"):
+        is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+    if not is_rotation:
+        raise ValueError(f"its pose is not a rotation: {matrix[:, :3].tolist()}.")
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ matrix[:, 3]
+    return Camera(torch.from_numpy(pose), focal, focal, width / 2, height / 2, width=round(width), height=round(height))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+
+from reference_trainer.json_files import read_json
 
 __all__ = ["blender_split", "evenly_spaced", "file_split", "llff_split"]
 
@@ -108,13 +109,13 @@ def file_split(path: str | Path, names: Sequence[str], views: int | None) -> tup
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no split file {path}.")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is not valid JSON: {error}") from error
+    content = read_json(path)
     lists = (
         {key: value for key, value in content.items() if isinstance(value, list)} if isinstance(content, dict) else {}
     )
+    for key, value in lists.items():
+        if key.startswith(("train", "test")) and not all(isinstance(name, str) for name in value):
+            raise ValueError(f"{path}: the list {key!r} must hold names of images, strings.")
     train = _training_list(path, lists, views)
     if "test" not in lists:
         raise ValueError(f"{path} has no list 'test'; it has {sorted(lists)}.")

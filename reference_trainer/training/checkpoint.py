@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from reference_trainer.files import replacing
+from reference_trainer.tensor_files import load_tensors
 
 __all__ = ["load_checkpoint", "save_checkpoint"]
 
@@ -34,10 +35,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     """
     if not path.is_file():
         raise FileNotFoundError(f"there is no checkpoint at {path}: train first, or give the path of a checkpoint.pt.")
-    try:
-        state = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # torch.load raises many types for damaged files
-        raise ValueError(f"{path} is not a readable checkpoint ({type(error).__name__}: {error}).") from error
+    state = load_tensors(path, device, what="a readable checkpoint")
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
         raise ValueError(f"{path} is not a checkpoint of this program (expected format {_FORMAT!r}).")
     return state

@@ -220,6 +220,29 @@ def test_damaged_files(tmp_path, content, message):
         load_ply(path)
 
 
+@pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.KSPLAT", "a.sog"])
+def test_compressed_formats_say_what_to_do(tmp_path, name):
+    (tmp_path / name).write_bytes(b"\x1f\x8b anything")
+    with pytest.raises(ValueError, match=r"is a compressed format.*give the PLY that it was made from"):
+        load_ply(tmp_path / name)
+
+
+def test_a_compressed_ply_says_what_to_do(tmp_path):
+    lines = ["ply", "format binary_little_endian 1.0", "element chunk 1", "property float min_x"]
+    lines += ["element vertex 1", "property uint packed_position", "end_header", ""]
+    (tmp_path / "a.compressed.ply").write_bytes("\n".join(lines).encode() + bytes(8))
+    with pytest.raises(ValueError, match=r"is a compressed PLY.*give the PLY that it was made from"):
+        load_ply(tmp_path / "a.compressed.ply")
+
+
+def test_a_model_that_needs_a_filter_is_not_drawn_without_it(tmp_path):
+    lines = ["ply", "format ascii 1.0", "element vertex 1"]
+    lines += [f"property float {name}" for name in [*BASE, "filter_3D"]]
+    (tmp_path / "mip.ply").write_text("\n".join([*lines, "end_header", " ".join(["0"] * 15), ""]))
+    with pytest.raises(ValueError, match=r"filter_3D \(Mip-Splatting\): give the fused PLY"):
+        load_ply(tmp_path / "mip.ply")
+
+
 def test_a_cut_anywhere_is_an_error(tmp_path):
     save_ply(make(3, 1), tmp_path / "a.ply")
     content = (tmp_path / "a.ply").read_bytes()

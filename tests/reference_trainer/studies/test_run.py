@@ -15,6 +15,7 @@ from reference_trainer.studies.run import (
     BAKED_PLY,
     CHECKPOINT,
     CONFIG,
+    PLAN,
     PLY,
     RESULTS,
     load_run,
@@ -24,6 +25,7 @@ from reference_trainer.studies.run import (
 )
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.plan import Plan
 from reference_trainer.training.trainer import Trainer, TrainingStoppedError
 
 EVERY = {"monitor_every": 3, "checkpoint_every": 4}
@@ -234,3 +236,39 @@ def test_summary(finished):
     psnr = finished[1]["mean"]["test"]["psnr"]
     assert f"{psnr:.4g}" in lines[2]
     assert "n/a" in lines[2]  # no perceptual metric
+
+
+def test_auto_trains_by_the_plan_and_keeps_it(options, short, tmp_path):
+    said: list[str] = []
+    results = run_experiment(options, short, tmp_path, **EVERY, auto=True, say=said.append)
+    stored = Plan.from_dict(json.loads((tmp_path / PLAN).read_text()))
+    assert stored.applied(short) == dataclasses.replace(short, sh_degree=2)
+    assert results["config"] == json.loads((tmp_path / CONFIG).read_text())["config"]
+    assert results["config"]["sh_degree"] == 2
+    assert load_run(tmp_path).gaussians.sh_degree == 2
+    assert any(line.startswith("plan: SH bands reduced (sh_degree=2): ") for line in said)
+
+    with pytest.raises(ValueError, match=r"sh_degree: 2 -> 3"):
+        run_experiment(options, short, tmp_path, **EVERY)
+    with pytest.raises(ValueError, match=r"sh_degree: 2 -> 3"):
+        run_experiment(options, short, tmp_path, **EVERY, auto=True, given=["sh_degree"])
+
+
+def test_an_interrupted_run_continues_with_its_own_plan(options, short, monkeypatch, tmp_path):
+    """Even if the rules have changed since."""
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "evaluate", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run_experiment(options, short, tmp_path, **EVERY, auto=True)
+    monkeypatch.setattr(run_module, "make_plan", lambda *a, **k: pytest.fail("planned again"))
+    assert run_experiment(options, short, tmp_path, **EVERY, auto=True)["config"]["sh_degree"] == 2
+
+
+def test_a_run_that_began_without_a_plan_goes_on_without(finished, options, short):
+    out, results = finished
+    assert not (out / PLAN).exists()
+    assert run_experiment(options, short, out, **EVERY, auto=True) == results
+
+
+def test_what_is_given_is_trained(options, short, tmp_path):
+    assert run_experiment(options, short, tmp_path, **EVERY, auto=True, given=["sh_degree"])["config"]["sh_degree"] == 3

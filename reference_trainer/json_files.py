@@ -1,0 +1,80 @@
+"""Reading JSON files that somebody else may have written, and settings out of them."""
+
+from __future__ import annotations
+
+import json
+from inspect import formatannotation
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+__all__ = ["read_json", "settings_from"]
+
+T = TypeVar("T")
+
+
+def read_json(path: str | Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        ValueError: if it is not JSON in UTF-8, or nested too deeply; the message names the file.
+        OSError: if it cannot be read.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(folder, "split.json").write_text('{"test": ["a.png"]}')
+        ...     read_json(f"{folder}/split.json")
+        {'test': ['a.png']}
+    """
+    path = Path(path)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not valid JSON: {error}") from error
+
+
+def settings_from(kind: type[T], values: Any, where: str) -> T:
+    """Make a dataclass of plain fields from a JSON object; fields that it lacks get their defaults.
+
+    Args:
+        kind: a dataclass whose fields are numbers, strings, booleans or None, or a choice of strings.
+        values: what was read.
+        where: what to call it in errors: a file, and a place in it.
+
+    Raises:
+        ValueError: if it is no object, has a field that there is not, a value of another type, or one that ``kind``
+            refuses.
+
+    Example:
+        >>> from reference_trainer.training.config import TrainConfig
+        >>> settings_from(TrainConfig, {"dropout": 0.2}, "config.json").dropout
+        0.2
+        >>> settings_from(TrainConfig, {"iterations": "many"}, "config.json")
+        Traceback (most recent call last):
+        ...
+        ValueError: config.json: iterations must be int, got 'many'.
+    """
+    if not isinstance(values, dict):
+        raise ValueError(f"{where} must be an object, got {values!r:.80}.")
+    hints = get_type_hints(kind)
+    unknown = sorted(values.keys() - hints.keys())
+    if unknown:
+        raise ValueError(f"{where} has unknown settings {unknown[:8]}; another version may have written it.")
+    for name, value in values.items():
+        if not _allows(hints[name], value):
+            raise ValueError(f"{where}: {name} must be {formatannotation(hints[name])}, got {value!r:.80}.")
+        if type(value) is int and value.bit_length() > 63:
+            raise ValueError(f"{where}: {name} must fit into 64 bits.")
+    try:
+        return kind(**values)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def _allows(hint: Any, value: Any) -> bool:
+    """Whether a value read from JSON is of the type of a field: a class, a union of them, or a choice of strings."""
+    if get_origin(hint) is Literal:
+        return type(value) is str and value in get_args(hint)
+    if get_args(hint):
+        return any(_allows(option, value) for option in get_args(hint))
+    return type(value) is hint or (type(value) is int and hint is float)  # a bool is no number here

@@ -1,0 +1,113 @@
+"""Reading files of ``torch.save`` without trusting them."""
+
+from __future__ import annotations
+
+import io
+import pickletools
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["load_tensors"]
+
+_STORAGES = ("Bool", "Byte", "Char", "Short", "Int", "Long", "Half", "BFloat16", "Float", "Double")
+# torch's own list for weights_only has bytearray and Tensor as well, which take any amount of memory from a few bytes.
+_ALLOWED = {
+    "collections OrderedDict",
+    "torch._utils _rebuild_parameter",
+    "torch._utils _rebuild_tensor_v2",
+    *(f"torch {kind}Storage" for kind in _STORAGES),
+}
+_PICKLES_OF_OLD_FILES = 5  # magic number, version, platform, content, names of the storages
+
+
+def load_tensors(path: str | Path, device: torch.device | str = "cpu", *, what: str = "a file of tensors") -> Any:
+    """Read tensors, numbers and strings in nested dicts and lists; no code in the file is executed.
+
+    Beyond what ``torch.load(weights_only=True)`` does, the checksums are compared, so that a damaged file is refused
+    and not read as other numbers, and nothing is read that would take more memory than the file has bytes. Files from
+    before PyTorch 1.6 have no checksums; they are read, too.
+
+    Args:
+        path: the file.
+        device: where the tensors go.
+        what: what the file should be, for the error.
+
+    Raises:
+        ValueError: if the file is damaged, or holds anything else.
+        OSError: if it cannot be read.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     torch.save({"step": 3, "x": torch.zeros(2)}, f"{folder}/state.pt")
+        ...     load_tensors(f"{folder}/state.pt")
+        {'step': 3, 'x': tensor([0., 0.])}
+    """
+    path = Path(path)
+    data = io.BytesIO(path.read_bytes())
+    try:
+        if data.getvalue().startswith(b"PK\x03\x04"):
+            data = _checked_archive(data)
+        else:
+            _check_old_file(data)
+        state = torch.load(data, map_location=device, weights_only=True)
+        _check_tensors(state)
+    except Exception as error:  # zipfile, pickletools and torch raise many types for damaged files
+        reason = str(error).partition("\n")[0]  # torch goes on with advice to load the file without this safety
+        raise ValueError(f"{path} is not {what} ({type(error).__name__}: {reason}).") from error
+    return state
+
+
+def _checked_archive(data: io.BytesIO) -> io.BytesIO:
+    """Return the archive anew, its checksums compared, so that torch finds in it what was checked here.
+
+    A damaged attribute of a record makes torch take it for a folder, and return a tensor of memory that nobody wrote.
+    """
+    clean = io.BytesIO()
+    with zipfile.ZipFile(data) as archive, zipfile.ZipFile(clean, "w") as copy:
+        names = archive.namelist()
+        if len(set(names)) != len(names):
+            raise ValueError("two of its records have one name")
+        for record in archive.infolist():
+            if record.compress_type != zipfile.ZIP_STORED:
+                raise ValueError(f"its record {record.filename} is compressed, which torch.save does not do")
+            content = archive.read(record)
+            if record.filename.endswith(".pkl"):
+                _check_pickle(io.BytesIO(content))
+            copy.writestr(record.filename, content)
+    clean.seek(0)
+    return clean
+
+
+def _check_old_file(data: io.BytesIO) -> None:
+    """Refuse a file in the format before PyTorch 1.6 that names something else or asks for more than it has."""
+    size = len(data.getbuffer())
+    for part in range(_PICKLES_OF_OLD_FILES):
+        _check_pickle(data, largest=size if part == 3 else None)
+    data.seek(0)
+
+
+def _check_pickle(file: IO[bytes], largest: int | None = None) -> None:
+    """Refuse a pickle that names anything but tensors, or a size above the largest."""
+    for opcode, argument, _ in pickletools.genops(file):
+        if opcode.name == "STACK_GLOBAL" or (opcode.name == "GLOBAL" and argument not in _ALLOWED):
+            raise ValueError(f"it holds {argument or 'an object'}, not only tensors, numbers and strings")
+        if largest is not None and isinstance(argument, int) and argument > largest:
+            raise ValueError(f"it announces {argument} numbers in {largest} bytes")
+
+
+def _check_tensors(state: Any) -> None:
+    """Refuse tensors that repeat their storage: a few bytes could stand for any size."""
+    pending, seen = [state], set[int]()
+    while pending:
+        x = pending.pop()
+        if isinstance(x, Tensor) and x.numel() * x.element_size() > x.untyped_storage().nbytes():
+            raise ValueError(f"a tensor of shape {tuple(x.shape)} has {x.untyped_storage().nbytes()} bytes")
+        if isinstance(x, Mapping | list | tuple) and id(x) not in seen:
+            seen.add(id(x))
+            pending.extend(x.values() if isinstance(x, Mapping) else x)

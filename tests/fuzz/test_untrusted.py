@@ -1,0 +1,136 @@
+"""Files that want more than to be read: to execute code, to take memory, to reach out of the scene folder."""
+
+import json
+import os
+import pickle
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from fuzz import samples
+
+from reference_trainer.evaluation.lpips import load_lpips
+from reference_trainer.scenes.blender import read_transforms
+from reference_trainer.scenes.colmap import colmap_frames, read_colmap
+from reference_trainer.scenes.llff import read_llff
+from reference_trainer.scenes.load import load_scene
+from reference_trainer.training.checkpoint import load_checkpoint
+
+ESCAPES = ["../../etc/passwd", "/etc/passwd", "..", "images/../../secret.png", "./../secret.png", "a/../../../b.png"]
+READERS = {
+    "checkpoint.pt": lambda folder: load_checkpoint(folder / "checkpoint.pt"),
+    "lpips.pth": lambda folder: load_lpips(folder / "lpips.pth"),
+    "poses_bounds.npy": lambda folder: read_llff(folder / "poses_bounds.npy", folder / "images"),
+}
+
+
+class Call:
+    """What a pickle makes of it: the result of calling a function."""
+
+    def __init__(self, function, *arguments):
+        self.function, self.arguments = function, arguments
+
+    def __reduce__(self):
+        return self.function, self.arguments
+
+
+def write_pickle(path, content, form):
+    """Store a malicious object in one of the ways in which PyTorch and NumPy store objects."""
+    if form == "archive":
+        torch.save(content, path)
+    elif form == "old":
+        torch.save(content, path, _use_new_zipfile_serialization=False)
+    elif form == "pickle":
+        path.write_bytes(pickle.dumps(content, protocol=2))
+    elif form == "npy":
+        with path.open("wb") as file:  # with a name, numpy would append .npy
+            np.save(file, np.array([content], object), allow_pickle=True)
+    else:
+        with path.open("wb") as file:
+            np.savez(file, x=np.array([content], object))
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("form", ["archive", "old", "pickle", "npy", "npz"])
+@pytest.mark.parametrize("depth", [0, 1])
+def test_nothing_is_executed(tmp_path, name, form, depth):
+    target = tmp_path / "executed"
+    evil = Call(os.mkdir, str(target))
+    write_pickle(tmp_path / name, {"format": "ca_reg-checkpoint-1", "step": evil} if depth else evil, form)
+    with pytest.raises(ValueError, match=name.replace(".", r"\.")):
+        READERS[name](tmp_path)
+    assert not target.exists()
+
+
+def test_the_test_above_would_see_an_execution(tmp_path):
+    write_pickle(tmp_path / "evil.pt", Call(os.mkdir, str(tmp_path / "executed")), "archive")
+    torch.load(tmp_path / "evil.pt", weights_only=False)
+    assert (tmp_path / "executed").is_dir()
+
+
+@pytest.mark.parametrize("name", ["checkpoint.pt", "lpips.pth"])
+@pytest.mark.parametrize("function", [bytearray, torch.Tensor, torch.UntypedStorage])
+def test_a_few_bytes_do_not_take_a_gigabyte(tmp_path, name, function):
+    # All three are on the list of what torch.load(weights_only=True) calls.
+    samples.write_checkpoint(tmp_path)
+    with zipfile.ZipFile(tmp_path / "checkpoint.pt") as good, zipfile.ZipFile(tmp_path / "evil.pt", "w") as evil:
+        for item in good.namelist():
+            content = pickle.dumps({"x": Call(function, 10**9)}, protocol=2)
+            evil.writestr(item, content if item.endswith("data.pkl") else good.read(item))
+    (tmp_path / "evil.pt").replace(tmp_path / name)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="not only tensors, numbers and strings"):
+        READERS[name](tmp_path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1_000_000
+
+
+@pytest.mark.parametrize("name", ESCAPES)
+def test_colmap_names_stay_in_the_image_folder(tmp_path, name):
+    samples.write_colmap_text(tmp_path)
+    samples.write_llff(tmp_path)  # its pictures
+    (tmp_path / "secret.png").write_bytes((tmp_path / "images" / "r_1.png").read_bytes())
+    file = tmp_path / "images.txt"
+    file.write_text(file.read_text().replace("r_1.png", name))
+    with pytest.raises(ValueError, match="leads out of the scene folder"):
+        colmap_frames(read_colmap(tmp_path), tmp_path / "images")
+
+
+@pytest.mark.parametrize("name", [*ESCAPES, ".", "", "train/.."])
+def test_transforms_stay_in_the_scene_folder(tmp_path, name):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    samples.write_blender(folder)
+    for outside in ("scene.png", "secret.png"):  # they would be found
+        (tmp_path / outside).write_bytes((folder / "train" / "r_1.png").read_bytes())
+    file = folder / "transforms.json"
+    content = json.loads(file.read_text())
+    content["frames"][1]["file_path"] = name
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"transforms\.json.*(leads out of the scene folder|the scene folder itself)"):
+        read_transforms(file)
+
+
+@pytest.mark.parametrize("points", ["../points.ply", "/etc/points.ply", "sparse/../../0"])
+def test_points_stay_in_the_scene_folder(tmp_path, points):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    samples.write_llff(folder)
+    samples.write_points(tmp_path)
+    with pytest.raises(ValueError, match="leads out of the scene folder"):
+        load_scene(folder, points=points, views=1)
+
+
+def test_links_that_the_user_made_are_followed(tmp_path):
+    store, scene = tmp_path / "store", tmp_path / "scene"
+    store.mkdir()
+    scene.mkdir()
+    samples.write_blender(store)
+    (scene / "train").symlink_to(store / "train", target_is_directory=True)
+    (scene / "transforms.json").symlink_to(store / "transforms.json")
+    (tmp_path / "linked").symlink_to(scene, target_is_directory=True)
+    frames = read_transforms(tmp_path / "linked" / "transforms.json")
+    assert [frame.name for frame in frames] == ["train/r_0", "train/r_1", "train/r_2"]
