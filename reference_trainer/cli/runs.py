@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
+from reference_trainer.studies.engines.choice import EngineName
 from reference_trainer.training.config import PRESETS, TrainConfig
 
 __all__ = ["Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
@@ -53,7 +55,9 @@ class Demo:
         """Run the command."""
         from reference_trainer.studies.demo import demo
 
-        demo(self.out, iterations=self.iterations, seeds=range(self.seeds), jobs=self.jobs, say=print)
+        done = demo(self.out, iterations=self.iterations, seeds=range(self.seeds), jobs=self.jobs, say=print)
+        if done.failures:
+            sys.exit(1)
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,8 @@ class Train:
     given: Given = frozenset()
     device: str = "cpu"
     """"cpu" or "cuda"."""
+    compile: bool = False
+    """Compile the exact moments (of analytic training): half a minute at first, then twice as fast."""
     monitor_every: int = 500
     """Steps between measurements of CA and PSNR for TensorBoard; 0 for none."""
     lpips: str | None = None
@@ -82,8 +88,10 @@ class Train:
 
     def __call__(self) -> None:
         """Run the command."""
+        from reference_trainer.render.compiled import use_compiled
         from reference_trainer.studies.run import run_experiment, summary
 
+        use_compiled(self.compile)
         results = run_experiment(
             self.scene,
             self.config,
@@ -222,15 +230,25 @@ class Render:
 
 
 @dataclass(frozen=True)
-class Compare:
-    """Train baseline, dropout, noise and both on a scene with several seeds; one table with mean and spread.
+class EveryScene(SceneOptions):
+    """The options that hold for every scene of a comparison."""
 
-    Finished runs are kept: the same command continues an interrupted comparison, or adds seeds.
+    path: Annotated[str, tyro.conf.Suppress] = "synthetic"  # each scene has its own
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Train baseline, dropout, noise and both on scenes with several seeds; one table per scene with mean and spread.
+
+    Finished runs are kept: the same command continues an interrupted comparison, or adds seeds. A run that fails is
+    reported at the end and does not stop the others; the exit code is then 1.
     """
 
     out: Path
-    """Folder of the comparison; each run has a folder <strategy>/seed_<k> in it."""
-    scene: Scene = field(default_factory=SceneOptions)
+    """Folder of the comparison; each run has a folder <strategy>/seed_<k> in it, below <scene> if there are several."""
+    path: tuple[str, ...] = ("synthetic",)
+    """Scene folders (COLMAP, LLFF or Blender files), or "synthetic"; the other options hold for all of them."""
+    scene: Annotated[EveryScene, tyro.conf.arg(name="")] = field(default_factory=EveryScene)
     config: Config = field(default_factory=lambda: PRESETS["fsgs"])
     preset: Literal["fsgs", "inria", "binocular"] = "fsgs"
     """Schedule of a published code base; other options override it."""
@@ -239,17 +257,29 @@ class Compare:
     seeds: int = 3
     """Number of seeds."""
     jobs: int = 1
-    """Runs at a time, each in its own process with its share of the processors."""
+    """Runs at a time, each in its own process with its share of the processors (of the whole cluster, on Ray)."""
+    engine: EngineName = "auto"
+    """"processes" of this machine, or "ray" (needs ca_reg[ray]); "auto" is Ray if there is an address."""
+    address: str | None = None
+    """A running Ray cluster, "host:6379" or "auto", instead of one on this machine; by default $RAY_ADDRESS. --out
+    and the scenes must be on a file system that its machines share."""
+    retries: int = 3
+    """How many dead workers of one run are replaced; each continues from the last checkpoint."""
     device: str = "cpu"
     """"cpu" or "cuda"."""
     monitor_every: int = 500
     """Steps between measurements of CA and PSNR; 0 for none."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints: what a dead worker costs at most."""
     lpips: str | None = None
     """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.studies.compare import compare, report, strategies
+        from reference_trainer.studies.compare import compare, scene_folders, strategies
+        from reference_trainer.studies.compare_report import report
+        from reference_trainer.studies.engines.choice import choose_engine
+        from reference_trainer.studies.grid import Running
 
         config = replace(self.config, dropout=0.0, noise=0.0, analytic=False, ca_weight=0.0, scale_noise=False)
         every = strategies(
@@ -259,15 +289,16 @@ class Compare:
             scale_noise=self.config.scale_noise,
         )
         chosen: dict[str, TrainConfig] = {name: every[name] for name in self.strategies}
-        comparison = compare(
-            self.scene,
-            chosen,
-            range(self.seeds),
-            self.out,
-            jobs=self.jobs,
+        running = Running(
+            choose_engine(self.engine, jobs=self.jobs, address=self.address, device=self.device),
+            retries=self.retries,
             device=self.device,
             monitor_every=self.monitor_every,
+            checkpoint_every=self.checkpoint_every,
             lpips=self.lpips,
             say=print,
         )
-        report(comparison, self.out, say=print)
+        comparisons = compare(scene_folders(self.path, self.scene, self.out), chosen, range(self.seeds), running)
+        report(comparisons, say=print)
+        if any(comparison.failures for comparison in comparisons.values()):
+            sys.exit(1)

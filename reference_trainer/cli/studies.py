@@ -43,6 +43,8 @@ class ErrorRuntime:
     """Largest number of renders."""
     seeds: int = 3
     """Independent sequences of masks."""
+    compile: bool = False
+    """Measure the moments compiled, too."""
     device: str = "cpu"
     """"cpu" or "cuda"."""
 
@@ -51,7 +53,13 @@ class ErrorRuntime:
         from reference_trainer.studies.error_runtime_study import study_error_runtime
 
         study_error_runtime(
-            self.sources, self.out, max_samples=self.max_samples, seeds=self.seeds, device=self.device, say=print
+            self.sources,
+            self.out,
+            max_samples=self.max_samples,
+            seeds=self.seeds,
+            compiled=self.compile,
+            device=self.device,
+            say=print,
         )
 
 

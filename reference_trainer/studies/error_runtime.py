@@ -15,11 +15,13 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.model import Model
+from reference_trainer.render.compiled import use_compiled
 from reference_trainer.render.first_order import first_order_map
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.timing import in_turns, now
 
 __all__ = [
+    "COMPILED",
     "DOUBLE",
     "ERRORS",
     "FIRST_ORDER",
@@ -34,6 +36,7 @@ __all__ = [
 MONTE_CARLO = "Monte Carlo"
 FIRST_ORDER = "first order"
 SINGLE = "exact float32"
+COMPILED = "exact float32, compiled"
 DOUBLE = "exact float64"
 
 Error = Literal["score", "map"]
@@ -147,7 +150,13 @@ class ErrorRuntime:
 
 @torch.no_grad()
 def error_runtime(
-    model: Model, view: View, *, max_samples: int = 1024, seeds: int = 3, progress: Callable[[str], None] | None = None
+    model: Model,
+    view: View,
+    *,
+    max_samples: int = 1024,
+    seeds: int = 3,
+    compiled: bool = False,
+    progress: Callable[[str], None] | None = None,
 ) -> ErrorRuntime:
     """Measure error and wall-clock time of all estimators of the co-adaptation of one view at a drop rate of 1/2.
 
@@ -165,6 +174,7 @@ def error_runtime(
         view: what to render; only its name and camera matter.
         max_samples: largest K, a power of two, at least 16.
         seeds: number of Monte Carlo runs, at least 1; their masks come from the seeds 0, 1, 2, ...
+        compiled: whether to measure the compiled moments too, if the machine has a working compiler.
         progress: receives a line before each part.
 
     Returns:
@@ -203,12 +213,24 @@ def error_runtime(
         rms = (estimate - reference).square().mean().sqrt().item()
         return found, abs(found - score) / score, rms / score
 
+    def moments() -> Tensor:
+        return model.moments(opacities, view, multiplier).variance
+
+    def compiled_moments() -> Tensor:
+        use_compiled()
+        try:
+            return moments()
+        finally:
+            use_compiled(False)
+
     calls: dict[str, Callable[[], Tensor]] = {
         "render": lambda: model.render(opacities, view)[0],
         FIRST_ORDER: lambda: first_order_map(model.splats(opacities, view), multiplier),
-        SINGLE: lambda: model.moments(opacities, view, multiplier).variance,
+        SINGLE: moments,
         DOUBLE: lambda: double.moments(precise, view, multiplier).variance,
     }
+    if compiled and use_compiled():
+        calls[COMPILED] = compiled_moments
     tell(f"render, {', '.join(list(calls)[1:])}")
     maps = {name: call() for name, call in calls.items()}
     seconds = in_turns(calls, ROUNDS, device)

@@ -17,6 +17,7 @@ from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.orbit import orbit_views
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.error_runtime import (
+    COMPILED,
     DOUBLE,
     ERRORS,
     FIRST_ORDER,
@@ -44,6 +45,7 @@ def study_error_runtime(
     *,
     max_samples: int = 1024,
     seeds: int = 3,
+    compiled: bool = False,
     device: str = "cpu",
     say: Say = print,
 ) -> dict[str, ErrorRuntime]:
@@ -57,6 +59,7 @@ def study_error_runtime(
         out: folder for the results.
         max_samples: largest K.
         seeds: number of Monte Carlo runs.
+        compiled: whether to measure the compiled moments too.
         device: where to render.
         say: receives the progress and the tables.
 
@@ -75,11 +78,17 @@ def study_error_runtime(
         if name in models:
             raise ValueError(f"two sources are called {name}: rename one, or study them in different folders.")
         models[name] = _of_ply(source, device) if is_ply else _of_run(source, device)
-    return study(models, out, max_samples=max_samples, seeds=seeds, say=say)
+    return study(models, out, max_samples=max_samples, seeds=seeds, compiled=compiled, say=say)
 
 
 def study(
-    models: Mapping[str, tuple[Model, View]], out: Path, *, max_samples: int = 1024, seeds: int = 3, say: Say = print
+    models: Mapping[str, tuple[Model, View]],
+    out: Path,
+    *,
+    max_samples: int = 1024,
+    seeds: int = 3,
+    compiled: bool = False,
+    say: Say = print,
 ) -> dict[str, ErrorRuntime]:
     """Measure every model, and write ``error_runtime.json``, ``.md`` and ``.png``.
 
@@ -91,6 +100,7 @@ def study(
         out: folder for the results.
         max_samples: largest K.
         seeds: number of Monte Carlo runs.
+        compiled: whether to measure the compiled moments too.
         say: receives the progress and the tables.
 
     Returns:
@@ -109,11 +119,13 @@ def study(
     scenes: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     results: dict[str, ErrorRuntime] = {}
     for name, (model, view) in models.items():
-        settings = _settings(model, view, max_samples, seeds)
+        settings = _settings(model, view, max_samples, seeds) | ({"compiled": True} if compiled else {})
         if scenes.get(name, {}).get("settings") == settings:
             say(f"{name}: measured before, kept")
         else:
-            result = error_runtime(model, view, max_samples=max_samples, seeds=seeds, progress=progress(name))
+            result = error_runtime(
+                model, view, max_samples=max_samples, seeds=seeds, compiled=compiled, progress=progress(name)
+            )
             scenes[name] = {"settings": settings, **result.as_dict(), "machine": machine()}
             write_json(file, scenes)
         results[name] = ErrorRuntime.from_dict(scenes[name])
@@ -183,7 +195,7 @@ def error_runtime_figure(results: Mapping[str, ErrorRuntime], path: Path) -> Non
 
 def _panel(axes: Any, result: ErrorRuntime) -> None:
     """Draw one scene: filled markers for the score, hollow ones for the map."""
-    styles = {MONTE_CARLO: ("o", "C0"), FIRST_ORDER: ("s", "C1"), SINGLE: ("D", "C2")}
+    styles = {MONTE_CARLO: ("o", "C0"), FIRST_ORDER: ("s", "C1"), SINGLE: ("D", "C2"), COMPILED: ("^", "C3")}
     for error in ERRORS:
         for estimator, (marker, color) in styles.items():
             measured = [m for m in result.measurements if m.estimator == estimator and m.rms(error) > 0]

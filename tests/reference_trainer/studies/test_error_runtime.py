@@ -12,8 +12,10 @@ from oracles import brute_force, random_scene
 from ca_reg.functional import apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.model import Model
 from reference_trainer.model.gaussians import SH_C0, Gaussians
+from reference_trainer.render import compiled, compiled_moments
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.error_runtime import (
+    COMPILED,
     DOUBLE,
     FIRST_ORDER,
     MONTE_CARLO,
@@ -179,3 +181,19 @@ def test_views_without_a_score_are_refused(scene):
     black = dataclasses.replace(model.gaussians, sh_dc=torch.full((9, 1, 3), -9.0))
     with pytest.raises(ValueError, match="nothing varies"):
         error_runtime(Model(black, torch.zeros(3)), view)
+
+
+def test_compiled_moments_are_measured_beside_the_eager_ones(scene, monkeypatch):
+    calls = []
+
+    def kernel(function, *arguments):
+        calls.append(function)
+        function(*arguments)
+
+    monkeypatch.setattr(compiled_moments, "kernel", kernel)
+    monkeypatch.setattr(compiled, "_obstacle", lambda: "")
+    measured = error_runtime(*scene, max_samples=16, seeds=1, compiled=True)
+    assert calls
+    assert not compiled.is_compiled(torch.device("cpu"))
+    assert measured.of(COMPILED).rms("map") < 1e-5
+    assert [m.estimator for m in measured.measurements[-2:]] == [DOUBLE, COMPILED]

@@ -57,7 +57,7 @@ def calls(monkeypatch):
     """Studies whose measurements take no time, and the settings of each."""
     asked = []
 
-    def measure(model, view, *, max_samples, seeds, progress):
+    def measure(model, view, *, max_samples, seeds, compiled, progress):
         asked.append((view.name, max_samples))
         if view.name == "away":
             raise ValueError("no pixel of away")
