@@ -1,29 +1,18 @@
-"""The same training with different regularizers over several seeds, and one table with mean and spread."""
+"""The same training with different regularizers over several scenes and seeds."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
-from multiprocessing import get_context
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import torch
-
-from ca_reg.monitor import LOG_NAME
-from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.figures import comparison_figure, dynamics_figure
-from reference_trainer.studies.run import run_experiment
+from reference_trainer.studies.compare_report import Comparison, save
+from reference_trainer.studies.engines.engine import Failure
+from reference_trainer.studies.grid import Run, Running, run_grid
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["Comparison", "compare", "comparison_table", "report", "strategies"]
-
-REPORT = "comparison.json"
-TABLE = "comparison.md"
+__all__ = ["compare", "scene_folders", "strategies"]
 
 
 def strategies(
@@ -45,165 +34,79 @@ def strategies(
     return sampled | expected
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """The results of all runs.
+def scene_folders(paths: Sequence[str], options: SceneOptions, out: Path) -> dict[Path, SceneOptions]:
+    """Return the folder of the comparison of every scene: ``out`` for a single one, else ``out/<name of the scene>``.
 
     Args:
-        runs: for every strategy the content of ``results.json`` of each finished seed.
-        failures: runs that did not finish, with the error of each.
+        paths: of the scenes, or ``"synthetic"``.
+        options: all other options, which hold for every scene.
+        out: folder of the whole.
+
+    Raises:
+        ValueError: if there is no scene, or two have the same name.
+
+    Example:
+        >>> [str(folder) for folder in scene_folders(["data/fern", "synthetic"], SceneOptions(), Path("runs"))]
+        ['runs/fern', 'runs/synthetic']
+        >>> [str(folder) for folder in scene_folders(["data/fern"], SceneOptions(), Path("runs"))]
+        ['runs']
     """
-
-    runs: dict[str, list[dict[str, Any]]]
-    failures: dict[str, str]
-
-
-def _run(
-    options: SceneOptions,
-    config: TrainConfig,
-    out: Path,
-    threads: int,
-    device: str,
-    monitor_every: int,
-    lpips: str | None,
-) -> dict[str, Any]:
-    """Do one run in a process of its own."""
-    torch.set_num_threads(threads)
-    return run_experiment(options, config, out, device=device, monitor_every=monitor_every, lpips=lpips)
+    names = [path if path == "synthetic" else Path(path).resolve().name for path in paths]
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"expected at least 1 scene, and scenes whose folders have different names, got {[*paths]}.")
+    shared = dataclasses.asdict(options)  # a command line may have a class of its own, which workers need not know
+    return {
+        out if len(names) == 1 else out / name: SceneOptions(**shared | {"path": path})
+        for name, path in zip(names, paths, strict=True)
+    }
 
 
 def compare(
-    options: SceneOptions,
+    scenes: Mapping[Path, SceneOptions],
     configs: Mapping[str, TrainConfig],
     seeds: Sequence[int],
-    out: Path,
-    *,
-    jobs: int = 1,
-    device: str = "cpu",
-    monitor_every: int = 500,
-    lpips: str | None = None,
-    say: Callable[[str], None] = lambda text: None,
-) -> Comparison:
-    """Train every strategy with every seed; finished runs are kept, interrupted ones continue.
+    running: Running,
+) -> dict[Path, Comparison]:
+    """Train every strategy on every scene with every seed; finished runs are kept, interrupted ones continue.
 
     Args:
-        options: the scene.
+        scenes: by folder of the comparison; run k of a strategy lives in ``<folder>/<strategy>/seed_<k>``.
         configs: settings by name of the strategy.
         seeds: of the runs; they replace the seed of the settings.
-        out: folder of the comparison; run k of a strategy lives in ``<strategy>/seed_<k>``.
-        jobs: how many runs at a time, each in a process of its own with its share of the processors.
-        device: where to train.
-        monitor_every: steps between measurements of CA and PSNR.
-        lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
-        say: receives a line about every run.
+        running: where and how the runs are done.
 
     Returns:
-        The results of the runs that finished, and the errors of the others.
+        For every folder the results of the runs that finished, and why the others did not. Both are also written
+        there.
 
     Raises:
-        ValueError: if there is nothing to run, or ``jobs`` is not positive.
+        ValueError: if there is nothing to run.
     """
-    if jobs < 1 or not configs or not seeds:
+    if not scenes or not configs or not seeds:
         raise ValueError(
-            f"expected at least 1 strategy, 1 seed and 1 job, got {len(configs)}, {len(seeds)} and {jobs}."
+            f"expected at least 1 scene, 1 strategy and 1 seed, got {len(scenes)}, {len(configs)} and {len(seeds)}."
         )
-    threads = max(1, (os.cpu_count() or 1) // jobs)
-    grid = [(name, seed) for seed in seeds for name in configs]
-    results: dict[tuple[str, int], dict[str, Any]] = {}
-    failures: dict[str, str] = {}
-    with ProcessPoolExecutor(max_workers=jobs, mp_context=get_context("spawn")) as pool:
-        futures = {
-            pool.submit(
-                _run,
-                options,
-                dataclasses.replace(configs[name], seed=seed),
-                out / name / f"seed_{seed}",
-                threads,
-                device,
-                monitor_every,
-                lpips,
-            ): (name, seed)
-            for name, seed in grid
-        }
-        try:
-            for done, future in enumerate(as_completed(futures), start=1):
-                name, seed = futures[future]
-                try:
-                    results[name, seed] = result = future.result()
-                except Exception as error:  # one failing run must not stop the others; it is reported
-                    failures[f"{name}, seed {seed}"] = f"{type(error).__name__}: {error}"
-                    say(f"[{done}/{len(grid)}] {name}, seed {seed}: FAILED, {error}")
-                    continue
-                psnr = result["mean"].get("test", result["mean"]["train"])["psnr"]
-                quality = "no PSNR" if psnr is None else f"{psnr:.2f} dB"
-                say(f"[{done}/{len(grid)}] {name}, seed {seed}: {quality} in {result['seconds']:.0f} s")
-        except BaseException:  # an interruption must not wait for the runs that have not begun
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    runs = {name: [results[name, seed] for seed in seeds if (name, seed) in results] for name in configs}
-    comparison = Comparison({name: of for name, of in runs.items() if of}, failures)
-    if comparison.runs:
-        write_json(out / REPORT, {**dataclasses.asdict(comparison), "machine": machine()})
-        (out / TABLE).write_text(comparison_table(comparison.runs) + "\n", encoding="utf-8")
-    return comparison
+    grid = [(folder, name, seed) for seed in seeds for folder in scenes for name in configs]
+    runs = [
+        Run(
+            label=_label(name, seed) if len(scenes) == 1 else f"{folder.name}, {_label(name, seed)}",
+            options=scenes[folder],
+            config=dataclasses.replace(configs[name], seed=seed),
+            out=folder / name / f"seed_{seed}",
+        )
+        for folder, name, seed in grid
+    ]
+    comparisons = {folder: Comparison({}, {}) for folder in scenes}
+    for (folder, name, seed), outcome in zip(grid, run_grid(runs, running), strict=True):
+        if isinstance(outcome, Failure):
+            comparisons[folder].failures[_label(name, seed)] = outcome
+        else:
+            comparisons[folder].runs.setdefault(name, []).append(outcome)
+    for folder, comparison in comparisons.items():
+        save(comparison, folder)
+    return comparisons
 
 
-def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Return one row per strategy in Markdown, every entry the mean and sample standard deviation over the seeds.
-
-    CA is the paper's protocol, whose drop rate depends on p; "CA at 1/2" drops half of the Gaussians of every model.
-    Both are in units of 1e-3.
-    """
-    columns: dict[str, tuple[str, str, float]] = {
-        "test PSNR": ("test", "psnr", 1.0),
-        "test SSIM": ("test", "ssim", 1.0),
-        "test LPIPS": ("test", "lpips", 1.0),
-        "test CA x1e-3": ("test", "ca", 1e-3),
-        "test CA at 1/2": ("test", "ca_half", 1e-3),
-        "test CV": ("test", "cv", 1.0),
-        "train PSNR": ("train", "psnr", 1.0),
-        "train CA x1e-3": ("train", "ca", 1e-3),
-    }
-    rows: list[dict[str, object]] = []
-    for name, of in runs.items():
-        row: dict[str, object] = {"strategy": name, "seeds": len(of)}
-        for column, (split, quantity, unit) in columns.items():
-            values = [run["mean"].get(split, {}).get(quantity) for run in of]
-            known = [value for value in values if value is not None]
-            if known:
-                row[column] = format_mean_std(known, unit=unit)
-        row["Gaussians"] = format_mean_std([run["gaussians"] for run in of], unit=1e3) + "k"
-        row["seconds"] = format_mean_std([run["seconds"] for run in of])
-        rows.append(row)
-    present = [column for column in columns if any(column in row for row in rows)]
-    return markdown_table(rows, ["strategy", "seeds", *present, "Gaussians", "seconds"])
-
-
-def report(comparison: Comparison, out: Path, *, say: Callable[[str], None] = print) -> None:
-    """Print the table, draw the figures of the first seed, and name the runs that failed.
-
-    Args:
-        comparison: the results.
-        out: folder of the comparison.
-        say: receives the text.
-
-    Raises:
-        RuntimeError: if no run finished.
-    """
-    for name, error in comparison.failures.items():
-        say(f"FAILED {name}: {error}")
-    if not comparison.runs:
-        raise RuntimeError(f"no run of the comparison in {out} finished; the errors are above.")
-    say("")
-    say(comparison_table(comparison.runs))
-    first = {name: out / name / f"seed_{of[0]['config']['seed']}" for name, of in comparison.runs.items()}
-    say("")
-    if all((folder / LOG_NAME).exists() for folder in first.values()):
-        dynamics_figure(first, out / "dynamics.png")
-        say(f"CA and PSNR against the iteration: {out / 'dynamics.png'}")
-    views = next(iter(comparison.runs.values()))[0]["views"]
-    for view in (view for view in views if view["split"] == "test"):
-        stem = Path(view["name"]).stem
-        comparison_figure(first, out / f"test_{stem}.png", view=stem)
-        say(f"photograph, render, error and CA map of each strategy: {out / f'test_{stem}.png'}")
-    say(f"table and all numbers: {out / TABLE}, {out / REPORT}; curves: tensorboard --logdir {out}")
+def _label(name: str, seed: int) -> str:
+    """Return what a run is called among those of its scene."""
+    return f"{name}, seed {seed}"

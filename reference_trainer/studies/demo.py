@@ -6,7 +6,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.compare import Comparison, compare, report, strategies
+from reference_trainer.studies.compare import compare, strategies
+from reference_trainer.studies.compare_report import Comparison, report
+from reference_trainer.studies.engines.processes import Processes
+from reference_trainer.studies.grid import Running
 from reference_trainer.training.config import with_preset
 
 __all__ = ["demo"]
@@ -25,9 +28,9 @@ def demo(
         say: receives the text.
     """
     config = with_preset("fsgs", iterations=iterations, opacity_reset_every=0, densify_from=min(500, iterations // 4))
-    options = SceneOptions("synthetic")
     chosen = {name: settings for name, settings in strategies(config).items() if not settings.analytic}
     say(f"Training the built-in scene (3 views) with {', '.join(chosen)}: {iterations} steps each, {jobs} at a time.")
-    comparison = compare(options, chosen, seeds, out, jobs=jobs, monitor_every=max(1, iterations // 5), say=say)
-    report(comparison, out, say=say)
-    return comparison
+    running = Running(Processes(jobs), monitor_every=max(1, iterations // 5), say=say)
+    comparisons = compare({out: SceneOptions("synthetic")}, chosen, seeds, running)
+    report(comparisons, say=say)
+    return comparisons[out]

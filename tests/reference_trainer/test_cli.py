@@ -13,6 +13,8 @@ from reference_trainer.studies import compare as compare_module
 from reference_trainer.studies import pruning as pruning_module
 from reference_trainer.studies import run as run_module
 from reference_trainer.studies import score_ply as score_module
+from reference_trainer.studies.compare_report import Comparison
+from reference_trainer.studies.engines.engine import Failure
 from reference_trainer.training.config import PRESETS
 
 SMALL = ["--downscale", "8", "--iterations", "3", "--monitor-every", "2"]
@@ -48,7 +50,7 @@ def trained(tmp_path_factory):
         (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
         (["bake"], ["PATH", "--dropout", "--out"]),
         (["render"], ["--what", "--frames", "{test,train,flight}"]),
-        (["compare"], ["--strategies", "--seeds", "--jobs", "--iterations"]),
+        (["compare"], ["--strategies", "--seeds", "--jobs", "--iterations", "--engine", "--address", "--path"]),
     ],
 )
 def test_help(command, options, capsys):
@@ -168,15 +170,35 @@ def test_the_preset_of_binocular_decays_opacities(monkeypatch, tmp_path):
 def test_what_is_compared(given, rates, monkeypatch, tmp_path):
     asked: dict = {}
 
-    def fake(scene, configs, seeds, out, **keywords):
-        asked.update(configs=configs, seeds=list(seeds), out=out, **keywords)
+    def fake(scenes, configs, seeds, running):
+        asked.update(scenes=scenes, configs=configs, seeds=list(seeds), running=running)
+        return {}
 
     monkeypatch.setattr(compare_module, "compare", fake)
-    monkeypatch.setattr(compare_module, "report", lambda comparison, out, say: None)
     main(["compare", "--out", str(tmp_path), "--seeds", "2", "--jobs", "3", "--iterations", "7", *given])
     assert {name: (config.dropout, config.noise) for name, config in asked["configs"].items()} == rates
     assert {config.iterations for config in asked["configs"].values()} == {7}
-    assert (asked["seeds"], asked["jobs"], asked["out"]) == ([0, 1], 3, tmp_path)
+    assert (asked["seeds"], asked["running"].engine.jobs) == ([0, 1], 3)
+    assert asked["scenes"] == {tmp_path: SceneOptions()}
+
+
+def test_several_scenes_and_how_they_are_run(monkeypatch, tmp_path):
+    asked: dict = {}
+
+    def fake(scenes, configs, seeds, running):
+        asked.update(scenes=scenes, running=running)
+        return {tmp_path / "fern": Comparison({}, {"baseline, seed 0": Failure("ValueError: no", "")})}
+
+    monkeypatch.setattr(compare_module, "compare", fake)
+    with pytest.raises(SystemExit) as exit_:
+        main(["compare", "--out", str(tmp_path), "--path", "data/fern", "synthetic", "--downscale", "2",
+              "--engine", "processes", "--retries", "1", "--checkpoint-every", "50"])  # fmt: skip
+    assert exit_.value.code == 1  # a run failed
+    assert asked["scenes"] == {
+        tmp_path / "fern": SceneOptions("data/fern", downscale=2.0),
+        tmp_path / "synthetic": SceneOptions("synthetic", downscale=2.0),
+    }
+    assert (asked["running"].retries, asked["running"].checkpoint_every) == (1, 50)
 
 
 @pytest.mark.parametrize(
@@ -219,8 +241,11 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["train", "--dropout", "1.5"], "dropout must be in [0, 1), got 1.5"),
         (["train", "--sh-every", "0"], "sh_every must be at least 1, got 0"),
         (["train", "--downscale", "0.5"], "downscale must be at least 1"),
-        (["compare", "--seeds", "0"], "at least 1 strategy, 1 seed and 1 job"),
-        (["compare", "--jobs", "0"], "at least 1 strategy, 1 seed and 1 job"),
+        (["compare", "--seeds", "0"], "at least 1 scene, 1 strategy and 1 seed"),
+        (["compare", "--jobs", "0"], "at least 1 job, got 0"),
+        (["compare", "--path", "a/fern", "b/fern"], "scenes whose folders have different names"),
+        (["compare", "--retries", "-1"], "retries of at least 0"),
+        (["compare", "--engine", "processes", "--address", "auto"], "--address auto is that of a Ray cluster"),
         (["evaluate"], "nothing to evaluate: give the folder of a run, or --ply FILE"),
         (["evaluate", "nowhere"], "nowhere holds no run (no config.json): give the --out folder"),
         (["render", "nowhere"], "nowhere holds no run"),

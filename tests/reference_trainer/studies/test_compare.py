@@ -1,16 +1,20 @@
 import dataclasses
 import json
 import statistics
-import threading
-from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
+import sweep_tasks
 
 from ca_reg.monitor import LOG_NAME
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies import compare as compare_module
 from reference_trainer.studies import demo as demo_module
-from reference_trainer.studies.compare import Comparison, compare, comparison_table, report, strategies
+from reference_trainer.studies.compare import compare, scene_folders, strategies
+from reference_trainer.studies.compare_report import REPORT, TABLE, Comparison, comparison_table, report
+from reference_trainer.studies.engines.choice import choose_engine
+from reference_trainer.studies.engines.engine import Failure, attempt
+from reference_trainer.studies.engines.processes import Processes
+from reference_trainer.studies.grid import Running
 from reference_trainer.studies.run import RESULTS, run_experiment
 from reference_trainer.training.config import TrainConfig
 
@@ -51,59 +55,126 @@ def test_strategies_change_the_regularizers_only():
     assert strategies(base, dropout=0.1, noise=0.5)["both"] == dataclasses.replace(base, dropout=0.1, noise=0.5)
 
 
-@pytest.mark.parametrize(("configs", "seeds", "jobs"), [({}, [0], 1), ({"a": TrainConfig()}, [], 1),
-                                                        ({"a": TrainConfig()}, [0], 0)])  # fmt: skip
-def test_nothing_to_compare(tmp_path, configs, seeds, jobs):
-    with pytest.raises(ValueError, match="at least 1 strategy, 1 seed and 1 job"):
-        compare(SceneOptions(), configs, seeds, tmp_path, jobs=jobs)
+class Here:
+    """An engine that does every task in this process, one at a time."""
+
+    jobs = 1
+
+    def __init__(self):
+        self.tasks = []
+
+    def start(self, number, task):
+        self.tasks.append(task)
+        self.now = number, attempt(task, 1)
+
+    def wait(self):
+        return [self.now]
+
+    def close(self):
+        pass
 
 
-def test_a_comparison_without_a_result_is_an_error(tmp_path):
+SCENE, CONFIG = {Path("x"): SceneOptions()}, {"a": TrainConfig()}
+
+
+@pytest.mark.parametrize(("scenes", "configs", "seeds"), [({}, CONFIG, [0]), (SCENE, {}, [0]), (SCENE, CONFIG, [])])
+def test_nothing_to_compare(scenes, configs, seeds):
+    with pytest.raises(ValueError, match="at least 1 scene, 1 strategy and 1 seed"):
+        compare(scenes, configs, seeds, Running(Here()))
+
+
+def test_scenes_of_the_same_name_would_share_a_folder(tmp_path):
+    with pytest.raises(ValueError, match="different names"):
+        scene_folders([str(tmp_path / "a" / "fern"), str(tmp_path / "b" / "fern")], SceneOptions(), tmp_path)
+
+
+def test_the_options_hold_for_every_scene(tmp_path):
+    folders = scene_folders(["synthetic", "data/fern/"], SceneOptions(downscale=4.0), tmp_path)
+    assert folders == {
+        tmp_path / "synthetic": SceneOptions("synthetic", downscale=4.0),
+        tmp_path / "fern": SceneOptions("data/fern/", downscale=4.0),
+    }
+
+
+def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
+    """One run of eight fails; every scene has its own table and its own failures."""
+
+    def train(options, config, out, device, monitor_every, checkpoint_every, lpips):
+        assert (device, monitor_every, checkpoint_every, lpips) == ("cpu", 7, 9, str(Path("weights.pth").resolve()))
+        assert out.is_dir()
+        assert out.is_absolute()
+        if (options.path, config.dropout, config.seed) == ("synthetic", 0.2, 1):
+            raise RuntimeError("all Gaussians were pruned")
+        return made(20.0 + config.seed) | {"scene": options.path, "dropout": config.dropout}
+
+    monkeypatch.setattr("reference_trainer.studies.grid.train_run", train)
+    monkeypatch.chdir(tmp_path)
+    engine = Here()
+    scenes = scene_folders(["synthetic", "data/fern"], SceneOptions(), Path("out"))
+    configs = {"baseline": TrainConfig(), "dropout": TrainConfig(dropout=0.2)}
+    said = []
+    running = Running(engine, monitor_every=7, checkpoint_every=9, lpips="weights.pth", say=said.append)
+    comparisons = compare(scenes, configs, [0, 1], running)
+
+    assert len({task.arguments[2] for task in engine.tasks}) == 8
+    assert list(comparisons) == [Path("out/synthetic"), Path("out/fern")]
+    synthetic, fern = comparisons.values()
+    assert {name: [run["mean"]["test"]["psnr"] for run in runs] for name, runs in synthetic.runs.items()} == {
+        "baseline": [20.0, 21.0],
+        "dropout": [20.0],
+    }
+    assert {run["scene"] for run in fern.runs["dropout"]} == {str(tmp_path / "data" / "fern")}
+    assert fern.failures == {}
+    assert list(synthetic.failures) == ["dropout, seed 1"]
+    assert "synthetic, dropout, seed 1: FAILED, RuntimeError: all Gaussians were pruned" in said[5]
+    stored = json.loads(Path("out/synthetic", REPORT).read_text())
+    assert stored["failures"]["dropout, seed 1"]["error"] == "RuntimeError: all Gaussians were pruned"
+    assert "in train" in stored["failures"]["dropout, seed 1"]["traceback"]
+    assert [row["seeds"] for row in cells(Path("out/fern", TABLE).read_text())] == ["2", "2"]
+
+
+def test_failed_runs_are_listed_at_the_end(tmp_path):
     said: list[str] = []
-    with pytest.raises(RuntimeError, match="no run of the comparison"):
-        report(Comparison({}, {"a, seed 0": "ValueError: no"}), tmp_path, say=said.append)
-    assert said == ["FAILED a, seed 0: ValueError: no"]
+    report({tmp_path: Comparison({}, {"a, seed 0": Failure("ValueError: no", "Traceback")})}, say=said.append)
+    assert said[-2:] == [
+        "1 of 1 runs FAILED; the same command tries them again:",
+        f"FAILED a, seed 0: ValueError: no ({tmp_path / REPORT} has the traceback)",
+    ]
+
+
+def test_a_worker_that_does_not_share_the_folder_does_not_train(tmp_path, options):
+    """As on another machine of a cluster: the folder of the run is not there."""
+
+    class Elsewhere(Here):
+        def start(self, number, task):
+            task.arguments[2].rmdir()
+            super().start(number, task)
+
+    comparison = compare({tmp_path: options}, {"a": TrainConfig(iterations=2)}, [0], Running(Elsewhere()))[tmp_path]
+    assert "must be on a file system that all machines of the cluster share" in comparison.failures["a, seed 0"].error
+    assert not (tmp_path / "a" / "seed_0").exists()
+
+
+@pytest.mark.parametrize("wrong", [{"retries": -1}, {"checkpoint_every": 0}])
+def test_what_running_refuses(wrong):
+    with pytest.raises(ValueError, match="retries of at least 0 and checkpoint_every of at least 1"):
+        Running(Here(), **wrong)
 
 
 def test_the_demo_is_a_comparison_of_all_strategies(tmp_path, monkeypatch):
     asked: dict = {}
 
-    def fake(options, configs, seeds, out, **keywords):
-        asked.update(options=options, configs=configs, seeds=seeds, out=out, **keywords)
-        return Comparison({}, {})
+    def fake(scenes, configs, seeds, running):
+        asked.update(scenes=scenes, configs=configs, seeds=list(seeds), running=running)
+        return {tmp_path: Comparison({}, {})}
 
     monkeypatch.setattr(demo_module, "compare", fake)
-    monkeypatch.setattr(demo_module, "report", lambda comparison, out, say: None)
+    monkeypatch.setattr(demo_module, "report", lambda comparisons, say: None)
     demo_module.demo(tmp_path, iterations=4, seeds=range(2), jobs=2, say=lambda text: None)
     assert list(asked["configs"]) == ["baseline", "dropout", "noise", "both"]
     assert {config.iterations for config in asked["configs"].values()} == {4}
-    assert asked["options"] == SceneOptions("synthetic")
-    assert asked["monitor_every"] == 1
-    assert (asked["out"], list(asked["seeds"]), asked["jobs"]) == (tmp_path, [0, 1], 2)
-
-
-def test_an_interruption_does_not_begin_the_other_runs(tmp_path, monkeypatch):
-    asked: list[dict] = []
-
-    class Pool(ThreadPoolExecutor):
-        def __init__(self, max_workers, mp_context):
-            super().__init__(max_workers)
-
-        def submit(self, function, *args):
-            return super().submit(threading.Event().wait, 0.01)
-
-        def shutdown(self, wait=True, *, cancel_futures=False):
-            asked.append({"wait": wait, "cancel_futures": cancel_futures})
-            super().shutdown(wait, cancel_futures=cancel_futures)
-
-    def interrupt(futures):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(compare_module, "ProcessPoolExecutor", Pool)
-    monkeypatch.setattr(compare_module, "as_completed", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        compare(SceneOptions(), {"a": TrainConfig()}, range(50), tmp_path)
-    assert asked[0] == {"wait": False, "cancel_futures": True}
+    assert asked["scenes"] == {tmp_path: SceneOptions("synthetic")}
+    assert (asked["running"].monitor_every, asked["running"].engine.jobs, asked["seeds"]) == (1, 2, [0, 1])
 
 
 @pytest.mark.slow
@@ -118,30 +189,70 @@ def test_a_comparison_from_photographs_to_figures(tmp_path, options):
     run_experiment(options, configs["dropout"], tmp_path / "dropout" / "seed_0", monitor_every=3)
     before = (tmp_path / "dropout" / "seed_0" / RESULTS).stat().st_mtime_ns
     said: list[str] = []
-    comparison = compare(options, configs, [0, 1], tmp_path, jobs=2, monitor_every=3, say=said.append)
+    running = Running(Processes(2), monitor_every=3, say=said.append)
+    comparison = compare({tmp_path: options}, configs, [0, 1], running)[tmp_path]
     assert (tmp_path / "dropout" / "seed_0" / RESULTS).stat().st_mtime_ns == before
     assert {name: [run["config"]["seed"] for run in runs] for name, runs in comparison.runs.items()} == {
         "baseline": [0, 1],
         "dropout": [0, 1],
     }
     assert sorted(comparison.failures) == ["doomed, seed 0", "doomed, seed 1"]
-    assert all("TrainingStoppedError: all Gaussians were pruned" in text for text in comparison.failures.values())
+    for failure in comparison.failures.values():
+        assert "TrainingStoppedError: all Gaussians were pruned" in failure.error
+        assert "in run_experiment" in failure.traceback
     assert sum("FAILED" in line for line in said) == 2
     assert len(said) == 6
 
-    rows = {row["strategy"]: row for row in cells((tmp_path / compare_module.TABLE).read_text())}
+    rows = {row["strategy"]: row for row in cells((tmp_path / TABLE).read_text())}
     for name, runs in comparison.runs.items():
         values = [run["mean"]["test"]["psnr"] for run in runs]
         mean, spread = (float(x) for x in rows[name]["test PSNR"].split(" ± "))
         assert mean == pytest.approx(statistics.mean(values), abs=0.05)
         assert spread == pytest.approx(statistics.stdev(values), rel=0.06)
-    stored = json.loads((tmp_path / compare_module.REPORT).read_text())
+    stored = json.loads((tmp_path / REPORT).read_text())
     assert stored["runs"] == comparison.runs
-    assert stored["failures"] == comparison.failures
+    assert stored["failures"] == {name: dataclasses.asdict(why) for name, why in comparison.failures.items()}
 
     said.clear()
-    report(comparison, tmp_path, say=said.append)
+    report({tmp_path: comparison}, say=said.append)
     for name in ("dynamics", "test_test_0", "test_test_1", "test_test_outside"):
         assert (tmp_path / f"{name}.png").stat().st_size > 1000, name
     assert (tmp_path / "baseline" / "seed_1" / LOG_NAME).exists()
     assert sum(line.startswith("FAILED doomed") for line in said) == 2
+
+
+def files_of(folder: Path) -> dict[Path, int]:
+    """When every file below a folder was written."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["processes", "ray"])
+def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_path, options, monkeypatch):
+    """The worker of seed 1 is killed at its first checkpoint; a second call starts no worker and writes no run."""
+    if name == "ray":
+        pytest.importorskip("ray")
+    tests = Path(sweep_tasks.__file__).parent
+    monkeypatch.setenv("PYTHONPATH", f"{tests.parent}:{tests}")  # Ray passes it to its workers
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr("reference_trainer.studies.grid.train_run", sweep_tasks.train_and_be_killed_once)
+    config = TrainConfig(iterations=60, dropout=0.2)
+    whole = run_experiment(options, dataclasses.replace(config, seed=1), tmp_path / "whole", monitor_every=0)
+
+    out = tmp_path / "sweep"
+    said: list[str] = []
+    running = Running(choose_engine(name, jobs=2), monitor_every=0, checkpoint_every=10, say=said.append)
+    comparison = compare({out: options}, {"dropout": config}, [0, 1], running)[out]
+    assert (out / "dropout" / "seed_1" / "killed").exists()
+    assert sum("again with another (1 of 3)" in line for line in said) == 1
+    assert comparison.failures == {}
+    assert [run["config"]["seed"] for run in comparison.runs["dropout"]] == [0, 1]
+    assert comparison.runs["dropout"][1]["views"] == whole["views"]
+
+    before = files_of(out / "dropout")
+    nobody = Here()
+    again = compare({out: options}, {"dropout": config}, [0, 1], Running(nobody, say=said.append))[out]
+    assert again == comparison
+    assert nobody.tasks == []
+    assert files_of(out / "dropout") == before
+    assert all(line.endswith("finished before") for line in said[-2:])

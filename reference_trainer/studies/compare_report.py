@@ -1,0 +1,115 @@
+"""What a comparison leaves: its results as JSON, a table with mean and spread, figures, and the list of failed runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ca_reg.monitor import LOG_NAME
+from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
+from reference_trainer.files import write_text
+from reference_trainer.studies.engines.engine import Failure
+from reference_trainer.studies.figures import comparison_figure, dynamics_figure
+
+__all__ = ["REPORT", "TABLE", "Comparison", "comparison_table", "report", "save"]
+
+REPORT = "comparison.json"
+TABLE = "comparison.md"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The results of all runs on one scene.
+
+    Args:
+        runs: for every strategy the content of ``results.json`` of each finished seed.
+        failures: runs that did not finish, and why.
+    """
+
+    runs: dict[str, list[dict[str, Any]]]
+    failures: dict[str, Failure]
+
+
+def save(comparison: Comparison, out: Path) -> None:
+    """Write the results as JSON, and the table if there is anything to put into it.
+
+    Args:
+        comparison: the results.
+        out: folder of the comparison.
+    """
+    write_json(out / REPORT, {**dataclasses.asdict(comparison), "machine": machine()})
+    if comparison.runs:
+        write_text(out / TABLE, comparison_table(comparison.runs) + "\n")
+
+
+def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """Return one row per strategy in Markdown, every entry the mean and sample standard deviation over the seeds.
+
+    CA is the paper's protocol, whose drop rate depends on p; "CA at 1/2" drops half of the Gaussians of every model.
+    Both are in units of 1e-3.
+    """
+    columns: dict[str, tuple[str, str, float]] = {
+        "test PSNR": ("test", "psnr", 1.0),
+        "test SSIM": ("test", "ssim", 1.0),
+        "test LPIPS": ("test", "lpips", 1.0),
+        "test CA x1e-3": ("test", "ca", 1e-3),
+        "test CA at 1/2": ("test", "ca_half", 1e-3),
+        "test CV": ("test", "cv", 1.0),
+        "train PSNR": ("train", "psnr", 1.0),
+        "train CA x1e-3": ("train", "ca", 1e-3),
+    }
+    rows: list[dict[str, object]] = []
+    for name, of in runs.items():
+        row: dict[str, object] = {"strategy": name, "seeds": len(of)}
+        for column, (split, quantity, unit) in columns.items():
+            values = [run["mean"].get(split, {}).get(quantity) for run in of]
+            known = [value for value in values if value is not None]
+            if known:
+                row[column] = format_mean_std(known, unit=unit)
+        row["Gaussians"] = format_mean_std([run["gaussians"] for run in of], unit=1e3) + "k"
+        row["seconds"] = format_mean_std([run["seconds"] for run in of])
+        rows.append(row)
+    present = [column for column in columns if any(column in row for row in rows)]
+    return markdown_table(rows, ["strategy", "seeds", *present, "Gaussians", "seconds"])
+
+
+def report(comparisons: Mapping[Path, Comparison], *, say: Callable[[str], None] = print) -> None:
+    """Print the table of every scene, draw the figures of its first seed, and name the runs that failed.
+
+    Args:
+        comparisons: the results by folder.
+        say: receives the text.
+    """
+    for out, comparison in comparisons.items():
+        say("")
+        if len(comparisons) > 1:
+            say(f"{out.name}:")
+            say("")
+        if comparison.runs:
+            _report(comparison, out, say)
+    failed = [(out, name, why) for out, of in comparisons.items() for name, why in of.failures.items()]
+    if failed:
+        say("")
+        finished = sum(len(runs) for of in comparisons.values() for runs in of.runs.values())
+        say(f"{len(failed)} of {finished + len(failed)} runs FAILED; the same command tries them again:")
+        for out, name, why in failed:
+            say(f"FAILED {name}: {why.error} ({out / REPORT} has the traceback)")
+
+
+def _report(comparison: Comparison, out: Path, say: Callable[[str], None]) -> None:
+    """Print the table of one scene and draw its figures."""
+    say(comparison_table(comparison.runs))
+    first = {name: out / name / f"seed_{of[0]['config']['seed']}" for name, of in comparison.runs.items()}
+    say("")
+    if all((folder / LOG_NAME).exists() for folder in first.values()):
+        dynamics_figure(first, out / "dynamics.png")
+        say(f"CA and PSNR against the iteration: {out / 'dynamics.png'}")
+    views = next(iter(comparison.runs.values()))[0]["views"]
+    for view in (view for view in views if view["split"] == "test"):
+        stem = Path(view["name"]).stem
+        comparison_figure(first, out / f"test_{stem}.png", view=stem)
+        say(f"photograph, render, error and CA map of each strategy: {out / f'test_{stem}.png'}")
+    say(f"table and all numbers: {out / TABLE}, {out / REPORT}; curves: tensorboard --logdir {out}")

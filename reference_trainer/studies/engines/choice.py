@@ -1,0 +1,39 @@
+"""Which engine a sweep uses."""
+
+from __future__ import annotations
+
+import os
+from typing import Literal, TypeAlias
+
+from reference_trainer.studies.engines.engine import Engine
+from reference_trainer.studies.engines.processes import Processes
+from reference_trainer.studies.engines.ray_cluster import RayCluster
+
+__all__ = ["EngineName", "choose_engine"]
+
+EngineName: TypeAlias = Literal["auto", "processes", "ray"]
+
+
+def choose_engine(name: EngineName, *, jobs: int, address: str | None = None, device: str = "cpu") -> Engine:
+    """Return the engine of a name.
+
+    Args:
+        name: ``"auto"`` is Ray if there is the address of a cluster, in ``address`` or ``$RAY_ADDRESS``, and else the
+            processes of this machine: on a single machine Ray does nothing that they do not.
+        jobs: tasks at a time.
+        address: of a Ray cluster; see `RayCluster`.
+        device: where the tasks compute; on a Ray cluster a task on ``"cuda"`` reserves one GPU.
+
+    Raises:
+        ValueError: if an address is given to the processes of this machine, or ``jobs`` is not positive.
+        ImportError: if Ray is asked for and not installed.
+
+    Example:
+        >>> choose_engine("processes", jobs=2).jobs
+        2
+    """
+    if name == "processes" and address is not None:
+        raise ValueError(f"--address {address} is that of a Ray cluster: use --engine ray, or leave the address out.")
+    if name == "ray" or (name == "auto" and (address or os.environ.get("RAY_ADDRESS"))):
+        return RayCluster(jobs, address=address, gpus=1.0 if device.startswith("cuda") else 0.0)
+    return Processes(jobs)

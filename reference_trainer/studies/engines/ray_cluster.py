@@ -1,0 +1,103 @@
+"""A Ray cluster as an engine: one on this machine that ends with the sweep, or a real one at an address."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from reference_trainer.studies.engines.engine import Answer, Death, Failure, Task, attempt
+
+__all__ = ["RayCluster"]
+
+_OBJECT_STORE = 128 * 2**20  # bytes; the answers are small, and Ray would take a third of the memory
+_PATIENCE = 60.0  # seconds for the runs to save their checkpoints
+
+
+class RayCluster:
+    """Every task as a Ray task with processors of its own.
+
+    Needs Ray (``ca_reg[ray]``). On a real cluster every machine needs the same installation, and a file system that
+    all of them and this machine share under the same path.
+
+    Args:
+        jobs: tasks at a time; each reserves its share of the cluster's processors, at most those of one machine.
+        address: of a running cluster, as `ray.init` takes it: ``"host:6379"``, ``"ray://host:10001"``, or ``"auto"``
+            for the one that this machine belongs to. None for ``$RAY_ADDRESS``, and without it for a cluster on this
+            machine that ends with the sweep.
+        gpus: GPUs that a task reserves; fractions share one.
+
+    Raises:
+        ValueError: if ``jobs`` is not positive.
+        ImportError: if Ray is not installed.
+    """
+
+    def __init__(self, jobs: int, *, address: str | None = None, gpus: float = 0.0) -> None:
+        if jobs < 1:
+            raise ValueError(f"expected at least 1 job, got {jobs}.")
+        try:
+            import ray
+        except ImportError as error:
+            raise ImportError(
+                "running on Ray needs Ray: pip install 'ca_reg[ray]'; --engine processes does without."
+            ) from error
+        self.jobs = jobs
+        self._address = address or os.environ.get("RAY_ADDRESS") or "local"
+        self._gpus = gpus
+        self._ray: Any = ray
+        self._mine = False
+        self._attempt: Any = None
+        self._threads = 1
+        self._running: dict[Any, int] = {}
+
+    def start(self, number: int, task: Task) -> None:
+        """Begin a task; see `Engine`."""
+        if self._attempt is None:
+            self._connect()
+        self._running[self._attempt.options(name=task.label).remote(task, self._threads)] = number
+
+    def wait(self) -> list[tuple[int, Answer]]:
+        """Wait for at least one task; see `Engine`."""
+        ended, _ = self._ray.wait(list(self._running))
+        return [(self._running.pop(reference), self._answer(reference)) for reference in ended]
+
+    def close(self) -> None:
+        """Interrupt what still runs, wait for it, and leave the cluster; one that was started for the sweep ends."""
+        for reference in self._running:
+            self._ray.cancel(reference)
+        if self._running:
+            self._ray.wait(list(self._running), num_returns=len(self._running), timeout=_PATIENCE)
+        self._running.clear()
+        if self._mine:
+            self._ray.shutdown()
+            self._mine = False
+
+    def _connect(self) -> None:
+        """Join the cluster or start one, and find out how many processors a task gets."""
+        ray = self._ray
+        if not ray.is_initialized():  # else the caller has chosen a cluster, which stays the caller's
+            local: dict[str, Any] = {}
+            if self._address == "local":
+                os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a sweep on one machine reports to nobody
+                # More jobs than processors is the user's wish, and Ray would wait for the processors for ever.
+                local = {"num_cpus": max(self.jobs, os.cpu_count() or 1), "object_store_memory": _OBJECT_STORE,
+                         "include_dashboard": False}  # fmt: skip
+            ray.init(address=self._address, log_to_driver=False, logging_level="warning", **local)
+            self._mine = True
+        machines = [node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]]
+        share = min(sum(machines) // self.jobs, max(machines, default=1.0))
+        self._threads = max(1, int(share))
+        # Ray's own retries are off: `run_all` retries, counts and reports the same way for every engine.
+        self._attempt = ray.remote(num_cpus=self._threads, num_gpus=self._gpus, max_retries=0)(attempt)
+
+    def _answer(self, reference: Any) -> Answer:
+        """Return what a task that has ended says, or why it says nothing."""
+        exceptions = self._ray.exceptions
+        try:
+            answer: Answer = self._ray.get(reference)
+        except exceptions.RayTaskError as error:  # raised outside of the call, as by a machine without this package
+            first, *_ = str(error.cause).splitlines() or [""]
+            return Failure(f"{type(error.cause).__name__}: {first}", str(error))
+        except exceptions.RayError as error:
+            sentence = " ".join(str(error).split()).partition(". ")[0]
+            return Death(f"the worker died ({type(error).__name__}: {sentence})")
+        return answer

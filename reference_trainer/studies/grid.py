@@ -1,0 +1,147 @@
+"""A grid of runs on an engine: finished runs are kept, interrupted ones continue, failing ones do not stop the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies.engines.engine import Engine, Failure, Task, Value, attempt
+from reference_trainer.studies.engines.run_all import run_all
+from reference_trainer.studies.run import RESULTS, run_experiment
+from reference_trainer.training.config import TrainConfig
+
+__all__ = ["Run", "Running", "run_grid", "train_run"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a grid.
+
+    Args:
+        label: what to call it.
+        options: the scene.
+        config: the training.
+        out: folder of the run, which no other run of the grid has.
+    """
+
+    label: str
+    options: SceneOptions
+    config: TrainConfig
+    out: Path
+
+
+@dataclass(frozen=True)
+class Running:
+    """How the runs of a grid are done, which changes none of their results.
+
+    Args:
+        engine: where to.
+        retries: how many dead workers of one run are replaced; each continues from the last checkpoint.
+        device: where to train.
+        monitor_every: steps between measurements of CA and PSNR; 0 for none.
+        checkpoint_every: steps between checkpoints: what a dead worker costs at most.
+        lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
+        say: receives a line about every run and every worker that died.
+
+    Raises:
+        ValueError: if ``retries`` is negative, or ``checkpoint_every`` not positive.
+    """
+
+    engine: Engine
+    retries: int = 3
+    device: str = "cpu"
+    monitor_every: int = 500
+    checkpoint_every: int = 500
+    lpips: str | None = None
+    say: Callable[[str], None] = lambda text: None
+
+    def __post_init__(self) -> None:
+        if self.retries < 0 or self.checkpoint_every < 1:
+            raise ValueError(
+                f"expected retries of at least 0 and checkpoint_every of at least 1, got {self.retries} and "
+                f"{self.checkpoint_every}."
+            )
+
+
+def run_grid(runs: Sequence[Run], running: Running) -> list[dict[str, Any] | Failure]:
+    """Do all runs; what is finished already is read here and not given to a worker.
+
+    The folders of the runs are made here, so that a worker on another machine knows whether it sees the same ones.
+
+    Args:
+        runs: what to do.
+        running: where and how.
+
+    Returns:
+        For every run the content of ``results.json``, or why there is none.
+    """
+    outcomes: dict[int, dict[str, Any] | Failure] = {}
+
+    def note(number: int, outcome: Value | Failure, when: str) -> None:
+        outcomes[number] = outcome.value if isinstance(outcome, Value) else outcome
+        running.say(f"[{len(outcomes)}/{len(runs)}] {runs[number].label}: {_line(outcomes[number], when)}")
+
+    tasks: dict[int, Task] = {}
+    for number, run in enumerate(runs):
+        where = (run.options.absolute(), run.config, run.out.resolve())  # workers have other working directories
+        if (run.out / RESULTS).exists():  # refuses those of other settings
+            finished = attempt(Task(run.label, run_experiment, where), torch.get_num_threads())
+            note(number, finished, "before")
+        else:
+            run.out.mkdir(parents=True, exist_ok=True)
+            how = (running.device, running.monitor_every, running.checkpoint_every, _lpips(running.lpips))
+            tasks[number] = Task(run.label, train_run, (*where, *how))
+    numbers = list(tasks)
+    for index, outcome in run_all(running.engine, list(tasks.values()), retries=running.retries, say=running.say):
+        note(numbers[index], outcome, "now")
+    return [outcomes[number] for number in range(len(runs))]
+
+
+def train_run(
+    options: SceneOptions,
+    config: TrainConfig,
+    out: Path,
+    device: str,
+    monitor_every: int,
+    checkpoint_every: int,
+    lpips: str | None,
+) -> dict[str, Any]:
+    """Do or continue one run, in a worker; see `run_experiment`.
+
+    Raises:
+        FileNotFoundError: if the folder of the run is not there, because this machine does not share it.
+    """
+    if not out.is_dir():
+        raise FileNotFoundError(
+            f"{out} is not on the machine of the worker: --out must be on a file system that all machines of the "
+            f"cluster share under the same path, and so must the scenes."
+        )
+    return run_experiment(
+        options,
+        config,
+        out,
+        device=device,
+        monitor_every=monitor_every,
+        checkpoint_every=checkpoint_every,
+        lpips=lpips,
+    )
+
+
+def _lpips(option: str | None) -> str | None:
+    """Return the perceptual metric with an absolute path, if it is one."""
+    return option if option in (None, "installed") else str(Path(option).resolve())
+
+
+def _line(outcome: dict[str, Any] | Failure, when: str) -> str:
+    """Return an outcome in a few words."""
+    if isinstance(outcome, Failure):
+        return f"FAILED, {outcome.error}"
+    mean = outcome["mean"]
+    psnr = mean["test" if "test" in mean else "train"]["psnr"]
+    quality = "no PSNR" if psnr is None else f"{psnr:.2f} dB"
+    return f"{quality}, finished before" if when == "before" else f"{quality} in {outcome['seconds']:.0f} s"

@@ -1,0 +1,101 @@
+"""Real processes, killed for real."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import sweep_tasks
+
+from reference_trainer.studies.engines import processes as processes_module
+from reference_trainer.studies.engines.engine import Failure, Task, Value
+from reference_trainer.studies.engines.processes import Processes
+from reference_trainer.studies.engines.run_all import run_all
+
+TESTS = Path(sweep_tasks.__file__).parent
+
+
+def until(condition, seconds=30):
+    """Wait for a condition."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.01)
+
+
+def gone(pid):
+    """Whether a process has ended; one that nobody has waited for yet has."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def kill_the_one_who_waits(folder):
+    """Kill the process of `sweep_tasks.wait_to_be_killed` when it has said its number."""
+    until((folder / "pid").exists)
+    os.kill(int((folder / "pid").read_text()), signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_task_that_raises_is_an_outcome_with_its_traceback():
+    outcomes = dict(run_all(Processes(2), [Task(str(n), sweep_tasks.square, (n,)) for n in (2, 3)]))
+    assert outcomes[0] == Value(4)
+    assert isinstance(outcomes[1], Failure)
+    assert outcomes[1].error == "ValueError: three is refused"
+    assert "in square" in outcomes[1].traceback
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_replaced_and_takes_no_other_task_with_it(tmp_path):
+    killer = threading.Thread(target=kill_the_one_who_waits, args=(tmp_path,))
+    killer.start()
+    said = []
+    tasks = [Task("victim", sweep_tasks.wait_to_be_killed, (str(tmp_path), 5)), Task("other", sweep_tasks.square, (2,))]
+    outcomes = dict(run_all(Processes(2), tasks, say=said.append))
+    killer.join()
+    assert outcomes == {0: Value(25), 1: Value(4)}
+    assert len(said) == 1
+    assert said[0].startswith("victim: the worker was killed by SIGKILL, as the system does when memory runs out")
+
+
+@pytest.mark.slow
+def test_a_worker_that_leaves_without_an_answer():
+    outcomes = dict(run_all(Processes(1), [Task("leave", sweep_tasks.leave, ())], retries=0))
+    assert outcomes[0].error == "the worker ended with exit code 7 and no answer"
+
+
+@pytest.mark.slow
+def test_every_task_has_a_process_with_its_share_of_the_processors(monkeypatch):
+    monkeypatch.setattr(processes_module.os, "cpu_count", lambda: 6)
+    tasks = [Task(str(n), sweep_tasks.environment, ()) for n in range(2)]
+    values = [outcome.value for _, outcome in run_all(Processes(2), tasks)]
+    assert len({pid for pid, _ in values} | {os.getpid()}) == 3
+    assert [threads for _, threads in values] == [3, 3]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_worker_is_interrupted_once_however_its_parent_ends(tmp_path, number):
+    """The sweep runs in a session of its own; SIGINT goes to all of its group, as Ctrl-C in a terminal does."""
+    command = [sys.executable, str(TESTS / "sweep_tasks.py"), str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}
+    sweep = subprocess.Popen(command, env=environment, start_new_session=True, stderr=subprocess.PIPE)
+    until((tmp_path / "started").exists)
+    worker = int((tmp_path / "started").read_text())
+    if number == signal.SIGINT:
+        os.killpg(sweep.pid, number)
+    else:
+        os.kill(sweep.pid, number)
+    until((tmp_path / "interrupted").exists)
+    sweep.communicate(timeout=30)
+    until(lambda: gone(worker))
+
+
+def test_no_job_is_refused():
+    with pytest.raises(ValueError, match="at least 1 job, got 0"):
+        Processes(0)

@@ -1,0 +1,84 @@
+"""What the workers of the sweep tests do; they find it by module and name, as any task."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import torch
+
+from reference_trainer.studies import grid
+from reference_trainer.studies.run import CHECKPOINT, RESULTS
+
+
+def square(number):
+    """Return the square, or raise for 3."""
+    if number == 3:
+        raise ValueError("three is refused")
+    return number * number
+
+
+def environment():
+    """Return the process and its threads."""
+    return os.getpid(), torch.get_num_threads()
+
+
+def wait_to_be_killed(folder, number):
+    """The first time, leave the number of the process and sleep; the next time, return."""
+    file = Path(folder, "pid")
+    if not file.exists():
+        file.with_suffix(".part").write_text(str(os.getpid()))
+        file.with_suffix(".part").rename(file)
+        time.sleep(60)
+    return number * number
+
+
+def leave():
+    """End the process as a library might."""
+    os._exit(7)
+
+
+def note_the_interruption(folder):
+    """Sleep, and leave a note when interrupted."""
+    part = Path(folder, "started.part")
+    part.write_text(str(os.getpid()))
+    part.rename(Path(folder, "started"))
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        Path(folder, "interrupted").touch()
+        raise
+
+
+def train_and_be_killed_once(options, config, out, *rest):
+    """A run whose first worker is killed as soon as there is a checkpoint; the run of seed 0 is spared."""
+    marker = out / "killed"
+    if config.seed and not marker.exists():
+        threading.Thread(target=_kill_at_checkpoint, args=(out, marker), daemon=True).start()
+    return TRAIN(options, config, out, *rest)
+
+
+TRAIN = grid.train_run  # the test puts the function above in its place
+
+
+def _kill_at_checkpoint(out, marker):
+    while not (out / CHECKPOINT).exists():
+        time.sleep(0.001)
+    assert not (out / RESULTS).exists()
+    marker.touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def interrupted_sweep(folder):
+    """A whole sweep of one task, for a process of its own that is to be ended from outside."""
+    from reference_trainer.studies.engines.engine import Task
+    from reference_trainer.studies.engines.processes import Processes
+    from reference_trainer.studies.engines.run_all import run_all
+
+    list(run_all(Processes(1), [Task("sleeper", note_the_interruption, (folder,))]))
+
+
+if __name__ == "__main__":
+    interrupted_sweep(sys.argv[1])
