@@ -63,6 +63,7 @@ class CAMonitor:
         TypeError: if ``views`` is not a mapping or an argument is of the wrong type.
         ValueError: if there are no views, a group is empty, ``every`` or ``resume_step`` is out of range, or a line of
             the log to resume is damaged.
+        OSError: if the log cannot be written, such as on a full disk; what is in it stays.
 
     Example:
         >>> import tempfile
@@ -104,7 +105,7 @@ class CAMonitor:
         folder.mkdir(parents=True, exist_ok=True)
         self.path = folder / LOG_NAME
         self._last_step = _keep_lines(self.path, resume_step)
-        self._file = self.path.open("a", encoding="utf-8")
+        self._file = self.path.open("ab", buffering=0)
         self._writer = _summary_writer(folder, resume_step)
         self.backends: tuple[str, ...] = ("jsonl",) if self._writer is None else ("jsonl", "tensorboard")
         hint = "" if self._writer else "; for TensorBoard: pip install 'ca_reg[tensorboard]'"
@@ -172,14 +173,25 @@ class CAMonitor:
 
     def _write(self, record: dict[str, float | int | str | None]) -> None:
         """Append one line, and the scalars to TensorBoard."""
-        self._file.write(json.dumps(record, allow_nan=False) + "\n")
-        self._file.flush()
+        self._append(json.dumps(record, allow_nan=False).encode() + b"\n")
         if self._writer is None:
             return
         for key, x in record.items():
             if key.startswith(("ca/", "psnr/", "gaussians")) and isinstance(x, int | float):
                 self._writer.add_scalar(key, x, record["step"])
         self._writer.flush()
+
+    def _append(self, line: bytes) -> None:
+        """Add a line to the log, on disk and whole, or leave the log as it is."""
+        end, rest = self.path.stat().st_size, line
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            self._file.truncate(end)
+            reason = f"{error.strerror} (the last measurement is not logged)"
+            raise OSError(error.errno, reason, str(self.path)) from error
 
 
 def _keep_lines(path: Path, resume_step: int | None) -> int:
@@ -192,8 +204,14 @@ def _keep_lines(path: Path, resume_step: int | None) -> int:
                 kept.append(line + "\n")
                 last = max(last, record["step"])
     partial = path.with_suffix(".tmp")
-    partial.write_text("".join(kept), encoding="utf-8")
-    partial.replace(path)  # never a moment without the log on disk
+    try:
+        with partial.open("w", encoding="utf-8") as file:
+            file.writelines(kept)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)  # never a moment without the log on disk
+    finally:
+        partial.unlink(missing_ok=True)
     return last
 
 

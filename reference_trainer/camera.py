@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -27,8 +28,8 @@ class Camera:
         height: image height, pixels.
 
     Raises:
-        ValueError: if the view matrix is not a finite (4, 4) tensor, a focal length is not positive or the size is
-            not positive.
+        ValueError: if the view matrix is not a finite (4, 4) tensor, a focal length is not positive and finite, the
+            principal point not finite, or the size not positive.
 
     Example:
         >>> camera = Camera(torch.eye(4), fx=100.0, fy=100.0, cx=32.0, cy=24.0, width=64, height=48)
@@ -50,8 +51,10 @@ class Camera:
         pose = self.world_to_camera
         if pose.shape != (4, 4) or not bool(torch.isfinite(pose).all()):
             raise ValueError(f"world_to_camera must be a finite (4, 4) tensor, got shape {tuple(pose.shape)}: {pose}.")
-        if not (self.fx > 0 and self.fy > 0):
-            raise ValueError(f"focal lengths must be positive pixels, got fx={self.fx}, fy={self.fy}.")
+        if not (0 < self.fx < math.inf and 0 < self.fy < math.inf):
+            raise ValueError(f"focal lengths must be positive, finite pixels, got fx={self.fx}, fy={self.fy}.")
+        if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
+            raise ValueError(f"the principal point must be finite, in pixels, got cx={self.cx}, cy={self.cy}.")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"the image size must be positive, got {self.width}x{self.height}.")
 

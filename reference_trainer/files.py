@@ -7,20 +7,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["replacing"]
+__all__ = ["remove_leftovers", "replacing", "write_text"]
+
+_PART = ".part"
 
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """Give a place to write to; on success it becomes ``path`` in one move, on failure nothing has changed.
 
-    Missing folders are made. The content is on disk before the move: a power cut leaves the old file or the new.
+    Missing folders are made. The content is on disk before the move, and the move before this returns: a power cut
+    leaves the old file or the new, and what is written later does not survive without what was written before.
 
     Args:
         path: the file to create or replace.
 
     Yields:
         A path in the same folder to write the content to.
+
+    Raises:
+        OSError: if it cannot be written, such as on a full disk; it names ``path``.
 
     Example:
         >>> import tempfile
@@ -32,11 +38,49 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{_PART}")
     try:
         yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
+        _sync(temporary)
         os.replace(temporary, path)
+        if os.name == "posix":  # elsewhere a folder cannot be opened
+            _sync(path.parent)
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(temporary)):
+            raise
+        reason = f"{os.strerror(error.errno)} (not written; what was there before is kept)"
+        raise OSError(error.errno, reason, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text in UTF-8 as `replacing` does.
+
+    Args:
+        path: the file to create or replace.
+        text: all of its content.
+    """
+    with replacing(path) as place:
+        place.write_text(text, encoding="utf-8")
+
+
+def remove_leftovers(folder: str | Path) -> int:
+    """Remove what killed processes had begun to write below a folder, and return how many files that were.
+
+    Args:
+        folder: where no other process is writing now.
+    """
+    leftovers = [path for path in Path(folder).rglob(f".*{_PART}") if path.is_file()]
+    for path in leftovers:
+        path.unlink(missing_ok=True)
+    return len(leftovers)
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file or the entries of a folder are on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

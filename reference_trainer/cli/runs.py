@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -85,25 +86,29 @@ class Train:
     """Steps between measurements of CA and PSNR for TensorBoard; 0 for none."""
     lpips: str | None = None
     """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
+    deterministic: bool = False
+    """One thread and repeatable algorithms: the same result whatever the number of threads, and on CUDA every time."""
 
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.render.compiled import use_compiled
         from reference_trainer.studies.run import run_experiment, summary
+        from reference_trainer.training.determinism import deterministic
 
         use_compiled(self.compile)
-        results = run_experiment(
-            self.scene,
-            self.config,
-            self.out,
-            auto=self.auto,
-            given=self.given,
-            device=self.device,
-            monitor_every=self.monitor_every,
-            lpips=self.lpips,
-            progress=True,
-            say=print,
-        )
+        with deterministic(self.device) if self.deterministic else nullcontext():
+            results = run_experiment(
+                self.scene,
+                self.config,
+                self.out,
+                auto=self.auto,
+                given=self.given,
+                device=self.device,
+                monitor_every=self.monitor_every,
+                lpips=self.lpips,
+                progress=True,
+                say=print,
+            )
         print(summary(results))
         print(f"Everything is in {self.out}; curves: tensorboard --logdir {self.out}")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from reference_trainer.files import replacing
+from reference_trainer.files import write_text
 
 __all__ = ["format_mean_std", "machine", "markdown_table", "mean_std", "write_json"]
 
@@ -40,8 +40,7 @@ def write_json(path: str | Path, data: object) -> None:
         {'ca': None, 'views': [1, 2]}
     """
     text = json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    with replacing(path) as place:
-        place.write_text(text, encoding="utf-8")
+    write_text(path, text)
 
 
 def mean_std(values: Iterable[float]) -> tuple[float, float]:

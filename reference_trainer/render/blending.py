@@ -23,6 +23,7 @@ from reference_trainer.render.footprints import (
     tile,
     untile,
 )
+from reference_trainer.render.precision import without_autocast
 from reference_trainer.render.tiles import Block, TileLists
 from reference_trainer.render.workspace import Workspace
 
@@ -91,6 +92,7 @@ class _Composite(torch.autograd.Function):
         return untile(sums, lists)
 
     @staticmethod
+    @without_autocast
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
         table, values = ctx.saved_tensors
         lists: TileLists = ctx.lists

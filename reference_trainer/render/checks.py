@@ -59,7 +59,10 @@ def check_projection(
 def check_background(background: Tensor) -> None:
     """Raise `NotFiniteError` unless the colour behind everything is finite."""
     if not bool(background.isfinite().all()):
-        raise NotFiniteError(f"background must be finite, got {background.tolist()}.")
+        count = int((~background.isfinite()).sum())
+        raise NotFiniteError(
+            f"background must be finite, got nan or infinity in {count} of {background.numel()} numbers."
+        )
 
 
 def _refuse(results: tuple[Tensor, ...], inputs: Mapping[str, Tensor], camera: Camera) -> None:
@@ -76,5 +79,5 @@ def _refuse(results: tuple[Tensor, ...], inputs: Mapping[str, Tensor], camera: C
         raise NotFiniteError(
             f"Gaussians project to nan or infinity, from finite inputs: their scales go up to "
             f"{inputs['scales'].abs().max().item():.3g}, the camera has fx={camera.fx:.3g}, fy={camera.fy:.3g}, "
-            f"cx={camera.cx:.3g}, cy={camera.cy:.3g}."
+            f"cx={camera.cx:.3g}, cy={camera.cy:.3g}. If training made them, lower the learning rates."
         )

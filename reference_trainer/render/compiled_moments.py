@@ -23,6 +23,7 @@ from reference_trainer.render.footprints import (
     untile,
 )
 from reference_trainer.render.moment_rows import behind_rows, gradient_rows, moment_rows
+from reference_trainer.render.precision import without_autocast
 from reference_trainer.render.tiles import Block, Chunk, TileLists
 
 __all__ = ["compiled_moments"]
@@ -70,6 +71,7 @@ class _CompiledMoments(torch.autograd.Function):
         return untile(means, lists), untile(variances, lists)
 
     @staticmethod
+    @without_autocast
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor | None, Tensor, None]:
         table, values, factors, behind = ctx.saved_tensors
         lists: TileLists = ctx.lists

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, NEAR_PLANE
+from reference_trainer.render.projection import screen_radii
 
 __all__ = ["DrawnLists", "Ellipses", "GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
 
@@ -171,7 +172,6 @@ def render_by(
 
 
 def _radii(conics: Tensor) -> Tensor:
-    """Three standard deviations of the longer axis, rounded up: gsplat's own radii follow the opacity instead."""
+    """Radii of the covariances: gsplat's own follow the opacity instead."""
     xx, xy, yy = conics.unbind(-1)  # of the inverse covariance
-    largest = (0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)) / (xx * yy - xy * xy)
-    return torch.ceil(3.0 * largest.sqrt())
+    return screen_radii(torch.stack([yy, -xy, xx], dim=-1) / (xx * yy - xy * xy).unsqueeze(-1))

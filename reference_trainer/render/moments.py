@@ -21,6 +21,7 @@ from reference_trainer.render.footprints import (
     untile,
 )
 from reference_trainer.render.moment_gradients import block_gradients
+from reference_trainer.render.precision import without_autocast
 from reference_trainer.render.recursion import (
     Entries,
     behind_tiles,
@@ -124,6 +125,7 @@ class _Moments(torch.autograd.Function):
         return untile(means, lists), untile(variances, lists)
 
     @staticmethod
+    @without_autocast
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor | None, Tensor, None]:
         table, values, factors, behind = ctx.saved_tensors
         lists: TileLists = ctx.lists

@@ -10,9 +10,10 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
 
-__all__ = ["Projection", "project", "rotation_matrices"]
+__all__ = ["Projection", "project", "rotation_matrices", "screen_radii"]
 
 _NO_DIRECTION = 1e-30  # a quaternion well below this is taken for 0
+_SMALLEST_SPREAD = 0.1**0.5  # px^2: half the difference of the variances along the axes is taken for no less
 
 
 class Projection(NamedTuple):
@@ -36,10 +37,26 @@ class Projection(NamedTuple):
 
     @property
     def radii(self) -> Tensor:
-        """Three standard deviations of the longer axis, rounded up, pixels, shape (M,), as in the INRIA code."""
-        xx, xy, yy = self.covariances.detach().unbind(-1)
-        largest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
-        return torch.ceil(3.0 * largest.sqrt())
+        """See `screen_radii`; shape (M,)."""
+        return screen_radii(self.covariances.detach())
+
+
+def screen_radii(covariances: Tensor) -> Tensor:
+    """Three standard deviations of the longer axis, rounded up; as in the INRIA code, more for round splats.
+
+    Args:
+        covariances: ``(xx, xy, yy)``, square pixels, shape (M, 3).
+
+    Returns:
+        Radii in pixels, shape (M,), of the type of the covariances.
+
+    Example:
+        >>> screen_radii(torch.tensor([[1.0, 0.0, 1.0], [9.0, 0.0, 1.0]])).tolist()  # 3 sqrt(1.32), 3 sqrt(9)
+        [4.0, 9.0]
+    """
+    xx, xy, yy = covariances.unbind(-1)
+    spread = torch.hypot(0.5 * (xx - yy), xy).clamp_min(_SMALLEST_SPREAD)
+    return torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt())
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:

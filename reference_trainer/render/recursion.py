@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
+from reference_trainer.render.checks import check_background
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA
 from reference_trainer.render.footprints import PIXELS, block_size, monomials, tile
 from reference_trainer.render.renderer import Splats
@@ -53,11 +54,13 @@ def behind_tiles(background: Tensor | None, splats: Splats) -> Tensor:
         splats: of the view.
 
     Raises:
-        ValueError: if the background has another shape.
+        ValueError: if the background has another shape, or is not finite.
     """
     shape = (3, splats.lists.height, splats.lists.width)
     if background is None:
         background = splats.colors.new_zeros(3)
+    else:
+        check_background(background)
     if background.shape not in (shape, shape[:1]):
         raise ValueError(f"background must have shape (3,) or {shape}, got {tuple(background.shape)}.")
     image = (background if background.ndim == 3 else background[:, None, None]).to(splats.colors).expand(shape)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
+from reference_trainer.neighbors import nearest_neighbors
 from reference_trainer.scenes.colmap import read_colmap
 from reference_trainer.scenes.scene import PointCloud
 
@@ -21,7 +22,6 @@ __all__ = [
 ]
 
 SMALLEST_SQUARED_DISTANCE = 1e-7  # INRIA's clamp: coinciding points still get a Gaussian of some size
-CHUNK_ELEMENTS = 4_000_000  # distances held at a time: 16 MB in float32
 
 
 def colmap_points(folder: str | Path) -> PointCloud:
@@ -154,16 +154,14 @@ def check_no_leak(points: PointCloud, train_names: Iterable[str], *, allow: bool
         )
 
 
-def mean_neighbor_distance(positions: Tensor, k: int = 3) -> Tensor:
-    """Return the root mean squared distance of each point to its ``k`` nearest others.
+def mean_neighbor_distance(positions: Tensor) -> Tensor:
+    """Return the root mean squared distance of each point to its three nearest others.
 
     Convention: the INRIA code takes the logarithm of this as the initial scale of a Gaussian. Coinciding points get
-    sqrt(1e-7) instead of 0. With fewer than ``k`` other points, all others count.
+    sqrt(1e-7) instead of 0. With fewer than three other points, all others count.
 
     Args:
-        positions: world coordinates, shape (N, 3), N at least 2. Time grows as N squared: 15,000 points take about a
-            second.
-        k: number of neighbours.
+        positions: world coordinates, shape (N, 3), N at least 2.
 
     Returns:
         Distances, shape (N,), positive.
@@ -172,20 +170,11 @@ def mean_neighbor_distance(positions: Tensor, k: int = 3) -> Tensor:
         ValueError: if the shape is not (N, 3) or N is less than 2.
 
     Example:
-        >>> mean_neighbor_distance(torch.tensor([[0.0, 0, 0], [0, 0, 2], [0, 0, 4]]), k=1).tolist()
-        [2.0, 2.0, 2.0]
+        >>> mean_neighbor_distance(torch.tensor([[0.0, 0, 0], [0, 0, 2]])).tolist()
+        [2.0, 2.0]
     """
     n = positions.shape[0]
     if positions.ndim != 2 or positions.shape[1] != 3 or n < 2:
         raise ValueError(f"positions must have shape (N, 3) with N >= 2, got {tuple(positions.shape)}.")
-    chunk = max(1, CHUNK_ELEMENTS // n)
-    result = positions.new_empty(n)
-    for start in range(0, n, chunk):
-        part = positions[start : start + chunk]
-        # By way of matrix products, cdist would return 0 for near duplicates.
-        distances = torch.cdist(part, positions, compute_mode="donot_use_mm_for_euclid_dist")
-        rows = torch.arange(len(part), device=positions.device)
-        distances[rows, start + rows] = torch.inf
-        nearest = distances.topk(min(k, n - 1), dim=1, largest=False).values
-        result[start : start + chunk] = nearest.square().mean(1)
-    return result.clamp_min(SMALLEST_SQUARED_DISTANCE).sqrt()
+    squares, _ = nearest_neighbors(positions, min(3, n - 1))
+    return squares.mean(1).clamp_min(SMALLEST_SQUARED_DISTANCE).sqrt()

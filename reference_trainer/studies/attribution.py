@@ -18,7 +18,7 @@ from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import heat_map, save_png, side_by_side
 from reference_trainer.evaluation.rank_correlation import spearman
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
-from reference_trainer.files import replacing
+from reference_trainer.files import replacing, write_text
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.render import render
 from reference_trainer.scenes.scene import View
@@ -245,7 +245,7 @@ def study_attribution(
     table = _table(data)
     ends = dict(zip(("low", "high"), scales["share"], strict=True))
     ends |= dict(zip(("low_per_weight", "high_per_weight"), scales["share_per_weight"], strict=True))
-    (out / "README.md").write_text(_README.format(table=table, ca_range=CA_PICTURE_RANGE, **ends), encoding="utf-8")
+    write_text(out / "README.md", _README.format(table=table, ca_range=CA_PICTURE_RANGE, **ends))
     say(table)
     say(f"Shares, PLYs and pictures are in {out}; README.md there says what the colours mean")
     return data

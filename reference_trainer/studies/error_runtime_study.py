@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,8 @@ import torch
 
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
+from reference_trainer.files import replacing, write_text
+from reference_trainer.json_files import read_json
 from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.orbit import orbit_views
 from reference_trainer.scenes.scene import View
@@ -116,7 +117,7 @@ def study(
         return lambda text: say(f"{scene}: {text}")
 
     file = out / REPORT
-    scenes: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    scenes: dict[str, Any] = read_json(file) if file.exists() else {}
     results: dict[str, ErrorRuntime] = {}
     for name, (model, view) in models.items():
         settings = _settings(model, view, max_samples, seeds) | ({"compiled": True} if compiled else {})
@@ -130,7 +131,7 @@ def study(
             write_json(file, scenes)
         results[name] = ErrorRuntime.from_dict(scenes[name])
     text = "\n".join(f"## {name}\n\n{error_runtime_table(result)}" for name, result in results.items())
-    (out / TABLE).write_text(text, encoding="utf-8")
+    write_text(out / TABLE, text)
     error_runtime_figure(results, out / FIGURE)
     say(text)
     say(f"numbers, tables and figure: {file}, {out / TABLE}, {out / FIGURE}")
@@ -190,7 +191,8 @@ def error_runtime_figure(results: Mapping[str, ErrorRuntime], path: Path) -> Non
     panels[0].set_ylabel("relative error")
     lines = dict(zip(*reversed(panels[-1].get_legend_handles_labels()), strict=True))
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize="small")
-    figure.savefig(path, dpi=110)
+    with replacing(path) as place:
+        figure.savefig(place, dpi=110, format="png")
 
 
 def _panel(axes: Any, result: ErrorRuntime) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ca_reg.dynamics import plot_dynamics
 from reference_trainer.evaluation.pictures import save_png, side_by_side
+from reference_trainer.files import replacing
 from reference_trainer.scenes.images import read_image
 
 __all__ = ["comparison_figure", "dynamics_figure"]
@@ -25,7 +26,8 @@ def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
     figure = Figure(figsize=(9, 5), layout="constrained")
     FigureCanvasAgg(figure)
     plot_dynamics(dict(runs), ax=figure.add_subplot())
-    figure.savefig(path, dpi=110)
+    with replacing(path) as place:
+        figure.savefig(place, dpi=110, format="png")
 
 
 def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split: str = "test") -> None:

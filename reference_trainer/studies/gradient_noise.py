@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,6 +12,8 @@ from torch import Tensor
 
 from ca_reg.functional import apply_dropout, draw_keep_mask, expected_squared_error
 from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.files import write_text
+from reference_trainer.json_files import read_json
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.scene import View
@@ -75,7 +76,7 @@ def study_gradient_noise(
         if not (run / CHECKPOINT).exists():
             raise FileNotFoundError(f"{run} holds no run (no {CHECKPOINT}): give the --out folder of ca-reg train.")
     file = out / "gradient_noise.json"
-    entries: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    entries: dict[str, Any] = read_json(file) if file.exists() else {}
     results: dict[str, GradientNoise] = {}
     for name, run in zip(names, runs, strict=True):
         settings = {
@@ -109,7 +110,7 @@ def study_gradient_noise(
             write_json(file, entries)
         results[name] = GradientNoise.from_dict(entries[name])
     text = gradient_noise_report(results)
-    (out / "gradient_noise.md").write_text(text, encoding="utf-8")
+    write_text(out / "gradient_noise.md", text)
     gradient_noise_figure(results, out / "gradient_noise.png")
     say(text)
     say(f"Tables, numbers and figure are in {out}")

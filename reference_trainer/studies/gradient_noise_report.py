@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from reference_trainer.evaluation.report import format_mean_std, markdown_table
+from reference_trainer.files import replacing
 from reference_trainer.studies.gradient_noise_moments import CANDIDATES, LOSSES, GradientNoise, Moments
 
 __all__ = ["gradient_noise_figure", "gradient_noise_report", "gradient_noise_table"]
@@ -120,4 +121,5 @@ def gradient_noise_figure(results: Mapping[str, GradientNoise], path: Path) -> N
         axes.grid(axis="y", alpha=0.3)
     lines = dict(zip(*reversed(panels[-1].get_legend_handles_labels()), strict=True))
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=3, frameon=False, fontsize="small")
-    figure.savefig(path, dpi=110)
+    with replacing(path) as place:
+        figure.savefig(place, dpi=110, format="png")

@@ -13,6 +13,7 @@ from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import save_gif, save_png
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.evaluation.trajectory import interpolate_cameras
+from reference_trainer.files import write_text
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.studies.run import load_run, model_of
@@ -82,7 +83,7 @@ def measure(
     }
     write_json(out / "evaluation.json", data)
     table = evaluation_table(result)
-    (out / "evaluation.md").write_text(table + "\n", encoding="utf-8")
+    write_text(out / "evaluation.md", table + "\n")
     say(table)
     say(f"Scores and pictures are in {out}")
     return result

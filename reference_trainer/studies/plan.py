@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +15,8 @@ import torch
 
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
+from reference_trainer.files import write_text
+from reference_trainer.json_files import read_json
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.plan_parts import parts_of_a_step
 from reference_trainer.studies.run import model_of
@@ -122,13 +123,13 @@ def study_plan(
                 with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
                     record = pool.submit(_train, options, settings, device, threads, name == AS_ASKED).result()
                 write_json(file, {"variant": name, **record})
-            records.append(json.loads(file.read_text(encoding="utf-8")))
+            records.append(read_json(file))
             if records[-1]["config"] != dataclasses.asdict(settings):
                 raise ValueError(f"{file} holds a training with other settings: give another folder, or delete it.")
             say(f"{name}, seed {seed}: {records[-1]['psnr']:.2f} dB, {records[-1]['cpu_seconds']:.0f} s of processors")
     table = plan_table(records)
     write_json(out / "plan_study.json", {"plan": plan.as_dict(), "trainings": records, "machine": machine()})
-    (out / "plan_study.md").write_text(table, encoding="utf-8")
+    write_text(out / "plan_study.md", table)
     say(table)
     return records
 

@@ -16,12 +16,13 @@ from torch import Tensor
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, mean_std, write_json
+from reference_trainer.files import replacing, write_text
+from reference_trainer.json_files import read_json
 from reference_trainer.model.density import DensityStatistics
-from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.attribution import blend_weights, mean_shares, share_per_weight
 from reference_trainer.studies.run import CHECKPOINT, CONFIG, load_run, model_of
-from reference_trainer.training.config import TrainConfig
+from reference_trainer.studies.run_settings import read_run_settings
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 
@@ -176,7 +177,7 @@ def study_pruning(
     records = {run: [dataclasses.asdict(each) for each in measured] for run, measured in found.items()}
     write_json(out / "pruning.json", {"criteria": CRITERIA, "runs": records, "machine": machine()})
     text = _report(found)
-    (out / "pruning.md").write_text(text, encoding="utf-8")
+    write_text(out / "pruning.md", text)
     _figure(found, out / "pruning.png")
     say(text)
     say(f"Numbers, table and figure are in {out}")
@@ -189,8 +190,7 @@ def _refuse_different(folders: Sequence[Path]) -> None:
     for folder in folders:
         if not (folder / CHECKPOINT).exists():
             raise FileNotFoundError(f"{folder} holds no run (no {CHECKPOINT}): give the --out folder of ca-reg train.")
-        data = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
-        of_both = (SceneOptions(**data["scene"]), TrainConfig(**data["config"]))  # fills in what older runs do not say
+        of_both = read_run_settings(folder / CONFIG)
         settings.append({name: value for each in of_both for name, value in vars(each).items() if name != "seed"})
     if not settings:
         raise ValueError("expected at least 1 run, got none: give the --out folders of ca-reg train.")
@@ -210,7 +210,7 @@ def _measure_run(
     key = [str(folder), (folder / CHECKPOINT).stat().st_mtime_ns, CRITERIA, fields]
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:12]
     file = out / "measured" / f"{folder.parent.name}_{folder.name}_{digest}.json"
-    known = [_read(record) for record in json.loads(file.read_text(encoding="utf-8"))] if file.exists() else []
+    known = [_read(record) for record in read_json(file)] if file.exists() else []
     by_key = {(each.criterion, each.fraction, each.steps): each for each in known}
     missing = [each for each in wanted if each not in by_key]
     if missing:
@@ -315,4 +315,5 @@ def _figure(found: dict[str, list[Pruned]], path: Path) -> None:
             ax.set(xlabel="Gaussians removed (%)", ylabel=f"test {title}", title=after)
             ax.grid(linewidth=0.3)
     grid[0][1].legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as place:
+        figure.savefig(place, dpi=110, format="png")

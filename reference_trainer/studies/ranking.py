@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.files import write_text
+from reference_trainer.json_files import read_json
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.ranking_report import correlations, ranking_figure, ranking_report
 from reference_trainer.studies.ranking_scores import VARIANTS, Ranking, RunScores, score_run
@@ -102,7 +104,7 @@ def study_ranking(
         },
     )
     text = ranking_report(ranking)
-    (out / "ranking.md").write_text(text, encoding="utf-8")
+    write_text(out / "ranking.md", text)
     ranking_figure(ranking, out / "ranking.png")
     say(text)
     say(f"Tables, numbers and figure are in {out}")
@@ -122,6 +124,6 @@ def _file_name(folder: Path, split: str, views: int | None) -> str:
 
 def _read(file: Path) -> RunScores:
     """Read a measurement; what JSON has no word for was nan."""
-    data = json.loads(file.read_text(encoding="utf-8"))
+    data = read_json(file)
     views = [{name: math.nan if x is None else x for name, x in view.items()} for view in data.pop("views")]
     return RunScores(**data, views=views)

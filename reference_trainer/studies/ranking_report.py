@@ -10,6 +10,7 @@ from pathlib import Path
 
 from reference_trainer.evaluation.rank_correlation import kendall, spearman
 from reference_trainer.evaluation.report import markdown_table, mean_std
+from reference_trainer.files import replacing
 from reference_trainer.studies.ranking_scores import VARIANTS, Ranking, RunScores
 
 __all__ = ["correlations", "disagreements", "group_labels", "ranking_figure", "ranking_report"]
@@ -188,7 +189,8 @@ def ranking_figure(ranking: Ranking, path: Path) -> None:
             ax.grid(linewidth=0.3)
         row[0].legend(*([x[-1]] for x in row[0].get_legend_handles_labels()), loc="upper left", fontsize=8)
         row[1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as place:
+        figure.savefig(place, dpi=110, format="png")
 
 
 def _score_cell(run: RunScores, variant: str) -> str | None:

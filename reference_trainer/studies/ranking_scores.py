@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from reference_trainer.evaluation.report import mean_std
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.run import CONFIG, load_run, model_of
+from reference_trainer.studies.run_settings import read_run_settings
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["VARIANTS", "Ranking", "RunScores", "score_run", "score_view"]
@@ -168,7 +168,7 @@ def score_run(folder: Path, *, split: str, views: int | None = None, device: str
     if not members:
         raise ValueError(f"{folder} has no {split} views to measure.")
     model = model_of(trainer)
-    options = SceneOptions(**json.loads((folder / CONFIG).read_text(encoding="utf-8"))["scene"])
+    options, _ = read_run_settings(folder / CONFIG)
     config = trainer.config
     settings = dataclasses.asdict(options) | dataclasses.asdict(config)
     return RunScores(

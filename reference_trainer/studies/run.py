@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import json
+import signal
+import sys
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,17 @@ from reference_trainer.evaluation.lpips import lpips_option
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.files import remove_leftovers
+from reference_trainer.json_files import read_json
 from reference_trainer.model.ply import save_ply
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
+from reference_trainer.studies.run_settings import read_run_settings
+from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.plan import Plan, make_plan
-from reference_trainer.training.trainer import Trainer
+from reference_trainer.training.trainer import Trainer, TrainingStoppedError
 
 __all__ = [
     "BAKED_PLY",
@@ -115,14 +120,16 @@ def run_experiment(
         The content of ``results.json``.
 
     Raises:
-        ValueError: if the folder holds a run with other settings.
-        TrainingStoppedError: if training cannot go on; the last checkpoint is kept.
-        TrainingInterrupted: on Ctrl-C, after a checkpoint has been saved; a second Ctrl-C does not wait for it.
+        ValueError: if the folder holds a run with other settings, or a damaged file.
+        TrainingStoppedError: if training cannot go on; the last checkpoint is kept, and the message names it.
+        TrainingInterrupted: on Ctrl-C, after a checkpoint has been saved; a second Ctrl-C does not wait for it. After
+            SIGTERM the checkpoint is saved, too, and the signal raised again, which ends the process.
+        OSError: if a file cannot be written, such as on a full disk; what was there before is kept.
     """
     perceptual = lpips_option(lpips, device=device)
     begun = (out / CONFIG).exists()
     if auto and begun and (out / PLAN).exists():
-        config = Plan.from_dict(json.loads((out / PLAN).read_text(encoding="utf-8"))).applied(config, given=given)
+        config = _plan(out / PLAN).applied(config, given=given)
     if begun:
         _refuse_other_run(out, _claim(options, config))
     if (out / RESULTS).exists():
@@ -136,17 +143,27 @@ def run_experiment(
         _tell(plan, out, say)
     elif not begun:
         (out / PLAN).unlink(missing_ok=True)  # of a run that ended before it had begun
+    remove_leftovers(out)
     checkpoint = out / CHECKPOINT
     resumed = checkpoint.exists()
     trainer = Trainer.load(checkpoint, scene, device) if resumed else Trainer(scene, config, device)
     write_json(out / CONFIG, _claim(options, config))  # not earlier: a mistyped scene must not claim the folder
     if resumed:
         say(f"{out}: continues from step {trainer.step}")
+    else:
+        trainer.save(checkpoint)
     try:
         _train(trainer, out, monitor_every, checkpoint_every, resumed=resumed, progress=progress, say=say)
-    except TrainingInterrupted:
+    except TrainingInterrupted as stop:
         trainer.save(checkpoint)
+        say(f"{out}: saved at step {trainer.step} of {config.iterations}; the same command continues there")
+        if stop.signal == signal.SIGTERM:  # who sent it expects the process to end by it
+            sys.stdout.flush()
+            signal.raise_signal(signal.SIGTERM)
         raise
+    except TrainingStoppedError as error:
+        step = load_checkpoint(checkpoint)["step"]
+        raise TrainingStoppedError(f"{error} The model of step {step} is kept in {checkpoint}.") from error
     model = model_of(trainer)
     save_ply(model.gaussians, out / PLY)
     if model.opacity_scale < 1 or model.expected_noise > 0:
@@ -188,18 +205,28 @@ def load_run(folder: Path, device: torch.device | str = "cpu") -> Trainer:
 
     Raises:
         FileNotFoundError: if the folder holds no run.
+        ValueError: if its settings or its checkpoint are damaged, or do not belong together.
     """
     if not (folder / CONFIG).exists():
         raise FileNotFoundError(f"{folder} holds no run (no {CONFIG}): give the --out folder of ca-reg train.")
-    settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
-    scene = SceneOptions(**settings["scene"]).load(seed=settings["config"]["seed"])
-    return Trainer.load(folder / CHECKPOINT, scene, device)
+    options, config = read_run_settings(folder / CONFIG)
+    return Trainer.load(folder / CHECKPOINT, options.load(seed=config.seed), device)
 
 
 def _results(out: Path) -> dict[str, Any]:
     """Read the results of a complete run."""
-    results: dict[str, Any] = json.loads((out / RESULTS).read_text(encoding="utf-8"))
+    results = read_json(out / RESULTS)
+    if not isinstance(results, dict) or "mean" not in results:
+        raise ValueError(f"{out / RESULTS} does not hold the results of a run: delete it to measure again.")
     return results
+
+
+def _plan(path: Path) -> Plan:
+    """Read the plan of a run."""
+    try:
+        return Plan.from_dict(read_json(path))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _claim(options: SceneOptions, config: TrainConfig) -> dict[str, Any]:
@@ -217,10 +244,7 @@ def _tell(plan: Plan, out: Path, say: Callable[[str], None]) -> None:
 
 def _refuse_other_run(out: Path, settings: dict[str, Any]) -> None:
     """Refuse a folder that holds a run with other settings."""
-    # A setting that an older version did not have yet was at its default.
-    defaults = {"scene": dataclasses.asdict(SceneOptions()), "config": dataclasses.asdict(TrainConfig())}
-    text = json.loads((out / CONFIG).read_text(encoding="utf-8"))
-    found = {part: defaults[part] | text.get(part, {}) for part in settings}
+    found = _claim(*read_run_settings(out / CONFIG))
     changed = [
         f"{key}: {found[part][key]} -> {value}"
         for part, values in settings.items()

@@ -14,6 +14,7 @@ from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.files import write_text
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.load import BACKGROUNDS
@@ -212,7 +213,7 @@ def score_ply_on_orbit(
     }
     write_json(folder / "evaluation.json", data)
     table = camera_table(result)
-    (folder / "evaluation.md").write_text(f"{facts}\n\n{table}", encoding="utf-8")
+    write_text(folder / "evaluation.md", f"{facts}\n\n{table}")
     say(table)
     say(f"Scores and pictures are in {folder}")
     return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,14 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     Args:
         path: where to; its folder is made.
         state: nested dicts of tensors, numbers, strings and None.
+
+    Raises:
+        OSError: if it cannot be written, such as on a full disk; it names the file.
     """
+    content = io.BytesIO()  # torch.save to a file hides the error of a full disk behind one of its own
+    torch.save({"format": _FORMAT, **state}, content)
     with replacing(path) as place:
-        torch.save({"format": _FORMAT, **state}, place)
+        place.write_bytes(content.getbuffer())
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Ctrl-C between steps, never in the middle of one."""
+"""Ctrl-C and SIGTERM between steps, never in the middle of one."""
 
 from __future__ import annotations
 
@@ -12,37 +12,52 @@ __all__ = ["TrainingInterrupted", "hold_interrupts"]
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """Ctrl-C between two steps: the model is whole and can be saved."""
+    """A signal between two steps: the model is whole and can be saved.
+
+    Attributes:
+        signal: which one, ``SIGINT`` (Ctrl-C) or ``SIGTERM`` (clusters, ``kill``). Who has saved raises SIGTERM again
+            (`signal.raise_signal`), so that the process ends as the sender expects.
+    """
+
+    def __init__(self, signal: signal.Signals) -> None:
+        super().__init__(signal.name)
+        self.signal = signal
 
 
 @contextmanager
-def hold_interrupts() -> Iterator[Callable[[], bool]]:
-    """Hold back Ctrl-C (SIGINT) and remember it; a second one interrupts at once.
+def hold_interrupts() -> Iterator[Callable[[], None]]:
+    """Hold back Ctrl-C (SIGINT) and SIGTERM and remember them; a second Ctrl-C interrupts at once.
 
     A model that is interrupted while its tensors are being changed is broken and must not be saved. Inside this block
-    the caller decides when to stop. Outside the main thread, where signals do not arrive, nothing is done.
+    the caller decides when to stop. A second SIGTERM changes nothing: who cannot wait sends SIGKILL. Outside the main
+    thread, where signals do not arrive, nothing is done; a signal that the process ignores (of a job in the
+    background) stays ignored.
 
     Yields:
-        A function that tells whether an interruption is waiting.
+        A function that raises `TrainingInterrupted` if a signal is waiting.
 
     Example:
-        >>> with hold_interrupts() as interrupted:
-        ...     interrupted()
-        False
+        >>> with hold_interrupts() as stop_if_interrupted:
+        ...     stop_if_interrupted()
     """
     if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
+        yield lambda: None
         return
-    waiting = False
+    waiting: list[signal.Signals] = []
 
     def remember(number: int, frame: FrameType | None) -> None:
-        nonlocal waiting
-        if waiting:
+        if waiting and number == signal.SIGINT:
             raise KeyboardInterrupt
-        waiting = True
+        waiting.append(signal.Signals(number))
 
-    before = signal.signal(signal.SIGINT, remember)
+    def stop() -> None:
+        if waiting:
+            raise TrainingInterrupted(waiting[0])
+
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
+    before = {number: signal.signal(number, remember) for number in numbers}
     try:
-        yield lambda: waiting
+        yield stop
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -25,9 +25,10 @@ from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoi
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation
 from reference_trainer.training.initial import initial_gaussians
-from reference_trainer.training.interruption import TrainingInterrupted, hold_interrupts
+from reference_trainer.training.interruption import hold_interrupts
 from reference_trainer.training.losses import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream, view_order
+from reference_trainer.training.state import read_state
 
 __all__ = ["Trainer", "TrainingStoppedError"]
 
@@ -103,18 +104,18 @@ class Trainer:
 
         Raises:
             TrainingStoppedError: if the loss or the Gaussians are not finite, or no Gaussian is left.
-            TrainingInterrupted: on Ctrl-C, between two steps: what is saved then continues to the identical result.
+            TrainingInterrupted: on Ctrl-C or SIGTERM, between two steps: what is saved then continues to the identical
+                result.
         """
         from tqdm import tqdm
 
         last = self.config.iterations if until is None else min(until, self.config.iterations)
         with (
-            hold_interrupts() as interrupted,
+            hold_interrupts() as stop_if_interrupted,
             tqdm(total=self.config.iterations, initial=self.step, disable=not progress, mininterval=0.5) as bar,
         ):
             while self.step < last:
-                if interrupted():
-                    raise TrainingInterrupted
+                stop_if_interrupted()
                 start = time.perf_counter()
                 loss, mse = self.train_step()
                 self.seconds += time.perf_counter() - start
@@ -124,6 +125,7 @@ class Trainer:
                 bar.update()
                 if after_step is not None:
                     after_step(self)
+            stop_if_interrupted()  # the last step is no shelter
 
     def train_step(self) -> tuple[float, float]:
         """Take one step on one view; return the loss and the mean squared error of the (regularized) render."""
@@ -133,7 +135,7 @@ class Trainer:
         try:
             loss, image, splats = self._expected_loss(view) if self._is_analytic() else self._sampled_loss(view)
         except NotFiniteError as error:
-            raise TrainingStoppedError(f"step {step + 1} has nothing to render: {error}") from error
+            raise TrainingStoppedError(f"step {step + 1} cannot be rendered: {error}") from error
         value = loss.item()
         if not math.isfinite(value):
             raise TrainingStoppedError(f"the loss became {value} at step {step + 1}: lower the learning rates.")
@@ -148,7 +150,19 @@ class Trainer:
         return value, mse
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint from which `load` continues to the identical result."""
+        """Write a checkpoint from which `load` continues to the identical result.
+
+        Raises:
+            TrainingStoppedError: if the model or the state of its optimizer is not finite: such a checkpoint would
+                replace a good one.
+            OSError: if it cannot be written; what was there before is kept.
+        """
+        optimizer = self.optimizer.state_dict()
+        tensors = [*optimizer["gaussians"].values(), *(x for of in optimizer["moments"].values() for x in of.values())]
+        if not all(bool(x.isfinite().all()) for x in tensors):
+            raise TrainingStoppedError(
+                f"Gaussians became nan or infinite by step {self.step}, which is not saved: lower the learning rates."
+            )
         state = {
             "config": json.dumps(dataclasses.asdict(self.config)),
             "scene": self.scene.name,
@@ -156,7 +170,7 @@ class Trainer:
             "step": self.step,
             "seconds": self.seconds,
             "statistics": vars(self.statistics),
-            **self.optimizer.state_dict(),
+            **optimizer,
         }
         save_checkpoint(path, state)
 
@@ -170,18 +184,14 @@ class Trainer:
             device: where to train.
 
         Raises:
-            ValueError: if the file is not a readable checkpoint, or belongs to another scene or other training views.
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is not a readable checkpoint, something in it is missing or does not fit, or it
+                belongs to another scene or other training views.
         """
-        state = load_checkpoint(path, device)
-        names = [view.name for view in scene.train]
-        if state["scene"] != scene.name:
-            raise ValueError(f"{path} was trained on the scene {state['scene']!r}, this one is {scene.name!r}.")
-        if state["train_views"] != names:
-            raise ValueError(f"{path} was trained on the views {state['train_views']}, the scene has {names}.")
-        trainer = cls(scene, TrainConfig(**json.loads(state["config"])), device)
-        trainer.step, trainer.seconds = state["step"], state["seconds"]
-        trainer.optimizer.load_state_dict(state)
-        trainer.statistics = DensityStatistics(**state["statistics"])
+        state = read_state(load_checkpoint(path, device), scene, path)
+        trainer = cls(scene, state.config, device)
+        trainer.step, trainer.seconds, trainer.statistics = state.step, state.seconds, state.statistics
+        trainer.optimizer.load_state_dict(state.optimizer)
         return trainer
 
     def _rates(self) -> LearningRates:
@@ -263,7 +273,7 @@ class Trainer:
             self._densify()
             if len(self.gaussians) == 0:
                 raise TrainingStoppedError(
-                    f"all Gaussians were pruned after step {step}: lower prune_opacity or the noise."
+                    f"all Gaussians were pruned after step {step}: lower prune_opacity or noise, raise opacity_reset."
                 )
         if config.opacity_decay < 1 and step > config.densify_from:
             decay_opacity(self.optimizer, config.opacity_decay)

@@ -184,3 +184,26 @@ def test_the_figure_shows_both_axes_for_every_run_and_group(tmp_path):
     alone, _ = plot_dynamics(tmp_path / "a", ax=plt.subplots()[1])
     assert [line.get_label() for line in alone.lines] == ["train", "test"]
     plt.close("all")
+
+
+def test_a_full_disk_leaves_whole_lines_and_names_the_log(tmp_path, full_disk):
+    monitor = make(tmp_path)
+    monitor(10, OPACITY)
+    before = (tmp_path / "ca.jsonl").read_bytes()
+    with (
+        full_disk(len(before) + 20),
+        pytest.raises(OSError, match=r"too large \(the last measurement is not logged\): '.*ca\.jsonl'$"),
+    ):
+        monitor(20, OPACITY)
+    assert (tmp_path / "ca.jsonl").read_bytes() == before
+    monitor(20, OPACITY)  # there is room again
+    monitor.close()
+    assert [line["step"] for line in lines(tmp_path)] == [10, 20]
+
+
+def test_a_full_disk_at_the_start_keeps_the_log(tmp_path, full_disk):
+    run(make(tmp_path), 1, 31)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with full_disk(20), pytest.raises(OSError, match="too large"):
+        make(tmp_path, resume_step=30)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -1,6 +1,8 @@
+import errno
+
 import pytest
 
-from reference_trainer.files import replacing
+from reference_trainer.files import remove_leftovers, replacing
 
 
 def test_the_new_content_replaces_the_old(tmp_path):
@@ -33,3 +35,35 @@ def test_writing_nothing_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError), replacing(tmp_path / "note.txt"):
         pass
     assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_named_and_keeps_what_was_there(tmp_path, full_disk):
+    file = tmp_path / "note.txt"
+    file.write_text("old")
+    with (
+        full_disk(1000),
+        pytest.raises(OSError, match=r"\(not written; what was there before is kept\): '.*note\.txt'$") as caught,
+        replacing(file) as place,
+    ):
+        place.write_bytes(bytes(1001))
+    assert (caught.value.errno, caught.value.filename) == (errno.EFBIG, str(file))
+    assert file.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_an_error_about_another_file_keeps_its_name(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"directory: '.*other'$"), replacing(tmp_path / "note.txt"):
+        (tmp_path / "other").read_text()
+
+
+def test_leftovers_of_killed_processes(tmp_path):
+    keep = [tmp_path / "part", tmp_path / "a.part", tmp_path / ".hidden", tmp_path / "deep"]
+    keep[-1].mkdir()
+    for path in keep[:-1]:
+        path.write_text("mine")
+    with replacing(tmp_path / "deep" / "x.png") as place:
+        place.write_text("whole")
+        (tmp_path / "deep" / place.name.replace("x.png", "y.png")).write_text("ha")  # of a process that is no more
+    assert remove_leftovers(tmp_path) == 1
+    assert sorted(tmp_path.rglob("*")) == sorted([*keep, tmp_path / "deep" / "x.png"])
+    assert remove_leftovers(tmp_path / "nowhere") == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import statistics
@@ -16,6 +15,8 @@ from typing import Any
 import torch
 
 from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.files import write_text
+from reference_trainer.json_files import read_json
 from reference_trainer.studies.speed.calls import SUBJECT, gradients, image
 from reference_trainer.studies.speed.growth_memory import count, predict
 from reference_trainer.studies.speed.growth_points import Axis, gaussians_per_pixel, growth_axes
@@ -98,7 +99,7 @@ def study(
             f"expected at least 1 axis, 1 round and a positive limit, got {len(axes)}, {repeats} and {time_limit}."
         )
     file, place = out / REPORT, torch.device(device)
-    measured: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))["measured"] if file.exists() else {}
+    measured: dict[str, Any] = read_json(file)["measured"] if file.exists() else {}
     settings = {"repeats": repeats, "device": str(place), "threads": torch.get_num_threads()}
 
     def once(name: str, spec: WorkloadSpec, expected: float) -> dict[str, Any]:
@@ -140,7 +141,7 @@ def study(
     }
     write_json(file, report)
     text = growth_tables(report)
-    (out / TABLE).write_text(text, encoding="utf-8")
+    write_text(out / TABLE, text)
     growth_figure(report, out / FIGURE)
     say(text)
     say(f"numbers, tables and figure: {file}, {out / TABLE}, {out / FIGURE}")

@@ -93,7 +93,7 @@ _FOOTPRINTS = 24 + 4 * 4  # the gathered table, dx, dy, w1, w2
 _TERMS = 24 + 8  # of the polynomial before they are stacked, and the row of the tile
 _ALPHAS, _ALONG = 4 * 4, 2 * 4  # four buffers of a block, and the two more of the backward pass
 _GRADIENTS = 40  # six of the table and four of the values
-_SAVED = 56 * 4  # what autograd keeps of the projection and of what it joins
+_SAVED = 66 * 4  # what autograd keeps of the projection and of what it joins
 # Until the next chunk is as far, its names still hold the chunk before; views of its last block hold it even longer.
 _EARLIER = (_POLYNOMIAL + _OF_ENTRIES, _SUMS, _ALPHAS)
 _EARLIER_BACKWARD = (_POLYNOMIAL + _FOOTPRINTS + _OF_ENTRIES + _GRADIENTS, _SUMS, _ALPHAS + _ALONG)

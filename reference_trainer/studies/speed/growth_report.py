@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from reference_trainer.evaluation.report import markdown_table
+from reference_trainer.files import replacing
 from reference_trainer.render.footprints import PIXELS
 from reference_trainer.studies.speed.growth_memory import PHASES
 from reference_trainer.studies.speed.measure import PASSES
@@ -163,7 +164,8 @@ def growth_figure(report: Mapping[str, Any], path: Path) -> None:
                 panel.legend(fontsize="x-small")
     panels[0, 0].set_ylabel("seconds")
     panels[1, 0].set_ylabel("peak memory above the inputs, MiB")
-    figure.savefig(path, dpi=110)
+    with replacing(path) as place:
+        figure.savefig(place, dpi=110, format="png")
 
 
 def _curve(

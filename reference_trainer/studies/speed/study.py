@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -13,6 +12,8 @@ from typing import Any
 import torch
 
 from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.files import write_text
+from reference_trainer.json_files import read_json
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.speed.limits import measure_limits
 from reference_trainer.studies.speed.measure import measure_workload
@@ -121,7 +122,7 @@ def study(
     }
     write_json(out / REPORT, report)
     text = speed_tables(report)
-    (out / TABLE).write_text(text, encoding="utf-8")
+    write_text(out / TABLE, text)
     say(text)
     say(f"numbers and tables: {out / REPORT}, {out / TABLE}")
     if old is not None:
@@ -131,7 +132,7 @@ def study(
 
 def _read(against: Path) -> dict[str, Any]:
     """Read an older report before minutes are spent on a new one."""
-    old: dict[str, Any] = json.loads(against.read_text(encoding="utf-8"))
+    old: dict[str, Any] = read_json(against)
     if missing := {"device", "machine", "ratios", "errors"} - old.keys():
         raise ValueError(f"{against} has no {sorted(missing)}: give a {REPORT} that this study has written.")
     return old

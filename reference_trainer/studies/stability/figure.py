@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from reference_trainer.files import replacing
 from reference_trainer.studies.stability.quantities import SCENE_QUANTITIES
 from reference_trainer.studies.stability.report import worst_errors
 
@@ -45,7 +46,8 @@ def stability_figure(report: Mapping[str, Any], path: Path) -> None:
             _lines(panel, case)
         if len(sweeps) % 2:
             right.axes[-1].set_visible(False)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as place:
+        figure.savefig(place, dpi=110, format="png")
 
 
 def _heat(figure: Any, cases: Sequence[Mapping[str, Any]]) -> None:

@@ -48,10 +48,8 @@ def _renderer() -> Iterator[Case]:
             yield single(_RENDERER, f"{label} in camera.{name}", partial(_bad_camera, name, bad), refused="camera")
         yield single(_RENDERER, f"{label} in the pose", partial(_bad_pose, bad), refused="world_to_camera")
         yield single(_RENDERER, f"{label} in the harmonics", partial(_bad_harmonics, bad), refused="sh")
-        yield Case(
-            _RENDERER, f"{label} in a background of the moments", partial(_bad_background, bad), until=0.0,
-            beyond="overflow", note="passed on: mean and variance are not finite, and the score says NOT_FINITE",
-        )  # fmt: skip
+        moments = partial(_bad_background, bad)
+        yield single(_RENDERER, f"{label} in a background of the moments", moments, refused="background")
         yield single(_RENDERER, f"{label} in points of a new model", partial(_bad_points, bad), refused="positions")
 
 
@@ -169,7 +167,7 @@ def _bad_harmonics(bad: float) -> Probe:
     return Probe(lambda: image(broken), lambda: image(sh))
 
 
-def _bad_background(bad: float, _: float) -> Probe:
+def _bad_background(bad: float) -> Probe:
     splats = splats_of(base_scene().to(torch.float32))
 
     def variance(background: Tensor) -> Quantities:

@@ -9,6 +9,7 @@ from time import perf_counter
 from typing import Any
 
 from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.files import write_text
 from reference_trainer.studies.stability.blends import blend_cases
 from reference_trainer.studies.stability.case import Case
 from reference_trainer.studies.stability.figure import stability_figure
@@ -63,7 +64,7 @@ def study_stability(out: Path, *, cases: Sequence[Case] | None = None, say: Say 
     }
     write_json(out / REPORT, report)
     text = stability_tables(report)
-    (out / TABLE).write_text(text, encoding="utf-8")
+    write_text(out / TABLE, text)
     stability_figure(report, out / FIGURE)
     say(text)
     say(f"numbers, tables and picture: {out / REPORT}, {out / TABLE}, {out / FIGURE}")

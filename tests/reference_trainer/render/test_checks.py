@@ -1,6 +1,7 @@
 """What the renderer refuses: bad numbers by name, and worlds too far from their origin."""
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -55,10 +56,10 @@ def test_harmonics_are_looked_at_as_far_as_they_are_used(scene):
         render(**inputs, camera=scene.camera, sh=sh)
 
 
-@pytest.mark.parametrize("change", [{"cx": math.nan}, {"cy": math.inf}, {"fx": math.inf}])
+@pytest.mark.parametrize("change", [{"fx": 1e38}, {"fy": 1e38}])
 def test_a_bad_camera_is_told_from_bad_gaussians(scene, change):
     name, bad = next(iter(change.items()))
-    with pytest.raises(NotFiniteError, match=f"from finite inputs: .*{name}={bad:g}"):
+    with pytest.raises(NotFiniteError, match=f"from finite inputs: .*{name}={re.escape(f'{bad:.3g}')}"):
         draw(scene, camera=replace(scene.camera, **change))
 
 

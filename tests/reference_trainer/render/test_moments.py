@@ -187,3 +187,26 @@ def test_no_tensor_grows_with_the_pixel_gaussian_pairs_of_a_long_list(monkeypatc
         images.variance.sum().backward()
     # Either a row of 14 numbers per Gaussian, or four buffers of what is held at once.
     assert largest.elements <= max(16 * (n + 1), 8 * pairs) < PIXELS * longest
+
+
+@pytest.mark.parametrize("background", [torch.tensor([0.5, torch.nan, 0.5]), torch.full((3, 13, 19), torch.inf)])
+def test_a_background_that_is_not_finite_is_refused(background):
+    scene = random_scene(5, 19, 13, seed=7)
+    splats = splat(*scene[:4], scene.camera, colors=scene.colors)
+    with pytest.raises(ValueError, match=r"background must be finite, got nan or infinity in \d+ of \d+ numbers"):
+        render_moments(splats, Multiplier.dropout(0.5), background=background)
+
+
+def test_a_backward_pass_inside_autocast_keeps_its_precision():
+    """As of the plain renderer."""
+    gradients = []
+    for enabled in (False, True):
+        scene = random_scene(40, 19, 13, seed=7).to(torch.float32, torch.device("cpu"))
+        leaves = [x.clone().requires_grad_() for x in (scene.opacities, scene.colors)]
+        splats = splat(*scene[:3], leaves[0], scene.camera, colors=leaves[1])
+        out = render_moments(splats, Multiplier.dropout(0.5))
+        loss = out.mean.square().sum() + out.variance.sum()
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=enabled):
+            loss.backward()
+        gradients.append([x.grad for x in leaves])
+    assert all(torch.equal(plain, cast) for plain, cast in zip(*gradients, strict=True))

@@ -153,6 +153,20 @@ def test_mixed_precision_changes_nothing(device):
     assert torch.equal(plain, cast)
 
 
+def test_a_backward_pass_inside_autocast_keeps_the_precision_of_the_compositing(device):
+    """The rest of it is PyTorch's own: the rotation of the means comes out in bfloat16, as everywhere in PyTorch."""
+    gradients = []
+    for enabled in (False, True):
+        scene = random_scene(60, 30, 20, seed=4).to(torch.float32, device)
+        leaves = [x.clone().requires_grad_() for x in (*scene[:4], scene.colors)]
+        loss = render(*leaves[:4], scene.camera, colors=leaves[4]).image.square().sum()
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled):
+            loss.backward()
+        gradients.append([x.grad for x in leaves])
+    for plain, cast in zip(*(of[1:] for of in gradients), strict=True):
+        assert torch.equal(plain, cast)
+
+
 def test_tensors_of_whole_numbers_are_refused():
     scene = random_scene(6, 8, 8, seed=0)
     with pytest.raises(TypeError, match=r"scales must be a floating-point tensor, got torch.int64; .*\.float"):

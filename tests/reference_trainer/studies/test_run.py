@@ -2,6 +2,7 @@ import dataclasses
 import json
 import shutil
 import signal
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -109,6 +110,80 @@ def test_ctrl_c_saves_where_it_is(finished, options, short, monkeypatch, tmp_pat
     assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
 
 
+def test_sigterm_saves_and_then_ends_the_process_as_its_sender_expects(finished, options, short, monkeypatch, tmp_path):
+    original, received = Trainer.train_step, []
+
+    def train_step(trainer: Trainer) -> tuple[float, float]:
+        if trainer.step == 5:
+            signal.raise_signal(signal.SIGTERM)
+        return original(trainer)
+
+    said: list[str] = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: received.append(load_run(tmp_path).step))
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(Trainer, "train_step", train_step)
+            with pytest.raises(TrainingInterrupted):
+                run_experiment(options, short, tmp_path, **EVERY, say=said.append)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert received == [6]  # raised again, when the model had been saved
+    assert said[-1] == f"{tmp_path}: saved at step 6 of 11; the same command continues there"
+    run_experiment(options, short, tmp_path, **EVERY)
+    assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
+
+
+def test_a_full_disk_keeps_the_last_checkpoint(finished, options, short, monkeypatch, tmp_path, full_disk):
+    original = Trainer.save
+
+    def save(trainer: Trainer, path: Path) -> None:
+        with full_disk(100_000) if trainer.step > 4 else nullcontext():
+            original(trainer, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "save", save)
+        with pytest.raises(OSError, match=r"what was there before is kept.*checkpoint\.pt"):
+            run_experiment(options, short, tmp_path, **EVERY)
+    assert load_run(tmp_path).step == 4
+    assert not list(tmp_path.rglob("*.part"))
+    run_experiment(options, short, tmp_path, **EVERY)
+    assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
+
+
+def test_leftovers_of_a_killed_run_are_removed(options, short, tmp_path):
+    leftover = tmp_path / "views" / "train" / ".train_0.png.1234.part"
+    leftover.parent.mkdir(parents=True)
+    leftover.write_bytes(b"half")
+    run_experiment(options, short, tmp_path, **EVERY)
+    assert not leftover.exists()
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "said"),
+    [
+        (CONFIG, "{", r"config\.json is not valid JSON"),
+        (CONFIG, "{}", r"config\.json is not the config\.json of a run"),
+        (CONFIG, '{"scene": {}, "config": {"dropout": "much"}}', r"config\.json, config: dropout must be float, got"),
+        (RESULTS, "[]", r"results\.json does not hold the results of a run: delete it"),
+    ],
+)
+def test_damaged_files_are_named(finished, options, short, tmp_path, file, content, said):
+    shutil.copytree(finished[0], tmp_path / "run")
+    (tmp_path / "run" / file).write_text(content)
+    with pytest.raises(ValueError, match=said):
+        run_experiment(options, short, tmp_path / "run", **EVERY)
+    if file == CONFIG:
+        with pytest.raises(ValueError, match=said):
+            load_run(tmp_path / "run")
+
+
+def test_a_damaged_plan_is_named(options, short, tmp_path):
+    (tmp_path / CONFIG).write_text('{"scene": {}, "config": {}}')
+    (tmp_path / PLAN).write_text("[]")
+    with pytest.raises(ValueError, match=r"plan\.json: expected a plan"):
+        run_experiment(options, short, tmp_path, auto=True)
+
+
 @pytest.mark.parametrize(
     ("owner", "name", "call"),
     [
@@ -204,7 +279,7 @@ def test_divergence_keeps_the_last_checkpoint(options, short, monkeypatch, tmp_p
 def test_a_model_that_vanishes_does_not_overwrite_the_checkpoint(options, short, tmp_path):
     config = dataclasses.replace(short, prune_opacity=0.99)
     for _ in range(2):
-        with pytest.raises(TrainingStoppedError, match="all Gaussians were pruned after step 4"):
+        with pytest.raises(TrainingStoppedError, match=r"pruned after step 4: .* step 3 is kept in .*\.pt"):
             run_experiment(options, config, tmp_path, monitor_every=0, checkpoint_every=3)
         trainer = load_run(tmp_path)
         assert (trainer.step, len(trainer.gaussians)) == (3, 3000)
@@ -272,3 +347,10 @@ def test_a_run_that_began_without_a_plan_goes_on_without(finished, options, shor
 
 def test_what_is_given_is_trained(options, short, tmp_path):
     assert run_experiment(options, short, tmp_path, **EVERY, auto=True, given=["sh_degree"])["config"]["sh_degree"] == 3
+
+
+def test_a_training_that_stops_at_once_leaves_the_model_that_it_began_with(options, short, tmp_path):
+    config = dataclasses.replace(short, scales_rate=1e9, densify_every=0)
+    with pytest.raises(TrainingStoppedError, match=r"step 2 cannot be rendered: .* The model of step 0 is kept in "):
+        run_experiment(options, config, tmp_path, **EVERY)
+    assert load_run(tmp_path).step == 0

@@ -1,0 +1,64 @@
+"""The nearest neighbours of every point of a cloud."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["nearest_neighbors"]
+
+CHUNK_ELEMENTS = 4_000_000  # distances held at a time: 16 MB in float32
+CHUNK_ROWS = 256  # of the sorted points; more of them span a wider strip, fewer are too many calls
+
+
+@torch.no_grad()
+def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Find the nearest other points of every point, exactly.
+
+    The points are sorted along one axis: only those within a strip can be nearer than the neighbours already known, so
+    the time grows more slowly than N squared, and memory is bounded.
+
+    Args:
+        points: shape (N, 3).
+        count: number of neighbours k, less than N.
+
+    Returns:
+        Squared distances, shape (N, k), and the neighbours' numbers, shape (N, k) int64, nearest first.
+
+    Raises:
+        ValueError: if the shape is not (N, 3), or N is not above k.
+
+    Example:
+        >>> points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0]])
+        >>> squares, numbers = nearest_neighbors(points, 2)
+        >>> squares[0].tolist(), numbers[0].tolist()
+        ([1.0, 9.0], [1, 2])
+    """
+    n = points.shape[0]
+    if points.ndim != 2 or points.shape[1] != 3 or n <= count:
+        raise ValueError(f"points must have shape (N, 3) with N > {count}, got {tuple(points.shape)}.")
+    axis = int((points.amax(0) - points.amin(0)).argmax())
+    order = points[:, axis].argsort()
+    ordered = points[order]
+    along = ordered[:, axis].contiguous()
+    squares = points.new_empty(n, count)
+    numbers = torch.empty(n, count, dtype=torch.int64, device=points.device)
+    rows = max(1, min(CHUNK_ROWS, CHUNK_ELEMENTS // n))
+    for start in range(0, n, rows):
+        stop = min(start + rows, n)
+        near, _ = _search(ordered, start, stop, max(0, start - rows - count), min(n, stop + rows + count), count)
+        reach = near[:, -1].sqrt().amax() * (1 + 1e-5)  # rounded up: single precision must not lose a tie
+        low = int(torch.searchsorted(along, along[start] - reach))
+        high = int(torch.searchsorted(along, along[stop - 1] + reach, right=True))
+        found, places = _search(ordered, start, stop, min(low, start), max(high, stop), count)
+        squares[order[start:stop]], numbers[order[start:stop]] = found, order[places]
+    return squares, numbers
+
+
+def _search(ordered: Tensor, start: int, stop: int, low: int, high: int, count: int) -> tuple[Tensor, Tensor]:
+    """Return squared distances and places of the nearest among rows low..high, for every row start..stop."""
+    # By way of matrix products, cdist would return 0 for near duplicates.
+    distances = torch.cdist(ordered[start:stop], ordered[low:high], compute_mode="donot_use_mm_for_euclid_dist")
+    distances.square_().diagonal(start - low).fill_(torch.inf)
+    nearest = distances.topk(count, dim=1, largest=False)
+    return nearest.values, nearest.indices + low
