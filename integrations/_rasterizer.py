@@ -49,14 +49,17 @@ class ForwardCall:
 
 def check_installed() -> None:
     """Raise ImportError unless one of the rasterizers is there; does not import it."""
-    for name in MODULES:
-        if name in sys.modules or find_spec(name) is not None:
-            return
-    raise ImportError(
-        f"none of the rasterizers {', '.join(MODULES)} is installed. Install the one in the submodules of your code "
-        "base (it needs CUDA), pass your own class as rasterizer=..., or run the code base without CUDA: "
-        "python -m ca_reg.integrations.run --cpu train.py ..."
-    )
+    if not _installed():
+        raise ImportError(
+            f"none of the rasterizers {', '.join(MODULES)} is installed. Install the one in the submodules of your "
+            "code base (it needs CUDA), pass your own class as rasterizer=..., or run the code base without CUDA: "
+            "python -m ca_reg.integrations.run --cpu train.py ..."
+        )
+
+
+def _installed() -> list[str]:
+    """Return the names of the rasterizers that can be imported."""
+    return [name for name in MODULES if name in sys.modules or find_spec(name) is not None]
 
 
 def rasterizer_class(module: ModuleType) -> type | None:
@@ -72,8 +75,8 @@ def rasterizer_classes() -> list[type]:
         ImportError: if there are none.
     """
     check_installed()
-    modules = [import_module(name) for name in MODULES if name in sys.modules or find_spec(name) is not None]
-    return list(dict.fromkeys(found for found in map(rasterizer_class, modules) if found is not None))
+    found = [rasterizer_class(import_module(name)) for name in _installed()]
+    return list(dict.fromkeys(cls for cls in found if cls is not None))
 
 
 def forward_signature(rasterizer: type) -> inspect.Signature:

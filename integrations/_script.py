@@ -7,10 +7,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["run_script", "stand_in_for_python"]
+__all__ = ["run_script", "set_command_line"]
 
 
-def stand_in_for_python(script: Path, arguments: Sequence[str]) -> None:
+def set_command_line(script: Path, arguments: Sequence[str]) -> None:
     """Give the script its command line, and its folder as the first place to import from.
 
     Args:

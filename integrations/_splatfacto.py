@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from ca_reg import CAScore, GaussianDropout, OpacityNoise
-from ca_reg.integrations.gsplat import Rasterization, regularized
+
+from .gsplat import Rasterization, regularized
 
 __all__ = ["CoAdaptation"]
 

@@ -9,7 +9,7 @@ from nerfstudio.models import splatfacto
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from ca_reg.integrations._splatfacto import CoAdaptation
+from ._splatfacto import CoAdaptation
 
 __all__ = ["SplatfactoCAModel", "SplatfactoCAModelConfig", "make_method"]
 

@@ -47,7 +47,7 @@ def __getattr__(name: str) -> Any:
     if name not in ("SplatfactoCAModel", "SplatfactoCAModelConfig", "splatfacto_ca"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
-        from ca_reg.integrations import _splatfacto_method
+        from . import _splatfacto_method
 
         return _splatfacto_method.make_method() if name == "splatfacto_ca" else getattr(_splatfacto_method, name)
     except Exception as error:  # whatever an incompatible nerfstudio comes up with

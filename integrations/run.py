@@ -22,12 +22,10 @@ from torch import nn
 from ca_reg.modules import GaussianDropout, OpacityNoise
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
-from ._script import run_script, stand_in_for_python
+from ._script import run_script, set_command_line
 from .inria import RasterizerHook, Scope
 
 __all__ = ["main"]
-
-_OUTPUTS = (2, 3, 4)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -40,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     hook = None
     if options.regularizers:
         hook = RasterizerHook(nn.Sequential(*options.regularizers), scope=options.scope, seed=options.seed)
-    stand_in_for_python(options.script, options.arguments)
+    set_command_line(options.script, options.arguments)
     with _reported(options, hook), ExitStack() as undo:
         if options.cpu:
             from reference_trainer.compat import stand_in
@@ -68,7 +66,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--seed", type=int, default=0, help="of masks and noise (default: 0); the script's random numbers are its own")
     add("--report", type=Path, metavar="FILE", help="write what was done as JSON, too")
     add("--cpu", action="store_true", help="run without CUDA: a stand-in for the rasterizer of the code base")
-    add("--outputs", type=int, choices=_OUTPUTS, help="length of the tuple that the stand-in returns")
+    add("--outputs", type=int, choices=(2, 3, 4), help="length of the tuple that the stand-in returns")
     add("script", type=Path, help="train.py or render.py of the code base")
     add("arguments", nargs=argparse.REMAINDER, help="of the script")
     options = parser.parse_args(arguments)

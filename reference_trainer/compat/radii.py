@@ -9,10 +9,9 @@ from reference_trainer.camera import Camera
 from reference_trainer.render.constants import NEAR_PLANE
 from reference_trainer.render.projection import project
 
-__all__ = ["in_front", "screen_radii"]
+__all__ = ["in_front", "visible_radii"]
 
 CUDA_TILE = 16  # pixels; a Gaussian is visible to the INRIA code if the square around it meets a tile of the picture
-SMALLEST_DISCRIMINANT = 0.1  # px^4; the INRIA code's guard of the square root, which enlarges round splats a little
 
 
 def in_front(means: Tensor, camera: Camera) -> Tensor:
@@ -27,8 +26,8 @@ def in_front(means: Tensor, camera: Camera) -> Tensor:
 
 
 @torch.no_grad()
-def screen_radii(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-    """Measure three standard deviations of the longer axis of every splat, rounded up.
+def visible_radii(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) -> Tensor:
+    """Measure the radii of the splats that meet the picture.
 
     As in the originals the opacity does not matter: a Gaussian of opacity 0 has a radius, though it is not drawn.
 
@@ -44,18 +43,15 @@ def screen_radii(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Cam
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
         >>> means = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [9.0, 0.0, 1.0]])
-        >>> screen_radii(means, torch.eye(4)[:1].repeat(3, 1), torch.full((3, 3), 0.1), camera).tolist()
+        >>> visible_radii(means, torch.eye(4)[:1].repeat(3, 1), torch.full((3, 3), 0.1), camera).tolist()
         [16, 0, 0]
     """
     radii = torch.zeros(means.shape[0], dtype=torch.int32, device=means.device)
     front = torch.nonzero(in_front(means, camera)).squeeze(1)
     splats = project(means[front], quaternions[front], scales[front], camera.to(means.device, means.dtype))
-    xx, xy, yy = splats.covariances.unbind(-1)
-    discriminant = (0.25 * (xx - yy).square() + xy.square()).clamp_min(SMALLEST_DISCRIMINANT)
-    radius = torch.ceil(3.0 * torch.sqrt(0.5 * (xx + yy) + discriminant.sqrt()))
     centre = splats.means - 0.5  # in the INRIA code pixel centres are integers
     tiles = centre.new_tensor([-(-camera.width // CUDA_TILE), -(-camera.height // CUDA_TILE)])
-    first = ((centre - radius[:, None]) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
-    last = ((centre + radius[:, None] + CUDA_TILE - 1) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
-    radii[front] = torch.where((last > first).all(-1), radius, 0.0).to(torch.int32)
+    first = ((centre - splats.radii[:, None]) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
+    last = ((centre + splats.radii[:, None] + CUDA_TILE - 1) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
+    radii[front] = torch.where((last > first).all(-1), splats.radii, 0.0).to(torch.int32)
     return radii

@@ -8,7 +8,7 @@ from types import ModuleType
 from torch import Tensor, nn
 
 from reference_trainer.compat.absolute import splat_weights, with_absolute_gradients
-from reference_trainer.compat.radii import in_front, screen_radii
+from reference_trainer.compat.radii import in_front, visible_radii
 from reference_trainer.compat.settings import GaussianRasterizationSettings, camera_of
 from reference_trainer.render import draw, splat
 
@@ -84,7 +84,7 @@ def rasterize(
         projection = projection._replace(depths=projection.depths.reciprocal())
     depth = outputs > 2 and not absolute
     rendering = draw(splats._replace(projection=projection), background=settings.bg, depth=depth)
-    radii = screen_radii(means, quaternions, scales, camera)
+    radii = visible_radii(means, quaternions, scales, camera)
     if absolute:
         weights = means.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
         return with_absolute_gradients(rendering.image, sink[:, 2:], splats, settings.bg), radii, weights

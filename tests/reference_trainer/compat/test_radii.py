@@ -6,7 +6,7 @@ import pytest
 import torch
 from oracles import random_scene
 
-from reference_trainer.compat.radii import in_front, screen_radii
+from reference_trainer.compat.radii import in_front, visible_radii
 
 
 def _definition(mean, quaternion, scale, camera) -> int:
@@ -38,7 +38,7 @@ def _definition(mean, quaternion, scale, camera) -> int:
 def test_radii_equal_the_definition(size):
     scene = random_scene(150, 70, 45, seed=2, size=size)
     means = scene.means * 1.6  # so that many lie off the picture
-    radii = screen_radii(means, scene.quaternions, scene.scales, scene.camera)
+    radii = visible_radii(means, scene.quaternions, scene.scales, scene.camera)
     expected = [_definition(*rows, scene.camera) for rows in zip(means, scene.quaternions, scene.scales, strict=True)]
     assert radii.dtype == torch.int32
     assert radii.tolist() == expected
