@@ -197,9 +197,15 @@ def test_total_effects_come_through_the_reference_renderer():
 @pytest.mark.parametrize("reason", [Reason.EMPTY, Reason.NOT_FINITE])
 def test_without_a_value_all_are_zero_and_the_reason_says_why(reason):
     scene = Scene(4)
-    if reason is Reason.NOT_FINITE:
-        scene.colors[0] = math.nan
-    score = CAScore(exact=scene.moments, threshold=1.0 if reason is Reason.EMPTY else THRESHOLD)
+
+    def diverged(*arguments):
+        moments = scene.moments(*arguments)
+        return moments._replace(variance=moments.variance * math.nan)
+
+    if reason is Reason.EMPTY:
+        score = CAScore(exact=scene.moments, threshold=1.0)
+    else:
+        score = CAScore(exact=diverged, threshold=THRESHOLD)
     shares, result = attribute(score, scene.moments.shares, scene.opacity, None)
     effects, same = total_effects(score, scene.opacity, None)
     assert result.reason is same.reason is reason

@@ -151,3 +151,11 @@ def test_a_step_computes_no_moments_unless_it_trains_on_them(tiny_scene, monkeyp
     assert not calls
     Trainer(tiny_scene, TrainConfig(iterations=2, dropout=0.2, analytic=True)).train()
     assert len(calls) == 2
+
+
+def test_random_points_start_half_as_wide_and_measured_ones_as_wide_as_they_are(tiny_scene):
+    random = dataclasses.replace(tiny_scene, points=dataclasses.replace(tiny_scene.points, source="random"))
+    measured = dataclasses.replace(tiny_scene, points=dataclasses.replace(tiny_scene.points, source="points.ply"))
+    assert make_plan(random, TrainConfig()).applied(TrainConfig()).initial_scale == 0.5
+    assert make_plan(measured, TrainConfig()).applied(TrainConfig()).initial_scale == 1
+    assert items(random, TrainConfig(), given=["initial_scale"])["size of initial points"].changes == {}
