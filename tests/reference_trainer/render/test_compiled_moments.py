@@ -1,5 +1,7 @@
 """Compiled moments against eager ones: the algorithm operation by operation in float64, then compiled in float32."""
 
+import warnings
+
 import pytest
 import torch
 from oracles import random_scene
@@ -21,9 +23,11 @@ def uncompiled(monkeypatch):
 
 
 @pytest.fixture
-def working_compiler(request):
-    if not use_compiled():
-        pytest.skip("there is no working compiler")
+def working_compiler():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if not use_compiled():
+            pytest.skip("there is no working compiler")
     yield
     use_compiled(False)
 
