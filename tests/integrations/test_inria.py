@@ -1,8 +1,5 @@
 """The hook on the rasterizers of the INRIA family."""
 
-import sys
-from types import ModuleType
-
 import pytest
 import torch
 from inria_fake import PIPE, Model, make_rasterizer, make_render, rasterize
@@ -14,25 +11,6 @@ from reference_trainer.model.density import DensityStatistics
 
 BLACK = torch.zeros(3)
 FORMS = ["plain", "inverse-depth", "weights", "depth-alpha"]
-
-
-@pytest.fixture
-def rasterizer():
-    return make_rasterizer()
-
-
-@pytest.fixture
-def model_class(monkeypatch):
-    """A fresh GaussianModel where the code bases have theirs."""
-
-    class GaussianModel(Model):
-        def update_learning_rate(self, iteration):
-            return super().update_learning_rate(iteration)
-
-    module = ModuleType("scene.gaussian_model")
-    module.GaussianModel = GaussianModel
-    monkeypatch.setitem(sys.modules, "scene.gaussian_model", module)
-    return GaussianModel
 
 
 def loss_of(image):

@@ -5,11 +5,10 @@ import difflib
 import importlib.util
 import io
 import sys
-from types import ModuleType
 
 import pytest
 import torch
-from inria_fake import PIPE, Model, make_rasterizer, make_render
+from inria_fake import PIPE, Model, make_render
 from torch import nn
 
 from ca_reg import GaussianDropout
@@ -17,25 +16,6 @@ from ca_reg.integrations._rasterizer import find_radii
 from ca_reg.integrations.inria import RasterizerHook
 
 BLACK = torch.zeros(3)
-
-
-@pytest.fixture
-def rasterizer():
-    return make_rasterizer()
-
-
-@pytest.fixture
-def model_class(monkeypatch):
-    """A fresh GaussianModel where the code bases have theirs."""
-
-    class GaussianModel(Model):
-        def update_learning_rate(self, iteration):
-            return super().update_learning_rate(iteration)
-
-    module = ModuleType("scene.gaussian_model")
-    module.GaussianModel = GaussianModel
-    monkeypatch.setitem(sys.modules, "scene.gaussian_model", module)
-    return GaussianModel
 
 
 def test_the_classes_are_put_back_exactly(rasterizer, model_class):
