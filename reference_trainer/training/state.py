@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +19,10 @@ from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["TrainingState", "read_state"]
+
+_ENTRIES = ("config", "scene", "train_views", "step", "seconds", "statistics", "gaussians", "moments")
+_STATISTICS = ("gradient_sum", "steps", "largest_radius")
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 class TrainingState(NamedTuple):
@@ -46,52 +52,91 @@ def read_state(state: dict[str, Any], scene: Scene, where: Path) -> TrainingStat
         where: the file, for errors.
 
     Raises:
-        ValueError: if something is missing or of another type or shape, a number is not finite, or the checkpoint
-            belongs to another scene or other training views.
+        ValueError: if something is missing, unknown, or of another type or shape, a number is not finite or out of
+            its range, or the checkpoint belongs to another scene or other training views.
     """
     try:
         return _read(state, scene, where)
-    except KeyError as error:
-        raise ValueError(f"{where} is a damaged checkpoint: it lacks {error}; train anew, or take a copy.") from error
-    except (TypeError, AttributeError, RecursionError, json.JSONDecodeError) as error:
+    except (TypeError, AttributeError, LookupError) as error:
         raise ValueError(f"{where} is a damaged checkpoint: {error}") from error
 
 
 def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
-    """Read a state; whatever it lacks is a KeyError, whatever is of another type a TypeError."""
+    """Read a state; what is of a type that is not checked for is a TypeError, an AttributeError or a LookupError."""
+    _refuse_other_entries(state, ("format", *_ENTRIES), f"{where}")
     names = [view.name for view in scene.train]
     if state["scene"] != scene.name:
-        raise ValueError(f"{where} was trained on the scene {state['scene']!r}, this one is {scene.name!r}.")
+        raise ValueError(f"{where} was trained on the scene {state['scene']!r:.80}, this one is {scene.name!r}.")
     if state["train_views"] != names:
-        raise ValueError(f"{where} was trained on the views {state['train_views']}, the scene has {names}.")
-    config = settings_from(TrainConfig, json.loads(state["config"]), f"{where}, config")
+        raise ValueError(f"{where} was trained on the views {state['train_views']!r:.400}, the scene has {names}.")
+    config = _config(state["config"], where)
     step, seconds = state["step"], state["seconds"]
     if type(step) is not int or not 0 <= step <= config.iterations:
-        raise ValueError(f"{where}: step must be a whole number from 0 to {config.iterations}, got {step!r}.")
+        raise ValueError(f"{where}: step must be a whole number from 0 to {config.iterations}, got {step!r:.80}.")
     if type(seconds) is not float or not 0 <= seconds < math.inf:
-        raise ValueError(f"{where}: seconds must be a positive number, got {seconds!r}.")
-    tensors = state["gaussians"]
+        raise ValueError(f"{where}: seconds must be a positive number, got {seconds!r:.80}.")
+    tensors, moments = state["gaussians"], state["moments"]
+    parameters = [field.name for field in dataclasses.fields(Gaussians)]
+    _refuse_other_entries(tensors, parameters, f"{where}, gaussians")
+    _refuse_other_entries(moments, parameters, f"{where}, moments")
     try:
         gaussians = Gaussians(**tensors)
     except ValueError as error:
         raise ValueError(f"{where}, gaussians: {error}") from error
+    if len(gaussians) == 0:
+        raise ValueError(f"{where}, gaussians: there is none to train.")
     if gaussians.sh_degree != config.sh_degree:
         raise ValueError(f"{where}, gaussians: expected sh_degree {config.sh_degree}, got {gaussians.sh_degree}.")
     for name, x in tensors.items():
         _check(x, tuple(x.shape), f"{where}, {name}")
-        moments = state["moments"][name]
-        for key in ("step", "exp_avg", "exp_avg_sq") if moments else ():
-            _check(moments[key], () if key == "step" else tuple(x.shape), f"{where}, {key} of {name}")
-    statistics = DensityStatistics(**state["statistics"])
-    for name, x in vars(statistics).items():
-        _check(x, (len(gaussians),), f"{where}, {name}")
-    return TrainingState(config, step, seconds, statistics, {"gaussians": tensors, "moments": state["moments"]})
+        if moments[name] != {}:  # as before the first step
+            _check_moments(moments[name], tuple(x.shape), step, f"{where}, moments of {name}")
+    _refuse_other_entries(state["statistics"], _STATISTICS, f"{where}, statistics")
+    for name, x in state["statistics"].items():
+        _check(x, (len(gaussians),), f"{where}, {name}", least=0)
+    # They are counted up in place, which a file can forbid: by a gradient, or by memory that is shared.
+    statistics = DensityStatistics(**{name: x.detach().clone() for name, x in state["statistics"].items()})
+    plain = {name: {key: x.detach() for key, x in of.items()} for name, of in moments.items()}
+    return TrainingState(config, step, seconds, statistics, {"gaussians": tensors, "moments": plain})
 
 
-def _check(x: Any, shape: tuple[int, ...], what: str) -> None:
-    """Refuse anything but finite float32 of a shape."""
+def _config(text: Any, where: Path) -> TrainConfig:
+    """Read the settings."""
+    if type(text) is not str:
+        raise ValueError(f"{where} is a damaged checkpoint: config must be JSON, got {type(text).__name__}.")
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{where} is a damaged checkpoint: config is not JSON: {error}") from error
+    return settings_from(TrainConfig, values, f"{where}, config")
+
+
+def _refuse_other_entries(values: Any, names: Collection[str], what: str) -> None:
+    """Refuse anything but a dict with these names, and no other."""
+    if type(values) is not dict:
+        raise ValueError(f"{what}: expected entries by name, got {type(values).__name__}; the checkpoint is damaged.")
+    if missing := [name for name in names if name not in values]:
+        raise ValueError(f"{what}: it lacks {missing[0]!r}; the checkpoint is damaged, train anew, or take a copy.")
+    if unknown := [f"{name!r:.40}" for name in values if name not in names]:
+        raise ValueError(f"{what}: unknown entry {unknown[0]}; it is damaged, or another version wrote it.")
+
+
+def _check_moments(moments: Any, shape: tuple[int, ...], step: int, what: str) -> None:
+    """Refuse what Adam cannot go on with: a negative square would be a nan after the next step."""
+    _refuse_other_entries(moments, _MOMENTS, what)
+    for key, x in moments.items():
+        _check(x, () if key == "step" else shape, f"{what}, {key}", least=None if key == "exp_avg" else 0)
+    taken = moments["step"].item()
+    if taken > step or taken != int(taken):
+        raise ValueError(f"{what}, step: expected a whole number up to {step}, got {taken:g}.")
+
+
+def _check(x: Any, shape: tuple[int, ...], what: str, *, least: float | None = None) -> None:
+    """Refuse anything but finite float32 of a shape, and what is smaller than the least."""
     if not isinstance(x, Tensor) or x.dtype != torch.float32 or tuple(x.shape) != shape:
         got = f"{x.dtype}, {tuple(x.shape)}" if isinstance(x, Tensor) else type(x).__name__
         raise ValueError(f"{what}: expected float32 of shape {shape}, got {got}.")
     if not bool(x.isfinite().all()):
         raise ValueError(f"{what}: holds nan or infinity.")
+    if least is not None and not bool((x >= least).all()):
+        raise ValueError(f"{what}: must not be below {least:g}, got {x.min().item():g}.")

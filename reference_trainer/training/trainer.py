@@ -189,7 +189,10 @@ class Trainer:
                 belongs to another scene or other training views.
         """
         state = read_state(load_checkpoint(path, device), scene, path)
-        trainer = cls(scene, state.config, device)
+        try:
+            trainer = cls(scene, state.config, device)
+        except ValueError as error:
+            raise ValueError(f"{path}, config: {error}") from error
         trainer.step, trainer.seconds, trainer.statistics = state.step, state.seconds, state.statistics
         trainer.optimizer.load_state_dict(state.optimizer)
         return trainer

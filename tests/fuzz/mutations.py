@@ -9,9 +9,11 @@ import struct
 from collections.abc import Callable
 from typing import Any, Literal
 
+from fuzz.state_mutations import STATE_MUTATIONS
+
 __all__ = ["CUT", "Form", "damage"]
 
-Form = Literal["binary", "text", "json"]
+Form = Literal["binary", "text", "json", "state"]
 Mutation = Callable[[bytes, random.Random], bytes]
 
 _INTEGERS = (0, 1, 2, 255, 10**6, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
@@ -146,6 +148,7 @@ _MUTATIONS: dict[Form, dict[str, Mutation]] = {
     "binary": _BYTES | {"swap word": _swap_word},
     "text": _BYTES | _TEXT,
     "json": _BYTES | _TEXT | {"change node": _change_node, "change node again": _change_node},
+    "state": STATE_MUTATIONS,
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import io
 import json
 import struct
@@ -14,13 +15,17 @@ from PIL import Image
 
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
+from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.checkpoint import save_checkpoint
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.trainer import Trainer
 
 __all__ = [
-    "write_blender", "write_checkpoint", "write_colmap_binary", "write_colmap_text", "write_image", "write_llff",
-    "write_log", "write_lpips", "write_model", "write_model_ascii", "write_points", "write_run_settings", "write_split",
+    "small_scene", "write_blender", "write_checkpoint", "write_colmap_binary", "write_colmap_text", "write_image",
+    "write_llff", "write_log", "write_lpips", "write_model", "write_model_ascii", "write_points",
+    "write_run_settings", "write_split", "write_trainer",
 ]  # fmt: skip
 
 VIEWS = 3
@@ -130,6 +135,23 @@ def write_checkpoint(folder: Path) -> None:
     moments = {name: {"mean": torch.zeros_like(x), "steps": torch.ones(())} for name, x in tensors.items()}
     state = {"step": 3, "seconds": 0.5, "scene": "fern", "train_views": ["a", "b"], "nothing": None}
     save_checkpoint(folder / "checkpoint.pt", {**state, "gaussians": tensors, "moments": moments})
+
+
+@functools.cache
+def small_scene() -> Scene:
+    """The scene of the trainer, whose step takes milliseconds."""
+    return synthetic_scene(width=32, height=24, points=60)
+
+
+def write_trainer(folder: Path) -> None:
+    """A trainer whose next step counts and whose second one densifies, prunes and resets: all of its state is used."""
+    config = TrainConfig(
+        iterations=5, dropout=0.2, noise=0.3, sh_degree=1, sh_every=1, densify_from=1, densify_every=3,
+        opacity_reset_from=3, opacity_reset_every=1,
+    )  # fmt: skip
+    trainer = Trainer(small_scene(), config)
+    trainer.train(until=2)
+    trainer.save(folder / "checkpoint.pt")
 
 
 def write_lpips(folder: Path, *, archive: bool = True) -> None:

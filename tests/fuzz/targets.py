@@ -22,6 +22,7 @@ from reference_trainer.scenes.ply_points import ply_points
 from reference_trainer.scenes.splits import file_split
 from reference_trainer.studies.run_settings import read_run_settings
 from reference_trainer.training.checkpoint import load_checkpoint
+from reference_trainer.training.trainer import Trainer, TrainingStoppedError
 
 __all__ = ["TARGETS"]
 
@@ -76,6 +77,30 @@ def _lpips_weights(folder: Path) -> Any:
     return [parameter for stage in metric._stages for parameter in stage.parameters()] + metric._heads
 
 
+def _two_steps(folder: Path) -> Any:
+    """Continue a training, up to its densification: a state that is half wrong shows in what the steps make of it."""
+    trainer = Trainer.load(folder / "checkpoint.pt", samples.small_scene())
+    try:
+        for _ in range(min(2, trainer.config.iterations - trainer.step)):
+            trainer.train_step()
+    except TrainingStoppedError:  # finite, but nothing to draw: told in the words of the training
+        return None
+    return trainer
+
+
+def _trainer_fits(trainer: Any) -> None:
+    if trainer is None:
+        return
+    count = len(trainer.gaussians)
+    assert count > 0
+    for x in (*vars(trainer.gaussians).values(), *vars(trainer.statistics).values()):
+        assert x.dtype == torch.float32
+        assert len(x) == count
+        assert bool(x.isfinite().all()), "values that are not finite"
+    for moments in trainer.optimizer.state_dict()["moments"].values():
+        assert all(bool(x.isfinite().all()) for x in moments.values()), "moments that are not finite"
+
+
 TARGETS = (
     *(
         Target(f"COLMAP {name}.bin", f"{name}.bin", samples.write_colmap_binary, read_colmap, "binary",
@@ -123,6 +148,7 @@ TARGETS = (
            "text", finite=False, check=_gaussians_fit),
     Target("checkpoint", "checkpoint.pt", samples.write_checkpoint,
            lambda folder: load_checkpoint(folder / "checkpoint.pt"), "binary", checksummed=True),
+    Target("Trainer.load", "checkpoint.pt", samples.write_trainer, _two_steps, "state", check=_trainer_fits),
     Target("LPIPS weights", "lpips.pth", samples.write_lpips, _lpips_weights, "binary", checksummed=True),
     Target("LPIPS weights, old format", "lpips.pth", partial(samples.write_lpips, archive=False), _lpips_weights,
            "binary"),

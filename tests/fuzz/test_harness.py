@@ -4,6 +4,8 @@ import time
 
 import numpy as np
 import pytest
+import torch
+from fuzz import samples
 from fuzz.harness import Target, fuzz
 from fuzz.mutations import damage
 
@@ -79,3 +81,14 @@ def test_damage_depends_on_the_seed_alone(form):
     good = GOOD[:44]
     assert [damage(good, form, seed) for seed in range(300)] == [damage(good, form, seed) for seed in range(300)]
     assert sum(damage(good, form, seed)[1] != good for seed in range(300)) > 270
+
+
+def test_a_damaged_state_is_an_intact_file_and_depends_on_the_seed_alone(tmp_path):
+    samples.write_trainer(tmp_path)
+    good = (tmp_path / "checkpoint.pt").read_bytes()
+    found = [damage(good, "state", seed)[1] for seed in range(60)]
+    assert found == [damage(good, "state", seed)[1] for seed in range(60)]
+    assert len(set(found)) > 50
+    for data in found:
+        (tmp_path / "checkpoint.pt").write_bytes(data)
+        torch.load(tmp_path / "checkpoint.pt", weights_only=True)
