@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from reference_trainer.studies import grid
-from reference_trainer.studies.run import CHECKPOINT, RESULTS
+from reference_trainer.studies.run_folder import CHECKPOINT, RESULTS
 
 
 def square(number):
@@ -50,6 +50,11 @@ def note_the_interruption(folder):
     except KeyboardInterrupt:
         Path(folder, "interrupted").touch()
         raise
+
+
+def note_the_interruption_here(*arguments):
+    """The same in the working folder, in place of any task."""
+    note_the_interruption(".")
 
 
 def train_and_be_killed_once(options, config, out, *rest):

@@ -6,8 +6,6 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,9 @@ from reference_trainer.evaluation.report import format_mean_std, machine, markdo
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies.engines.engine import Failure, Task
+from reference_trainer.studies.engines.processes import Processes
+from reference_trainer.studies.engines.run_all import run_all
 from reference_trainer.studies.plan_parts import parts_of_a_step
 from reference_trainer.studies.run import model_of
 from reference_trainer.training.config import TrainConfig
@@ -96,7 +97,8 @@ def study_plan(
 ) -> list[dict[str, Any]]:
     """Train a scene with every item of its plan on and off and write ``plan_study.json`` and ``plan_study.md``.
 
-    Every training has a fresh process, one after the other; what is in the folder is not trained again.
+    Every training has a fresh process, one after the other, because time and peak memory are measured; what is in the
+    folder is not trained again. A worker that dies is replaced, a training that fails does not stop the others.
 
     Args:
         options: the scene.
@@ -106,31 +108,47 @@ def study_plan(
         seeds: number of seeds.
         alternatives: keys of `ALTERNATIVES` to try besides.
         device: where to train.
-        say: receives a line about every training, and the table.
+        say: receives a line about every training and every worker that died, and the table.
 
     Returns:
         One record per training.
+
+    Raises:
+        ValueError: if the folder holds a training with other settings.
+        RuntimeError: if a training failed; everything about the others has been written.
     """
     plan = make_plan(options.load(seed=config.seed), config)
     chosen = {name: shortened(of, iterations) for name, of in variants(plan, config, alternatives).items()}
-    records: list[dict[str, Any]] = []
-    for seed in range(seeds):
-        for name, of in chosen.items():
-            file = out / name.replace("/", "_").replace(" ", "_") / f"seed_{seed}.json"
-            settings = dataclasses.replace(of, seed=seed)
-            if not file.exists():
-                threads = torch.get_num_threads()
-                with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
-                    record = pool.submit(_train, options, settings, device, threads, name == AS_ASKED).result()
-                write_json(file, {"variant": name, **record})
-            records.append(read_json(file))
-            if records[-1]["config"] != dataclasses.asdict(settings):
-                raise ValueError(f"{file} holds a training with other settings: give another folder, or delete it.")
-            say(f"{name}, seed {seed}: {records[-1]['psnr']:.2f} dB, {records[-1]['cpu_seconds']:.0f} s of processors")
-    table = plan_table(records)
-    write_json(out / "plan_study.json", {"plan": plan.as_dict(), "trainings": records, "machine": machine()})
-    write_text(out / "plan_study.md", table)
-    say(table)
+    trainings = {
+        out / name.replace("/", "_").replace(" ", "_") / f"seed_{seed}.json": (name, dataclasses.replace(of, seed=seed))
+        for seed in range(seeds)
+        for name, of in chosen.items()
+    }
+    threads = torch.get_num_threads()
+    tasks: dict[Path, Task] = {}
+    for file, (name, settings) in trainings.items():
+        if file.exists():
+            say(_line(_read(file, settings)))
+        else:
+            tasks[file] = Task(f"{name}, seed {settings.seed}", _train, (options, name, settings, device, threads))
+    failures = _train_all(tasks, say)
+    records = [_read(file, settings) for file, (_, settings) in trainings.items() if file.exists()]
+    study = {
+        "plan": plan.as_dict(),
+        "trainings": records,
+        "failures": {label: dataclasses.asdict(why) for label, why in failures.items()},
+        "machine": machine(),
+    }
+    write_json(out / "plan_study.json", study)
+    if records:
+        table = plan_table(records)
+        write_text(out / "plan_study.md", table)
+        say(table)
+    if failures:
+        raise RuntimeError(
+            f"{len(failures)} of {len(trainings)} trainings failed ({', '.join(failures)}): "
+            f"{out / 'plan_study.json'} has the tracebacks; the same command tries them again."
+        )
     return records
 
 
@@ -152,8 +170,10 @@ def plan_table(records: Sequence[Mapping[str, Any]]) -> str:
     rows: list[dict[str, object]] = []
     for name in dict.fromkeys(record["variant"] for record in records):
         of = [record for record in records if record["variant"] == name]
-        gains = [_known(record, "psnr") - _known(base[record["config"]["seed"]], "psnr") for record in of]
-        difference = "" if name == AS_ASKED else ", ".join(f"{gain:+.2f}" for gain in gains)
+        pairs = [(record, base.get(record["config"]["seed"])) for record in of]
+        gains = [_known(x, "psnr") - _known(y, "psnr") if y else math.nan for x, y in pairs]
+        known = ["n/a" if math.isnan(gain) else f"{gain:+.2f}" for gain in gains]
+        difference = "" if name == AS_ASKED else ", ".join(known)
         measured = {
             column: format_mean_std([_known(record, key) for record in of], unit=unit)
             for column, (key, unit) in columns.items()
@@ -168,12 +188,40 @@ def plan_table(records: Sequence[Mapping[str, Any]]) -> str:
     return table + "\n" + markdown_table(left, ["part", "ms", "% of a step"])
 
 
+def _train_all(tasks: Mapping[Path, Task], say: Callable[[str], None]) -> dict[str, Failure]:
+    """Do trainings, each in a process of its own, and write their records to files; return those that failed."""
+    failures: dict[str, Failure] = {}
+    places, queue = list(tasks), list(tasks.values())
+    for index, outcome in run_all(Processes(1), queue, say=say):
+        if isinstance(outcome, Failure):
+            failures[queue[index].label] = outcome
+            say(f"{queue[index].label}: FAILED, {outcome.error}")
+        else:
+            write_json(places[index], outcome.value)
+            say(_line(outcome.value))
+    return failures
+
+
+def _read(file: Path, settings: TrainConfig) -> dict[str, Any]:
+    """Return the record of a training, which must be that of these settings."""
+    record: dict[str, Any] = read_json(file)
+    if record["config"] != dataclasses.asdict(settings):
+        raise ValueError(f"{file} holds a training with other settings: give another folder, or delete it.")
+    return record
+
+
+def _line(record: Mapping[str, Any]) -> str:
+    """Return a training in a few words."""
+    seconds = f"{record['cpu_seconds']:.0f} s of processors"
+    return f"{record['variant']}, seed {record['config']['seed']}: {_known(record, 'psnr'):.2f} dB, {seconds}"
+
+
 def _known(record: Mapping[str, Any], key: str) -> float:
     """Return a number of a record; JSON has null for one that does not exist."""
     return math.nan if record[key] is None else float(record[key])
 
 
-def _train(options: SceneOptions, config: TrainConfig, device: str, threads: int, with_parts: bool) -> dict[str, Any]:
+def _train(options: SceneOptions, variant: str, config: TrainConfig, device: str, threads: int) -> dict[str, Any]:
     """Do one training in a process of its own."""
     torch.set_num_threads(threads)
     scene = options.load(seed=config.seed)
@@ -184,18 +232,23 @@ def _train(options: SceneOptions, config: TrainConfig, device: str, threads: int
     found = evaluate(model_of(trainer), dataclasses.replace(scene, train=() if scene.test else scene.train))
     split = "test" if scene.test else "train"
     return {
+        "variant": variant,
         "config": dataclasses.asdict(config),
         "cpu_seconds": seconds,
         "seconds": trainer.seconds,
         "peak_bytes": peak,
         "gaussians": len(trainer.gaussians),
         **{name: found.mean(split, name) for name in ("psnr", "ssim", "ca", "ca_exact")},
-        "parts": parts_of_a_step(trainer) if with_parts and config.seed == 0 else None,
+        "parts": parts_of_a_step(trainer) if variant == AS_ASKED and config.seed == 0 else None,
     }
 
 
 def _peak_bytes() -> int:
     """Return the largest memory that this process has held so far, libraries included; bytes."""
+    status = Path("/proc/self/status")
+    for line in status.read_text(encoding="utf-8").splitlines() if status.exists() else ():
+        if line.startswith("VmHWM:"):  # Linux, where getrusage counts the peak of the parent, too
+            return int(line.split()[1]) << 10
     import resource
     import sys
 

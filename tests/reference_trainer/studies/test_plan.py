@@ -1,11 +1,21 @@
 import dataclasses
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 from typing import get_args
 
 import pytest
+import sweep_tasks
 
 from reference_trainer.cli import studies as commands
 from reference_trainer.studies import plan as plan_module
+from reference_trainer.studies.engines.engine import Task, attempt
+from reference_trainer.studies.engines.processes import Processes
+from reference_trainer.studies.engines.run_all import run_all
 from reference_trainer.studies.plan import ALTERNATIVES, plan_table, shortened, study_plan, variants
 from reference_trainer.studies.plan_parts import parts_of_a_step
 from reference_trainer.training.config import TrainConfig
@@ -21,28 +31,32 @@ TWO = Plan(
 )
 
 
+TESTS = Path(sweep_tasks.__file__).parent
+
+
 class Here:
-    """A pool that works in this process."""
+    """An engine that does every task in this process."""
 
-    def __init__(self, **keywords):
+    jobs = 1
+
+    def __init__(self, jobs):
+        assert jobs == 1
+
+    def start(self, number, task):
+        self.now = number, attempt(task, 1)
+
+    def wait(self):
+        return [self.now]
+
+    def close(self):
         pass
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        pass
-
-    def submit(self, function, *arguments):
-        self.result = lambda: function(*arguments)
-        return self
 
 
 @pytest.fixture(scope="module")
 def studied(tmp_path_factory, options, short):
     out, said = tmp_path_factory.mktemp("plan"), []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan_module, "ProcessPoolExecutor", Here)
+        patch.setattr(plan_module, "Processes", Here)
         records = study_plan(
             options, out, config=short, iterations=4, seeds=2, alternatives=["no densification"], say=said.append
         )
@@ -86,7 +100,8 @@ def test_the_study_trains_what_it_says(studied):
 
 def test_a_second_call_trains_nothing(studied, options, short, monkeypatch):
     out, records, _ = studied
-    monkeypatch.setattr(plan_module, "_train", lambda *a: pytest.fail("trained again"))
+    monkeypatch.setattr(plan_module, "Processes", Here)
+    monkeypatch.setattr(Here, "start", lambda *a: pytest.fail("trained again"))
     again = study_plan(
         options, out, config=short, iterations=4, seeds=2, alternatives=["no densification"], say=lambda text: None
     )
@@ -95,11 +110,90 @@ def test_a_second_call_trains_nothing(studied, options, short, monkeypatch):
         study_plan(options, out, config=dataclasses.replace(short, noise=0.1), iterations=4, say=lambda text: None)
 
 
-def test_differences_are_taken_within_a_seed():
-    def record(variant: str, seed: int, psnr: float) -> dict:
-        rest = dict.fromkeys(("ssim", "gaussians", "cpu_seconds", "peak_bytes"), 0.0) | {"ca": None}
-        return {"variant": variant, "config": {"seed": seed}, "psnr": psnr, **rest}
+def record(variant: str, seed: int, psnr: float) -> dict:
+    """What the table needs of a training."""
+    rest = dict.fromkeys(("ssim", "gaussians", "cpu_seconds", "peak_bytes"), 0.0) | {"ca": None}
+    return {"variant": variant, "config": {"seed": seed}, "psnr": psnr, **rest}
 
+
+def test_a_training_that_fails_is_reported_and_the_others_go_on(options, short, tmp_path, monkeypatch):
+    """The one that the others of its seed are compared with, so that there is no difference to tell."""
+    failing = ["as asked, seed 1"]
+
+    def train(options, variant, config, device, threads):
+        if f"{variant}, seed {config.seed}" in failing:
+            raise MemoryError("no room")
+        return record(variant, config.seed, 20.0) | {"config": dataclasses.asdict(config)}
+
+    def study():
+        said = []
+        return study_plan(options, tmp_path, config=short, iterations=4, seeds=2, say=said.append), said
+
+    monkeypatch.setattr(plan_module, "Processes", Here)
+    monkeypatch.setattr(plan_module, "_train", train)
+    with pytest.raises(RuntimeError, match=r"1 of 4 trainings failed \(as asked, seed 1\): .* tries them again"):
+        study()
+    stored = json.loads((tmp_path / "plan_study.json").read_text())
+    assert [(r["variant"], r["config"]["seed"]) for r in stored["trainings"]] == [
+        ("as asked", 0), ("SH bands", 0), ("SH bands", 1)
+    ]  # fmt: skip
+    assert stored["failures"]["as asked, seed 1"]["error"] == "MemoryError: no room"
+    assert "in train" in stored["failures"]["as asked, seed 1"]["traceback"]
+    assert "+0.00, n/a" in (tmp_path / "plan_study.md").read_text()
+
+    before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("seed_*.json")}
+    failing.clear()
+    records, said = study()
+    assert [(r["variant"], r["config"]["seed"]) for r in records] == [
+        (name, seed) for seed in (0, 1) for name in ("as asked", "SH bands")
+    ]
+    assert {file: file.stat().st_mtime_ns for file in before} == before
+    assert "+0.00, +0.00" in said[-1]
+    assert json.loads((tmp_path / "plan_study.json").read_text())["failures"] == {}
+
+
+STUDY = """
+from pathlib import Path
+import sweep_tasks
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies import plan
+from reference_trainer.training.config import TrainConfig
+plan._train = sweep_tasks.note_the_interruption_here
+plan.study_plan(SceneOptions("synthetic", downscale=8.0), Path("out"), config=TrainConfig(iterations=1), seeds=1)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_training_is_interrupted_however_the_study_ends(tmp_path, number):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}
+    study = subprocess.Popen(
+        [sys.executable, "-c", STUDY], cwd=tmp_path, env=environment, start_new_session=True, stderr=subprocess.DEVNULL
+    )
+    until((tmp_path / "started").exists)
+    study.send_signal(number)
+    until((tmp_path / "interrupted").exists)
+    study.wait(timeout=30)
+
+
+def until(condition):
+    """Wait for a condition."""
+    end = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.01)
+
+
+@pytest.mark.slow
+def test_the_peak_of_a_training_is_its_own():
+    """Every training has a fresh process, and what the parent has held does not count."""
+    held = b"x" * (1 << 30)
+    tasks = [Task("peak", plan_module._peak_bytes, ())]
+    ((_, outcome),) = run_all(Processes(1), tasks)
+    assert 2**24 < outcome.value < len(held)
+
+
+def test_differences_are_taken_within_a_seed():
     rows = plan_table(
         [record("as asked", 0, 20.0), record("x", 0, 21.0), record("as asked", 1, 10.0), record("x", 1, 9.5)]
     ).splitlines()
