@@ -65,13 +65,14 @@ def write_text(path: str | Path, text: str) -> None:
         place.write_text(text, encoding="utf-8")
 
 
-def remove_leftovers(folder: str | Path) -> int:
-    """Remove what killed processes had begun to write below a folder, and return how many files that were.
+def remove_leftovers(folder: str | Path, *, below: bool = True) -> int:
+    """Remove what killed processes had begun to write in a folder, and return how many files that were.
 
     Args:
         folder: where no other process is writing now.
+        below: in all folders below it, too.
     """
-    leftovers = [path for path in Path(folder).rglob(f".*{_PART}") if path.is_file()]
+    leftovers = [path for path in Path(folder).glob(f"{'**/' * below}.*{_PART}") if path.is_file()]
     for path in leftovers:
         path.unlink(missing_ok=True)
     return len(leftovers)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,10 @@ from torch import Tensor
 from ca_reg import CAResult
 from reference_trainer.camera import Camera
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
+from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import heat_map, save_png, side_by_side
+from reference_trainer.evaluation.report import machine
 from reference_trainer.render.statistics import color_variance_map
 from reference_trainer.scenes.scene import View
 
@@ -70,7 +72,9 @@ def evaluate_cameras(
     samples: int = 5,
     seed: int = 0,
     pictures: Path | None = None,
+    keep: Path | None = None,
     progress: bool = False,
+    say: Callable[[str], None] = lambda text: None,
 ) -> CameraEvaluation:
     """Measure a model from cameras without photographs.
 
@@ -81,7 +85,9 @@ def evaluate_cameras(
         seed: of the CA score's masks.
         pictures: a folder for two PNG files per camera, the render and a panel of it with the variance of the protocol,
             the exact variance and the neutral one; None for no pictures.
+        keep: a file for the scores of the cameras that are done, as of `evaluate`.
         progress: whether to show a progress bar.
+        say: receives what became of the scores that were kept.
 
     Returns:
         Scores per camera.
@@ -91,10 +97,18 @@ def evaluate_cameras(
     opacities, nothing = model.gaussians.opacities, model.background[:, None, None]
     score, exact = model.ca_score(samples=samples, seed=seed), model.exact_ca_score()
     neutral = model.exact_ca_score(neutral=True)
+    kept = KeptRecords(keep, (model, list(cameras), samples, seed, machine()), say)
+    names = [f"{index:03d}" for index in range(len(cameras))]
+    known = [kept.get(name, () if pictures is None else _files(pictures / name)) for name in names]
+    done = sum(record is not None for record in known)
     views = []
-    with tqdm(total=4 * len(cameras), unit="score", disable=not progress) as bar:  # minutes each for large models
-        for index, camera in enumerate(cameras):
-            view = View(f"{index:03d}", camera, nothing.expand(3, camera.height, camera.width))
+    # Minutes each for large models.
+    with tqdm(total=4 * len(cameras), initial=4 * done, unit="score", disable=not progress) as bar:
+        for index, (name, camera, record) in enumerate(zip(names, cameras, known, strict=True)):
+            if record is not None:
+                views.append(CameraScores(**record))
+                continue
+            view = View(name, camera, nothing.expand(3, camera.height, camera.width))
             out = model.rendering(model.test_opacities, view)
             variance, covered = color_variance_map(out.splats)
             bar.update()
@@ -104,7 +118,7 @@ def evaluate_cameras(
                 bar.update()
             views.append(
                 CameraScores(
-                    name=view.name,
+                    name=name,
                     ca=results[0].value,
                     ca_std_error=results[0].std_error,
                     ca_exact=results[1].value,
@@ -116,14 +130,20 @@ def evaluate_cameras(
                 )
             )
             if pictures is not None:
-                _draw(out.image.clamp(0, 1), results, pictures / view.name)
+                _draw(out.image.clamp(0, 1), results, pictures / name)
+            kept.add(name, asdict(views[-1]))
     return CameraEvaluation(views)
+
+
+def _files(stem: Path) -> tuple[Path, Path]:
+    """Return the places of the render and of the panel of a camera."""
+    return stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}_panel.png")
 
 
 def _draw(image: Tensor, results: Sequence[CAResult], stem: Path) -> None:
     """Write the render, and a panel of it with the variance of the protocol, the exact one and the neutral one."""
     maps = [heat_map(r.variance.masked_fill(~r.visible, math.nan).float(), CA_PICTURE_RANGE) for r in results]
     titles = [f"{name} {r.value * 1e3:.2f}e-3" for name, r in zip(("CA", "exact", "neutral"), results, strict=True)]
-    save_png(stem.with_name(f"{stem.name}.png"), image)
-    panel = side_by_side([image, *maps], [f"render {stem.name}", *titles])
-    save_png(stem.with_name(f"{stem.name}_panel.png"), panel)
+    render, panel = _files(stem)
+    save_png(render, image)
+    save_png(panel, side_by_side([image, *maps], [f"render {stem.name}", *titles]))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,11 +12,14 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from ca_reg import CAScore
+from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import error_map, heat_map, save_png, side_by_side
+from reference_trainer.evaluation.report import machine
 from reference_trainer.render.statistics import color_variance_map
-from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.scene import Scene, View
 
 __all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "evaluate"]
 
@@ -89,7 +93,8 @@ def evaluate(
     seed: int = 0,
     perceptual: PerceptualMetric | None = None,
     pictures: Path | None = None,
-    progress: Callable[[str], None] | None = None,
+    keep: Path | None = None,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> Evaluation:
     """Measure a model on the training and test views of a scene.
 
@@ -102,45 +107,78 @@ def evaluate(
         seed: of the CA score's masks.
         perceptual: a perceptual metric, or None to leave it out.
         pictures: a folder for one PNG per view: photograph, render, error, CA map; None for no pictures.
-        progress: called with the name of each view before it is measured.
+        keep: a file for the scores of the views that are done, see `KeptRecords`: an interrupted evaluation continues
+            with the next view. The caller removes it when the result is written.
+        progress: receives the number and the name of each view before it is measured, and the time left.
 
     Returns:
         Scores per view and their means.
     """
-    views: list[ViewScores] = []
-    opacities = model.gaussians.opacities
     score = model.ca_score(samples=samples, seed=seed)
     half = model.ca_score(samples=samples, seed=seed, drop_rate=0.5)
-    exact = model.exact_ca_score()
-    for split, members in (("train", scene.train), ("test", scene.test)):
-        for index, view in enumerate(member.to(opacities.device) for member in members):
-            if progress is not None:
-                progress(f"{split} {view.name}")
-            out = model.rendering(model.test_opacities, view)
-            image = out.image.clamp(0, 1)
-            ca = score(opacities, view, index=index)
-            ca_half = ca if score.settings.drop_rate == 0.5 else half(opacities, view, index=index)
-            variance, covered = color_variance_map(out.splats)
-            views.append(
-                ViewScores(
-                    name=view.name,
-                    split=split,
-                    psnr=psnr(image, view.image),
-                    ssim=ssim(image, view.image),
-                    lpips=math.nan if perceptual is None else perceptual(image, view.image),
-                    ca=ca.value,
-                    ca_std_error=ca.std_error,
-                    ca_half=ca_half.value,
-                    ca_exact=exact(opacities, view).value,
-                    visible=ca.visible.double().mean().item(),
-                    cv=variance[covered].double().mean().item() if bool(covered.any()) else math.nan,
-                )
-            )
-            if pictures is not None:
-                stem = pictures / split / Path(view.name).stem
-                ca_map = heat_map(ca.variance.masked_fill(~ca.visible, math.nan).float(), CA_PICTURE_RANGE)
-                panels = [view.image, image, error_map(image, view.image), ca_map]
-                labels = ["photograph", f"render {views[-1].psnr:.2f} dB", "error", f"CA {ca.value * 1e3:.2f}e-3"]
-                save_png(stem.with_name(stem.name + ".png"), image)
-                save_png(stem.with_name(stem.name + "_panel.png"), side_by_side(panels, labels))
+    members = [(split, *each) for split in ("train", "test") for each in enumerate(getattr(scene, split))]
+    device = model.background.device
+    metric = perceptual and [_identity(perceptual, view.image.to(device)) for _, _, view in members[:1]]
+    depends_on = (model, scene.train, scene.test, samples, seed, metric, machine())
+    kept = KeptRecords(keep, depends_on, progress)
+    views: list[ViewScores] = []
+    start, measured = time.perf_counter(), 0
+    for number, (split, index, view) in enumerate(members):
+        stem = None if pictures is None else pictures / split / Path(view.name).stem
+        files = [] if stem is None else [stem.with_name(f"{stem.name}{end}.png") for end in ("", "_panel")]
+        known = kept.get(f"{split} {index}", files)
+        if known is not None:
+            views.append(ViewScores(**known))
+            continue
+        seconds = (time.perf_counter() - start) / measured * (len(members) - number) if measured else None
+        left = "" if seconds is None else f", about {seconds:.0f} s left"
+        progress(f"[{number + 1}/{len(members)}] {split} {view.name}{left}")
+        views.append(_measure(model, view, split, index, score, half, perceptual, files))
+        kept.add(f"{split} {index}", asdict(views[-1]))
+        measured += 1
     return Evaluation(views, len(model.gaussians), None if perceptual is None else perceptual.name)
+
+
+def _measure(
+    model: Model,
+    photograph: View,
+    split: str,
+    index: int,
+    score: CAScore,
+    half: CAScore,
+    perceptual: PerceptualMetric | None,
+    files: Sequence[Path],
+) -> ViewScores:
+    """Measure one view, and write its picture and its panel if there are files for them."""
+    opacities = model.gaussians.opacities
+    view = photograph.to(opacities.device)
+    out = model.rendering(model.test_opacities, view)
+    image = out.image.clamp(0, 1)
+    ca = score(opacities, view, index=index)
+    ca_half = ca if score.settings.drop_rate == 0.5 else half(opacities, view, index=index)
+    variance, covered = color_variance_map(out.splats)
+    scores = ViewScores(
+        name=view.name,
+        split=split,
+        psnr=psnr(image, view.image),
+        ssim=ssim(image, view.image),
+        lpips=math.nan if perceptual is None else perceptual(image, view.image),
+        ca=ca.value,
+        ca_std_error=ca.std_error,
+        ca_half=ca_half.value,
+        ca_exact=model.exact_ca_score()(opacities, view).value,
+        visible=ca.visible.double().mean().item(),
+        cv=variance[covered].double().mean().item() if bool(covered.any()) else math.nan,
+    )
+    if files:
+        ca_map = heat_map(ca.variance.masked_fill(~ca.visible, math.nan).float(), CA_PICTURE_RANGE)
+        panels = [view.image, image, error_map(image, view.image), ca_map]
+        labels = ["photograph", f"render {scores.psnr:.2f} dB", "error", f"CA {ca.value * 1e3:.2f}e-3"]
+        save_png(files[0], image)
+        save_png(files[1], side_by_side(panels, labels))
+    return scores
+
+
+def _identity(perceptual: PerceptualMetric, image: Tensor) -> tuple[str, float]:
+    """Return what tells a metric from others: its name, and what it says of a photograph, as weights may differ."""
+    return perceptual.name, float(perceptual(image, image.flip(2)))

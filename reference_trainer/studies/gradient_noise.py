@@ -28,7 +28,8 @@ from reference_trainer.studies.gradient_noise_moments import (
     dot,
 )
 from reference_trainer.studies.gradient_noise_report import gradient_noise_figure, gradient_noise_report
-from reference_trainer.studies.run import CHECKPOINT, load_run
+from reference_trainer.studies.run import load_run
+from reference_trainer.studies.run_folder import CHECKPOINT
 from reference_trainer.studies.timing import now
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation

@@ -12,7 +12,8 @@ import torch
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.engines.engine import Engine, Failure, Task, Value, attempt
 from reference_trainer.studies.engines.run_all import run_all
-from reference_trainer.studies.run import RESULTS, run_experiment
+from reference_trainer.studies.run import run_experiment
+from reference_trainer.studies.run_folder import RESULTS
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["Run", "Running", "run_grid", "train_run"]
@@ -88,17 +89,18 @@ def run_grid(runs: Sequence[Run], running: Running) -> list[dict[str, Any] | Fai
 
     tasks: dict[int, Task] = {}
     for number, run in enumerate(runs):
-        where = (run.options.absolute(), run.config, run.out.resolve())  # workers have other working directories
-        if (run.out / RESULTS).exists():  # refuses those of other settings
-            finished = attempt(Task(run.label, run_experiment, where), torch.get_num_threads())
-            note(number, finished, "before")
+        if (run.out / RESULTS).exists():
+            note(number, _read(run), "before")
         else:
             run.out.mkdir(parents=True, exist_ok=True)
             how = (running.device, running.monitor_every, running.checkpoint_every, _lpips(running.lpips))
-            tasks[number] = Task(run.label, train_run, (*where, *how))
+            tasks[number] = Task(run.label, train_run, (*_where(run), *how))
     numbers = list(tasks)
     for index, outcome in run_all(running.engine, list(tasks.values()), retries=running.retries, say=running.say):
         note(numbers[index], outcome, "now")
+    for number in numbers:  # a run that another sweep was at work on failed here, and may be finished by now
+        if isinstance(outcomes[number], Failure) and (runs[number].out / RESULTS).exists():
+            note(number, _read(runs[number]), "meanwhile")
     return [outcomes[number] for number in range(len(runs))]
 
 
@@ -132,6 +134,16 @@ def train_run(
     )
 
 
+def _read(run: Run) -> Value | Failure:
+    """Return the results of a finished run; one of other settings is refused."""
+    return attempt(Task(run.label, run_experiment, _where(run)), torch.get_num_threads())
+
+
+def _where(run: Run) -> tuple[SceneOptions, TrainConfig, Path]:
+    """Return what a run is and where it lives; workers have other working directories."""
+    return run.options.absolute(), run.config, run.out.resolve()
+
+
 def _lpips(option: str | None) -> str | None:
     """Return the perceptual metric with an absolute path, if it is one."""
     return option if option in (None, "installed") else str(Path(option).resolve())
@@ -144,4 +156,4 @@ def _line(outcome: dict[str, Any] | Failure, when: str) -> str:
     mean = outcome["mean"]
     psnr = mean["test" if "test" in mean else "train"]["psnr"]
     quality = "no PSNR" if psnr is None else f"{psnr:.2f} dB"
-    return f"{quality}, finished before" if when == "before" else f"{quality} in {outcome['seconds']:.0f} s"
+    return f"{quality}, finished {when}" if when != "now" else f"{quality} in {outcome['seconds']:.0f} s"

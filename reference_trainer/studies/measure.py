@@ -9,11 +9,12 @@ from pathlib import Path
 import torch
 
 from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric, evaluate
+from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import save_gif, save_png
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.evaluation.trajectory import interpolate_cameras
-from reference_trainer.files import write_text
+from reference_trainer.files import remove_leftovers, write_text
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.studies.run import load_run, model_of
@@ -58,6 +59,8 @@ def measure(
 ) -> Evaluation:
     """Measure a model on a scene; write ``evaluation.json``, ``evaluation.md`` and pictures, and print the table.
 
+    If it is interrupted, the same call continues with the next view.
+
     Args:
         model: what to measure.
         scene: its views.
@@ -68,8 +71,10 @@ def measure(
         about: what a PLY says of itself, for the JSON file; None for a run, which has a file of its own.
         say: receives the table and the progress.
     """
+    keep = out / PARTIAL
+    remove_leftovers(out / "views")
     result = evaluate(
-        model, scene, samples=samples, seed=seed, perceptual=perceptual, pictures=out / "views", progress=say
+        model, scene, samples=samples, seed=seed, perceptual=perceptual, pictures=out / "views", keep=keep, progress=say
     )
     settings = model.ca_score(samples=samples, seed=seed).settings
     data = {
@@ -84,6 +89,7 @@ def measure(
     write_json(out / "evaluation.json", data)
     table = evaluation_table(result)
     write_text(out / "evaluation.md", table + "\n")
+    keep.unlink(missing_ok=True)
     say(table)
     say(f"Scores and pictures are in {out}")
     return result

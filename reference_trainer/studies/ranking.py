@@ -15,7 +15,7 @@ from reference_trainer.json_files import read_json
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.ranking_report import correlations, ranking_figure, ranking_report
 from reference_trainer.studies.ranking_scores import VARIANTS, Ranking, RunScores, score_run
-from reference_trainer.studies.run import CHECKPOINT
+from reference_trainer.studies.run_folder import CHECKPOINT
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["rank_runs", "study_ranking"]
@@ -36,11 +36,11 @@ def rank_runs(
 
     Args:
         runs: folders of runs.
-        out: folder of the study; each finished run leaves a file in ``measured/``.
+        out: folder of the study; each finished run leaves a file in ``measured/``, the one in progress its views.
         split: ``"train"`` or ``"test"``: which views to measure.
         views: measure only the first so many; None for all.
         device: where to render.
-        say: receives a line for every run.
+        say: receives a line for every run and every view.
 
     Returns:
         The measurements, sorted by scene and by the exact score.
@@ -61,7 +61,10 @@ def rank_runs(
         file = out / "measured" / _file_name(folder, split, views)
         if not file.exists():
             say(f"[{number}/{len(folders)}] {folder}")
-            write_json(file, dataclasses.asdict(score_run(folder, split=split, views=views, device=device)))
+            keep = file.with_suffix(".partial.json")
+            scores = score_run(folder, split=split, views=views, device=device, keep=keep, say=say)
+            write_json(file, dataclasses.asdict(scores))
+            keep.unlink(missing_ok=True)
         found.append(_read(file))
     # nan compares with nothing: without a score, last
     found.sort(key=lambda run: (run.scene, not math.isfinite(run.mean("exact")), run.mean("exact")))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,14 @@ from torch import Tensor
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier
 from ca_reg.types import read_moments
+from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.report import mean_std
+from reference_trainer.evaluation.report import machine, mean_std
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies.run import CONFIG, load_run, model_of
+from reference_trainer.studies.run import load_run, model_of
+from reference_trainer.studies.run_folder import CONFIG
 from reference_trainer.studies.run_settings import read_run_settings
 from reference_trainer.training.config import TrainConfig
 
@@ -150,7 +153,15 @@ def score_view(model: Model, view: View, *, index: int) -> dict[str, float]:
     }
 
 
-def score_run(folder: Path, *, split: str, views: int | None = None, device: str = "cpu") -> RunScores:
+def score_run(
+    folder: Path,
+    *,
+    split: str,
+    views: int | None = None,
+    device: str = "cpu",
+    keep: Path | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> RunScores:
     """Measure all variants on the views of a run.
 
     Args:
@@ -158,6 +169,9 @@ def score_run(folder: Path, *, split: str, views: int | None = None, device: str
         split: ``"train"`` or ``"test"``.
         views: measure only the first so many; None for all.
         device: where to render.
+        keep: a file for the scores of the views that are done, see `KeptRecords`; the caller removes it when the
+            result is written.
+        say: receives the number and the name of each view before it is measured.
 
     Raises:
         ValueError: if the split has no view.
@@ -171,6 +185,15 @@ def score_run(folder: Path, *, split: str, views: int | None = None, device: str
     options, _ = read_run_settings(folder / CONFIG)
     config = trainer.config
     settings = dataclasses.asdict(options) | dataclasses.asdict(config)
+    kept = KeptRecords(keep, (model, members, VARIANTS, machine()), say)
+    measured = []
+    for index, view in enumerate(members):
+        scores = kept.get(str(index))
+        if scores is None:
+            say(f"    [{index + 1}/{len(members)}] {view.name}")
+            scores = score_view(model, view.to(device), index=index)
+            kept.add(str(index), scores)
+        measured.append({"name": view.name, **scores})
     return RunScores(
         folder=str(folder),
         scene=_scene(trainer.scene.name, options),
@@ -179,9 +202,7 @@ def score_run(folder: Path, *, split: str, views: int | None = None, device: str
         seed=config.seed,
         settings={name: value for name, value in settings.items() if name not in _IN_LABEL},
         gaussians=len(model.gaussians),
-        views=[
-            {"name": view.name, **score_view(model, view.to(device), index=index)} for index, view in enumerate(members)
-        ],
+        views=measured,
     )
 
 

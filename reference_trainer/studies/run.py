@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import signal
 import sys
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,29 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAMonitor
-from reference_trainer.evaluation.evaluate import evaluate
+from reference_trainer.evaluation.evaluate import PerceptualMetric, evaluate
+from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.lpips import lpips_option
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.files import remove_leftovers
-from reference_trainer.json_files import read_json
 from reference_trainer.model.ply import save_ply
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.studies.run_folder import (
+    BAKED_PLY,
+    CHECKPOINT,
+    CONFIG,
+    PLAN,
+    PLY,
+    RESULTS,
+    VIEWS,
+    begun_with,
+    claim,
+    read_results,
+)
+from reference_trainer.studies.run_lock import run_lock
 from reference_trainer.studies.run_settings import read_run_settings
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
@@ -30,26 +44,7 @@ from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.plan import Plan, make_plan
 from reference_trainer.training.trainer import Trainer, TrainingStoppedError
 
-__all__ = [
-    "BAKED_PLY",
-    "CHECKPOINT",
-    "CONFIG",
-    "PLAN",
-    "PLY",
-    "RESULTS",
-    "load_run",
-    "model_of",
-    "run_experiment",
-    "save_for_viewers",
-    "summary",
-]
-
-CONFIG = "config.json"
-PLAN = "plan.json"
-CHECKPOINT = "checkpoint.pt"
-PLY = "point_cloud.ply"
-BAKED_PLY = "point_cloud_for_viewers.ply"
-RESULTS = "results.json"
+__all__ = ["load_run", "model_of", "run_experiment", "save_for_viewers", "summary"]
 
 
 def model_of(trainer: Trainer) -> Model:
@@ -100,7 +95,7 @@ def run_experiment(
     the reasons for those that were not asked for, ``checkpoint.pt``, ``ca.jsonl`` with TensorBoard events,
     ``point_cloud.ply`` with the plain opacities (where those of the test are others, after dropout or with
     ``scale_noise``, also ``point_cloud_for_viewers.ply`` with them, marked), ``views/`` with pictures of every view,
-    and ``results.json``, which marks the run as complete.
+    and ``results.json``, which marks the run as complete. While it is written it is locked (`run_lock`).
 
     Args:
         options: the scene; random initial points use the seed of ``config``.
@@ -121,63 +116,34 @@ def run_experiment(
 
     Raises:
         ValueError: if the folder holds a run with other settings, or a damaged file.
+        FolderInUseError: if another process is at work in the folder; nothing there was touched.
         TrainingStoppedError: if training cannot go on; the last checkpoint is kept, and the message names it.
         TrainingInterrupted: on Ctrl-C, after a checkpoint has been saved; a second Ctrl-C does not wait for it. After
             SIGTERM the checkpoint is saved, too, and the signal raised again, which ends the process.
         OSError: if a file cannot be written, such as on a full disk; what was there before is kept.
     """
     perceptual = lpips_option(lpips, device=device)
-    begun = (out / CONFIG).exists()
-    if auto and begun and (out / PLAN).exists():
-        config = _plan(out / PLAN).applied(config, given=given)
-    if begun:
-        _refuse_other_run(out, _claim(options, config))
+    begun_with(out, options, config, auto=auto, given=given)
     if (out / RESULTS).exists():
-        say(f"{out}: complete, nothing to do")
-        return _results(out)
-    scene = options.load(seed=config.seed)
-    if auto and not begun:
-        plan = make_plan(scene, config, given=given)
-        config = plan.applied(config, given=given)
-        write_json(out / PLAN, plan.as_dict())
-        _tell(plan, out, say)
-    elif not begun:
-        (out / PLAN).unlink(missing_ok=True)  # of a run that ended before it had begun
-    remove_leftovers(out)
-    checkpoint = out / CHECKPOINT
-    resumed = checkpoint.exists()
-    trainer = Trainer.load(checkpoint, scene, device) if resumed else Trainer(scene, config, device)
-    write_json(out / CONFIG, _claim(options, config))  # not earlier: a mistyped scene must not claim the folder
-    if resumed:
-        say(f"{out}: continues from step {trainer.step}")
-    else:
-        trainer.save(checkpoint)
-    try:
-        _train(trainer, out, monitor_every, checkpoint_every, resumed=resumed, progress=progress, say=say)
-    except TrainingInterrupted as stop:
-        trainer.save(checkpoint)
-        say(f"{out}: saved at step {trainer.step} of {config.iterations}; the same command continues there")
-        if stop.signal == signal.SIGTERM:  # who sent it expects the process to end by it
-            sys.stdout.flush()
-            signal.raise_signal(signal.SIGTERM)
-        raise
-    except TrainingStoppedError as error:
-        step = load_checkpoint(checkpoint)["step"]
-        raise TrainingStoppedError(f"{error} The model of step {step} is kept in {checkpoint}.") from error
-    model = model_of(trainer)
-    save_ply(model.gaussians, out / PLY)
-    if model.opacity_scale < 1 or model.expected_noise > 0:
-        save_for_viewers(model, out / BAKED_PLY)
-    evaluation = evaluate(model, scene, perceptual=perceptual, pictures=out / "views")
-    results = {
-        "scene": scene.name,
-        "config": dataclasses.asdict(config),
-        "seconds": trainer.seconds,
-        **evaluation.as_dict(),
-        "machine": machine(),
-    }
-    write_json(out / RESULTS, results)
-    return _results(out)
+        return _complete(out, say)
+    scene = options.load(seed=config.seed)  # before the folder is made: a mistyped scene must not claim it
+    with run_lock(out):
+        begun = begun_with(out, options, config, auto=auto, given=given)  # by another process since, perhaps to its end
+        if (out / RESULTS).exists():
+            return _complete(out, say)
+        settings = _planned(scene, config, out, auto=auto, given=given, say=say) if begun is None else begun
+        remove_leftovers(out, below=False)  # below may be what an evaluation of the run writes at this moment
+        remove_leftovers(out / VIEWS)
+        resumed = (out / CHECKPOINT).exists()
+        trainer = Trainer.load(out / CHECKPOINT, scene, device) if resumed else Trainer(scene, settings, device)
+        write_json(out / CONFIG, claim(options, settings))
+        if resumed:
+            say(f"{out}: continues from step {trainer.step}")
+        else:
+            trainer.save(out / CHECKPOINT)
+        with _saved_at_the_end(trainer, out, say):
+            _train(trainer, out, monitor_every, checkpoint_every, resumed=resumed, progress=progress, say=say)
+        return _measure(trainer, out, perceptual, say)
 
 
 def summary(results: Mapping[str, Any]) -> str:
@@ -213,25 +179,23 @@ def load_run(folder: Path, device: torch.device | str = "cpu") -> Trainer:
     return Trainer.load(folder / CHECKPOINT, options.load(seed=config.seed), device)
 
 
-def _results(out: Path) -> dict[str, Any]:
-    """Read the results of a complete run."""
-    results = read_json(out / RESULTS)
-    if not isinstance(results, dict) or "mean" not in results:
-        raise ValueError(f"{out / RESULTS} does not hold the results of a run: delete it to measure again.")
-    return results
+def _complete(out: Path, say: Callable[[str], None]) -> dict[str, Any]:
+    """Return the results of a run that is complete."""
+    say(f"{out}: complete, nothing to do")
+    return read_results(out)
 
 
-def _plan(path: Path) -> Plan:
-    """Read the plan of a run."""
-    try:
-        return Plan.from_dict(read_json(path))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _claim(options: SceneOptions, config: TrainConfig) -> dict[str, Any]:
-    """Return the content of ``config.json``."""
-    return {"scene": dataclasses.asdict(options.absolute()), "config": dataclasses.asdict(config)}
+def _planned(
+    scene: Scene, config: TrainConfig, out: Path, *, auto: bool, given: Collection[str], say: Callable[[str], None]
+) -> TrainConfig:
+    """Return the settings that a run begins with, and write the plan that they come from, if they come from one."""
+    if not auto:
+        (out / PLAN).unlink(missing_ok=True)  # of a run that ended before it had begun
+        return config
+    plan = make_plan(scene, config, given=given)
+    write_json(out / PLAN, plan.as_dict())
+    _tell(plan, out, say)
+    return plan.applied(config, given=given)
 
 
 def _tell(plan: Plan, out: Path, say: Callable[[str], None]) -> None:
@@ -242,19 +206,22 @@ def _tell(plan: Plan, out: Path, say: Callable[[str], None]) -> None:
     say(f"plan: {len(changing)} settings changed, reasons in {out / PLAN}; --no-auto trains exactly as asked")
 
 
-def _refuse_other_run(out: Path, settings: dict[str, Any]) -> None:
-    """Refuse a folder that holds a run with other settings."""
-    found = _claim(*read_run_settings(out / CONFIG))
-    changed = [
-        f"{key}: {found[part][key]} -> {value}"
-        for part, values in settings.items()
-        for key, value in values.items()
-        if found[part][key] != value
-    ]
-    if changed:
-        raise ValueError(
-            f"{out} holds a run with other settings ({'; '.join(changed)}): give another folder, or delete this one."
-        )
+@contextmanager
+def _saved_at_the_end(trainer: Trainer, out: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Save a training that is interrupted, and say what is left of one that cannot go on."""
+    checkpoint = out / CHECKPOINT
+    try:
+        yield
+    except TrainingInterrupted as stop:
+        trainer.save(checkpoint)
+        say(f"{out}: saved at step {trainer.step} of {trainer.config.iterations}; the same command continues there")
+        if stop.signal == signal.SIGTERM:  # who sent it expects the process to end by it
+            sys.stdout.flush()
+            signal.raise_signal(signal.SIGTERM)
+        raise
+    except TrainingStoppedError as error:
+        step = load_checkpoint(checkpoint)["step"]
+        raise TrainingStoppedError(f"{error} The model of step {step} is kept in {checkpoint}.") from error
 
 
 def _train(
@@ -301,3 +268,26 @@ def _train(
             checkpoint(trainer)
 
         trainer.train(after_step=after_step, progress=progress)
+
+
+def _measure(
+    trainer: Trainer, out: Path, perceptual: PerceptualMetric | None, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Write the trained model, its pictures and its scores; return the results."""
+    model = model_of(trainer)
+    save_ply(model.gaussians, out / PLY)
+    if model.opacity_scale < 1 or model.expected_noise > 0:
+        save_for_viewers(model, out / BAKED_PLY)
+    evaluation = evaluate(
+        model, trainer.scene, perceptual=perceptual, pictures=out / VIEWS, keep=out / PARTIAL, progress=say
+    )
+    results = {
+        "scene": trainer.scene.name,
+        "config": dataclasses.asdict(trainer.config),
+        "seconds": trainer.seconds,
+        **evaluation.as_dict(),
+        "machine": machine(),
+    }
+    (out / PARTIAL).unlink(missing_ok=True)  # first, because a complete run is not touched again
+    write_json(out / RESULTS, results)
+    return read_results(out)

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from reference_trainer.evaluation.cameras import CameraEvaluation, evaluate_cameras
 from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric
+from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
-from reference_trainer.files import write_text
+from reference_trainer.files import remove_leftovers, write_text
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.load import BACKGROUNDS
@@ -173,6 +174,8 @@ def score_ply_on_orbit(
 ) -> CameraEvaluation:
     """Measure the model of a PLY without photographs; write ``evaluation.json``, ``evaluation.md`` and pictures.
 
+    If it is interrupted, the same call continues with the next camera.
+
     Args:
         ply: the model, in any frame and of any size.
         orbit: the cameras.
@@ -182,7 +185,7 @@ def score_ply_on_orbit(
         samples: K of the CA score.
         seed: of its masks.
         device: where to render.
-        say: receives the table.
+        say: receives the table, and what became of an interrupted measurement.
 
     Raises:
         ValueError: as `of_ply` and `OrbitOptions.views`, or if there is no such background.
@@ -202,7 +205,11 @@ def score_ply_on_orbit(
     model = replace(model, gaussians=_scaled(model.gaussians, enlarged))
     cameras = orbit.views(model.gaussians.means, model.gaussians.opacities)
     folder = out or _folder(ply)
-    result = evaluate_cameras(model, cameras, samples=samples, seed=seed, pictures=folder / "views", progress=True)
+    keep = folder / PARTIAL
+    remove_leftovers(folder / "views")
+    result = evaluate_cameras(
+        model, cameras, samples=samples, seed=seed, pictures=folder / "views", keep=keep, progress=True, say=say
+    )
     data = {
         "ply": asdict(facts),
         "orbit": asdict(orbit) | {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged},
@@ -214,6 +221,7 @@ def score_ply_on_orbit(
     write_json(folder / "evaluation.json", data)
     table = camera_table(result)
     write_text(folder / "evaluation.md", f"{facts}\n\n{table}")
+    keep.unlink(missing_ok=True)
     say(table)
     say(f"Scores and pictures are in {folder}")
     return result

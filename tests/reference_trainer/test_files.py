@@ -64,6 +64,7 @@ def test_leftovers_of_killed_processes(tmp_path):
     with replacing(tmp_path / "deep" / "x.png") as place:
         place.write_text("whole")
         (tmp_path / "deep" / place.name.replace("x.png", "y.png")).write_text("ha")  # of a process that is no more
+    assert remove_leftovers(tmp_path, below=False) == 0
     assert remove_leftovers(tmp_path) == 1
     assert sorted(tmp_path.rglob("*")) == sorted([*keep, tmp_path / "deep" / "x.png"])
     assert remove_leftovers(tmp_path / "nowhere") == 0

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import math
+import re
 
 import pytest
 import torch
@@ -198,4 +199,8 @@ def test_every_view_gets_its_pictures(tiny_scene, gaussians, tmp_path):
     with Image.open(tmp_path / "train" / "deep.png") as image, Image.open(tmp_path / "train/deep_panel.png") as panel:
         assert image.size == (32, 24)
         assert panel.width >= 4 * 32
-    assert said == [f"train {name}" for name in names] + ["test test_0"]
+    members = [*(f"train {name}" for name in names), "test test_0"]
+    assert [re.sub(r", about \d+ s left$", "", text) for text in said] == [
+        f"[{number}/4] {member}" for number, member in enumerate(members, start=1)
+    ]
+    assert ["left" in text for text in said] == [False, True, True, True]

@@ -24,7 +24,7 @@ from reference_trainer.studies.attribution import (
     study_attribution,
 )
 from reference_trainer.studies.measure import of_run
-from reference_trainer.studies.run import CHECKPOINT, CONFIG
+from reference_trainer.studies.run_folder import CHECKPOINT, CONFIG
 from reference_trainer.training.trainer import Trainer
 
 

@@ -15,7 +15,8 @@ from reference_trainer.studies.engines.choice import choose_engine
 from reference_trainer.studies.engines.engine import Failure, attempt
 from reference_trainer.studies.engines.processes import Processes
 from reference_trainer.studies.grid import Running
-from reference_trainer.studies.run import RESULTS, run_experiment
+from reference_trainer.studies.run import run_experiment
+from reference_trainer.studies.run_folder import RESULTS
 from reference_trainer.training.config import TrainConfig
 
 

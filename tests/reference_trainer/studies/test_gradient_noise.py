@@ -23,8 +23,8 @@ from reference_trainer.studies.gradient_noise_moments import (
     Moments,
     StepNoise,
 )
-from reference_trainer.studies.run import CHECKPOINT
-from reference_trainer.studies.run import CONFIG as RUN_CONFIG
+from reference_trainer.studies.run_folder import CHECKPOINT
+from reference_trainer.studies.run_folder import CONFIG as RUN_CONFIG
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation
 from reference_trainer.training.losses import expected_photometric_loss, photometric_loss

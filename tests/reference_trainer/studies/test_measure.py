@@ -9,7 +9,8 @@ from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
 from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.images import read_image
 from reference_trainer.studies.measure import evaluation_table, measure, of_run, render_run
-from reference_trainer.studies.run import BAKED_PLY, PLY, run_experiment
+from reference_trainer.studies.run import run_experiment
+from reference_trainer.studies.run_folder import BAKED_PLY, PLY
 from reference_trainer.training.config import TrainConfig
 
 

@@ -24,7 +24,8 @@ from reference_trainer.studies.ranking_report import (
     ranking_report,
 )
 from reference_trainer.studies.ranking_scores import VARIANTS, Ranking, RunScores, score_view
-from reference_trainer.studies.run import CHECKPOINT, CONFIG, run_experiment
+from reference_trainer.studies.run import run_experiment
+from reference_trainer.studies.run_folder import CHECKPOINT, CONFIG
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 

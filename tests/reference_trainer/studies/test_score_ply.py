@@ -8,13 +8,16 @@ import pytest
 import torch
 from PIL import Image
 
+from reference_trainer.evaluation import cameras as cameras_module
+from reference_trainer.evaluation import evaluate as evaluate_module
 from reference_trainer.evaluation.cameras import CameraEvaluation, CameraScores
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.scenes.options import OrbitOptions
 from reference_trainer.studies.measure import of_run
-from reference_trainer.studies.run import BAKED_PLY, PLY, save_for_viewers
+from reference_trainer.studies.run import save_for_viewers
+from reference_trainer.studies.run_folder import BAKED_PLY, PLY
 from reference_trainer.studies.score_ply import camera_table, of_ply, score_ply, score_ply_on_orbit
 
 FEW = OrbitOptions(cameras=2, size=40)
@@ -120,6 +123,61 @@ def test_what_is_written_for_an_orbit(tmp_path):
     assert (tmp_path / "ball" / "evaluation.md").read_text().endswith(said[1])
     with Image.open(tmp_path / "ball" / "views" / "001.png") as picture:
         assert picture.size == (40, 40)
+
+
+@pytest.mark.parametrize("on", ["orbit", "scene"])
+def test_an_interrupted_measurement_continues_to_the_same_files(tmp_path, options, monkeypatch, on):
+    save_ply(ball(), tmp_path / "ball.ply")
+    module, name = (cameras_module, "_draw") if on == "orbit" else (evaluate_module, "_measure")
+    original, done = getattr(module, name), []
+
+    def measure(out, **keywords):
+        said: list[str] = []
+        if on == "orbit":
+            score_ply_on_orbit(tmp_path / "ball.ply", FEW, out, say=said.append, **keywords)
+        else:
+            score_ply(tmp_path / "ball.ply", options, out, samples=2, say=said.append, **keywords)
+        return said
+
+    def stopped(*arguments):
+        if done:
+            raise KeyboardInterrupt
+        done.append(arguments)
+        return original(*arguments)
+
+    measure(tmp_path / "whole")
+    monkeypatch.setattr(module, name, stopped)
+    with pytest.raises(KeyboardInterrupt):
+        measure(tmp_path / "cut")
+    monkeypatch.setattr(module, name, original)
+    assert not (tmp_path / "cut" / "evaluation.json").exists()
+    (tmp_path / "cut" / "views" / ".001.png.1.part").touch()  # as kill -9 leaves it
+    assert f"1 measured before the interruption, kept: {tmp_path}/cut/evaluation.partial.json" in measure(
+        tmp_path / "cut"
+    )
+    files = [
+        {str(path.relative_to(tmp_path / out)): path.read_bytes() for path in (tmp_path / out).rglob("*.*")}
+        for out in ("whole", "cut")
+    ]
+    assert files[0] == files[1]
+
+
+def test_another_model_in_the_same_file_is_measured_anew(tmp_path, monkeypatch):
+    draw = cameras_module._draw
+
+    def stopped(image, results, stem):
+        if stem.name == "001":
+            raise KeyboardInterrupt
+        draw(image, results, stem)
+
+    expected, _ = orbit(ball(opacity=0.8), tmp_path, "model")
+    monkeypatch.setattr(cameras_module, "_draw", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        orbit(ball(opacity=0.9), tmp_path, "model")
+    monkeypatch.undo()
+    found, said = orbit(ball(opacity=0.8), tmp_path, "model")
+    assert found == expected
+    assert "they belong to another model, scene, setting or machine: everything is measured anew" in said[1]
 
 
 def test_a_baked_and_a_plain_ply_have_the_same_scores(tmp_path):
