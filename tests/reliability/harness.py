@@ -1,11 +1,10 @@
-"""Runs that are killed with SIGKILL at random moments, and what must be true of what they leave."""
+"""Runs that are killed, and what must be true of what they leave."""
 
 from __future__ import annotations
 
 import multiprocessing
-import random
-import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,16 @@ from ca_reg.monitor import LOG_NAME
 from reference_trainer.json_files import read_json
 from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.run import CHECKPOINT, RESULTS, run_experiment
+from reference_trainer.studies.run import run_experiment
+from reference_trainer.studies.run_folder import CHECKPOINT, RESULTS
+from reference_trainer.studies.run_lock import LOCK
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["Outcome", "Settings", "campaign", "differences"]
+__all__ = ["Outcome", "Settings", "differences", "inspect", "run", "start"]
+
+_USED_BY_RUNS = ("matplotlib", "torch._dynamo", "torch.utils.tensorboard", "PIL.PngImagePlugin", "kornia.core.check")
+_NO_RESULTS = ("events.out.tfevents", LOCK)  # TensorBoard's own files, and who was at work there
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,7 @@ class Settings:
         config: how.
         monitor_every: steps between measurements.
         checkpoint_every: steps between checkpoints.
+        auto: whether it makes a plan.
         threads: of its process.
     """
 
@@ -41,6 +46,7 @@ class Settings:
     config: TrainConfig
     monitor_every: int
     checkpoint_every: int
+    auto: bool = False
     threads: int = 1
 
 
@@ -62,86 +68,51 @@ class Outcome:
     moments: Counter[str] = field(default_factory=Counter)
     defects: list[str] = field(default_factory=list)
 
+    def __str__(self) -> str:
+        where = ", ".join(f"{count} {moment}" for moment, count in self.moments.most_common())
+        lines = [
+            f"{self.kills} kills ({where}), {self.half_written} in the middle of writing a file",
+            f"{self.finished} runs came to their end, compared bit for bit with the uninterrupted one",
+            f"{len(self.defects)} defects",
+        ]
+        return "\n    ".join(["\n".join(lines), *self.defects])
 
-def campaign(settings: Settings, folder: Path, kills: int, *, seed: int = 0) -> Outcome:
-    """Kill runs until so many kills are done, and then let the last one come to its end.
 
-    Args:
-        settings: of the runs.
-        folder: an empty one.
-        kills: how many.
-        seed: of the moments, from the begin of a process to half of the time of a whole run, more of them early: so
-            that a run is killed several times before it comes to its end.
-    """
+def start(target: Callable[..., None], *arguments: Any) -> Any:
+    """Start a process that is killed."""
     context = multiprocessing.get_context("forkserver")  # imports once, and forks the runs from there
-    context.set_forkserver_preload([__name__])
-    whole, draw, out = folder / "whole", random.Random(seed), Outcome()
-
-    def start(place: Path) -> Any:
-        process = context.Process(target=_run, args=(settings, place))
-        process.start()
-        return process
-
-    begin = time.perf_counter()
-    process = start(whole)
-    process.join()
-    if process.exitcode != 0:
-        raise RuntimeError("the uninterrupted run failed, see above")
-    seconds = time.perf_counter() - begin
-    run, step = folder / "run_0", -1
-    while out.kills < kills or out.finished == 0 or run.exists():
-        process = start(run)
-        process.join(0.5 * seconds * draw.random() ** 2 if out.kills < kills else None)
-        process.kill()  # no effect on a process that has ended
-        process.join()
-        if process.exitcode < 0:
-            out.kills += 1
-            step = _inspect(run, step, out)
-            continue
-        if process.exitcode == 0:
-            out.defects += [f"{run.name}: {text}" for text in differences(run, whole)]
-        else:
-            out.defects.append(f"{run.name} did not continue after a kill at step {step}, see above")
-        out.finished += 1
-        run, step = folder / f"run_{out.finished}", -1
-    return out
+    context.set_forkserver_preload([__name__, *_USED_BY_RUNS])
+    process = context.Process(target=target, args=arguments)
+    process.start()
+    return process
 
 
-def differences(run: Path, whole: Path) -> list[str]:
-    """Return what two finished runs differ in, but for the time they took."""
-    names = [sorted(str(p.relative_to(f)) for p in f.rglob("*") if "tfevents" not in p.name) for f in (run, whole)]
-    found = [] if names[0] == names[1] else [f"files {sorted(set(names[0]) ^ set(names[1]))}"]
-    for name in sorted(set(names[0]) & set(names[1])):
-        one, other = run / name, whole / name
-        if name == CHECKPOINT:
-            left, right = load_checkpoint(one), load_checkpoint(other)
-            same = _same({**left, "seconds": 0}, {**right, "seconds": 0})
-        elif name == RESULTS:
-            left, right = read_json(one), read_json(other)
-            same = {**left, "seconds": 0} == {**right, "seconds": 0}
-        else:
-            same = one.is_dir() or one.read_bytes() == other.read_bytes()
-        found += [] if same else [name]
-    return found
-
-
-def _run(settings: Settings, out: Path) -> None:
+def run(settings: Settings, out: Path) -> None:
     """Begin or continue the run: what the killed process does."""
     torch.set_num_threads(settings.threads)
     run_experiment(
         settings.scene,
         settings.config,
         out,
+        auto=settings.auto,
         monitor_every=settings.monitor_every,
         checkpoint_every=settings.checkpoint_every,
     )
 
 
-def _inspect(run: Path, step: int, out: Outcome) -> int:
-    """Read everything that a killed run has left; return the step of its checkpoint."""
+def inspect(run: Path, step: int, out: Outcome, *, name: str) -> int:
+    """Read everything that a killed run has left and count the kill; return the step of its checkpoint.
+
+    Args:
+        run: its folder.
+        step: of its checkpoint at the kill before, -1 for none.
+        out: receives what is found.
+        name: of the run in the defects.
+    """
     files = [path for path in run.rglob("*") if path.is_file()]
+    out.kills += 1
     out.half_written += any(path.suffix in (".part", ".tmp") for path in files)
-    before = step
+    before, step = step, -1
     for path in files:
         try:
             if path.name == CHECKPOINT:
@@ -155,12 +126,33 @@ def _inspect(run: Path, step: int, out: Outcome) -> int:
             elif path.name == LOG_NAME:
                 list(read_log(path))
         except (ValueError, OSError) as error:
-            out.defects.append(f"{run.name}, {path.name} after a kill: {error}")
+            out.defects.append(f"{name}: {path.name} after a kill: {error}")
     if step < before:
-        out.defects.append(f"{run.name}: the checkpoint went back from step {before} to {step}")
+        out.defects.append(f"{name}: the checkpoint went back from step {before} to {step}")
     evaluating = any(path.suffix == ".ply" for path in files)
     out.moments["evaluating" if evaluating else "training" if step >= 0 else "before the first checkpoint"] += 1
     return step
+
+
+def differences(run: Path, whole: Path) -> list[str]:
+    """Return what two finished runs differ in, but for the time they took."""
+    names = [
+        sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if not path.name.startswith(_NO_RESULTS))
+        for folder in (run, whole)
+    ]
+    found = [] if names[0] == names[1] else [f"files {sorted(set(names[0]) ^ set(names[1]))}"]
+    for name in sorted(set(names[0]) & set(names[1])):
+        one, other = run / name, whole / name
+        if name == CHECKPOINT:
+            left, right = load_checkpoint(one), load_checkpoint(other)
+            same = _same({**left, "seconds": 0}, {**right, "seconds": 0})
+        elif name == RESULTS:
+            left, right = read_json(one), read_json(other)
+            same = {**left, "seconds": 0} == {**right, "seconds": 0}
+        else:
+            same = one.is_dir() or one.read_bytes() == other.read_bytes()
+        found += [] if same else [name]
+    return found
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -1,5 +1,6 @@
 import pytest
-from reliability.harness import Settings, campaign
+from reliability.harness import Settings
+from reliability.kill import campaign
 
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig

@@ -1,0 +1,78 @@
+"""Every operation of a writing function, and some of those of a whole run, is the last of a process."""
+
+import itertools
+import signal
+
+import pytest
+from reliability.harness import start
+from reliability.operations import listed, perform
+from reliability.writes import SHORT, campaign
+
+from ca_reg.monitor import LOG_NAME, _keep_lines
+from reference_trainer.files import write_text
+
+CARELESS = """
+from pathlib import Path
+place = Path({place!r})
+place.write_text("the new one")
+place.replace({path!r})
+Path({path!r}).with_name("other.txt").touch()
+"""
+
+
+def killed(folder, fatal, power, action, *arguments):
+    process = start(perform, folder, fatal, power, action, *arguments)
+    process.join()
+    assert process.exitcode in (0, -signal.SIGKILL)
+    return process.exitcode != 0
+
+
+def contents(path, old, power, action, *arguments):
+    """What a file holds if the action is killed at its first operation, its second, ..., and these operations."""
+    seen = []
+    for fatal in itertools.count(1):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(old)
+        if not killed(path.parent, fatal, power, action, *arguments):
+            return seen, [name.split()[0] for name in listed(path.parent).read_text().splitlines()]
+        seen.append(path.read_text())
+
+
+@pytest.mark.parametrize("power", [False, True])
+def test_a_file_is_the_old_one_or_the_new_wherever_its_writer_is_killed(tmp_path, power):
+    path = tmp_path / "folder" / "note.txt"
+    seen, operations = contents(path, "old", power, write_text, path, "the new one")
+    assert operations == ["mkdir", "open", "write", "write", "rename", "remove"]
+    assert seen == ["old"] * 5 + ["the new one"]
+
+
+@pytest.mark.parametrize("power", [False, True])
+def test_a_log_is_the_old_one_or_the_shortened_wherever_that_is_killed(tmp_path, power):
+    path, lines = tmp_path / "folder" / LOG_NAME, [f'{{"step": {step}}}\n' for step in (1, 2, 3)]
+    seen, operations = contents(path, "".join(lines), power, _keep_lines, path, 2)
+    assert operations == ["open", "write", "write", "rename", "remove"]
+    assert seen == ["".join(lines)] * 4 + ["".join(lines[:2])]
+
+
+@pytest.mark.parametrize(("power", "after"), [(False, "the new one"), (True, "the n")])
+def test_a_careless_writer_is_found_out(tmp_path, power, after):
+    """In place, a kill leaves a part; moved without being synced, a power cut does."""
+    path = tmp_path / "folder" / "note.txt"
+    in_place = f"from pathlib import Path; Path({str(path)!r}).write_text('the new one')"
+    assert contents(path, "old", power, exec, in_place)[0] == ["old", "", "th" if power else "the n"]
+    moved = CARELESS.format(place=str(path.with_name("place.txt")), path=str(path))
+    assert contents(path, "old", power, exec, moved)[0] == ["old"] * 4 + [after]
+
+
+def test_runs_killed_at_a_few_of_their_operations_end_like_the_uninterrupted_one(tmp_path):
+    operations, out = campaign(SHORT, tmp_path, first=40, every=70)
+    assert out.defects == []
+    assert out.kills == out.finished == len(operations[39::70]) >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("power", [False, True])
+def test_runs_killed_at_more_of_their_operations_and_again(tmp_path, power):
+    operations, out = campaign(SHORT, tmp_path, first=3, every=20, power=power, again=0)
+    assert out.defects == []
+    assert out.kills == out.finished == 2 * len(operations[2::20]) >= 10
