@@ -12,7 +12,7 @@ from typing import IO, Any
 import torch
 from torch import Tensor
 
-__all__ = ["load_tensors"]
+__all__ = ["load_tensors", "moved"]
 
 _STORAGES = ("Bool", "Byte", "Char", "Short", "Int", "Long", "Half", "BFloat16", "Float", "Double")
 # torch's own list for weights_only has bytearray and Tensor as well, which take any amount of memory from a few bytes.
@@ -55,12 +55,30 @@ def load_tensors(path: str | Path, device: torch.device | str = "cpu", *, what: 
             data = _checked_archive(data)
         else:
             _check_old_file(data)
-        state = torch.load(data, map_location=device, weights_only=True)
+        state = torch.load(data, map_location="cpu", weights_only=True)
         _check_tensors(state)
+        return moved(state, device)
     except Exception as error:  # zipfile, pickletools and torch raise many types for damaged files
         reason = str(error).partition("\n")[0]  # torch goes on with advice to load the file without this safety
         raise ValueError(f"{path} is not {what} ({type(error).__name__}: {reason}).") from error
-    return state
+
+
+def moved(state: Any, device: torch.device | str) -> Any:
+    """Return a state with its tensors on a device; those that are there already are not copied.
+
+    Args:
+        state: nested dicts and lists of tensors and anything else.
+        device: where to.
+
+    Example:
+        >>> moved({"x": [torch.zeros(2)], "step": 3}, "meta")
+        {'x': [tensor(..., device='meta', size=(2,))], 'step': 3}
+    """
+    if isinstance(state, Tensor):
+        return state.to(device)
+    if isinstance(state, dict):
+        return type(state)((key, moved(value, device)) for key, value in state.items())
+    return [moved(value, device) for value in state] if isinstance(state, list) else state
 
 
 def _checked_archive(data: io.BytesIO) -> io.BytesIO:

@@ -3,11 +3,12 @@
 import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
 import torch
+from pretended_card import CARD, pretended_card, register_card
 
 # The tests are many small operations: a second thread only spins, and slows them down when the cores are busy.
 torch.set_num_threads(1)
@@ -22,12 +23,20 @@ def data_root() -> Path:
     return root
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def device(request: pytest.FixtureRequest) -> torch.device:
-    """Every device that this machine has."""
+@pytest.fixture(params=["cpu", CARD, pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
+    """Every device that this machine has, and one that it only pretends to have."""
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
-    return torch.device(request.param)
+    with pretended_card() if request.param == CARD else nullcontext():
+        yield torch.device(request.param)
+
+
+@pytest.fixture
+def card() -> Iterator[torch.device]:
+    """A device that is none, and refuses what CUDA would refuse."""
+    with pretended_card() as device:
+        yield device
 
 
 @pytest.fixture
@@ -54,6 +63,8 @@ def full_disk() -> Callable[[int], AbstractContextManager[None]]:
 
 
 def pytest_configure(config):
-    """Hear Ctrl-C: a shell starts background jobs deaf to it, and some tests send it to themselves."""
+    """Prepare what must be before the first test."""
+    register_card()
+    # A shell starts background jobs deaf to Ctrl-C, and some tests send it to themselves.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

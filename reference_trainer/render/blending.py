@@ -24,6 +24,7 @@ from reference_trainer.render.footprints import (
     untile,
 )
 from reference_trainer.render.precision import without_autocast
+from reference_trainer.render.running_sums import running_sums_
 from reference_trainer.render.tiles import Block, TileLists
 from reference_trainer.render.workspace import Workspace
 
@@ -112,7 +113,7 @@ class _Composite(torch.autograd.Function):
                 g, v = of_tiles[block.tiles], block.of(of_entries).transpose(0, 1)
                 # Alphas: a splat adds T_i v_i itself and dims by 1 / (1 - alpha_i) the sum of all behind it.
                 torch.bmm(g.transpose(1, 2), v, out=along)
-                torch.mul(alphas.weights, along, out=behind).cumsum_(-1)
+                running_sums_(torch.mul(alphas.weights, along, out=behind))
                 behind.sub_(behind[..., -1:].clone()).div_(alphas.passed)  # its negative
                 along.mul_(alphas.transmittance).add_(behind).mul_(alphas.raw)
                 to_block = block.of(to_entries).transpose(0, 1)

@@ -37,7 +37,7 @@ _LN_2 = math.log(2.0)
 
 def block_size(device: torch.device) -> int:
     """Return how many pixel-Gaussian pairs to hold at once on a device."""
-    return BLOCK_ELEMENTS_CUDA if device.type == "cuda" else BLOCK_ELEMENTS_CPU
+    return BLOCK_ELEMENTS_CPU if device.type == "cpu" else BLOCK_ELEMENTS_CUDA
 
 
 def pack(means: Tensor, factors: Tensor, opacities: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from reference_trainer.files import replacing
-from reference_trainer.tensor_files import load_tensors
+from reference_trainer.tensor_files import load_tensors, moved
 
 __all__ = ["load_checkpoint", "save_checkpoint"]
 
@@ -19,6 +19,8 @@ _FORMAT = "ca_reg-checkpoint-1"
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write a state of tensors, numbers and strings; an interrupted write leaves the file that was there before.
 
+    The tensors are written as those of a CPU, so that any machine can read them.
+
     Args:
         path: where to; its folder is made.
         state: nested dicts of tensors, numbers, strings and None.
@@ -27,7 +29,7 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
         OSError: if it cannot be written, such as on a full disk; it names the file.
     """
     content = io.BytesIO()  # torch.save to a file hides the error of a full disk behind one of its own
-    torch.save({"format": _FORMAT, **state}, content)
+    torch.save({"format": _FORMAT, **moved(state, "cpu")}, content)
     with replacing(path) as place:
         place.write_bytes(content.getbuffer())
 

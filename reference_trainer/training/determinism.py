@@ -34,7 +34,7 @@ def deterministic(device: torch.device | str = "cpu") -> Iterator[None]:
     threads, algorithms = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     fill = torch.utils.deterministic.fill_uninitialized_memory  # type: ignore[attr-defined]
     torch.set_num_threads(1)
-    if torch.device(device).type == "cuda":
+    if torch.device(device).type != "cpu":
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         torch.use_deterministic_algorithms(True)
         # All buffers are written before they are read.

@@ -49,7 +49,10 @@ class Padded(NamedTuple):
     def multiplier(self, multiplier):
         """The multiplier with its moments per entry."""
         return Multiplier(
-            *(x.flatten()[self.order] if isinstance(x, Tensor) else x for x in (multiplier.mean, multiplier.variance))
+            *(
+                x.to(self.order.device).flatten()[self.order] if isinstance(x, Tensor) else x
+                for x in (multiplier.mean, multiplier.variance)
+            )
         )
 
 

@@ -241,7 +241,7 @@ def test_wrong_calls_are_refused():
     cloud = Cloud(5)
     dropout = Multiplier.dropout(0.2)
     with pytest.raises(ValueError, match="sigmoid"):
-        CAPenalty(cloud.moments, dropout)(torch.randn(5, dtype=torch.float64), cloud.colors)
+        CAPenalty(cloud.moments, dropout)(torch.tensor([-1.0, 0.5, 0.5, 0.5, 0.5]).double(), cloud.colors)
     with pytest.raises(TypeError, match="must return a Multiplier"):
         CAPenalty(cloud.moments, lambda o: o)(cloud.opacity, cloud.colors)
     with pytest.raises(TypeError, match="without variance"):

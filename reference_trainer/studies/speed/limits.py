@@ -13,7 +13,7 @@ from reference_trainer.studies.timing import in_turns
 
 __all__ = ["Limits", "bounds", "covered_pairs", "measure_limits"]
 
-_CACHED = {"cpu": 1 << 16, "cuda": 1 << 24}  # elements: 256 KiB stay in a core's cache; a GPU needs more to be busy
+_CACHED_CPU, _CACHED_CUDA = 1 << 16, 1 << 24  # elements: 256 KiB stay in a core's cache; a GPU needs more to be busy
 _LARGE = 1 << 26  # elements: 256 MiB, beyond any cache
 _CALLS = 100  # of a function on the cached buffer per timing
 _MIN_ALPHA = 1 / 255
@@ -36,7 +36,7 @@ class Limits:
 
 def measure_limits(device: torch.device, *, repeats: int = 7) -> Limits:
     """Measure the limits: the fastest of the repetitions, because what slowed down the others is no limit."""
-    x = -5 * torch.rand(_CACHED[device.type], device=device)
+    x = -5 * torch.rand(_CACHED_CPU if device.type == "cpu" else _CACHED_CUDA, device=device)
     out = torch.empty_like(x)
     source = torch.ones(_LARGE, device=device)
     target = torch.empty_like(source)

@@ -1,14 +1,20 @@
+import dataclasses
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import torch
+from pretended_card import pretended_card
 
 from reference_trainer.cli import main
+from reference_trainer.scenes.scene import Scene
 from reference_trainer.studies import run as run_module
+from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.determinism import deterministic
+from reference_trainer.training.trainer import Trainer
 
 
 def test_one_thread_and_afterwards_as_before():
@@ -49,6 +55,40 @@ def test_the_option_of_the_command(monkeypatch, tmp_path):
     finally:
         torch.set_num_threads(1)
     assert seen == [2, 1]
+
+
+def trained_on_a_card(scene: Scene, config: TrainConfig, order: int, *, repeatable: bool) -> dict[str, torch.Tensor]:
+    """Parameters after a training on a card that adds in an order of its own where it may."""
+    with pretended_card(order=order) as card, deterministic(card) if repeatable else nullcontext():
+        trainer = Trainer(scene, config, card)
+        trainer.train()
+        return {name: x.detach().cpu() for name, x in trainer.gaussians.named()}
+
+
+@pytest.mark.parametrize("change", [{}, {"analytic": True, "iterations": 8}], ids=["sampled", "analytic"])
+def test_on_a_card_the_order_of_additions_does_not_matter(tiny_scene, busy, change):
+    """Nor does anything that happens in training lack an algorithm that repeats itself: the card refuses that."""
+    config = dataclasses.replace(busy, **{"iterations": 14, **change})
+    one, other = (trained_on_a_card(tiny_scene, config, order, repeatable=True) for order in (0, 1))
+    assert all(torch.equal(x, other[name]) for name, x in one.items())
+
+
+def test_on_a_card_it_matters_without(tiny_scene, busy):
+    config = dataclasses.replace(busy, iterations=2)
+    one, other = (trained_on_a_card(tiny_scene, config, order, repeatable=False) for order in (0, 1))
+    assert not torch.equal(one["means"], other["means"])
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_on_cuda_training_repeats_itself_bit_for_bit(tiny_scene, busy):
+    with deterministic("cuda"):
+        one, other = (Trainer(tiny_scene, busy, "cuda") for _ in range(2))
+        one.train()
+        other.train()
+    assert len(one.gaussians) == len(other.gaussians)
+    for (name, x), (_, y) in zip(one.gaussians.named(), other.gaussians.named(), strict=True):
+        assert torch.equal(x, y), name
 
 
 _RUN = """

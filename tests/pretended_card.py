@@ -1,0 +1,196 @@
+"""A graphics card that is none: tensors on the device "card" compute on the processor and refuse what CUDA refuses.
+
+It shows without a card that code is written for one. Mixing devices, a generator of another device, a factory function
+that forgot the device, `numpy()`, an operation that cannot repeat itself where that is asked for: each fails here as it
+would on CUDA. What it does not show is CUDA's rounding, memory and speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache, partial
+from typing import Any
+
+import pytest
+import torch
+from cuda_rules import check_determinism, check_devices, check_generator, shuffled_additions
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils import _pytree as pytree
+from torch.utils import backend_registration
+from torch.utils._python_dispatch import return_and_correct_aliasing
+
+__all__ = ["CARD", "pretended_card", "register_card"]
+
+CARD = "card"
+
+_SIZED_LATER = ("arange", "arange.start", "arange.start_step", "eye", "eye.m", "linspace")
+"""What PyTorch makes by resizing an empty tensor, which a tensor written in Python cannot follow."""
+
+_generators: dict[int, torch.device] = {}  # by address: a generator comes back from C++ as another object
+_order: torch.Generator | None = None
+_libraries: list[torch.library.Library] = []
+
+
+class CardTensor(Tensor):
+    """A tensor that says it is on the card; the numbers are in a tensor on the processor."""
+
+    numbers: Tensor
+
+    @staticmethod
+    def __new__(cls, numbers: Tensor) -> CardTensor:
+        out = Tensor._make_wrapper_subclass(
+            cls,
+            numbers.size(),
+            strides=numbers.stride(),
+            storage_offset=numbers.storage_offset(),
+            dtype=numbers.dtype,
+            device=torch.device(CARD, 0),
+        )
+        out.numbers = numbers
+        return out
+
+    def __repr__(self) -> str:
+        return f"CardTensor({self.numbers})"
+
+    @classmethod
+    def __torch_dispatch__(cls, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _compute(op, *args, **(kwargs or {}))
+
+
+class _Generator(torch.Generator):
+    """A generator that says it is where it was asked to be; PyTorch cannot make one for a device written in Python."""
+
+    def __new__(cls, device: Any = "cpu") -> _Generator:
+        out = super().__new__(cls, "cpu")
+        out._where = torch.device(device)
+        _generators[out._cdata] = out._where
+        return out
+
+    def __del__(self) -> None:
+        _generators.pop(self._cdata, None)
+
+    @property
+    def device(self) -> torch.device:
+        return self._where
+
+
+class _FromNumbers(TorchFunctionMode):
+    """What PyTorch does not hand to a device written in Python: making tensors of Python numbers, and the reverse."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        ours = bool(args) and isinstance(args[0], CardTensor)
+        if func in (torch.tensor, torch.as_tensor, torch.asarray) and _is_card(kwargs.get("device")):
+            return args[0] if ours else func(*args, **{**kwargs, "device": "cpu"}).to(CARD)
+        if func is Tensor.new_tensor and ours:
+            return torch.tensor(args[1], **{"dtype": args[0].dtype, **kwargs}).to(CARD)
+        if func is Tensor.tolist and ours:
+            return args[0].detach().numbers.tolist()
+        if func is Tensor.numpy and ours:
+            raise TypeError("can't convert a tensor on the card to numpy. Use Tensor.cpu() first.")
+        if isinstance(kwargs.get("generator"), _Generator) and not ours and not _is_card(kwargs.get("device")):
+            check_generator(kwargs["generator"].device, torch.device("cpu"))
+        return func(*args, **kwargs)
+
+
+class _Module:
+    """What PyTorch asks the module of a device."""
+
+    is_initialized = is_available = staticmethod(lambda: True)
+    device_count = staticmethod(lambda: 1)
+    current_device = staticmethod(lambda: 0)
+    manual_seed_all = staticmethod(lambda seed: None)
+    _is_in_bad_fork = staticmethod(lambda: False)
+    get_amp_supported_dtype = staticmethod(lambda: [torch.float16, torch.bfloat16])
+
+
+@contextmanager
+def pretended_card(*, order: int | None = None) -> Iterator[torch.device]:
+    """Make the device "card" usable; skips where PyTorch has no devices written in Python.
+
+    Args:
+        order: seed of the order in which `index_add` adds, which CUDA leaves open; as on a processor by default.
+
+    Yields:
+        The device.
+    """
+    global _order
+    if not register_card():
+        pytest.skip("this PyTorch has no devices that are written in Python")
+    _order = None if order is None else torch.Generator().manual_seed(order)
+    generator = torch.Generator
+    torch.Generator = _Generator  # type: ignore[misc]
+    try:
+        with _FromNumbers():
+            yield torch.device(CARD)
+    finally:
+        torch.Generator = generator  # type: ignore[misc]
+        _order = None
+
+
+@cache
+def register_card() -> bool:
+    """Make the device known to PyTorch; return whether that can be done.
+
+    It must happen before the first backward pass of a process: PyTorch counts the devices then.
+    """
+    if not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"):
+        return False
+    backend_registration._setup_privateuseone_for_python_backend(CARD, backend_module=_Module())
+    every, aten = torch.library.Library("_", "IMPL"), torch.library.Library("aten", "IMPL")
+    every.fallback(_compute, "PrivateUse1")
+    for name in _SIZED_LATER:
+        base, _, overload = name.partition(".")
+        aten.impl(name, partial(_compute, getattr(getattr(torch.ops.aten, base), overload or "default")), "PrivateUse1")
+    every.fallback(torch.library.fallthrough_kernel, "AutocastPrivateUse1")
+    for op in (torch.ops.aten.matmul, torch.ops.aten.mm, torch.ops.aten.bmm):
+        aten.impl(op.default, partial(_autocast, op.default), "AutocastPrivateUse1")
+    _libraries.extend([every, aten])  # what they register lasts as long as they do
+    return True
+
+
+def _autocast(op: Any, one: Tensor, other: Tensor) -> Tensor:
+    """Multiply in the short type that was asked for, as `torch.autocast` does on CUDA."""
+    with torch._C._ExcludeDispatchKeyGuard(torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastPrivateUse1)):
+        return op(*(x.to(torch.get_autocast_dtype(CARD)) if x.is_floating_point() else x for x in (one, other)))
+
+
+def _compute(op: Any, *args: Any, **kwargs: Any) -> Any:
+    """Do one operation on the processor, after the checks that CUDA makes."""
+    name, device = op._schema.name, kwargs.get("device")
+    leaves = pytree.tree_leaves((args, kwargs))
+    ours = [x for x in leaves if isinstance(x, CardTensor)]
+    _check(name, args, leaves, ours, CARD if device is None else device)
+    if device is not None:
+        kwargs = {**kwargs, "device": torch.device("cpu")}
+    inner = pytree.tree_map(_numbers, args)
+    if _order is not None:
+        inner = shuffled_additions(name, inner, _order)
+    out = op(*inner, **pytree.tree_map(_numbers, kwargs))
+    if any(x.shape != x.numbers.shape or x.stride() != x.numbers.stride() for x in ours):
+        raise NotImplementedError(f"the pretended card cannot follow {name}, which changes the shape of a tensor")
+    on_card = isinstance(args[0], CardTensor) if name == "aten::copy_" else bool(ours)
+    if on_card if device is None else _is_card(device):
+        out = pytree.tree_map(lambda x: CardTensor(x) if isinstance(x, Tensor) else x, out)
+    return return_and_correct_aliasing(op, args, kwargs, out) if ours else out
+
+
+def _check(name: str, args: Sequence[Any], leaves: Sequence[Any], ours: Sequence[Tensor], device: Any) -> None:
+    """Refuse what CUDA would refuse."""
+    for x in leaves:
+        if isinstance(x, torch._C.Generator):
+            check_generator(_generators.get(x._cdata, torch.device("cpu")), torch.device(device))
+    if ours:
+        foreign = [x for x in leaves if isinstance(x, Tensor) and not isinstance(x, CardTensor)]
+        check_devices(name, args, foreign)
+        check_determinism(name, ours)
+
+
+def _is_card(device: Any) -> bool:
+    return device is not None and torch.device(device).type == CARD
+
+
+def _numbers(x: Any) -> Any:
+    return x.numbers if isinstance(x, CardTensor) else x
