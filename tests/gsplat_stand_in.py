@@ -46,7 +46,7 @@ def _rasterize(given, *, culls):
     cameras = [camera_of(pose, k, a.width, a.height) for pose, k in zip(a.viewmats, a.Ks, strict=True)]
     listed = [_listed(a, camera, culls) for camera in cameras]
     ids = torch.cat(listed)
-    camera_ids = torch.repeat_interleave(torch.arange(len(cameras)), torch.tensor([len(x) for x in listed]))
+    camera_ids = torch.cat([torch.full_like(x, number) for number, x in enumerate(listed)])
     parts = [project(a.means[i], a.quats[i], a.scales[i], c) for i, c in zip(listed, cameras, strict=True)]
     packed_means, depths = torch.cat([p.means for p in parts]), torch.cat([p.depths for p in parts])
     radii = torch.cat([_radii(p) for p in parts])

@@ -66,11 +66,12 @@ def make_rasterizer(form: str = "depth-alpha") -> type[nn.Module]:
                 sh=shs, colors=colors_precomp, background=settings.bg, depth=True,
             )  # fmt: skip
             centres = out.splats.projection.means
+            half = centres.new_tensor([0.5 * width, 0.5 * height])
             if centres.requires_grad and means2D.requires_grad:
 
                 def deliver(gradient):
                     means2D.grad = torch.zeros_like(means2D)
-                    means2D.grad[out.splats.indices, :2] = gradient * gradient.new_tensor([0.5 * width, 0.5 * height])
+                    means2D.grad[out.splats.indices, :2] = gradient * half
 
                 centres.register_hook(deliver)
             radii = radii_of_all(means3D, rotations, scales, camera)
@@ -78,7 +79,7 @@ def make_rasterizer(form: str = "depth-alpha") -> type[nn.Module]:
             members = {
                 "plain": (),
                 "inverse-depth": (plane,),
-                "weights": (torch.ones(len(means3D)),),
+                "weights": (torch.ones(len(means3D), device=means3D.device),),
                 "depth-alpha": (plane, out.alpha[None]),
             }
             return (out.image, radii, *members[form])
@@ -89,7 +90,7 @@ def make_rasterizer(form: str = "depth-alpha") -> type[nn.Module]:
 @torch.no_grad()
 def radii_of_all(means, rotations, scales, camera):
     """Radii follow from the covariances alone: a Gaussian of opacity 0 has one, as in the CUDA code."""
-    radii = torch.zeros(len(means), dtype=torch.int32)
+    radii = torch.zeros(len(means), dtype=torch.int32, device=means.device)
     front = (means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]) > NEAR_PLANE
     radii[front] = project(means[front], rotations[front], scales[front], camera).radii.to(torch.int32)
     return radii
@@ -98,8 +99,8 @@ def radii_of_all(means, rotations, scales, camera):
 class Model:
     """Raw parameters and activated properties, under the names that the code bases use."""
 
-    def __init__(self, n: int = 60, seed: int = 0):
-        scene = random_scene(n, 32, 24, seed).to(torch.float32)
+    def __init__(self, n: int = 60, seed: int = 0, device: torch.device | str = "cpu"):
+        scene = random_scene(n, 32, 24, seed).to(torch.float32, device)
         self._xyz = nn.Parameter(scene.means)
         self._scaling = nn.Parameter(scene.scales.log())
         self._rotation = nn.Parameter(scene.quaternions)
@@ -129,9 +130,9 @@ def settings_of(camera: Camera, background: Tensor) -> Settings:
         bg=background,
         scale_modifier=1.0,
         viewmatrix=camera.world_to_camera.T,
-        projmatrix=torch.eye(4),
+        projmatrix=torch.eye(4, device=background.device),
         sh_degree=0,
-        campos=torch.zeros(3),
+        campos=torch.zeros(3, device=background.device),
         prefiltered=False,
         debug=False,
     )
@@ -156,8 +157,8 @@ def make_render(rasterizer: type[nn.Module], named_alpha: bool = False):
     """Make a render function of the family; ``keep`` renders a subset by index, as the paper's code does."""
 
     def render(viewpoint_camera, pc, pipe, bg_color, keep=None, **replaced):
-        rows = torch.arange(len(pc.get_xyz)) if keep is None else keep
-        points = torch.zeros(len(rows), 3, requires_grad=True)
+        count = len(pc.get_xyz) if keep is None else len(keep)
+        points = torch.zeros(count, 3, requires_grad=True, device=pc.get_xyz.device)
         if keep is not None:
             replaced = {
                 "means3D": pc.get_xyz[keep],

@@ -3,6 +3,9 @@
 It shows without a card that code is written for one. Mixing devices, a generator of another device, a factory function
 that forgot the device, `numpy()`, an operation that cannot repeat itself where that is asked for: each fails here as it
 would on CUDA. What it does not show is CUDA's rounding, memory and speed.
+
+One thing it cannot do: PyTorch computes gradients in a thread of the device, where tensors of Python numbers
+(`torch.tensor`, `new_tensor`) end the process. Make them in the forward pass.
 """
 
 from __future__ import annotations
@@ -86,6 +89,8 @@ class _FromNumbers(TorchFunctionMode):
             return args[0] if ours else func(*args, **{**kwargs, "device": "cpu"}).to(CARD)
         if func is Tensor.new_tensor and ours:
             return torch.tensor(args[1], **{"dtype": args[0].dtype, **kwargs}).to(CARD)
+        if func is Tensor.__getitem__ and ours and isinstance(args[1], tuple):
+            args = args[0], tuple(torch.tensor(i) if isinstance(i, list) else i for i in args[1])
         if func is Tensor.tolist and ours:
             return args[0].detach().numbers.tolist()
         if func is Tensor.numpy and ours:

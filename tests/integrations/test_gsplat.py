@@ -76,7 +76,9 @@ def loss_of(images):
 @pytest.mark.parametrize(
     ("stand_in", "packed"), [(rasterization, True), (rasterization, False), (rasterization_1_4, False)]
 )
-def test_masked_and_removed_gaussians_give_the_same_images_and_gradients(stand_in, packed, params, cameras):
+def test_masked_and_removed_gaussians_give_the_same_images_and_gradients(stand_in, packed, params, cameras, device):
+    params = params.to(device)
+    cameras = {name: x.to(device) if isinstance(x, torch.Tensor) else x for name, x in cameras.items()}
     dropout = GaussianDropout(0.4)
     wrapped = regularized(stand_in, dropout, generator=torch.Generator().manual_seed(1))
     image, alpha, info = wrapped(**activated(params), **cameras, packed=packed)

@@ -14,14 +14,16 @@ FORMS = ["plain", "inverse-depth", "weights", "depth-alpha"]
 
 
 def loss_of(image):
-    return (image * torch.linspace(0.5, 1.5, image.numel()).reshape(image.shape)).sin().sum()
+    weights = torch.linspace(0.5, 1.5, image.numel(), device=image.device)
+    return (image * weights.reshape(image.shape)).sin().sum()
 
 
 class Bookkeeping:
     """What the family keeps for densification, written from its description."""
 
-    def __init__(self, n):
-        self.accumulated, self.count, self.radii = torch.zeros(n), torch.zeros(n), torch.zeros(n, dtype=torch.int32)
+    def __init__(self, n, device):
+        self.accumulated, self.count = torch.zeros(n, device=device), torch.zeros(n, device=device)
+        self.radii = torch.zeros(n, dtype=torch.int32, device=device)
 
     def add(self, gradient, visible, radii):
         self.radii[visible] = torch.maximum(self.radii[visible], radii[visible])
@@ -33,37 +35,38 @@ class Bookkeeping:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_masking_with_zeroed_radii_is_removing_the_gaussians(form):
-    rasterizer, model = make_rasterizer(form), Model()
-    render, n = make_render(rasterizer), 60
+def test_masking_with_zeroed_radii_is_removing_the_gaussians(form, device):
+    rasterizer, model = make_rasterizer(form), Model(device=device)
+    render, n, black = make_render(rasterizer), 60, BLACK.to(device)
     dropout = GaussianDropout(0.4)
-    hooked, removed, naive = Bookkeeping(n), Bookkeeping(n), Bookkeeping(n)
-    ours = DensityStatistics.zeros(n)
+    hooked, removed, naive = (Bookkeeping(n, device) for _ in range(3))
+    ours = DensityStatistics.zeros(n, device)
     hook = RasterizerHook(dropout, rasterizer=rasterizer)
     for step in range(1, 6):
         with hook:
             hook.step(step)
-            package = render(model.camera, model, PIPE, BLACK)
+            package = render(model.camera, model, PIPE, black)
         gradients = torch.autograd.grad(loss_of(package["render"]), model.parameters())
         points = package["viewspace_points"].grad
         hooked.add(points, package["visibility_filter"], package["radii"])
 
         keep = dropout.keep.nonzero().squeeze(1)
-        subset = render(model.camera, model, PIPE, BLACK, keep=keep)
+        subset = render(model.camera, model, PIPE, black, keep=keep)
         expected = torch.autograd.grad(loss_of(subset["render"]), model.parameters())
         assert torch.equal(package["render"], subset["render"])
         for ours_, theirs in zip(gradients, expected, strict=True):
             torch.testing.assert_close(ours_, theirs, rtol=1e-6, atol=0)
-        full_radii, full_points = torch.zeros(n, dtype=torch.int32), torch.zeros(n, 3)
+        full_radii = torch.zeros(n, dtype=torch.int32, device=device)
+        full_points = torch.zeros(n, 3, device=device)
         full_radii[keep], full_points[keep] = subset["radii"], subset["viewspace_points"].grad
         removed.add(full_points, full_radii > 0, full_radii)
 
         # The reference trainer's own statistics, given the visible subset, in pixels.
         seen = full_radii.nonzero().squeeze(1)
-        per_pixel = full_points[seen, :2] / torch.tensor([16.0, 12.0])
+        per_pixel = full_points[seen, :2] / torch.tensor([16.0, 12.0], device=device)
         ours.update(seen, per_pixel, full_radii[seen], 32, 24)
         with torch.no_grad():
-            unmasked = render(model.camera, model, PIPE, BLACK)["radii"]
+            unmasked = render(model.camera, model, PIPE, black)["radii"]
         naive.add(points, unmasked > 0, unmasked)
 
     assert hook.tally.regularized == 5
