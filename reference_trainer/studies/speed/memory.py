@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import gc
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 
 import torch
 
+from reference_trainer.studies.engines.engine import Failure, Task
+from reference_trainer.studies.engines.processes import Processes
+from reference_trainer.studies.engines.run_all import run_all
 from reference_trainer.studies.speed.calls import SUBJECT, gradients, image
 from reference_trainer.studies.speed.workloads import WorkloadSpec
 
@@ -30,13 +31,20 @@ def peak_memory(spec: WorkloadSpec, device: torch.device) -> dict[str, int] | No
 
     Returns:
         Bytes for "forward" and "forward+backward"; None where the system does not tell (a CPU without Linux's /proc).
+
+    Raises:
+        RuntimeError: if the process that measures fails, or is killed for taking too much memory.
     """
     if device.type == "cuda":
         return _in_this_process(spec, str(device), torch.get_num_threads())
     if not (_PROCESS / "clear_refs").exists():
         return None
-    with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(_in_this_process, spec, str(device), torch.get_num_threads()).result()
+    task = Task("peak memory", _in_this_process, (spec, str(device), torch.get_num_threads()))
+    [(_, outcome)] = run_all(Processes(1), [task], retries=0)
+    if isinstance(outcome, Failure):
+        raise RuntimeError(f"the process that measures peak memory failed: {outcome.error}\n{outcome.traceback}")
+    measured: dict[str, int] = outcome.value
+    return measured
 
 
 def _in_this_process(spec: WorkloadSpec, device: str, threads: int) -> dict[str, int]:

@@ -31,6 +31,13 @@ def test_a_fresh_process_measures_a_rendering():
     assert 0 < peaks["forward"] <= peaks["forward+backward"] < 500 * MIB
 
 
+@pytest.mark.slow
+@needs_proc
+def test_a_failure_in_the_fresh_process_is_an_error_here():
+    with pytest.raises(RuntimeError, match=r"measures peak memory failed: ValueError: negative"):
+        peak_memory(WorkloadSpec(-1, 8, 8, 0.1), torch.device("cpu"))
+
+
 @pytest.mark.gpu
 def test_on_a_gpu_the_tensors_count():
     if not torch.cuda.is_available():
