@@ -95,6 +95,11 @@ class Train:
         from reference_trainer.studies.run import run_experiment, summary
         from reference_trainer.training.determinism import deterministic
 
+        if self.deterministic and self.config.renderer == "gsplat":
+            raise ValueError(
+                "--deterministic needs --renderer torch: gsplat's kernels add gradients in whatever order they come, "
+                "which PyTorch cannot change."
+            )
         use_compiled(self.compile)
         with deterministic(self.device) if self.deterministic else nullcontext():
             results = run_experiment(

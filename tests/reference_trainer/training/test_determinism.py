@@ -57,6 +57,13 @@ def test_the_option_of_the_command(monkeypatch, tmp_path):
     assert seen == [2, 1]
 
 
+def test_gsplat_cannot_repeat_itself(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--out", str(tmp_path / "run"), "--deterministic", "--renderer", "gsplat"])
+    assert "--deterministic needs --renderer torch" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def trained_on_a_card(scene: Scene, config: TrainConfig, order: int, *, repeatable: bool) -> dict[str, torch.Tensor]:
     """Parameters after a training on a card that adds in an order of its own where it may."""
     with pretended_card(order=order) as card, deterministic(card) if repeatable else nullcontext():
