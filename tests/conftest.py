@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from pretended_card import CARD, pretended_card, register_card
+from stand_ins.card import CARD, pretended_card, register_card
 
 # The tests are many small operations: a second thread only spins, and slows them down when the cores are busy.
 torch.set_num_threads(1)

@@ -4,7 +4,7 @@ import sys
 from types import ModuleType
 
 import pytest
-from inria_fake import Model, make_rasterizer
+from stand_ins.inria import Model, make_rasterizer
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from types import ModuleType
 
 import pytest
 import torch
-from gsplat_stand_in import intrinsics, rasterization, rasterization_1_4
 from oracles import random_scene
+from stand_ins.gsplat import intrinsics, rasterization, rasterization_1_4
 from torch import nn
 
 from ca_reg import GaussianDropout, OpacityNoise

@@ -6,11 +6,11 @@ On a machine with a CUDA device: ``pip install 'gsplat>=1.5' && pytest tests/int
 import inspect
 import itertools
 
-import gsplat_stand_in
 import pytest
 import torch
-from gsplat_stand_in import centred, intrinsics
 from oracles import brute_force, random_scene
+from stand_ins import gsplat as gsplat_stand_in
+from stand_ins.gsplat import centred, intrinsics
 
 from ca_reg import CAScore, GaussianDropout, ListMoments
 from ca_reg.functional import Multiplier

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from inria_fake import PIPE, Model, make_rasterizer, make_render, rasterize
+from stand_ins.inria import PIPE, Model, make_rasterizer, make_render, rasterize
 from torch import nn
 
 from ca_reg import GaussianDropout, OpacityNoise, StartStop

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 import torch
-from inria_fake import PIPE, Model, make_render
+from stand_ins.inria import PIPE, Model, make_render
 from torch import nn
 
 from ca_reg import GaussianDropout
@@ -72,7 +72,7 @@ def test_two_hooks_are_refused(rasterizer):
 def test_installed_rasterizers_are_found_whenever_they_are_imported(monkeypatch, tmp_path):
     for name in ("diff_gaussian_rasterization", "diff_gaussian_rasterization_abs"):
         (tmp_path / f"{name}.py").write_text(
-            "from inria_fake import make_rasterizer\nGaussianRasterizer = make_rasterizer()\n"
+            "from stand_ins.inria import make_rasterizer\nGaussianRasterizer = make_rasterizer()\n"
         )
         monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.syspath_prepend(tmp_path)
@@ -139,7 +139,7 @@ def test_a_tuple_without_radii_is_an_error():
 
 USER_FILE = """
 import torch
-from inria_fake import PIPE, Model, make_rasterizer, make_render
+from stand_ins.inria import PIPE, Model, make_rasterizer, make_render
 
 GaussianRasterizer = make_rasterizer()
 render = make_render(GaussianRasterizer)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from inria_fake import PIPE, Model, make_rasterizer, make_render
+from stand_ins.inria import PIPE, Model, make_rasterizer, make_render
 
 from ca_reg import CAScore, GaussianDropout
 from ca_reg.integrations.inria import RasterizerHook

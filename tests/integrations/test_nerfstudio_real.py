@@ -6,7 +6,7 @@ from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
 import torch
-from cpu_gsplat import rasterization
+from stand_ins.gsplat_of_nerfstudio import rasterization
 from torch import nn
 
 from ca_reg.integrations import nerfstudio

@@ -16,13 +16,13 @@ from ca_reg.integrations.run import main
 
 FILES = {
     "diff_gaussian_rasterization.py": """
-        from inria_fake import make_rasterizer
+        from stand_ins.inria import make_rasterizer
 
         GaussianRasterizer = make_rasterizer()
     """,
     "scene/__init__.py": "from scene.gaussian_model import GaussianModel\n",
     "scene/gaussian_model.py": """
-        from inria_fake import Model
+        from stand_ins.inria import Model
 
         class GaussianModel(Model):
             def update_learning_rate(self, iteration):
@@ -30,7 +30,7 @@ FILES = {
     """,
     "gaussian_renderer/__init__.py": """
         from diff_gaussian_rasterization import GaussianRasterizer
-        from inria_fake import make_render
+        from stand_ins.inria import make_render
 
         render = make_render(GaussianRasterizer)
     """,
@@ -165,7 +165,7 @@ def test_without_cuda_the_stand_in_comes_first(repository, capsys, monkeypatch):
     @contextmanager
     def stand_in(repository: Path, outputs: int | None = None):
         asked.append((repository, outputs))
-        from inria_fake import make_rasterizer
+        from stand_ins.inria import make_rasterizer
 
         module = ModuleType("diff_gaussian_rasterization")
         module.GaussianRasterizer = make_rasterizer("plain")

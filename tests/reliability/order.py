@@ -12,7 +12,7 @@ import statistics
 from collections.abc import Sequence
 
 import torch
-from pretended_card import CARD, pretended_card
+from stand_ins.card import CARD, pretended_card
 from torch import Tensor
 
 from reference_trainer.evaluation.metrics import psnr

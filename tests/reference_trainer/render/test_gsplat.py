@@ -8,8 +8,8 @@ import sys
 
 import pytest
 import torch
-from gsplat_stand_in import centred, rasterization
 from oracles import random_scene
+from stand_ins.gsplat import centred, rasterization
 
 from reference_trainer.model.density import DensityStatistics
 from reference_trainer.render import render

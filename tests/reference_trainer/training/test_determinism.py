@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from pretended_card import pretended_card
+from stand_ins.card import pretended_card
 
 from reference_trainer.cli import main
 from reference_trainer.scenes.scene import Scene

@@ -5,7 +5,7 @@ import functools
 
 import pytest
 import torch
-from gsplat_stand_in import rasterization
+from stand_ins.gsplat import rasterization
 
 from reference_trainer.render.gsplat import render_by
 from reference_trainer.training import trainer as module

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from gsplat_stand_in import rasterization
+from stand_ins.gsplat import rasterization
 
 from reference_trainer.render.gsplat import render_by
 from reference_trainer.studies.speed import gsplat as module

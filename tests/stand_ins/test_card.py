@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from pretended_card import pretended_card
+from stand_ins.card import pretended_card
 
 from reference_trainer.training.determinism import deterministic
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 import torch
-from cuda_rules import check_determinism, check_devices, check_generator, shuffled_additions
+from stand_ins.cuda_rules import check_determinism, check_devices, check_generator, shuffled_additions
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree as pytree

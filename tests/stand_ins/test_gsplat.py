@@ -4,8 +4,8 @@ import inspect
 
 import pytest
 import torch
-from gsplat_stand_in import intrinsics, rasterization, rasterization_1_4
 from oracles import random_scene
+from stand_ins.gsplat import intrinsics, rasterization, rasterization_1_4
 
 N, WIDTH, HEIGHT = 60, 24, 16
 
