@@ -61,15 +61,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--path", default="synthetic", help="scene folder")
     parser.add_argument("--images", help="image folder within the scene")
+    parser.add_argument("--downscale", type=float, default=1.0, help="of the photographs")
     parser.add_argument("--iterations", type=int, default=200, help="of each training")
+    parser.add_argument("--densify-every", type=int, default=25, help="steps, from step 50 on; 0 for never")
     parser.add_argument("--orders", type=int, default=3, help="how many orders of additions")
     parser.add_argument("--seeds", type=int, default=3, help="how many seeds to compare with")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    scene = SceneOptions(options.path, images=options.images).load()
+    scene = SceneOptions(options.path, images=options.images, downscale=options.downscale).load()
     config = TrainConfig(
         iterations=options.iterations, dropout=0.2, noise=0.4,
-        densify_from=options.iterations // 4, densify_every=options.iterations // 8,
+        densify_from=50, densify_every=options.densify_every,
     )  # fmt: skip
     orders, rows = range(options.orders), []
 

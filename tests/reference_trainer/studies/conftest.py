@@ -1,12 +1,17 @@
 """Runs of seconds: the built-in scene at 20 x 15 pixels, a dozen steps."""
 
 import dataclasses
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.run import run_experiment
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.trainer import Trainer
 
 
 @pytest.fixture(scope="session")
@@ -20,6 +25,26 @@ def short() -> TrainConfig:
     return TrainConfig(
         iterations=11, dropout=0.2, noise=0.3, sh_every=4, densify_from=2, densify_every=4, densify_gradient=2e-3
     )
+
+
+@pytest.fixture
+def ctrl_c(monkeypatch) -> Callable[[int], AbstractContextManager[None]]:
+    """A context in which somebody presses Ctrl-C at a step of every training, and the training says so at its end."""
+    original = Trainer.train_step
+
+    @contextmanager
+    def pressed_at(step: int) -> Iterator[None]:
+        def train_step(trainer: Trainer) -> tuple[float, float]:
+            if trainer.step == step:
+                signal.raise_signal(signal.SIGINT)
+            return original(trainer)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Trainer, "train_step", train_step)
+            with pytest.raises(TrainingInterrupted):
+                yield
+
+    return pressed_at
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import sweep_tasks
+from stand_ins.engine import Here
 
 from ca_reg.monitor import LOG_NAME
 from reference_trainer.scenes.options import SceneOptions
@@ -12,7 +13,7 @@ from reference_trainer.studies import demo as demo_module
 from reference_trainer.studies.compare import compare, scene_folders, strategies
 from reference_trainer.studies.compare_report import REPORT, TABLE, Comparison, comparison_table, report
 from reference_trainer.studies.engines.choice import choose_engine
-from reference_trainer.studies.engines.engine import Failure, attempt
+from reference_trainer.studies.engines.engine import Failure
 from reference_trainer.studies.engines.processes import Processes
 from reference_trainer.studies.grid import Running
 from reference_trainer.studies.run import run_experiment
@@ -54,25 +55,6 @@ def test_strategies_change_the_regularizers_only():
     for config in strategies(base, dropout=0.1, noise=0.5).values():
         assert dataclasses.replace(config, dropout=0.4, noise=0.0, analytic=False) == base
     assert strategies(base, dropout=0.1, noise=0.5)["both"] == dataclasses.replace(base, dropout=0.1, noise=0.5)
-
-
-class Here:
-    """An engine that does every task in this process, one at a time."""
-
-    jobs = 1
-
-    def __init__(self):
-        self.tasks = []
-
-    def start(self, number, task):
-        self.tasks.append(task)
-        self.now = number, attempt(task, 1)
-
-    def wait(self):
-        return [self.now]
-
-    def close(self):
-        pass
 
 
 SCENE, CONFIG = {Path("x"): SceneOptions()}, {"a": TrainConfig()}

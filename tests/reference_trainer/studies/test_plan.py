@@ -10,10 +10,11 @@ from typing import get_args
 
 import pytest
 import sweep_tasks
+from stand_ins.engine import Here
 
 from reference_trainer.cli import studies as commands
 from reference_trainer.studies import plan as plan_module
-from reference_trainer.studies.engines.engine import Task, attempt
+from reference_trainer.studies.engines.engine import Task
 from reference_trainer.studies.engines.processes import Processes
 from reference_trainer.studies.engines.run_all import run_all
 from reference_trainer.studies.plan import ALTERNATIVES, plan_table, shortened, study_plan, variants
@@ -32,24 +33,6 @@ TWO = Plan(
 
 
 TESTS = Path(sweep_tasks.__file__).parent
-
-
-class Here:
-    """An engine that does every task in this process."""
-
-    jobs = 1
-
-    def __init__(self, jobs):
-        assert jobs == 1
-
-    def start(self, number, task):
-        self.now = number, attempt(task, 1)
-
-    def wait(self):
-        return [self.now]
-
-    def close(self):
-        pass
 
 
 @pytest.fixture(scope="module")

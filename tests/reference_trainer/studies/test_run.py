@@ -81,19 +81,10 @@ def test_a_second_call_does_nothing(finished, options, short, monkeypatch):
     assert said == [f"{out}: complete, nothing to do"]
 
 
-def test_ctrl_c_saves_where_it_is(finished, options, short, monkeypatch, tmp_path):
+def test_ctrl_c_saves_where_it_is(finished, options, short, ctrl_c, tmp_path):
     """Between two periodic checkpoints nothing is lost."""
-    original = Trainer.train_step
-
-    def train_step(trainer: Trainer) -> tuple[float, float]:
-        if trainer.step == 5:
-            signal.raise_signal(signal.SIGINT)
-        return original(trainer)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "train_step", train_step)
-        with pytest.raises(TrainingInterrupted):
-            run_experiment(options, short, tmp_path, **EVERY)
+    with ctrl_c(5):
+        run_experiment(options, short, tmp_path, **EVERY)
     said: list[str] = []
     run_experiment(options, short, tmp_path, **EVERY, say=said.append)
     assert f"{tmp_path}: continues from step 6" in said

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 from filelock import FileLock
+from stand_ins.engine import Here
 
 from reference_trainer.studies.compare import compare
-from reference_trainer.studies.engines.engine import Value, attempt
+from reference_trainer.studies.engines.engine import Value
 from reference_trainer.studies.grid import Run, Running, run_grid
 from reference_trainer.studies.measure import of_run
 from reference_trainer.studies.run import run_experiment
 from reference_trainer.studies.run_folder import CHECKPOINT, RESULTS
 from reference_trainer.studies.run_lock import LOCK, FolderInUseError, run_lock
-from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.trainer import Trainer
 
 HOLD = """
@@ -122,18 +122,9 @@ def test_a_run_is_locked_from_its_first_file_to_its_last(tmp_path, options, shor
         run_experiment(options, short, tmp_path, monitor_every=0)
 
 
-def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, options, short, monkeypatch, elsewhere):
-    original = Trainer.train_step
-
-    def train_step(trainer: Trainer) -> tuple[float, float]:
-        if trainer.step == 5:
-            signal.raise_signal(signal.SIGINT)
-        return original(trainer)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "train_step", train_step)
-        with pytest.raises(TrainingInterrupted):
-            run_experiment(options, short, tmp_path, monitor_every=0)
+def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, options, short, ctrl_c, elsewhere):
+    with ctrl_c(5):
+        run_experiment(options, short, tmp_path, monitor_every=0)
     process = elsewhere(tmp_path)
     before = (tmp_path / CHECKPOINT).read_bytes()
     with pytest.raises(FolderInUseError):
@@ -175,21 +166,6 @@ def train_once(monkeypatch):
         return _train(*args, **keywords)
 
     return train
-
-
-class Here:
-    """An engine that does every task in this process."""
-
-    jobs = 1
-
-    def start(self, number, task):
-        self.now = number, attempt(task, 1)
-
-    def wait(self):
-        return [self.now]
-
-    def close(self):
-        pass
 
 
 def test_a_sweep_goes_on_without_the_run_that_is_at_work_elsewhere(tmp_path, options, short, elsewhere):
