@@ -233,13 +233,10 @@ def test_moves_to_a_device_and_keeps_its_precision():
     assert half.compute().dtype == torch.float64
 
 
-@pytest.mark.gpu
-def test_counts_on_the_gpu_what_was_rendered_there():
-    if not torch.cuda.is_available():
-        pytest.skip("needs a CUDA device")
-    metric = CAScoreMetric(lambda opacity, view: render_fn(opacity.cpu(), view)).to("cuda")
-    metric.update(OPACITY.cuda(), 0)
-    assert metric.compute().device.type == "cuda"
+def test_counts_on_the_device_what_was_rendered_there(device):
+    metric = CAScoreMetric(lambda opacity, view: render_fn(opacity.cpu(), view)).to(device)
+    metric.update(OPACITY.to(device), 0)
+    assert metric.compute().device.type == device.type
     assert metric.compute().item() == CAScore(render_fn)(OPACITY, 0).value
 
 
