@@ -228,8 +228,10 @@ def _moments(
 
 def _product_in_front(factors: Tensor) -> Tensor:
     """Product of the factors of all splats in front of each, shape (..., n)."""
-    one = torch.ones_like(factors.sum(-1, keepdim=True))
-    return torch.cat([one, factors.cumprod(-1)], dim=-1)[..., : factors.shape[-1]]
+    products = [torch.ones_like(factors.sum(-1))]
+    for factor in factors.unbind(-1):  # the gradient of cumprod has no algorithm on CUDA that repeats itself
+        products.append(products[-1] * factor)
+    return torch.stack(products, dim=-1)[..., : factors.shape[-1]]
 
 
 def _per_splat(value: float | Tensor, alphas: Tensor, name: str) -> Tensor:

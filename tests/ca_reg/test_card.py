@@ -1,5 +1,7 @@
 """The plug-in on a device that is not the processor: it draws, scores and differentiates there, and says the same."""
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 
@@ -14,6 +16,7 @@ from ca_reg import (
 )
 from ca_reg.functional import Multiplier
 from ca_reg.lists import PixelLists
+from reference_trainer.training.determinism import deterministic
 
 N, SIDE = 24, 4
 
@@ -84,14 +87,17 @@ def test_scores_are_those_of_the_processor(scenes, kind):
     assert found[1] == pytest.approx(found[0], rel=1e-12)
 
 
-def test_shares_and_penalty_have_the_gradients_of_the_processor(scenes):
+@pytest.mark.parametrize("repeatable", [False, True])
+def test_shares_and_penalty_have_the_gradients_of_the_processor(scenes, card, repeatable):
+    """Also where a user asks PyTorch for algorithms that repeat themselves: none of it lacks one on CUDA."""
     shares, gradients = [], []
     for scene in scenes:
         moments, opacity = ListMoments(scene.lists), scene.opacity.clone().requires_grad_()
         score = CAScore(exact=moments, threshold=0.1)
         shares.append(attribute(score, moments.shares, scene.opacity, None)[0].cpu())
-        image, _, term = CAPenalty(moments, Multiplier.dropout(0.2))(opacity, None)
-        (image.square().mean() + term).backward()
+        with deterministic(card) if repeatable else nullcontext():
+            image, _, term = CAPenalty(moments, Multiplier.dropout(0.2))(opacity, None)
+            (image.square().mean() + term).backward()
         gradients.append(opacity.grad.cpu())
     torch.testing.assert_close(shares[1], shares[0], rtol=1e-12, atol=0.0)
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-12, atol=0.0)

@@ -4,8 +4,8 @@ It shows without a card that code is written for one. Mixing devices, a generato
 that forgot the device, `numpy()`, an operation that cannot repeat itself where that is asked for: each fails here as it
 would on CUDA. What it does not show is CUDA's rounding, memory and speed.
 
-One thing it cannot do: PyTorch computes gradients in a thread of the device, where tensors of Python numbers
-(`torch.tensor`, `new_tensor`) end the process. Make them in the forward pass.
+Two things it cannot do while PyTorch computes gradients: make tensors of Python numbers (`torch.tensor`, `new_tensor`), and
+say what was refused in a gradient that PyTorch computes itself (`SystemError: ... returned NULL`).
 """
 
 from __future__ import annotations
@@ -128,7 +128,8 @@ def pretended_card(*, order: int | None = None) -> Iterator[torch.device]:
     generator = torch.Generator
     torch.Generator = _Generator  # type: ignore[misc]
     try:
-        with _FromNumbers():
+        # Gradients in this thread: an error in a thread of the device would end the process.
+        with torch.autograd.set_multithreading_enabled(False), _FromNumbers():
             yield torch.device(CARD)
     finally:
         torch.Generator = generator  # type: ignore[misc]
@@ -190,7 +191,7 @@ def _check(name: str, args: Sequence[Any], leaves: Sequence[Any], ours: Sequence
     if ours:
         foreign = [x for x in leaves if isinstance(x, Tensor) and not isinstance(x, CardTensor)]
         check_devices(name, args, foreign)
-        check_determinism(name, ours)
+        check_determinism(name, args, ours)
 
 
 def _is_card(device: Any) -> bool:

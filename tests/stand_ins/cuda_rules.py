@@ -24,11 +24,12 @@ _NEVER_THE_SAME = {
         "upsample_bilinear2d_backward", "upsample_bicubic2d_backward", "_upsample_bilinear2d_aa_backward",
         "_upsample_bicubic2d_aa_backward", "upsample_trilinear3d_backward", "reflection_pad1d_backward",
         "reflection_pad2d_backward", "reflection_pad3d_backward", "nll_loss_forward", "nll_loss2d_forward",
-        "_ctc_loss_backward", "_embedding_bag", "put_", "put", "histc", "median", "kthvalue",
+        "_ctc_loss_backward", "_embedding_bag", "put_", "put", "histc", "kthvalue",
         "grid_sampler_2d_backward", "grid_sampler_3d_backward",
     )
 }  # fmt: skip
 _NEVER_THE_SAME_OF_FLOATS = {"aten::cumsum", "aten::cumsum_"}
+_NEVER_THE_SAME_WITH_A_DIMENSION = {"aten::median", "aten::nanmedian"}
 _ATOMIC = {"aten::index_add", "aten::index_add_"}  # with (self, dimension, index, source) as arguments
 
 
@@ -55,18 +56,22 @@ def check_generator(where: torch.device, device: torch.device) -> None:
         raise RuntimeError(f"expected a {device.type!r} generator but found {where.type!r}")
 
 
-def check_determinism(name: str, ours: Sequence[Tensor]) -> None:
+def check_determinism(name: str, args: Sequence[Any], ours: Sequence[Tensor]) -> None:
     """Refuse what has no algorithm that repeats itself, where such algorithms are asked for.
 
     Args:
         name: of the operation.
+        args: its positional arguments.
         ours: the tensors on the card among its arguments.
     """
     if not torch.are_deterministic_algorithms_enabled():
         return
-    of_floats = ours[0].is_floating_point()
-    weighted = name == "aten::bincount" and len(ours) > 1
-    if name in _NEVER_THE_SAME or weighted or (name in _NEVER_THE_SAME_OF_FLOATS and of_floats):
+    if (
+        name in _NEVER_THE_SAME
+        or (name in _NEVER_THE_SAME_OF_FLOATS and ours[0].is_floating_point())
+        or (name in _NEVER_THE_SAME_WITH_A_DIMENSION and len(args) > 1)
+        or (name == "aten::bincount" and len(ours) > 1)  # with weights
+    ):
         raise RuntimeError(f"{name} does not have a deterministic implementation on CUDA")
 
 

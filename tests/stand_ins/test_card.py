@@ -107,3 +107,4 @@ def test_what_cannot_repeat_itself_is_refused_where_that_is_asked_for(card, call
 def test_whole_numbers_always_repeat_themselves(card):
     with deterministic(card):
         assert torch.bincount(on(card, 3).long().cumsum(0)).tolist() == [0, 1, 1, 1]
+        assert on(card, 3).median().item() == 1
