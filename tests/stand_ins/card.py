@@ -4,8 +4,8 @@ It shows without a card that code is written for one. Mixing devices, a generato
 that forgot the device, `numpy()`, an operation that cannot repeat itself where that is asked for: each fails here as it
 would on CUDA. What it does not show is CUDA's rounding, memory and speed.
 
-Two things it cannot do while PyTorch computes gradients: make tensors of Python numbers (`torch.tensor`, `new_tensor`), and
-say what was refused in a gradient that PyTorch computes itself (`SystemError: ... returned NULL`).
+Two things it cannot do while PyTorch computes gradients: make tensors of Python numbers (`torch.tensor`, `new_tensor`),
+and say what was refused in a gradient that PyTorch computes itself (`SystemError: ... returned NULL`).
 """
 
 from __future__ import annotations
