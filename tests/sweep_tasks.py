@@ -9,8 +9,8 @@ from pathlib import Path
 
 import torch
 
-from reference_trainer.studies import grid
-from reference_trainer.studies.run_folder import CHECKPOINT, RESULTS
+from reference_trainer.runs import grid
+from reference_trainer.runs.folder import CHECKPOINT, RESULTS
 
 
 def square(number):
@@ -78,9 +78,9 @@ def _kill_at_checkpoint(out, marker):
 
 def interrupted_sweep(folder):
     """A whole sweep of one task, for a process of its own that is to be ended from outside."""
-    from reference_trainer.studies.engines.engine import Task
-    from reference_trainer.studies.engines.processes import Processes
-    from reference_trainer.studies.engines.run_all import run_all
+    from reference_trainer.runs.engines.engine import Task
+    from reference_trainer.runs.engines.processes import Processes
+    from reference_trainer.runs.engines.run_all import run_all
 
     list(run_all(Processes(1), [Task("sleeper", note_the_interruption, (folder,))]))
 

@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from reference_trainer.runs.engines.choice import EngineName
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
-from reference_trainer.studies.engines.choice import EngineName
 from reference_trainer.training.config import PRESETS, TrainConfig
 
 __all__ = ["Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
@@ -54,7 +54,7 @@ class Demo:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.studies.demo import demo
+        from reference_trainer.runs.demo import demo
 
         done = demo(self.out, iterations=self.iterations, seeds=range(self.seeds), jobs=self.jobs, say=print)
         if done.failures:
@@ -92,7 +92,7 @@ class Train:
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.render.compiled import use_compiled
-        from reference_trainer.studies.run import run_experiment, summary
+        from reference_trainer.runs.run import run_experiment, summary
         from reference_trainer.training.determinism import deterministic
 
         if self.deterministic and self.config.renderer == "gsplat":
@@ -186,8 +186,8 @@ class Evaluate:
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.evaluation.lpips import lpips_option
-        from reference_trainer.studies.measure import measure, of_run
-        from reference_trainer.studies.score_ply import score_ply, score_ply_on_orbit
+        from reference_trainer.runs.measure import measure, of_run
+        from reference_trainer.runs.score_ply import score_ply, score_ply_on_orbit
 
         if self.run is not None and self.ply is not None:
             raise ValueError(f"give the folder of a run or --ply FILE, not both: got {self.run} and {self.ply}.")
@@ -234,7 +234,7 @@ class Render:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.studies.measure import render_run
+        from reference_trainer.runs.measure import render_run
 
         render_run(self.run, self.what, self.out, frames=self.frames, device=self.device, say=print)
 
@@ -286,10 +286,10 @@ class Compare:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.studies.compare import compare, scene_folders, strategies
-        from reference_trainer.studies.compare_report import report
-        from reference_trainer.studies.engines.choice import choose_engine
-        from reference_trainer.studies.grid import Running
+        from reference_trainer.runs.compare import compare, scene_folders, strategies
+        from reference_trainer.runs.compare_report import report
+        from reference_trainer.runs.engines.choice import choose_engine
+        from reference_trainer.runs.grid import Running
 
         config = replace(self.config, dropout=0.0, noise=0.0, analytic=False, ca_weight=0.0, scale_noise=False)
         every = strategies(

@@ -1,1 +1,1 @@
-"""Experiments on top of everything else: single runs, comparisons, and their reports."""
+"""Studies of the method and of the program, with their reports."""

@@ -21,9 +21,9 @@ from reference_trainer.evaluation.report import machine, markdown_table, write_j
 from reference_trainer.files import replacing, write_text
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.render import render
+from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies.measure import of_run
-from reference_trainer.studies.run import save_for_viewers
 
 __all__ = [
     "blend_weights",

@@ -15,6 +15,7 @@ from reference_trainer.evaluation.report import format_mean_std, machine, markdo
 from reference_trainer.files import replacing, write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.model.ply import load_ply
+from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.orbit import orbit_views
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.error_runtime import (
@@ -28,7 +29,6 @@ from reference_trainer.studies.error_runtime import (
     ErrorRuntime,
     error_runtime,
 )
-from reference_trainer.studies.measure import of_run
 
 __all__ = ["error_runtime_figure", "error_runtime_table", "study", "study_error_runtime"]
 

@@ -16,6 +16,8 @@ from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.runs.folder import CHECKPOINT
+from reference_trainer.runs.run import load_run
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.gradient_noise_moments import (
     ALL,
@@ -28,8 +30,6 @@ from reference_trainer.studies.gradient_noise_moments import (
     dot,
 )
 from reference_trainer.studies.gradient_noise_report import gradient_noise_figure, gradient_noise_report
-from reference_trainer.studies.run import load_run
-from reference_trainer.studies.run_folder import CHECKPOINT
 from reference_trainer.studies.timing import now
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation

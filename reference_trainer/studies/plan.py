@@ -15,12 +15,12 @@ from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
+from reference_trainer.runs.engines.engine import Failure, Task
+from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.engines.engine import Failure, Task
-from reference_trainer.studies.engines.processes import Processes
-from reference_trainer.studies.engines.run_all import run_all
 from reference_trainer.studies.plan_parts import parts_of_a_step
-from reference_trainer.studies.run import model_of
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import Plan, make_plan
 from reference_trainer.training.trainer import Trainer

@@ -19,11 +19,11 @@ from reference_trainer.evaluation.report import format_mean_std, machine, markdo
 from reference_trainer.files import replacing, write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.model.density import DensityStatistics
+from reference_trainer.runs.folder import CHECKPOINT, CONFIG
+from reference_trainer.runs.run import load_run, model_of
+from reference_trainer.runs.settings import read_run_settings
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.attribution import blend_weights, mean_shares, share_per_weight
-from reference_trainer.studies.run import load_run, model_of
-from reference_trainer.studies.run_folder import CHECKPOINT, CONFIG
-from reference_trainer.studies.run_settings import read_run_settings
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 

@@ -12,10 +12,10 @@ from pathlib import Path
 from reference_trainer.evaluation.report import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
+from reference_trainer.runs.folder import CHECKPOINT
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.ranking_report import correlations, ranking_figure, ranking_report
 from reference_trainer.studies.ranking_scores import VARIANTS, Ranking, RunScores, score_run
-from reference_trainer.studies.run_folder import CHECKPOINT
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["rank_runs", "study_ranking"]

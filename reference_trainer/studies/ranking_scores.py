@@ -19,11 +19,11 @@ from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import machine, mean_std
+from reference_trainer.runs.folder import CONFIG
+from reference_trainer.runs.run import load_run, model_of
+from reference_trainer.runs.settings import read_run_settings
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies.run import load_run, model_of
-from reference_trainer.studies.run_folder import CONFIG
-from reference_trainer.studies.run_settings import read_run_settings
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["VARIANTS", "Ranking", "RunScores", "score_run", "score_view"]

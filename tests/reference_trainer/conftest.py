@@ -1,10 +1,19 @@
-"""A tiny scene for everything that trains."""
+"""Tiny scenes and runs of seconds, for everything that trains."""
+
+import dataclasses
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 
+from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.trainer import Trainer
 
 
 @pytest.fixture(scope="session")
@@ -30,3 +39,51 @@ def busy() -> TrainConfig:
         opacity_reset_from=10,
         opacity_reset_every=9,
     )
+
+
+@pytest.fixture(scope="session")
+def options() -> SceneOptions:
+    """The built-in scene at 20 x 15 pixels."""
+    return SceneOptions("synthetic", downscale=8)
+
+
+@pytest.fixture(scope="session")
+def short() -> TrainConfig:
+    """Eleven steps with splits, dropout and noise; measurements and checkpoints do not fall together."""
+    return TrainConfig(
+        iterations=11, dropout=0.2, noise=0.3, sh_every=4, densify_from=2, densify_every=4, densify_gradient=2e-3
+    )
+
+
+@pytest.fixture
+def ctrl_c(monkeypatch) -> Callable[[int], AbstractContextManager[None]]:
+    """A context in which somebody presses Ctrl-C at a step of every training, and the training says so at its end."""
+    original = Trainer.train_step
+
+    @contextmanager
+    def pressed_at(step: int) -> Iterator[None]:
+        def train_step(trainer: Trainer) -> tuple[float, float]:
+            if trainer.step == step:
+                signal.raise_signal(signal.SIGINT)
+            return original(trainer)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Trainer, "train_step", train_step)
+            with pytest.raises(TrainingInterrupted):
+                yield
+
+    return pressed_at
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory, options, short):
+    """The folder of a finished run of seconds, and its results."""
+    out = tmp_path_factory.mktemp("run")
+    return out, run_experiment(options, short, out, monitor_every=0)
+
+
+@pytest.fixture(scope="session")
+def scaled(tmp_path_factory, options, short):
+    """The same training, evaluated with opacities times the mean of their noise."""
+    out = tmp_path_factory.mktemp("scaled")
+    return out, run_experiment(options, dataclasses.replace(short, scale_noise=True), out, monitor_every=11)

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from reference_trainer.cli import main
-from reference_trainer.studies.run_folder import RESULTS
+from reference_trainer.runs.folder import RESULTS
 from reference_trainer.training.trainer import Trainer
 
 TRAIN = "train --downscale 8 --iterations 4 --densify-from 1 --densify-every 2 --no-auto --dropout 0.2 --device card"

@@ -7,14 +7,14 @@ import pytest
 
 from reference_trainer import cli
 from reference_trainer.cli import main
+from reference_trainer.runs import compare as compare_module
+from reference_trainer.runs import run as run_module
+from reference_trainer.runs import score_ply as score_module
+from reference_trainer.runs.compare_report import Comparison
+from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.studies import attribution as attribution_module
-from reference_trainer.studies import compare as compare_module
 from reference_trainer.studies import pruning as pruning_module
-from reference_trainer.studies import run as run_module
-from reference_trainer.studies import score_ply as score_module
-from reference_trainer.studies.compare_report import Comparison
-from reference_trainer.studies.engines.engine import Failure
 from reference_trainer.training.config import PRESETS
 
 SMALL = ["--downscale", "8", "--iterations", "3", "--monitor-every", "2"]

@@ -16,9 +16,9 @@ from typing import Any
 import torch
 
 from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.studies.run import model_of
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer, TrainingStoppedError
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
-from reference_trainer.studies.engines.engine import Failure, Task
-from reference_trainer.studies.engines.processes import Processes
-from reference_trainer.studies.engines.run_all import run_all
+from reference_trainer.runs.engines.engine import Failure, Task
+from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.engines.run_all import run_all
 from reference_trainer.studies.speed.calls import SUBJECT, gradients, image
 from reference_trainer.studies.speed.workloads import WorkloadSpec
 

@@ -14,6 +14,8 @@ from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import write_json
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
+from reference_trainer.runs.folder import CHECKPOINT, CONFIG
+from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.attribution import (
     blend_weights,
@@ -23,8 +25,6 @@ from reference_trainer.studies.attribution import (
     mean_shares,
     study_attribution,
 )
-from reference_trainer.studies.measure import of_run
-from reference_trainer.studies.run_folder import CHECKPOINT, CONFIG
 from reference_trainer.training.trainer import Trainer
 
 

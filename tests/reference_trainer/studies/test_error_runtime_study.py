@@ -11,6 +11,8 @@ from reference_trainer.camera import Camera
 from reference_trainer.evaluation.model import Model
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
+from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies import error_runtime_study
 from reference_trainer.studies.error_runtime import SINGLE, ErrorRuntime, Measurement
@@ -20,8 +22,6 @@ from reference_trainer.studies.error_runtime_study import (
     study,
     study_error_runtime,
 )
-from reference_trainer.studies.measure import of_run
-from reference_trainer.studies.run import run_experiment
 
 
 @pytest.fixture(autouse=True)

@@ -13,6 +13,8 @@ from PIL import Image
 from ca_reg.functional import draw_keep_mask
 from reference_trainer.evaluation.report import write_json
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
+from reference_trainer.runs.folder import CHECKPOINT
+from reference_trainer.runs.folder import CONFIG as RUN_CONFIG
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies import gradient_noise as study_module
 from reference_trainer.studies.gradient_noise import gradient_noise, study_gradient_noise
@@ -23,8 +25,6 @@ from reference_trainer.studies.gradient_noise_moments import (
     Moments,
     StepNoise,
 )
-from reference_trainer.studies.run_folder import CHECKPOINT
-from reference_trainer.studies.run_folder import CONFIG as RUN_CONFIG
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation
 from reference_trainer.training.losses import expected_photometric_loss, photometric_loss

@@ -13,10 +13,10 @@ import sweep_tasks
 from stand_ins.engine import Here
 
 from reference_trainer.cli import studies as commands
+from reference_trainer.runs.engines.engine import Task
+from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.engines.run_all import run_all
 from reference_trainer.studies import plan as plan_module
-from reference_trainer.studies.engines.engine import Task
-from reference_trainer.studies.engines.processes import Processes
-from reference_trainer.studies.engines.run_all import run_all
 from reference_trainer.studies.plan import ALTERNATIVES, plan_table, shortened, study_plan, variants
 from reference_trainer.studies.plan_parts import parts_of_a_step
 from reference_trainer.training.config import TrainConfig

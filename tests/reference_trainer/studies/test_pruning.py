@@ -9,11 +9,11 @@ from PIL import Image
 from ca_reg import attribute
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.report import write_json
+from reference_trainer.runs.folder import CHECKPOINT, CONFIG
+from reference_trainer.runs.run import model_of
 from reference_trainer.studies import pruning as pruning_module
 from reference_trainer.studies.attribution import blend_weights
 from reference_trainer.studies.pruning import CRITERIA, Pruned, prune_lowest, pruning_order, study_pruning, train_on
-from reference_trainer.studies.run import model_of
-from reference_trainer.studies.run_folder import CHECKPOINT, CONFIG
 from reference_trainer.training import trainer as trainer_module
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer

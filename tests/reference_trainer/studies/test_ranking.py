@@ -13,6 +13,8 @@ from reference_trainer.camera import Camera
 from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import write_json
 from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.runs.folder import CHECKPOINT, CONFIG
+from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies import ranking as ranking_module
 from reference_trainer.studies.ranking import rank_runs, study_ranking
@@ -24,8 +26,6 @@ from reference_trainer.studies.ranking_report import (
     ranking_report,
 )
 from reference_trainer.studies.ranking_scores import VARIANTS, Ranking, RunScores, score_view
-from reference_trainer.studies.run import run_experiment
-from reference_trainer.studies.run_folder import CHECKPOINT, CONFIG
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 

@@ -10,8 +10,8 @@ import torch
 from stand_ins.card import pretended_card
 
 from reference_trainer.cli import main
+from reference_trainer.runs import run as run_module
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.studies import run as run_module
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.determinism import deterministic
 from reference_trainer.training.trainer import Trainer

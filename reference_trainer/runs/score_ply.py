@@ -18,12 +18,12 @@ from reference_trainer.evaluation.report import machine, markdown_table, write_j
 from reference_trainer.files import remove_leftovers, write_text
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
+from reference_trainer.runs.frame_check import check_frame
+from reference_trainer.runs.measure import measure
 from reference_trainer.scenes.load import BACKGROUNDS
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.scenes.orbit import bounding_sphere
 from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.studies.frame_check import check_frame
-from reference_trainer.studies.measure import measure
 
 __all__ = ["PlyFacts", "camera_table", "of_ply", "score_ply", "score_ply_on_orbit"]
 

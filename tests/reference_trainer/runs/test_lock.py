@@ -12,19 +12,19 @@ import pytest
 from filelock import FileLock
 from stand_ins.engine import Here
 
-from reference_trainer.studies.compare import compare
-from reference_trainer.studies.engines.engine import Value
-from reference_trainer.studies.grid import Run, Running, run_grid
-from reference_trainer.studies.measure import of_run
-from reference_trainer.studies.run import run_experiment
-from reference_trainer.studies.run_folder import CHECKPOINT, RESULTS
-from reference_trainer.studies.run_lock import LOCK, FolderInUseError, run_lock
+from reference_trainer.runs.compare import compare
+from reference_trainer.runs.engines.engine import Value
+from reference_trainer.runs.folder import CHECKPOINT, RESULTS
+from reference_trainer.runs.grid import Run, Running, run_grid
+from reference_trainer.runs.lock import LOCK, FolderInUseError, run_lock
+from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.run import run_experiment
 from reference_trainer.training.trainer import Trainer
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from reference_trainer.studies.run_lock import run_lock
+from reference_trainer.runs.lock import run_lock
 with run_lock(Path(sys.argv[1])):
     print("locked", flush=True)
     time.sleep(60)
@@ -101,7 +101,7 @@ def test_a_holder_that_makes_no_sense_is_not_repeated(tmp_path, content):
 
 def test_a_run_is_locked_from_its_first_file_to_its_last(tmp_path, options, short, monkeypatch):
     seen = []
-    write, save = "reference_trainer.studies.run.write_json", Trainer.save
+    write, save = "reference_trainer.runs.run.write_json", Trainer.save
 
     def locked(original):
         def call(*args):
@@ -150,13 +150,13 @@ def test_what_another_process_finished_while_the_scene_was_read_is_not_trained_a
         return scene
 
     monkeypatch.setattr(type(options), "load", load)
-    monkeypatch.setattr("reference_trainer.studies.run._train", train_once(monkeypatch))
+    monkeypatch.setattr("reference_trainer.runs.run._train", train_once(monkeypatch))
     assert run_experiment(options, short, tmp_path, monitor_every=0) == results[0]
 
 
 def train_once(monkeypatch):
     """Train, but not a second time."""
-    from reference_trainer.studies.run import _train
+    from reference_trainer.runs.run import _train
 
     calls = []
 

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 import pytest
 import sweep_tasks
 
-from reference_trainer.studies.engines.engine import Failure, Task, Value
-from reference_trainer.studies.engines.ray_cluster import RayCluster
-from reference_trainer.studies.engines.run_all import run_all
+from reference_trainer.runs.engines.engine import Failure, Task, Value
+from reference_trainer.runs.engines.ray_cluster import RayCluster
+from reference_trainer.runs.engines.run_all import run_all
 
 TESTS = Path(sweep_tasks.__file__).parent
 

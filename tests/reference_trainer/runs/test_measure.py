@@ -7,10 +7,10 @@ from PIL import Image
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
 from reference_trainer.model.ply import load_ply
+from reference_trainer.runs.folder import BAKED_PLY, PLY
+from reference_trainer.runs.measure import evaluation_table, measure, of_run, render_run
+from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.images import read_image
-from reference_trainer.studies.measure import evaluation_table, measure, of_run, render_run
-from reference_trainer.studies.run import run_experiment
-from reference_trainer.studies.run_folder import BAKED_PLY, PLY
 from reference_trainer.training.config import TrainConfig
 
 

@@ -11,8 +11,8 @@ from typing import Any
 from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
 from reference_trainer.files import write_text
-from reference_trainer.studies.engines.engine import Failure
-from reference_trainer.studies.figures import comparison_figure, dynamics_figure
+from reference_trainer.runs.engines.engine import Failure
+from reference_trainer.runs.figures import comparison_figure, dynamics_figure
 
 __all__ = ["REPORT", "TABLE", "Comparison", "comparison_table", "report", "save"]
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import sweep_tasks
 
-from reference_trainer.studies.engines import processes as processes_module
-from reference_trainer.studies.engines.engine import Failure, Task, Value
-from reference_trainer.studies.engines.processes import Processes
-from reference_trainer.studies.engines.run_all import run_all
+from reference_trainer.runs.engines import processes as processes_module
+from reference_trainer.runs.engines.engine import Failure, Task, Value
+from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.engines.run_all import run_all
 
 TESTS = Path(sweep_tasks.__file__).parent
 

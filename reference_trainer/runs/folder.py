@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from reference_trainer.json_files import read_json
+from reference_trainer.runs.settings import read_run_settings
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.run_settings import read_run_settings
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import Plan
 

@@ -7,8 +7,8 @@ import torch
 
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.runs.frame_check import check_frame
 from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.studies.frame_check import check_frame
 
 FORWARD = Camera(torch.eye(4), 10.0, 10.0, 10.0, 5.0, 20, 10)  # 90 degrees wide, 53 high, looks along +z
 BACKWARD = Camera(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])), 10.0, 10.0, 10.0, 5.0, 20, 10)

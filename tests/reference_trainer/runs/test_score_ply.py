@@ -14,11 +14,11 @@ from reference_trainer.evaluation.cameras import CameraEvaluation, CameraScores
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
+from reference_trainer.runs.folder import BAKED_PLY, PLY
+from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.run import save_for_viewers
+from reference_trainer.runs.score_ply import camera_table, of_ply, score_ply, score_ply_on_orbit
 from reference_trainer.scenes.options import OrbitOptions
-from reference_trainer.studies.measure import of_run
-from reference_trainer.studies.run import save_for_viewers
-from reference_trainer.studies.run_folder import BAKED_PLY, PLY
-from reference_trainer.studies.score_ply import camera_table, of_ply, score_ply, score_ply_on_orbit
 
 FEW = OrbitOptions(cameras=2, size=40)
 

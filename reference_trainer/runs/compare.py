@@ -6,10 +6,10 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from reference_trainer.runs.compare_report import Comparison, save
+from reference_trainer.runs.engines.engine import Failure
+from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.compare_report import Comparison, save
-from reference_trainer.studies.engines.engine import Failure
-from reference_trainer.studies.grid import Run, Running, run_grid
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["compare", "scene_folders", "strategies"]

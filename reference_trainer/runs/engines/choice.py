@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from typing import Literal, TypeAlias
 
-from reference_trainer.studies.engines.engine import Engine
-from reference_trainer.studies.engines.processes import Processes
-from reference_trainer.studies.engines.ray_cluster import RayCluster
+from reference_trainer.runs.engines.engine import Engine
+from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.engines.ray_cluster import RayCluster
 
 __all__ = ["EngineName", "choose_engine"]
 

@@ -8,16 +8,16 @@ import sweep_tasks
 from stand_ins.engine import Here
 
 from ca_reg.monitor import LOG_NAME
+from reference_trainer.runs import demo as demo_module
+from reference_trainer.runs.compare import compare, scene_folders, strategies
+from reference_trainer.runs.compare_report import REPORT, TABLE, Comparison, comparison_table, report
+from reference_trainer.runs.engines.choice import choose_engine
+from reference_trainer.runs.engines.engine import Failure
+from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.folder import RESULTS
+from reference_trainer.runs.grid import Running
+from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies import demo as demo_module
-from reference_trainer.studies.compare import compare, scene_folders, strategies
-from reference_trainer.studies.compare_report import REPORT, TABLE, Comparison, comparison_table, report
-from reference_trainer.studies.engines.choice import choose_engine
-from reference_trainer.studies.engines.engine import Failure
-from reference_trainer.studies.engines.processes import Processes
-from reference_trainer.studies.grid import Running
-from reference_trainer.studies.run import run_experiment
-from reference_trainer.studies.run_folder import RESULTS
 from reference_trainer.training.config import TrainConfig
 
 
@@ -90,7 +90,7 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
             raise RuntimeError("all Gaussians were pruned")
         return made(20.0 + config.seed) | {"scene": options.path, "dropout": config.dropout}
 
-    monkeypatch.setattr("reference_trainer.studies.grid.train_run", train)
+    monkeypatch.setattr("reference_trainer.runs.grid.train_run", train)
     monkeypatch.chdir(tmp_path)
     engine = Here()
     scenes = scene_folders(["synthetic", "data/fern"], SceneOptions(), Path("out"))
@@ -218,7 +218,7 @@ def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_
     tests = Path(sweep_tasks.__file__).parent
     monkeypatch.setenv("PYTHONPATH", f"{tests.parent}:{tests}")  # Ray passes it to its workers
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setattr("reference_trainer.studies.grid.train_run", sweep_tasks.train_and_be_killed_once)
+    monkeypatch.setattr("reference_trainer.runs.grid.train_run", sweep_tasks.train_and_be_killed_once)
     config = TrainConfig(iterations=60, dropout=0.2)
     whole = run_experiment(options, dataclasses.replace(config, seed=1), tmp_path / "whole", monitor_every=0)
 

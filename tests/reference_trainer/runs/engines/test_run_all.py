@@ -4,8 +4,8 @@ from collections import defaultdict
 
 import pytest
 
-from reference_trainer.studies.engines.engine import Death, Failure, Task, Value, attempt
-from reference_trainer.studies.engines.run_all import run_all
+from reference_trainer.runs.engines.engine import Death, Failure, Task, Value, attempt
+from reference_trainer.runs.engines.run_all import run_all
 
 
 class Told:

@@ -9,7 +9,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
-from reference_trainer.studies.engines.engine import Answer, Death, Task, attempt
+from reference_trainer.runs.engines.engine import Answer, Death, Task, attempt
 
 __all__ = ["Processes"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from reference_trainer.studies.engines.engine import Answer, Death, Failure, Task, attempt
+from reference_trainer.runs.engines.engine import Answer, Death, Failure, Task, attempt
 
 __all__ = ["RayCluster"]
 

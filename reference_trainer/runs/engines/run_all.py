@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 
-from reference_trainer.studies.engines.engine import Death, Engine, Failure, Task, Value
+from reference_trainer.runs.engines.engine import Death, Engine, Failure, Task, Value
 
 __all__ = ["run_all"]
 

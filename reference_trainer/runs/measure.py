@@ -16,8 +16,8 @@ from reference_trainer.evaluation.report import machine, markdown_table, write_j
 from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import remove_leftovers, write_text
 from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.studies.run import load_run, model_of
 
 __all__ = ["evaluation_table", "measure", "of_run", "render_run"]
 

@@ -22,9 +22,7 @@ from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.files import remove_leftovers
 from reference_trainer.model.ply import save_ply
-from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.studies.run_folder import (
+from reference_trainer.runs.folder import (
     BAKED_PLY,
     CHECKPOINT,
     CONFIG,
@@ -36,8 +34,10 @@ from reference_trainer.studies.run_folder import (
     claim,
     read_results,
 )
-from reference_trainer.studies.run_lock import run_lock
-from reference_trainer.studies.run_settings import read_run_settings
+from reference_trainer.runs.lock import run_lock
+from reference_trainer.runs.settings import read_run_settings
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingInterrupted

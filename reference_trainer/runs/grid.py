@@ -9,11 +9,11 @@ from typing import Any
 
 import torch
 
+from reference_trainer.runs.engines.engine import Engine, Failure, Task, Value, attempt
+from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.folder import RESULTS
+from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.engines.engine import Engine, Failure, Task, Value, attempt
-from reference_trainer.studies.engines.run_all import run_all
-from reference_trainer.studies.run import run_experiment
-from reference_trainer.studies.run_folder import RESULTS
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["Run", "Running", "run_grid", "train_run"]

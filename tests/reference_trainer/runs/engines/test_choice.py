@@ -2,9 +2,9 @@ import sys
 
 import pytest
 
-from reference_trainer.studies.engines.choice import choose_engine
-from reference_trainer.studies.engines.processes import Processes
-from reference_trainer.studies.engines.ray_cluster import RayCluster
+from reference_trainer.runs.engines.choice import choose_engine
+from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.engines.ray_cluster import RayCluster
 
 
 @pytest.fixture(autouse=True)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from reference_trainer.runs.compare import compare, strategies
+from reference_trainer.runs.compare_report import Comparison, report
+from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.grid import Running
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.compare import compare, strategies
-from reference_trainer.studies.compare_report import Comparison, report
-from reference_trainer.studies.engines.processes import Processes
-from reference_trainer.studies.grid import Running
 from reference_trainer.training.config import with_preset
 
 __all__ = ["demo"]
