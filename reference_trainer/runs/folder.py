@@ -31,7 +31,7 @@ PLAN = "plan.json"
 CHECKPOINT = "checkpoint.pt"
 PLY = "point_cloud.ply"
 BAKED_PLY = "point_cloud_for_viewers.ply"
-VIEWS = "views"
+VIEWS = "views"  # here and in the folder of an evaluation
 RESULTS = "results.json"
 
 

@@ -16,6 +16,7 @@ from reference_trainer.evaluation.report import machine, markdown_table, write_j
 from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import remove_leftovers, write_text
 from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.runs.folder import VIEWS
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene
 
@@ -72,9 +73,9 @@ def measure(
         say: receives the table and the progress.
     """
     keep = out / PARTIAL
-    remove_leftovers(out / "views")
+    remove_leftovers(out / VIEWS)
     result = evaluate(
-        model, scene, samples=samples, seed=seed, perceptual=perceptual, pictures=out / "views", keep=keep, progress=say
+        model, scene, samples=samples, seed=seed, perceptual=perceptual, pictures=out / VIEWS, keep=keep, progress=say
     )
     settings = model.ca_score(samples=samples, seed=seed).settings
     data = {

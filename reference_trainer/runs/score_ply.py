@@ -18,6 +18,7 @@ from reference_trainer.evaluation.report import machine, markdown_table, write_j
 from reference_trainer.files import remove_leftovers, write_text
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
+from reference_trainer.runs.folder import VIEWS
 from reference_trainer.runs.frame_check import check_frame
 from reference_trainer.runs.measure import measure
 from reference_trainer.scenes.load import BACKGROUNDS
@@ -206,9 +207,9 @@ def score_ply_on_orbit(
     cameras = orbit.views(model.gaussians.means, model.gaussians.opacities)
     folder = out or _folder(ply)
     keep = folder / PARTIAL
-    remove_leftovers(folder / "views")
+    remove_leftovers(folder / VIEWS)
     result = evaluate_cameras(
-        model, cameras, samples=samples, seed=seed, pictures=folder / "views", keep=keep, progress=True, say=say
+        model, cameras, samples=samples, seed=seed, pictures=folder / VIEWS, keep=keep, progress=True, say=say
     )
     data = {
         "ply": asdict(facts),
