@@ -7,7 +7,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import NEAR_PLANE
-from reference_trainer.render.projection import project
+from reference_trainer.render.eager.projection import project
 
 __all__ = ["in_front", "visible_radii"]
 

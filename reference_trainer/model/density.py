@@ -10,7 +10,7 @@ from torch import Tensor
 
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.model.optimizer import GaussianOptimizer
-from reference_trainer.render.projection import rotation_matrices
+from reference_trainer.render.eager.projection import rotation_matrices
 
 __all__ = ["DensityStatistics", "decay_opacity", "densify", "prune", "reset_opacity"]
 

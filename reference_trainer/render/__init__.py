@@ -1,6 +1,31 @@
-"""The pure-torch renderer. It takes tensors and a camera, and knows neither scenes nor the model."""
+"""The renderer. It takes tensors and a camera, and knows neither scenes nor the model.
+
+Two engines draw: compiled loops (`loops`) for float32 on a CPU, and PyTorch operations (`eager`) for everything else,
+which the loops are tested against. `use_engine` chooses.
+"""
 
 from reference_trainer.render.checks import NotFiniteError
-from reference_trainer.render.renderer import Rendering, Splats, draw, masked, render, splat
+from reference_trainer.render.engine import ENGINES, Engine, describe_engine, use_engine
+from reference_trainer.render.moments import render_moments, variance_shares
+from reference_trainer.render.renderer import draw, masked, render, splat
+from reference_trainer.render.splats import MomentImages, Rendering, Splats
+from reference_trainer.render.statistics import color_variance_map, first_order_map
 
-__all__ = ["NotFiniteError", "Rendering", "Splats", "draw", "masked", "render", "splat"]
+__all__ = [
+    "ENGINES",
+    "Engine",
+    "MomentImages",
+    "NotFiniteError",
+    "Rendering",
+    "Splats",
+    "color_variance_map",
+    "describe_engine",
+    "draw",
+    "first_order_map",
+    "masked",
+    "render",
+    "render_moments",
+    "splat",
+    "use_engine",
+    "variance_shares",
+]

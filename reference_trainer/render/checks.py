@@ -12,7 +12,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import MAX_ROUNDING
-from reference_trainer.render.projection import Projection
+from reference_trainer.render.splats import Projection
 
 __all__ = ["NotFiniteError", "check_background", "check_projection"]
 
@@ -23,17 +23,15 @@ class NotFiniteError(ValueError):
 
 @torch.no_grad()
 def check_projection(
-    projection: Projection, colors: Tensor, culled_by: Tensor, inputs: Mapping[str, Tensor], camera: Camera
+    finite: bool, projection: Projection, colors: Tensor, inputs: Mapping[str, Tensor], camera: Camera
 ) -> None:
     """Raise unless all numbers are finite and the world is not too far from its origin for their precision.
 
-    A sum is not finite if one of its summands is not. So this costs four sums and, on a GPU, one wait; only where
-    something is wrong are the inputs looked at one by one.
-
     Args:
+        finite: whether what decides about who is drawn, depths and opacities, and all that is projected are finite;
+            only where they are not are the inputs looked at one by one.
         projection: M projected Gaussians.
         colors: of them, shape (M, 3).
-        culled_by: sum of the depths and opacities of all N Gaussians, which decide about who is drawn, a scalar.
         inputs: the tensors as they were given, N Gaussians first, by name.
         camera: the view.
 
@@ -41,12 +39,10 @@ def check_projection(
         NotFiniteError: if an input is nan or infinite, or so large that the projection is; names it.
         ValueError: if the rounding of the coordinates moves Gaussians by more than `MAX_ROUNDING`.
     """
-    results = (projection.means, projection.covariances, colors)
-    # One wait for the GPU: at what share of its mean depth the scene lies from the origin of the world.
-    share = camera.position.abs().amax() / projection.depths.mean()
-    total, share = torch.stack([sum((x.sum() for x in results), culled_by), share.to(culled_by)]).tolist()
-    if not abs(total) < float("inf"):
-        _refuse(results, inputs, camera)
+    if not finite:
+        _refuse((projection.means, projection.covariances, colors), inputs, camera)
+    # At what share of its mean depth the scene lies from the origin of the world.
+    share = float(camera.position.abs().amax() / projection.depths.mean())
     rounding = 0.5 * torch.finfo(colors.dtype).eps * share * max(camera.fx, camera.fy)
     if rounding > MAX_ROUNDING:
         raise ValueError(

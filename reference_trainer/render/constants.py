@@ -28,14 +28,8 @@ MIN_TRANSMITTANCE: Final = 1e-4
 TILE: Final = 8
 """Side of a tile in pixels. Own choice: at the INRIA value of 16, about 1.6 times as many pairs are evaluated."""
 
-BLOCK_ELEMENTS_CPU: Final = 1 << 17
-"""Pixel-Gaussian pairs held at once on a CPU: temporaries of 512 KiB in float32 stay in the cache."""
+BLOCK_PAIRS_CPU: Final = 1 << 18
+"""Pixel-Gaussian pairs that the torch engine holds at once on a CPU: temporaries of 1 MiB stay in the cache."""
 
-CHUNK_ENTRIES: Final = 1 << 19
-"""List entries (a Gaussian in a tile) expanded at once: some 100 bytes each while they are composited."""
-
-BLOCK_ELEMENTS_CUDA: Final = 1 << 25
-"""Pixel-Gaussian pairs held at once on a GPU: 128 MiB temporaries keep it busy and the number of launches low."""
-
-SLICE_ENTRIES: Final = 8
-"""Entries of a tile that compiled moments take at once: twice as many take twice as long to compile."""
+BLOCK_PAIRS_CUDA: Final = 1 << 25
+"""The same on a GPU: temporaries of 128 MiB keep it busy and the number of launches low."""

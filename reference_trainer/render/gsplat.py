@@ -18,7 +18,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, NEAR_PLANE
-from reference_trainer.render.projection import screen_radii
+from reference_trainer.render.splats import screen_radii
 
 __all__ = ["DrawnLists", "Ellipses", "GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
 

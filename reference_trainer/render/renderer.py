@@ -3,65 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.blending import composite
-from reference_trainer.render.checks import check_background, check_projection
-from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
-from reference_trainer.render.projection import Projection, project
-from reference_trainer.render.spherical_harmonics import evaluate_sh
-from reference_trainer.render.tiles import TileLists, bin_gaussians
+from reference_trainer.render.checks import check_background
+from reference_trainer.render.engine import engine_for
+from reference_trainer.render.splats import Rendering, Splats
 
-__all__ = ["Rendering", "Splats", "draw", "masked", "render", "splat"]
-
-
-class Splats(NamedTuple):
-    """Gaussians made ready for one camera: projected, coloured, and listed per tile.
-
-    Args:
-        indices: which of the N Gaussians were projected, shape (M,).
-        projection: their ellipses.
-        opacities: activated, shape (M,).
-        colors: towards this camera, shape (M, 3).
-        lists: the splats of every tile.
-    """
-
-    indices: Tensor
-    projection: Projection
-    opacities: Tensor
-    colors: Tensor
-    lists: TileLists
-
-
-def masked(splats: Splats, opacities: Tensor) -> Splats:
-    """Return the same view of the same Gaussians with lower opacities, without projecting and sorting them again.
-
-    Args:
-        splats: of the Gaussians with opacities at least as high.
-        opacities: activated, of all N Gaussians, shape (N,) or (N, 1); 0 leaves a Gaussian out.
-    """
-    lower = opacities.reshape(-1)[splats.indices].to(splats.opacities.dtype)
-    return splats._replace(opacities=lower, lists=splats.lists.only(lower >= MIN_ALPHA))
-
-
-class Rendering(NamedTuple):
-    """A rendered view.
-
-    Args:
-        image: colours over the background, not clamped, shape (3, H, W).
-        alpha: accumulated alpha, shape (H, W).
-        depth: sum of weight times camera depth, not divided by alpha, shape (H, W); None unless asked for.
-        splats: what was drawn. ``splats.projection.means`` keeps its gradient (pixels) for densification.
-    """
-
-    image: Tensor
-    alpha: Tensor
-    depth: Tensor | None
-    splats: Splats
+__all__ = ["draw", "masked", "render", "splat"]
 
 
 def splat(
@@ -112,7 +63,7 @@ def splat(
     inputs = {name: _working(name, x, means.dtype) for name, x in named.items()}
     # Mixed precision would move means by pixels: its products have 8 bits.
     with torch.autocast(means.device.type, enabled=False):
-        return _splat(inputs, camera.to(means.device, inputs["means"].dtype), degree)
+        return engine_for(inputs["means"]).splat(inputs, camera.to(means.device, inputs["means"].dtype), degree)
 
 
 def _working(name: str, x: Tensor, dtype: torch.dtype) -> Tensor:
@@ -120,27 +71,6 @@ def _working(name: str, x: Tensor, dtype: torch.dtype) -> Tensor:
     if not x.is_floating_point():
         raise TypeError(f"{name} must be a floating-point tensor, got {x.dtype}; convert it with .float().")
     return x.to(torch.float64 if dtype == torch.float64 else torch.float32)
-
-
-def _splat(inputs: dict[str, Tensor], camera: Camera, degree: int) -> Splats:
-    """Cull, project, colour and list Gaussians in one precision, that of the camera."""
-    with torch.no_grad():
-        depths = inputs["means"] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
-        culled_by = depths.sum() + inputs["opacities"].sum()
-        indices = torch.nonzero((depths > NEAR_PLANE) & (inputs["opacities"] >= MIN_ALPHA)).squeeze(1)
-    drawn = inputs
-    if indices.shape[0] < depths.shape[0]:
-        drawn = {name: x.index_select(0, indices) for name, x in inputs.items()}
-    projection = project(drawn["means"], drawn["quaternions"], drawn["scales"], camera)
-    if "sh" in drawn:
-        directions = torch.nn.functional.normalize(drawn["means"] - camera.position, dim=-1)
-        colors = evaluate_sh(drawn["sh"], directions, degree)
-    else:
-        colors = drawn["colors"]
-    check_projection(projection, colors, culled_by, inputs, camera)
-    with torch.no_grad():
-        lists = bin_gaussians(projection, drawn["opacities"], camera.width, camera.height)
-    return Splats(indices, projection, drawn["opacities"], colors, lists)
 
 
 def render(
@@ -197,20 +127,27 @@ def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = Fals
         splats: from `splat` or `masked`.
         background: colour behind everything, shape (3,); black by default.
         depth: whether to accumulate depth as well.
+
+    Raises:
+        NotFiniteError: if the background is not finite.
     """
-    projection = splats.projection
-    if projection.means.requires_grad:
-        projection.means.retain_grad()
-    if background is not None:
+    if splats.projection.means.requires_grad:
+        splats.projection.means.retain_grad()
+    if background is None:
+        background = splats.colors.new_zeros(3)
+    else:
         check_background(background)
-    columns = [splats.colors, torch.ones_like(splats.opacities)[:, None]]
-    if depth:
-        columns.append(projection.depths[:, None])
     with torch.autocast(splats.opacities.device.type, enabled=False):
-        sums = composite(
-            projection.means, projection.factors, splats.opacities, torch.cat(columns, dim=1), splats.lists
-        )
-    image, alpha = sums[:3], sums[3]
-    if background is not None:
-        image = image + (1 - alpha) * background.to(image)[:, None, None]
-    return Rendering(image, alpha, sums[4] if depth else None, splats)
+        image, alpha, depths = splats.engine.composite(splats, background.to(splats.colors), depth=depth)
+    return Rendering(image, alpha, depths, splats)
+
+
+def masked(splats: Splats, opacities: Tensor) -> Splats:
+    """Return the same view of the same Gaussians with lower opacities, without projecting and sorting them again.
+
+    Args:
+        splats: of the Gaussians with opacities at least as high.
+        opacities: activated, of all N Gaussians, shape (N,) or (N, 1); 0 leaves a Gaussian out, at no cost.
+    """
+    lower = opacities.reshape(-1)[splats.indices].to(splats.opacities.dtype)
+    return splats.engine.masked(splats, lower)

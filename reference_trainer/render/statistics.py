@@ -1,17 +1,19 @@
-"""Per-pixel statistics of the splats behind a rendering, tile by tile."""
+"""Maps that are drawn beside the picture: how much the blended colours differ, and the paper's form of co-adaptation.
+
+They are looked at once in a while, and always evaluated by the torch engine.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from ca_reg.functional import color_variance
-from reference_trainer.render.blending import block_alphas
-from reference_trainer.render.footprints import PIXELS, block_size, footprints, pack, untile
-from reference_trainer.render.renderer import Splats
-from reference_trainer.render.workspace import Workspace
+from ca_reg.functional import Multiplier
+from reference_trainer.render.eager import formulas
+from reference_trainer.render.eager.walk import geometry_rows, walk
+from reference_trainer.render.splats import Splats
 
-__all__ = ["color_variance_map"]
+__all__ = ["color_variance_map", "first_order_map"]
 
 
 @torch.no_grad()
@@ -36,17 +38,40 @@ def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
         >>> round(variance[8, 8].item(), 2)  # weights 1/2 and 1/4: (1/3) (2/3)
         0.22
     """
-    lists = splats.lists
-    table = pack(splats.projection.means, splats.projection.factors, splats.opacities)
-    colors = torch.cat([splats.colors, splats.colors.new_zeros(1, 3)])
-    tiles = table.new_zeros(lists.lengths.shape[0], 2, PIXELS)
-    for chunk in lists.chunks(block_size(table.device)):
-        polynomial = footprints(table, chunk, lists).polynomial
-        workspace = Workspace(4, chunk, table)
-        for block in chunk.blocks:
-            weights = block_alphas(polynomial, block, workspace.of(block.shape[0], PIXELS, block.shape[1])).weights
-            which = chunk.gaussians[block.entries].view(block.shape)
-            result = color_variance(weights, colors[which][:, None].expand(-1, PIXELS, -1, -1))
-            tiles[chunk.tiles[block.tiles]] = torch.stack([result.variance, result.covered.to(table)], dim=1)
-    variance, covered = untile(tiles, lists)
+    rows = torch.cat([geometry_rows(splats), splats.colors.T])
+    behind = rows.new_zeros(1, splats.lists.height, splats.lists.width)
+    variance, covered = walk(formulas.color_variances, rows, behind, splats.lists, extra=1)
     return variance, covered > 0
+
+
+@torch.no_grad()
+def first_order_map(splats: Splats, multiplier: Multiplier) -> Tensor:
+    """Render ``v sum_i (c_i alpha_i)^2``, the paper's closed form (appendix, Eq. ca_final, where v is ``p (1 - p)``).
+
+    An approximation that knows neither transmittance nor background nor what lies behind a splat: hidden splats count
+    like visible ones. `ca_reg.functional.first_order_variance` says when it is right.
+
+    Args:
+        splats: of the full model, with its plain opacities.
+        multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,); only the variance
+            matters.
+
+    Returns:
+        The approximate variance per channel, shape (3, H, W).
+
+    Example:
+        >>> from reference_trainer.camera import Camera
+        >>> from reference_trainer.render import splat
+        >>> camera = Camera(torch.eye(4), 50.0, 50.0, 8.5, 8.5, 16, 16)
+        >>> means, quaternions = torch.tensor([[0.0, 0, 1], [0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]] * 2)
+        >>> splats = splat(means, quaternions, torch.full((2, 3), 0.2), torch.full((2,), 0.5), camera,
+        ...                colors=torch.ones(2, 3))
+        >>> round(first_order_map(splats, Multiplier.dropout(0.5))[0, 8, 8].item(), 3)  # 0.25 (0.25 + 0.25)
+        0.125
+    """
+    spread = multiplier.variance
+    if isinstance(spread, Tensor):
+        spread = spread[splats.indices].to(splats.colors)[:, None]
+    rows = torch.cat([geometry_rows(splats), (spread * splats.colors.square()).T])
+    behind = rows.new_zeros(3, splats.lists.height, splats.lists.width)
+    return walk(formulas.first_order, rows, behind, splats.lists, extra=0)

@@ -16,7 +16,7 @@ from torch import Tensor
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.model import Model
 from reference_trainer.render.compiled import use_compiled
-from reference_trainer.render.first_order import first_order_map
+from reference_trainer.render.statistics import first_order_map
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.timing import in_turns, now
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from reference_trainer.render.projection import project
+from reference_trainer.render.eager.projection import project
 from reference_trainer.studies.speed.workloads import Workload
 from reference_trainer.studies.timing import in_turns
 

@@ -6,7 +6,7 @@ from oracles import brute_force, random_scene
 
 from reference_trainer.compat.rasterizer import rasterizer_module
 from reference_trainer.compat.settings import camera_of
-from reference_trainer.render.spherical_harmonics import evaluate_sh
+from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
 
 NAME = "diff_gaussian_rasterization"
 

@@ -6,7 +6,7 @@ from oracles import brute_force, random_scene
 
 from ca_reg.functional import Multiplier, first_order_variance
 from reference_trainer.render import splat
-from reference_trainer.render.first_order import first_order_map
+from reference_trainer.render.statistics import first_order_map
 
 
 def alone(scene):

@@ -8,7 +8,7 @@ import torch
 from oracles import random_scene
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.projection import project, rotation_matrices
+from reference_trainer.render.eager.projection import project, rotation_matrices
 
 
 def in_front(n, seed):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from oracles import associated_legendre_sh
 
-from reference_trainer.render.spherical_harmonics import evaluate_sh, sh_basis
+from reference_trainer.render.eager.spherical_harmonics import evaluate_sh, sh_basis
 
 
 def test_basis_equals_legendre_definition():

@@ -2,61 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
+from reference_trainer.render.splats import Projection
 
-__all__ = ["Projection", "project", "rotation_matrices", "screen_radii"]
+__all__ = ["project", "rotation_matrices"]
 
 _NO_DIRECTION = 1e-30  # a quaternion well below this is taken for 0
-_SMALLEST_SPREAD = 0.1**0.5  # px^2: half the difference of the variances along the axes is taken for no less
-
-
-class Projection(NamedTuple):
-    """Projected Gaussians.
-
-    The inverse 2D covariance is kept as its triangular factor: the squared Mahalanobis distance of an offset (dx, dy)
-    is ``(l11 dx + l21 dy)^2 + (l22 dy)^2``. The inverse covariance of a needle at 45 degrees has large entries that
-    cancel; its factor does not cancel, so float32 is enough.
-
-    Args:
-        means: pixel coordinates, shape (M, 2).
-        factors: ``(l11, l21, l22)``, shape (M, 3).
-        covariances: ``(xx, xy, yy)`` of the dilated 2D covariance, square pixels, shape (M, 3).
-        depths: along the camera's z axis, shape (M,).
-    """
-
-    means: Tensor
-    factors: Tensor
-    covariances: Tensor
-    depths: Tensor
-
-    @property
-    def radii(self) -> Tensor:
-        """See `screen_radii`; shape (M,)."""
-        return screen_radii(self.covariances.detach())
-
-
-def screen_radii(covariances: Tensor) -> Tensor:
-    """Three standard deviations of the longer axis, rounded up; as in the INRIA code, more for round splats.
-
-    Args:
-        covariances: ``(xx, xy, yy)``, square pixels, shape (M, 3).
-
-    Returns:
-        Radii in pixels, shape (M,), of the type of the covariances.
-
-    Example:
-        >>> screen_radii(torch.tensor([[1.0, 0.0, 1.0], [9.0, 0.0, 1.0]])).tolist()  # 3 sqrt(1.32), 3 sqrt(9)
-        [4.0, 9.0]
-    """
-    xx, xy, yy = covariances.unbind(-1)
-    spread = torch.hypot(0.5 * (xx - yy), xy).clamp_min(_SMALLEST_SPREAD)
-    return torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt())
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:

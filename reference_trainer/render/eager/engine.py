@@ -1,0 +1,81 @@
+"""The engine of tensor operations: any dtype, any device; what the loops are tested against."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.checks import check_projection
+from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
+from reference_trainer.render.eager import formulas
+from reference_trainer.render.eager.binning import bin_gaussians
+from reference_trainer.render.eager.projection import project
+from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
+from reference_trainer.render.eager.walk import blocks, geometry_rows, pad_entries, tile, walk
+from reference_trainer.render.splats import Splats
+
+__all__ = ["TorchEngine"]
+
+
+class TorchEngine:
+    """See `Engine`."""
+
+    name = "torch"
+
+    def splat(self, inputs: dict[str, Tensor], camera: Camera, degree: int) -> Splats:
+        """Cull, project, colour and list Gaussians."""
+        with torch.no_grad():
+            depths = inputs["means"] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+            culled_by = depths.sum() + inputs["opacities"].sum()
+            indices = torch.nonzero((depths > NEAR_PLANE) & (inputs["opacities"] >= MIN_ALPHA)).squeeze(1)
+        drawn = inputs
+        if indices.shape[0] < depths.shape[0]:
+            drawn = {name: x.index_select(0, indices) for name, x in inputs.items()}
+        projection = project(drawn["means"], drawn["quaternions"], drawn["scales"], camera)
+        if "sh" in drawn:
+            directions = torch.nn.functional.normalize(drawn["means"] - camera.position, dim=-1)
+            colors = evaluate_sh(drawn["sh"], directions, degree)
+        else:
+            colors = drawn["colors"]
+        # A sum is not finite if one of its summands is not; one wait for a GPU.
+        total = sum((x.detach().sum() for x in (projection.means, projection.covariances, colors)), culled_by)
+        check_projection(bool(total.isfinite()), projection, colors, inputs, camera)
+        with torch.no_grad():
+            lists = bin_gaussians(projection, drawn["opacities"], camera.width, camera.height)
+        return Splats(indices, projection, drawn["opacities"], colors, lists, self)
+
+    def masked(self, splats: Splats, opacities: Tensor) -> Splats:
+        """Take those that are too faint out of the lists."""
+        return splats._replace(opacities=opacities, lists=splats.lists.only(opacities >= MIN_ALPHA))
+
+    def composite(
+        self, splats: Splats, background: Tensor, *, depth: bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Draw splats front to back."""
+        values = [splats.colors.T, splats.projection.depths[None]] if depth else [splats.colors.T]
+        shape = (splats.lists.height, splats.lists.width)
+        behind = torch.nn.functional.pad(background, (0, len(values) - 1))[:, None, None].expand(-1, *shape)
+        rows = torch.cat([geometry_rows(splats), *values])
+        sums = walk(formulas.composite, rows, behind, splats.lists, extra=1)
+        return sums[:3], sums[-1], sums[3] if depth else None
+
+    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
+        """Composite mean and variance back to front."""
+        rows = torch.cat([geometry_rows(splats), multiplier.T, splats.colors.T])
+        if alpha:  # one more colour, white over black
+            rows = torch.cat([rows, torch.ones_like(rows[:1])])
+            behind = torch.cat([behind, torch.zeros_like(behind[:1])])
+        images = walk(formulas.moments, rows, behind, splats.lists, extra=behind.shape[0])
+        return images[: behind.shape[0]], images[behind.shape[0] :]
+
+    def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
+        """Sum the summands of the variance over the pixels."""
+        rows = pad_entries(torch.cat([geometry_rows(splats), multiplier.T, splats.colors.T]))
+        tiles, per_pixel = tile(behind, splats.lists), tile(weights[None], splats.lists)[:, 0]
+        sums = torch.zeros(rows.shape[1], dtype=torch.float64, device=rows.device)
+        for block in blocks(splats.lists, rows.device):
+            of_block = formulas.summands(block, rows[:, block.gaussians], tiles[block.tiles])
+            of_entries = (of_block * per_pixel[block.tiles]).sum(-1, dtype=torch.float64).T
+            sums.index_add_(0, block.gaussians.flatten(), of_entries.flatten())
+        return sums[:-1]

@@ -1,0 +1,128 @@
+"""The formulas of compositing, tile by tile: what is drawn, its exact moments, their shares, and two statistics.
+
+Each takes a `Block`, the rows of its entries and what is behind its tiles, and is differentiated by PyTorch. ``T`` tiles
+of 64 pixels, ``L`` entries of each, nearest first.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ca_reg.functional import color_variance
+from reference_trainer.render.constants import MAX_ALPHA, MIN_TRANSMITTANCE
+from reference_trainer.render.eager.walk import Block
+
+__all__ = ["blend_weights", "color_variances", "composite", "first_order", "moments", "summands"]
+
+
+def _clamped(raw: Tensor) -> Tensor:
+    """Clamp alphas at `MAX_ALPHA` and let gradients pass, as the INRIA rasterizer does."""
+    return torch.where(raw > MAX_ALPHA, MAX_ALPHA + (raw - raw.detach()), raw)
+
+
+def _running_products(x: Tensor) -> Tensor:
+    """Return running products along the last dimension.
+
+    The gradient of `torch.cumprod` has no algorithm on CUDA that repeats itself, and is an error where one is asked
+    for. There, and only there, whole shifted copies are multiplied, log2 L times.
+    """
+    if x.device.type == "cpu" or not torch.are_deterministic_algorithms_enabled():
+        return x.cumprod(-1)
+    step = 1
+    while step < x.shape[-1]:
+        x = torch.cat([x[..., :step], x[..., step:] * x[..., :-step]], dim=-1)
+        step *= 2
+    return x
+
+
+def _in_front(passed: Tensor) -> Tensor:
+    """Return the product over all entries in front of each, (T, 64, L)."""
+    return torch.nn.functional.pad(_running_products(passed)[..., :-1], (1, 0), value=1.0)
+
+
+def blend_weights(raw: Tensor) -> Tensor:
+    """Return alpha times the transmittance in front of every splat; 0 from the one on that ends its pixel.
+
+    Args:
+        raw: alphas before the clamp, shape (T, 64, L).
+    """
+    alpha = _clamped(raw)
+    transmittance = _in_front(1 - alpha)
+    return torch.where(transmittance * (1 - alpha) >= MIN_TRANSMITTANCE, alpha * transmittance, 0.0)
+
+
+def composite(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
+    """Composite C values over what is behind, front to back; then the accumulated alpha, (T, C + 1, 64).
+
+    Args:
+        block: of tiles.
+        rows: geometry and values of the entries, shape (6 + C, T, L).
+        behind: shape (T, C, 64).
+    """
+    weights = blend_weights(block.alphas(rows[:6]))
+    alpha = weights.sum(-1)[:, None]
+    values = rows[6:].transpose(0, 1) @ weights.transpose(1, 2)
+    return torch.cat([values + (1 - alpha) * behind, alpha], dim=1)
+
+
+def _random(block: Block, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return m alpha, v alpha^2, and (1 - m alpha)^2 + v alpha^2 of every entry at every pixel, (L, T, 1, 64)."""
+    alpha = _clamped(block.alphas(rows[:6])).permute(2, 0, 1)[:, :, None]
+    m, v = rows[6:8].transpose(1, 2)[..., None, None]
+    expected, spread = m * alpha, v * alpha.square()
+    return expected, spread, (1 - expected).square() + spread
+
+
+def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
+    """Return mean and variance of C values under random factors on the alphas, (T, 2 C, 64).
+
+    The recursion of `ca_reg.functional.pixel_moments`, back to front: with d the contrast of a splat with the mean of
+    what is behind it, the mean grows by m alpha d, and the variance V becomes ((1 - m alpha)^2 + v alpha^2) V
+    + v alpha^2 d^2. Every term is a square times a non-negative weight: nothing cancels.
+
+    Args:
+        block: of tiles.
+        rows: geometry, mean m and variance v of the factor, and values of the entries, shape (8 + C, T, L).
+        behind: shape (T, C, 64).
+    """
+    expected, spread, shrink = _random(block, rows)
+    values = rows[8:].permute(2, 1, 0)[..., None]
+    mean, variance = behind, torch.zeros_like(behind)
+    for i in reversed(range(values.shape[0])):
+        contrast = values[i] - mean
+        variance = shrink[i] * variance + spread[i] * contrast.square()
+        mean = mean + expected[i] * contrast
+    return torch.cat([mean, variance], dim=1)
+
+
+def summands(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
+    """Return every entry's summand of the variance, mean over the C values, (L, T, 64); arguments as `moments`."""
+    expected, spread, shrink = _random(block, rows)
+    values = rows[8:].permute(2, 1, 0)[..., None]
+    mean, squares = behind, []
+    for i in reversed(range(values.shape[0])):
+        contrast = values[i] - mean
+        squares.append(contrast.square().mean(1))
+        mean = mean + expected[i] * contrast
+    front = torch.cat([torch.ones_like(shrink[:1]), shrink[:-1]]).cumprod(0)
+    return (front * spread)[:, :, 0] * torch.stack(squares[::-1])
+
+
+def color_variances(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
+    """Return the variance of the colours that are blended, and whether any are, (T, 2, 64) (paper, CV metric).
+
+    Args:
+        block: of tiles.
+        rows: geometry and colours of the entries, shape (9, T, L).
+        behind: one channel of zeros, shape (T, 1, 64).
+    """
+    weights = blend_weights(block.alphas(rows[:6]))
+    colors = rows[6:].permute(1, 2, 0)[:, None].expand(-1, weights.shape[1], -1, -1)
+    result = color_variance(weights, colors)
+    return torch.stack([result.variance, result.covered.to(behind)], dim=1)
+
+
+def first_order(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
+    """Return ``sum_i r_i alpha_i^2`` for C values r, (T, C, 64); nothing behind is looked at."""
+    return rows[6:].transpose(0, 1) @ _clamped(block.alphas(rows[:6])).square().transpose(1, 2)

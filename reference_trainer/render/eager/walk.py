@@ -1,0 +1,173 @@
+"""The walk over the tile lists: the one place where the alphas of pixels are evaluated in this engine.
+
+Tiles whose lists are about equally long are padded to a block and handed to a formula. Nothing of the size of the
+pixel-Gaussian pairs outlives its block: the gradient evaluates the formula of a block again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from reference_trainer.render.constants import BLOCK_PAIRS_CPU, BLOCK_PAIRS_CUDA, MIN_ALPHA, TILE
+from reference_trainer.render.precision import without_autocast
+from reference_trainer.render.splats import Splats, TileLists
+
+__all__ = ["PIXELS", "Block", "blocks", "geometry_rows", "pad_entries", "tile", "untile", "walk"]
+
+PIXELS = TILE * TILE
+_ABSENT = -1e4  # binary logarithm of the opacity of padding: its alpha is exactly 0
+_HALF = 0.5 * math.log2(math.e)  # exp(-x / 2) = 2^(-_HALF x)
+
+Formula = Callable[["Block", Tensor, Tensor], Tensor]
+
+
+class Block(NamedTuple):
+    """Tiles whose lists are padded to one length.
+
+    Args:
+        tiles: their numbers, row by row over the image, shape (T,).
+        centers: of the tiles, pixels, shape (2, T, 1).
+        gaussians: the Gaussian of every entry, nearest first; the number of Gaussians M is padding, shape (T, L).
+    """
+
+    tiles: Tensor
+    centers: Tensor
+    gaussians: Tensor
+
+    def alphas(self, geometry: Tensor) -> Tensor:
+        """Evaluate the alphas at every pixel, before the clamp at `MAX_ALPHA`; 0 below `MIN_ALPHA`.
+
+        Args:
+            geometry: `geometry_rows` of the entries, shape (6, T, L).
+
+        Returns:
+            Shape (T, 64, L), differentiable.
+        """
+        x, y, l11, l21, l22, log_opacity = geometry.unbind(0)
+        dx, dy = x - self.centers[0], y - self.centers[1]
+        # log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2, expanded around the tile's centre. Squaring w1 and w2,
+        # which are small wherever alpha is not, avoids the cancellation of a dx^2 + 2 b dx dy + c dy^2.
+        w1, w2 = l11 * dx + l21 * dy, l22 * dy
+        polynomial = torch.stack(
+            [
+                log_opacity - _HALF * (w1 * w1 + w2 * w2),
+                2 * _HALF * (l11 * w1),
+                2 * _HALF * (l21 * w1 + l22 * w2),
+                -_HALF * (l11 * l11),
+                -2 * _HALF * (l11 * l21),
+                -_HALF * (l21 * l21 + l22 * l22),
+            ],
+            dim=1,
+        )
+        exponents = _monomials(geometry.dtype, geometry.device) @ polynomial
+        return torch.nn.functional.threshold(exponents, math.log2(MIN_ALPHA), -math.inf).exp2()
+
+
+@lru_cache(maxsize=8)
+def _monomials(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Evaluate 1, x, y, x^2, x y, y^2 at a tile's pixels, measured from its centre, shape (64, 6)."""
+    axis = torch.arange(TILE, dtype=dtype, device=device) - (TILE - 1) / 2
+    y, x = (grid.reshape(-1) for grid in torch.meshgrid(axis, axis, indexing="ij"))
+    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
+
+
+def geometry_rows(splats: Splats) -> Tensor:
+    """Return x, y, l11, l21, l22 and the binary logarithm of the opacity of M splats, shape (6, M)."""
+    means, factors = splats.projection.means, splats.projection.factors
+    return torch.cat([means.T, factors.T, torch.log2(splats.opacities)[None]])
+
+
+def blocks(lists: TileLists, device: torch.device) -> Iterator[Block]:
+    """Iterate over all tiles with a non-empty list; a list that alone is too long makes a block of its own."""
+    pairs = BLOCK_PAIRS_CPU if device.type == "cpu" else BLOCK_PAIRS_CUDA
+    lengths, tiles = torch.sort(lists.lengths, descending=True, stable=True)
+    sizes = lengths.tolist()
+    end = next((i for i, n in enumerate(sizes) if n == 0), len(sizes))
+    first = 0
+    while first < end:
+        last = min(end, first + max(1, pairs // (PIXELS * sizes[first])))
+        numbers = tiles[first:last]
+        place = torch.arange(sizes[first], device=device)
+        where = (lists.starts[numbers, None] + place).clamp_(max=lists.gaussians.shape[0] - 1)
+        gaussians = lists.gaussians[where].long()
+        gaussians.masked_fill_(place >= lengths[first:last, None], lists.touched.shape[0])
+        corners = torch.stack([numbers % lists.columns, numbers.div(lists.columns, rounding_mode="floor")])
+        yield Block(numbers, (corners * TILE + TILE // 2)[..., None], gaussians)
+        first = last
+
+
+def walk(formula: Formula, rows: Tensor, behind: Tensor, lists: TileLists, *, extra: int) -> Tensor:
+    """Evaluate a formula of every tile's list and of what is behind it; differentiable in both.
+
+    Args:
+        formula: of a block, the rows of its entries (R, T, L), and what is behind its tiles (T, C, 64); returns
+            (T, C + extra, 64), which without any splats is what is behind, and 0.
+        rows: numbers of every splat, the first six `geometry_rows`, shape (R, M).
+        behind: images, shape (C, H, W).
+        lists: the splats of every tile.
+        extra: channels of the result beyond those of ``behind``.
+
+    Returns:
+        Images, shape (C + extra, H, W).
+    """
+    result: Tensor = _Walk.apply(formula, rows, behind, lists, extra)  # type: ignore[no-untyped-call]
+    return result
+
+
+class _Walk(torch.autograd.Function):
+    """A formula block by block, whose gradient is taken of one block after the other."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, formula: Formula, rows: Tensor, behind: Tensor, lists: TileLists, extra: int
+    ) -> Tensor:
+        entries, tiles = pad_entries(rows), tile(behind, lists)
+        result = torch.nn.functional.pad(tiles, (0, 0, 0, extra))
+        for block in blocks(lists, rows.device):
+            result[block.tiles] = formula(block, entries[:, block.gaussians], tiles[block.tiles])
+        ctx.formula, ctx.lists = formula, lists
+        ctx.save_for_backward(rows, behind)
+        return untile(result, lists)
+
+    @staticmethod
+    @without_autocast
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, Tensor, None, None]:
+        rows, behind = ctx.saved_tensors
+        lists: TileLists = ctx.lists
+        entries, tiles, upstream = pad_entries(rows), tile(behind, lists), tile(gradients[0], lists)
+        to_entries, to_tiles = torch.zeros_like(entries), upstream[:, : behind.shape[0]].clone()
+        for block in blocks(lists, rows.device):
+            inputs = [x.detach().requires_grad_() for x in (entries[:, block.gaussians], tiles[block.tiles])]
+            with torch.enable_grad():
+                result = ctx.formula(block, *inputs)
+            of_block, of_tiles = torch.autograd.grad(result, inputs, upstream[block.tiles], materialize_grads=True)
+            to_entries.index_add_(1, block.gaussians.flatten(), of_block.flatten(1))
+            to_tiles[block.tiles] = of_tiles
+        return None, to_entries[:, :-1], untile(to_tiles, lists), None, None
+
+
+def pad_entries(rows: Tensor) -> Tensor:
+    """Return rows (R, M) with an absent splat as the last, (R, M + 1)."""
+    absent = rows.new_zeros(rows.shape[0], 1)
+    absent[5] = _ABSENT
+    return torch.cat([rows, absent], dim=1)
+
+
+def untile(tiles: Tensor, lists: TileLists) -> Tensor:
+    """Reorder per-tile pixels of shape (tiles, C, 64) into an image of shape (C, H, W)."""
+    grid = tiles.view(lists.rows, lists.columns, -1, TILE, TILE)
+    image = grid.permute(2, 0, 3, 1, 4).reshape(-1, lists.rows * TILE, lists.columns * TILE)
+    return image[:, : lists.height, : lists.width]
+
+
+def tile(image: Tensor, lists: TileLists) -> Tensor:
+    """Reorder an image of shape (C, H, W) into per-tile pixels of shape (tiles, C, 64), zero outside the image."""
+    padding = (0, lists.columns * TILE - lists.width, 0, lists.rows * TILE - lists.height)
+    grid = torch.nn.functional.pad(image, padding).view(-1, lists.rows, TILE, lists.columns, TILE)
+    return grid.permute(1, 3, 0, 2, 4).reshape(lists.rows * lists.columns, -1, PIXELS)

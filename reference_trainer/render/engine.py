@@ -1,0 +1,142 @@
+"""What an engine is, which ones there are, and which one draws."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.splats import Splats
+
+__all__ = ["ENGINES", "Engine", "describe_engine", "engine_for", "use_engine"]
+
+ENGINES = ("auto", "torch", "loops")
+_VARIABLE = "CA_REG_ENGINE"
+
+
+class Engine(Protocol):
+    """Turns Gaussians into pictures, and into the exact moments of pictures.
+
+    All tensors of a call share one dtype and one device, and are checked already (`reference_trainer.render.renderer`,
+    `reference_trainer.render.moments`); what comes out is differentiable. Whoever adds an engine lists it in
+    `engine_for`.
+    """
+
+    name: str
+
+    def splat(self, inputs: dict[str, Tensor], camera: Camera, degree: int) -> Splats:
+        """Project the Gaussians that can be seen, colour them, and list them per tile.
+
+        Args:
+            inputs: means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh (N, K, 3) or colors
+                (N, 3), by name.
+            camera: the view.
+            degree: highest band of sh.
+
+        Raises:
+            NotFiniteError, ValueError: as `reference_trainer.render.checks`.
+        """
+
+    def masked(self, splats: Splats, opacities: Tensor) -> Splats:
+        """Return splats with opacities (M,) that are nowhere higher; those below `MIN_ALPHA` cost nothing."""
+
+    def composite(
+        self, splats: Splats, background: Tensor, *, depth: bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Draw splats front to back over a background (3,): image (3, H, W), alpha (H, W), depth (H, W) if asked."""
+
+    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
+        """Return mean and variance of red, green, blue, and accumulated alpha if asked, (3 or more, H, W) each.
+
+        Args:
+            splats: of the full model.
+            multiplier: mean and variance of every splat's factor, shape (M, 2).
+            behind: colours behind everything, shape (3, H, W).
+            alpha: whether the fourth channel is needed.
+        """
+
+    def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
+        """Return every splat's share of the weighted variance, (M,), float64.
+
+        Args:
+            splats: as for `moments`, and so on.
+            multiplier: likewise.
+            behind: likewise.
+            weights: of the pixels, shape (H, W).
+        """
+
+
+def use_engine(name: str) -> None:
+    """Choose the engine of this process and of those that it starts (through the environment, ``CA_REG_ENGINE``).
+
+    Args:
+        name: ``torch`` or ``loops``; ``auto``, the default, takes the loops for float32 on a CPU where numba is installed.
+
+    Raises:
+        ValueError: if there is no such engine.
+        ImportError: if loops are asked for and numba is missing.
+
+    Example:
+        >>> use_engine("torch")
+        >>> describe_engine("cpu")
+        'torch'
+        >>> use_engine("auto")
+    """
+    if name not in ENGINES:
+        raise ValueError(f"there is no engine {name!r}; choose one of {', '.join(ENGINES)}.")
+    if name == "loops" and not _has_numba():
+        raise ImportError("the engine of compiled loops needs numba: pip install 'ca_reg[trainer]', or use --engine torch.")
+    os.environ[_VARIABLE] = name
+
+
+def engine_for(like: Tensor) -> Engine:
+    """Return the engine that draws tensors of a dtype and device.
+
+    The loops know float32 on a CPU; everything else is drawn by torch, whatever was chosen.
+
+    Args:
+        like: a tensor of them.
+
+    Raises:
+        ValueError: if the environment names an engine that does not exist.
+    """
+    chosen = os.environ.get(_VARIABLE, "auto")
+    if chosen not in ENGINES:
+        raise ValueError(f"{_VARIABLE} names the engine {chosen!r}; choose one of {', '.join(ENGINES)}.")
+    if chosen == "torch" or like.device.type != "cpu" or like.dtype != torch.float32 or not _has_numba():
+        return _torch_engine()
+    return _loop_engine()
+
+
+def describe_engine(device: torch.device | str) -> str:
+    """Return which engine draws a model on a device, in words for people."""
+    engine = engine_for(torch.empty(0, device=device))
+    if engine.name == "torch":
+        return "torch"
+    from importlib.metadata import version
+
+    return f"loops (numba {version('numba')}, {torch.get_num_threads()} threads)"
+
+
+@functools.cache
+def _has_numba() -> bool:
+    return importlib.util.find_spec("numba") is not None
+
+
+@functools.cache
+def _torch_engine() -> Engine:
+    from reference_trainer.render.eager.engine import TorchEngine
+
+    return TorchEngine()
+
+
+@functools.cache
+def _loop_engine() -> Engine:
+    from reference_trainer.render.loops.engine import LoopEngine
+
+    return LoopEngine()

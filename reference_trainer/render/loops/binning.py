@@ -1,0 +1,181 @@
+"""Which Gaussian touches which tile, by counting instead of sorting.
+
+Gaussians are put in order of depth by a radix sort, and then each in turn appended to the lists of its tiles: a list
+is in order of depth because it was written in it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reference_trainer.render.constants import MIN_ALPHA, TILE
+from reference_trainer.render.loops.compiling import inlined, kernel
+from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.render.splats import Projection, TileLists
+
+__all__ = ["bin_gaussians"]
+
+Array = Any
+f4 = np.float32
+_ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
+_MIN, _TILE = f4(MIN_ALPHA), f4(TILE)
+_PARTS = 16  # of the order of depth, each with a count of its own of every tile, so that they can be filled at once
+_BITS = 11  # of a digit of the radix sort: three make a float32
+
+
+@inlined
+def _first_pixel(x: Any, size: Any) -> Any:
+    """Return the first pixel whose centre is at x or beyond it; in [0, size]."""
+    return max(_ZERO, min(size, np.ceil(x - _HALF)))
+
+
+@inlined
+def _last_pixel(x: Any, size: Any) -> Any:
+    """Return the last pixel whose centre is at x or before it; in [-1, size - 1]."""
+    return max(-_ONE, min(size - _ONE, np.floor(x - _HALF)))
+
+
+@kernel
+def _count_strips(
+    first: int, last: int, centers: Array, covariances: Array, opacities: Array, height: int, rows: Array, counts: Array
+) -> None:
+    """Find the first row of tiles that a Gaussian's ellipse touches, and how many."""
+    size = f4(height)
+    for i in range(first, last):
+        y = centers[i, 1]
+        reach = math.sqrt(_TWO * max(_ZERO, math.log(opacities[i] / _MIN)) * covariances[i, 2])
+        top, bottom = _first_pixel(y - reach, size), _last_pixel(y + reach, size)
+        rows[i] = np.int32(top) // TILE
+        counts[i] = np.int32(bottom) // TILE - rows[i] + 1 if bottom >= top else 0
+
+
+@kernel
+def _find_spans(
+    first: int, last: int, centers: Array, factors: Array, covariances: Array, opacities: Array, width: int,
+    height: int, rows: Array, strips: Array, spans: Array, entries: Array,
+) -> None:  # fmt: skip
+    """Find the first and the last tile of every strip: within one, an ellipse covers an interval of columns."""
+    for i in range(first, last):
+        x, y = centers[i, 0], centers[i, 1]
+        a, b, c = factors[i, 0], factors[i, 1], factors[i, 2]
+        limit = _TWO * max(_ZERO, math.log(opacities[i] / _MIN))
+        tip = covariances[i, 1] * math.sqrt(limit / covariances[i, 0])  # the dy at which it reaches furthest right
+        total = 0
+        for strip in range(strips[i], strips[i + 1]):
+            row = rows[i] + strip - strips[i]
+            upper = f4(row * TILE) + _HALF - y
+            lower = min(f4(row * TILE) + (_TILE - _HALF), f4(height) - _HALF) - y
+            to_left, to_right = min(max(-tip, upper), lower), min(max(tip, upper), lower)
+            half_left = math.sqrt(max(_ZERO, limit - (c * to_left) * (c * to_left)))
+            half_right = math.sqrt(max(_ZERO, limit - (c * to_right) * (c * to_right)))
+            left = _first_pixel(x - (half_left + b * to_left) / a, f4(width))
+            right = _last_pixel(x + (half_right - b * to_right) / a, f4(width))
+            spans[strip, 0] = np.int32(left) // TILE
+            spans[strip, 1] = np.int32(right) // TILE + 1 if right >= left else spans[strip, 0]
+            total += spans[strip, 1] - spans[strip, 0]
+        entries[i] = total
+
+
+@kernel
+def _sort_by_depth(depths: Array) -> Any:
+    """Return the order of positive depths, nearest first; equal ones stay in order."""
+    count, mask = depths.shape[0], (1 << _BITS) - 1
+    keys, order = depths.view(np.uint32).copy(), np.arange(count).astype(np.int32)
+    other_keys, other_order = np.empty_like(keys), np.empty_like(order)
+    for shift in range(0, 3 * _BITS, _BITS):  # the bits of positive floats are in the order of the floats
+        places = np.zeros(mask + 2, np.int64)
+        for i in range(count):
+            places[((keys[i] >> shift) & mask) + 1] += 1
+        for digit in range(mask):
+            places[digit + 1] += places[digit]
+        for i in range(count):
+            digit = (keys[i] >> shift) & mask
+            place = places[digit]
+            places[digit] = place + 1
+            other_keys[place], other_order[place] = keys[i], order[i]
+        keys, other_keys, order, other_order = other_keys, keys, other_order, order
+    return order
+
+
+@kernel
+def _count_entries(
+    first: int, last: int, order: Array, rows: Array, strips: Array, spans: Array, columns: int, counts: Array
+) -> None:
+    """Count the entries of every tile, part by part of the order of depth."""
+    for part in range(first, last):
+        count = counts[part]
+        for place in range(part * order.shape[0] // _PARTS, (part + 1) * order.shape[0] // _PARTS):
+            i = order[place]
+            for strip in range(strips[i], strips[i + 1]):
+                row = (rows[i] + strip - strips[i]) * columns
+                for tile in range(row + spans[strip, 0], row + spans[strip, 1]):
+                    count[tile] += 1
+
+
+@kernel
+def _fill_lists(
+    first: int, last: int, order: Array, rows: Array, strips: Array, spans: Array, columns: int, places: Array,
+    offsets: Array, gaussians: Array, slots: Array,
+) -> None:  # fmt: skip
+    """Append the Gaussians to the lists of their tiles."""
+    for part in range(first, last):
+        at = places[part]
+        for place in range(part * order.shape[0] // _PARTS, (part + 1) * order.shape[0] // _PARTS):
+            i = order[place]
+            slot = offsets[i]
+            for strip in range(strips[i], strips[i + 1]):
+                row = (rows[i] + strip - strips[i]) * columns
+                for tile in range(row + spans[strip, 0], row + spans[strip, 1]):
+                    gaussians[at[tile]] = i
+                    slots[at[tile]] = slot
+                    at[tile] += 1
+                    slot += 1
+
+
+def _ends(counts: Array) -> Array:
+    """Return where each of consecutive groups starts, and where the last ends."""
+    result = np.zeros(counts.shape[0] + 1, np.int64)
+    np.cumsum(counts, out=result[1:])
+    return result
+
+
+def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
+    """List the Gaussians of every tile: those whose 1/255 ellipse meets the rectangle of the tile's pixel centres.
+
+    Args:
+        projection: M projected Gaussians.
+        opacities: activated, shape (M,).
+        width: image width, pixels.
+        height: image height, pixels.
+    """
+    m, f, c, z = (x.detach().numpy() for x in projection)
+    o = opacities.detach().numpy()
+    count, columns, tiles = m.shape[0], -(-width // TILE), -(-width // TILE) * -(-height // TILE)
+    rows, counts, entries = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.int32)
+    in_threads(_count_strips, count, m, c, o, height, rows, counts, least=1024)
+    strips = _ends(counts)
+    spans = np.empty((strips[-1], 2), np.int32)
+    in_threads(_find_spans, count, m, f, c, o, width, height, rows, strips, spans, entries, least=1024)
+    offsets, order = _ends(entries), _sort_by_depth(z)
+    of_parts = np.zeros((_PARTS, tiles), np.int64)
+    in_threads(_count_entries, _PARTS, order, rows, strips, spans, columns, of_parts, least=1)
+    starts = _ends(of_parts.sum(0))
+    places = starts[:-1] + of_parts.cumsum(0) - of_parts
+    gaussians, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
+    in_threads(
+        _fill_lists, _PARTS, order, rows, strips, spans, columns, places, offsets, gaussians, slots, least=1
+    )
+    return TileLists(
+        width=width,
+        height=height,
+        starts=torch.from_numpy(starts),
+        gaussians=torch.from_numpy(gaussians),
+        touched=torch.from_numpy(entries > 0),
+        slots=torch.from_numpy(slots),
+        offsets=torch.from_numpy(offsets),
+    )

@@ -1,0 +1,68 @@
+"""The engine of compiled loops: float32 on a CPU, by hand-derived gradients, the same for any number of threads."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.checks import check_projection
+from reference_trainer.render.loops.binning import bin_gaussians
+from reference_trainer.render.loops.drawing import composite
+from reference_trainer.render.loops.moments import moments, shares
+from reference_trainer.render.loops.projection import project, visible
+from reference_trainer.render.splats import Projection, Splats
+
+__all__ = ["LoopEngine"]
+
+
+class LoopEngine:
+    """See `Engine`."""
+
+    name = "loops"
+
+    def splat(self, inputs: dict[str, Tensor], camera: Camera, degree: int) -> Splats:
+        """Cull, project, colour and list Gaussians."""
+        means, opacities = inputs["means"], inputs["opacities"]
+        colors = inputs["sh"] if "sh" in inputs else inputs["colors"][:, None]
+        indices, finite = visible(means.detach(), opacities.detach(), camera)
+        result = project(
+            means,
+            inputs["quaternions"],
+            inputs["scales"],
+            colors,
+            indices,
+            camera,
+            degree if "sh" in inputs else -1,
+        )
+        projection = Projection(result.means, result.factors, result.covariances, result.depths)
+        check_projection(finite and result.finite, projection, result.colors, inputs, camera)
+        if indices.shape[0] < opacities.shape[0]:
+            opacities = opacities.index_select(0, indices)
+        lists = bin_gaussians(projection, opacities, camera.width, camera.height)
+        return Splats(indices, projection, opacities, result.colors, lists, self)
+
+    def masked(self, splats: Splats, opacities: Tensor) -> Splats:
+        """Keep the lists: the loops pass over those that are too faint."""
+        return splats._replace(opacities=opacities)
+
+    def composite(
+        self, splats: Splats, background: Tensor, *, depth: bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Draw splats front to back; depth as the red of a second picture."""
+        geometry = (splats.projection.means, splats.projection.factors, splats.opacities)
+        image, light = composite(*geometry, splats.colors, background, splats.lists)
+        if not depth:
+            return image, 1 - light, None
+        red = torch.nn.functional.pad(splats.projection.depths[:, None], (0, 2))
+        return image, 1 - light, composite(*geometry, red, torch.zeros_like(background), splats.lists)[0][0]
+
+    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
+        """Composite mean and variance back to front."""
+        geometry = (splats.projection.means, splats.projection.factors, splats.opacities)
+        return moments(*geometry, splats.colors, multiplier, behind, splats.lists)
+
+    def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
+        """Sum the summands of the variance over the pixels."""
+        geometry = (splats.projection.means, splats.projection.factors, splats.opacities)
+        return shares(*geometry, splats.colors, multiplier, behind, weights, splats.lists)

@@ -1,0 +1,323 @@
+"""The recursion of the exact moments (`ca_reg.functional.pixel_moments`), tile by tile, its gradient, and the shares.
+
+Back to front, with ``d_i = c_i - mu_{i+1}`` the contrast of a splat with the mean of what is behind it:
+
+    mu_i = mu_{i+1} + m alpha_i d_i        V = sum_i spread_i S_i d_i^2        S_i = prod_{j<i} shrink_j
+
+where ``spread = v alpha^2`` and ``shrink = (1 - m alpha)^2 + spread``. Every term of V is a square times a non-negative
+weight: nothing cancels. The accumulated alpha is a fourth colour, 1 over 0; what it lacks of 1 is ``light``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reference_trainer.render.constants import MAX_ALPHA, TILE
+from reference_trainer.render.loops.arithmetic import PIXELS, X, Y
+from reference_trainer.render.loops.compiling import inlined, kernel
+from reference_trainer.render.loops.drawing import (
+    Rows,
+    alpha_at,
+    footprint,
+    footprint_gradient,
+    is_faint,
+    make_table,
+    row_sums,
+)
+from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.render.precision import without_autocast
+from reference_trainer.render.splats import TileLists
+
+__all__ = ["moments", "shares"]
+
+Array = Any
+f4 = np.float32
+_ZERO, _ONE, _TWO, _MAX, _THIRD = f4(0), f4(1), f4(2), f4(MAX_ALPHA), f4(1 / 3)
+
+
+@kernel
+def _forward(
+    first: int, last: int, starts: Array, gaussians: Array, table: Array, factors: Array, behind: Array, mean: Array,
+    variance: Array,
+) -> None:  # fmt: skip
+    _, height, width = behind.shape
+    columns = (width + TILE - 1) // TILE
+    m, v = np.empty((4, PIXELS), f4), np.empty((4, PIXELS), f4)
+    m0, m1, m2, light, v0, v1, v2, v3 = m[0], m[1], m[2], m[3], v[0], v[1], v[2], v[3]
+    for tile in range(first, last):
+        top, left = tile // columns * TILE, tile % columns * TILE
+        tile_x, tile_y = f4(left + TILE // 2), f4(top + TILE // 2)
+        for p in range(PIXELS):
+            y, x = top + p // TILE, left + p % TILE
+            inside = y < height and x < width
+            for c in range(3):
+                m[c, p] = behind[c, y, x] if inside else _ZERO
+            light[p] = _ONE
+            v0[p], v1[p], v2[p], v3[p] = _ZERO, _ZERO, _ZERO, _ZERO
+        for e in range(starts[tile + 1] - 1, starts[tile] - 1, -1):
+            i = gaussians[e]
+            if is_faint(table, i):
+                continue
+            polynomial = footprint(table, i, tile_x, tile_y)
+            r, g, b = table[i, 6], table[i, 7], table[i, 8]
+            factor, varies = factors[i, 0], factors[i, 1]
+            for p in range(PIXELS):
+                alpha = alpha_at(polynomial, X[p], Y[p])
+                alpha = alpha if alpha < _MAX else _MAX
+                expected, spread = factor * alpha, varies * alpha * alpha
+                passed = _ONE - expected
+                shrink = passed * passed + spread
+                d0, d1, d2, d3 = r - m0[p], g - m1[p], b - m2[p], light[p]
+                v0[p] = v0[p] * shrink + spread * d0 * d0
+                v1[p] = v1[p] * shrink + spread * d1 * d1
+                v2[p] = v2[p] * shrink + spread * d2 * d2
+                v3[p] = v3[p] * shrink + spread * d3 * d3
+                m0[p] += expected * d0
+                m1[p] += expected * d1
+                m2[p] += expected * d2
+                light[p] = passed * d3
+        for p in range(PIXELS):
+            y, x = top + p // TILE, left + p % TILE
+            if y < height and x < width:
+                for c in range(3):
+                    mean[c, y, x] = m[c, p]
+                mean[3, y, x] = _ONE - light[p]
+                for c in range(4):
+                    variance[c, y, x] = v[c, p]
+
+
+@kernel
+def _longest(first: int, last: int, starts: Array) -> int:
+    longest = 0
+    for tile in range(first, last):
+        longest = max(longest, starts[tile + 1] - starts[tile])
+    return longest
+
+
+@kernel
+def _backward(
+    first: int, last: int, starts: Array, gaussians: Array, slots: Array, table: Array, factors: Array, behind: Array,
+    to_mean: Array, to_variance: Array, rows: Array, to_behind: Array,
+) -> None:  # fmt: skip
+    """Carry gradients back: to what is in front of a splat by what is behind it, then to the splat itself.
+
+    With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
+    hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}: walked back to front, as division would fail at 0.
+    """
+    _, height, width = behind.shape
+    columns = (width + TILE - 1) // TILE
+    longest = _longest(first, last, starts)
+    kept = np.empty((longest, 6, PIXELS), f4)  # raw alpha, four contrasts, hidden
+    m, u, w = np.empty((4, PIXELS), f4), np.empty((4, PIXELS), f4), np.empty((4, PIXELS), f4)
+    hidden, front = np.empty(PIXELS, f4), np.empty(PIXELS, f4)
+    m0, m1, m2, light = m[0], m[1], m[2], m[3]
+    u0, u1, u2, u3 = u[0], u[1], u[2], u[3]
+    w0, w1, w2, w3 = w[0], w[1], w[2], w[3]
+    for tile in range(first, last):
+        top, left = tile // columns * TILE, tile % columns * TILE
+        tile_x, tile_y = f4(left + TILE // 2), f4(top + TILE // 2)
+        for p in range(PIXELS):
+            y, x = top + p // TILE, left + p % TILE
+            inside = y < height and x < width
+            for c in range(3):
+                m[c, p] = behind[c, y, x] if inside else _ZERO
+            for c in range(4):
+                u[c, p] = to_mean[c, y, x] if inside else _ZERO
+                w[c, p] = to_variance[c, y, x] if inside else _ZERO
+            light[p], hidden[p], front[p] = _ONE, _ZERO, _ONE
+        begin = starts[tile]
+        for k in range(starts[tile + 1] - begin - 1, -1, -1):
+            i = gaussians[begin + k]
+            if is_faint(table, i):
+                continue
+            polynomial = footprint(table, i, tile_x, tile_y)
+            r, g, b = table[i, 6], table[i, 7], table[i, 8]
+            factor, varies = factors[i, 0], factors[i, 1]
+            k0, k1, k2, k3, k4, k5 = kept[k, 0], kept[k, 1], kept[k, 2], kept[k, 3], kept[k, 4], kept[k, 5]
+            for p in range(PIXELS):
+                raw = alpha_at(polynomial, X[p], Y[p])
+                alpha = raw if raw < _MAX else _MAX
+                expected, spread = factor * alpha, varies * alpha * alpha
+                passed = _ONE - expected
+                d0, d1, d2, d3 = r - m0[p], g - m1[p], b - m2[p], light[p]
+                k0[p], k1[p], k2[p], k3[p], k4[p], k5[p] = raw, d0, d1, d2, d3, hidden[p]
+                weight = w0[p] * d0 * d0 + w1[p] * d1 * d1 + w2[p] * d2 * d2 + w3[p] * d3 * d3
+                hidden[p] = hidden[p] * (passed * passed + spread) + weight * spread
+                m0[p] += expected * d0
+                m1[p] += expected * d1
+                m2[p] += expected * d2
+                light[p] = passed * d3
+        for k in range(starts[tile + 1] - begin):
+            i = gaussians[begin + k]
+            row = rows[slots[begin + k]]
+            if is_faint(table, i):
+                row[:] = _ZERO
+                continue
+            factor, varies = factors[i, 0], factors[i, 1]
+            s, sx, sy, sxx, sxy, syy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+            to_r, to_g, to_b, to_factor, to_varies = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+            k0, k1, k2, k3, k4, k5 = kept[k, 0], kept[k, 1], kept[k, 2], kept[k, 3], kept[k, 4], kept[k, 5]
+            for p in range(PIXELS):
+                x, y = X[p], Y[p]
+                raw, d0, d1, d2, d3 = k0[p], k1[p], k2[p], k3[p], k4[p]
+                alpha = raw if raw < _MAX else _MAX
+                expected, spread = factor * alpha, varies * alpha * alpha
+                passed, product = _ONE - expected, front[p]
+                weight = w0[p] * d0 * d0 + w1[p] * d1 * d1 + w2[p] * d2 * d2 + w3[p] * d3 * d3
+                to_shrink = k5[p] * product
+                to_spread = weight * product + to_shrink
+                to_expected = u0[p] * d0 + u1[p] * d1 + u2[p] * d2 + u3[p] * d3 - _TWO * passed * to_shrink
+                twice = _TWO * product * spread
+                t0, t1 = u0[p] * expected + w0[p] * d0 * twice, u1[p] * expected + w1[p] * d1 * twice
+                t2, t3 = u2[p] * expected + w2[p] * d2 * twice, u3[p] * expected + w3[p] * d3 * twice
+                u0[p] -= t0
+                u1[p] -= t1
+                u2[p] -= t2
+                u3[p] -= t3
+                front[p] = product * (passed * passed + spread)
+                to_r += t0
+                to_g += t1
+                to_b += t2
+                to_factor += to_expected * alpha
+                to_varies += to_spread * alpha * alpha
+                d = raw * (_TWO * varies * to_spread * alpha + to_expected * factor)
+                s += d
+                sx += d * x
+                sy += d * y
+                sxx += d * x * x
+                sxy += d * x * y
+                syy += d * y * y
+            footprint_gradient(table, i, tile_x, tile_y, (s, sx, sy, sxx, sxy, syy), row)
+            row[6], row[7], row[8], row[9], row[10] = to_r, to_g, to_b, to_factor, to_varies
+        for p in range(PIXELS):
+            y, x = top + p // TILE, left + p % TILE
+            if y < height and x < width:
+                for c in range(3):
+                    to_behind[c, y, x] = u[c, p]
+
+
+@kernel
+def _shares(
+    first: int, last: int, starts: Array, gaussians: Array, slots: Array, table: Array, factors: Array, behind: Array,
+    weights: Array, rows: Array,
+) -> None:  # fmt: skip
+    """Sum the summands of the variance, mean over the colours, over the pixels of every tile."""
+    _, height, width = behind.shape
+    columns = (width + TILE - 1) // TILE
+    kept = np.empty((_longest(first, last, starts), 2, PIXELS), f4)  # alpha, squared contrast
+    m, front = np.empty((3, PIXELS), f4), np.empty(PIXELS, f4)
+    m0, m1, m2 = m[0], m[1], m[2]
+    for tile in range(first, last):
+        top, left = tile // columns * TILE, tile % columns * TILE
+        tile_x, tile_y = f4(left + TILE // 2), f4(top + TILE // 2)
+        for p in range(PIXELS):
+            y, x = top + p // TILE, left + p % TILE
+            inside = y < height and x < width
+            for c in range(3):
+                m[c, p] = behind[c, y, x] if inside else _ZERO
+            front[p] = weights[y, x] * _THIRD if inside else _ZERO
+        begin = starts[tile]
+        for k in range(starts[tile + 1] - begin - 1, -1, -1):
+            i = gaussians[begin + k]
+            if is_faint(table, i):
+                continue
+            polynomial = footprint(table, i, tile_x, tile_y)
+            r, g, b, factor = table[i, 6], table[i, 7], table[i, 8], factors[i, 0]
+            k0, k1 = kept[k, 0], kept[k, 1]
+            for p in range(PIXELS):
+                alpha = alpha_at(polynomial, X[p], Y[p])
+                alpha = alpha if alpha < _MAX else _MAX
+                d0, d1, d2 = r - m0[p], g - m1[p], b - m2[p]
+                k0[p], k1[p] = alpha, d0 * d0 + d1 * d1 + d2 * d2
+                m0[p] += factor * alpha * d0
+                m1[p] += factor * alpha * d1
+                m2[p] += factor * alpha * d2
+        for k in range(starts[tile + 1] - begin):
+            i = gaussians[begin + k]
+            total = 0.0
+            if not is_faint(table, i):
+                factor, varies = factors[i, 0], factors[i, 1]
+                for p in range(PIXELS):
+                    alpha, passed = kept[k, 0, p], _ONE - factor * kept[k, 0, p]
+                    spread = varies * alpha * alpha
+                    total += np.float64(front[p] * spread * kept[k, 1, p])
+                    front[p] *= passed * passed + spread
+            rows[slots[begin + k], 0] = total
+
+
+class _Moments(torch.autograd.Function):
+    """Mean and variance of red, green, blue and accumulated alpha, (4, H, W) each."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, multiplier: Tensor,
+        behind: Tensor, lists: TileLists,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        table, rows = make_table(means, factors, opacities, colors), Rows.of(lists)
+        mean, variance = (behind.new_empty(4, *behind.shape[1:]) for _ in range(2))
+        fixed = (table, multiplier.detach().contiguous().numpy(), behind.detach().contiguous().numpy())
+        arguments = (rows.starts, rows.gaussians, *fixed, mean.numpy(), variance.numpy())
+        in_threads(_forward, lists.columns * lists.rows, *arguments, least=4)
+        ctx.fixed, ctx.rows, ctx.lists = fixed, rows, lists
+        ctx.save_for_backward(opacities)
+        return mean, variance
+
+    @staticmethod
+    @without_autocast
+    def backward(ctx: Any, to_mean: Tensor, to_variance: Tensor) -> tuple[Tensor | None, ...]:
+        (opacities,), rows = ctx.saved_tensors, ctx.rows
+        to_rows = np.empty((rows.slots.shape[0], 11), f4)
+        to_behind = to_mean.new_empty(3, *to_mean.shape[1:])
+        upstream = (to_mean.contiguous().numpy(), to_variance.contiguous().numpy())
+        in_threads(_backward, ctx.lists.columns * ctx.lists.rows, *rows[:3], *ctx.fixed, *upstream, to_rows, to_behind.numpy(), least=4)
+        sums = opacities.new_empty(opacities.shape[0], 11)
+        in_threads(row_sums, opacities.shape[0], rows.offsets, to_rows, sums.numpy())
+        to_opacities = sums[:, 5] / opacities
+        return sums[:, :2], sums[:, 2:5], to_opacities, sums[:, 6:9], sums[:, 9:], to_behind, None
+
+
+def moments(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, multiplier: Tensor, behind: Tensor,
+    lists: TileLists,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Return mean and variance of every pixel under random factors on the alphas; differentiable.
+
+    Args:
+        means: pixel coordinates, shape (M, 2).
+        factors: of the inverse covariances, see `Projection`, shape (M, 3).
+        opacities: activated, shape (M,).
+        colors: shape (M, 3).
+        multiplier: mean and variance of every splat's factor, shape (M, 2).
+        behind: colours behind everything, shape (3, H, W).
+        lists: the splats of every tile.
+
+    Returns:
+        Mean and variance of red, green, blue and accumulated alpha, shape (4, H, W) each.
+    """
+    result: tuple[Tensor, Tensor] = _Moments.apply(means, factors, opacities, colors, multiplier, behind, lists)  # type: ignore[no-untyped-call]
+    return result
+
+
+def shares(
+    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, multiplier: Tensor, behind: Tensor,
+    weights: Tensor, lists: TileLists,
+) -> Tensor:  # fmt: skip
+    """Return every splat's share of the weighted variance of the pixels, shape (M,), float64.
+
+    Args:
+        means: as for `moments`, and so on to ``behind``.
+        weights: of the pixels, shape (H, W).
+        lists: the splats of every tile.
+    """
+    rows = Rows.of(lists)
+    images = (multiplier, behind, weights)
+    arguments = (make_table(means, factors, opacities, colors), *(x.detach().contiguous().numpy() for x in images))
+    of_rows = np.empty((rows.slots.shape[0], 1))
+    in_threads(_shares, lists.columns * lists.rows, *rows[:3], *arguments, of_rows, least=4)
+    sums = np.empty((opacities.shape[0], 1))
+    in_threads(row_sums, opacities.shape[0], rows.offsets, of_rows, sums)
+    return torch.from_numpy(sums[:, 0])

@@ -1,0 +1,320 @@
+"""From 3D Gaussians to coloured 2D ellipses, one Gaussian after the other; the formulas are those of `project`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
+from reference_trainer.render.loops.compiling import inlined, kernel
+from reference_trainer.render.loops.harmonics import basis, basis_gradient
+from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.render.precision import without_autocast
+
+__all__ = ["Projected", "project", "visible"]
+
+Array = Any
+f4 = np.float32
+_ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
+_DILATION, _NEAR, _MIN = f4(DILATION), f4(NEAR_PLANE), f4(MIN_ALPHA)
+_NO_DIRECTION = f4(1e-30)  # a quaternion well below this is taken for 0
+
+
+@kernel
+def _visible(first: int, last: int, means: Array, opacities: Array, view: Array, seen: Array) -> bool:
+    """Note who is in front of the near plane and not too faint; return whether all depths and opacities are finite."""
+    finite = True
+    for i in range(first, last):
+        depth = view[2, 0] * means[i, 0] + view[2, 1] * means[i, 1] + view[2, 2] * means[i, 2] + view[2, 3]
+        seen[i] = depth > _NEAR and opacities[i] >= _MIN
+        finite = finite and math.isfinite(depth + opacities[i])
+    return finite
+
+
+def visible(means: Tensor, opacities: Tensor, camera: Camera) -> tuple[Tensor, bool]:
+    """Return who can be seen, shape (M,), and whether all depths and opacities are finite.
+
+    Args:
+        means: world coordinates, shape (N, 3).
+        opacities: activated, shape (N,).
+        camera: the view.
+    """
+    seen = np.empty(means.shape[0], np.bool_)
+    arguments = (means.numpy(), opacities.numpy(), camera.world_to_camera.numpy(), seen)
+    finite = all(in_threads(_visible, means.shape[0], *arguments, least=4096))
+    return torch.from_numpy(np.flatnonzero(seen)), finite
+
+
+@inlined
+def _rotation(quaternions: Array, i: int) -> Any:
+    """Return the rotation matrix of a quaternion, its unit vector, and the factor that makes it one."""
+    w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
+    # Divided by the largest component first: the squares of the norm would overflow from 1e19 on, or underflow.
+    largest = max(max(abs(w), abs(x)), max(abs(y), abs(z)))
+    scale = _ONE / (largest if largest > _NO_DIRECTION else _NO_DIRECTION)
+    w, x, y, z = w * scale, x * scale, y * scale, z * scale
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    inverse = _ONE / norm if norm > f4(1e-12) else f4(1e12)
+    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+    matrix = (
+        _ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y),
+        _TWO * (x * y + w * z), _ONE - _TWO * (x * x + z * z), _TWO * (y * z - w * x),
+        _TWO * (x * z - w * y), _TWO * (y * z + w * x), _ONE - _TWO * (x * x + y * y),
+    )  # fmt: skip
+    return matrix, (w, x, y, z), scale * inverse
+
+
+@inlined
+def _dot(a: Any, b: Any) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def _cross(a: Any, b: Any) -> Any:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inlined
+def _plus(a: Any, scale: Any, b: Any) -> Any:
+    """Return a + scale b."""
+    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
+
+
+@inlined
+def _times(scale: Any, a: Any) -> Any:
+    return scale * a[0], scale * a[1], scale * a[2]
+
+
+@inlined
+def _clip(x: Any, limit: Any) -> Any:
+    return max(-limit, min(limit, x))
+
+
+@inlined
+def _in_camera(means: Array, i: int, view: Array) -> Any:
+    """Return a mean in the camera's frame."""
+    m = means[i, 0], means[i, 1], means[i, 2]
+    return _dot(view[0], m) + view[0, 3], _dot(view[1], m) + view[1, 3], _dot(view[2], m) + view[2, 3]
+
+
+@inlined
+def _axes(matrix: Any, row: Any, scales: Any) -> Any:
+    """Project the three scaled axes of a Gaussian on a row vector of the world."""
+    return (
+        scales[0] * (row[0] * matrix[0] + row[1] * matrix[3] + row[2] * matrix[6]),
+        scales[1] * (row[0] * matrix[1] + row[1] * matrix[4] + row[2] * matrix[7]),
+        scales[2] * (row[0] * matrix[2] + row[1] * matrix[5] + row[2] * matrix[8]),
+    )
+
+
+@inlined
+def _rows(slope_x: Any, slope_y: Any, z: Any, view: Array, lens: Array) -> Any:
+    """Return the two rows of (Jacobian x view rotation), linearised at slopes within the limits."""
+    forward = view[2, 0], view[2, 1], view[2, 2]
+    row_x = _times(lens[0] / z, _plus((view[0, 0], view[0, 1], view[0, 2]), -_clip(slope_x, lens[4]), forward))
+    row_y = _times(lens[1] / z, _plus((view[1, 0], view[1, 1], view[1, 2]), -_clip(slope_y, lens[5]), forward))
+    return row_x, row_y
+
+
+@inlined
+def _towards(means: Array, i: int, position: Array) -> Any:
+    """Return the unit vector from the camera to a mean, and one over their distance."""
+    x, y, z = means[i, 0] - position[0], means[i, 1] - position[1], means[i, 2] - position[2]
+    distance = math.sqrt(x * x + y * y + z * z)
+    inverse = _ONE / max(distance, f4(1e-12))
+    return (x * inverse, y * inverse, z * inverse), inverse
+
+
+@kernel
+def _forward(
+    first: int, last: int, indices: Array, means: Array, quaternions: Array, scales: Array, sh: Array, degree: int,
+    view: Array, lens: Array, position: Array, centers: Array, factors: Array, covariances: Array, depths: Array,
+    colors: Array,
+) -> bool:  # fmt: skip
+    """Project and colour; return whether all results are finite."""
+    finite = True
+    values = np.empty(16, f4)
+    for k in range(first, last):
+        i = indices[k]
+        x, y, z = _in_camera(means, i, view)
+        row_x, row_y = _rows(x / z, y / z, z, view, lens)
+        matrix, _, _ = _rotation(quaternions, i)
+        ux, uy = _axes(matrix, row_x, scales[i]), _axes(matrix, row_y, scales[i])
+        xx, xy, yy = _dot(ux, ux) + _DILATION, _dot(ux, uy), _dot(uy, uy) + _DILATION
+        l22 = _ONE / math.sqrt(yy)
+        cross = _cross(ux, _times(l22, uy))
+        l11 = _ONE / math.sqrt(_dot(cross, cross) + _DILATION * (xx + yy - _DILATION) * (l22 * l22))
+        centers[k, 0], centers[k, 1] = lens[0] * (x / z) + lens[2], lens[1] * (y / z) + lens[3]
+        factors[k, 0], factors[k, 1], factors[k, 2] = l11, -xy * (l22 * l22) * l11, l22
+        covariances[k, 0], covariances[k, 1], covariances[k, 2] = xx, xy, yy
+        depths[k] = z
+        if degree < 0:
+            for c in range(3):
+                colors[k, c] = sh[i, 0, c]
+        else:
+            direction, _ = _towards(means, i, position)
+            basis(direction[0], direction[1], direction[2], degree, values)
+            for c in range(3):
+                color = _HALF
+                for j in range((degree + 1) * (degree + 1)):
+                    color += values[j] * sh[i, j, c]
+                colors[k, c] = color if not color < _ZERO else _ZERO
+        total = centers[k, 0] + centers[k, 1] + xx + xy + yy + colors[k, 0] + colors[k, 1] + colors[k, 2]
+        finite = finite and math.isfinite(total)
+    return finite
+
+
+@kernel
+def _backward(
+    first: int, last: int, indices: Array, means: Array, quaternions: Array, scales: Array, sh: Array, degree: int,
+    view: Array, lens: Array, position: Array, colors: Array, to_centers: Array, to_factors: Array, to_depths: Array,
+    to_colors: Array, to_means: Array, to_quaternions: Array, to_scales: Array, to_sh: Array,
+) -> None:  # fmt: skip
+    """Carry gradients back to the Gaussians."""
+    values = np.empty(16, f4)
+    for k in range(first, last):
+        i = indices[k]
+        x, y, z = _in_camera(means, i, view)
+        slope_x, slope_y = x / z, y / z
+        row_x, row_y = _rows(slope_x, slope_y, z, view, lens)
+        matrix, (qw, qx, qy, qz), scale = _rotation(quaternions, i)
+        s = scales[i]
+        ux, uy = _axes(matrix, row_x, s), _axes(matrix, row_y, s)
+        xx, xy, yy = _dot(ux, ux) + _DILATION, _dot(ux, uy), _dot(uy, uy) + _DILATION
+        l22 = _ONE / math.sqrt(yy)
+        w = _times(l22, uy)
+        cross = _cross(ux, w)
+        spread = _DILATION * (xx + yy - _DILATION)
+        l11 = _ONE / math.sqrt(_dot(cross, cross) + spread * (l22 * l22))
+        # l21 = -xy l22^2 l11, l11 = (cross^2 + spread l22^2)^(-1/2), l22 = yy^(-1/2)
+        to_l11 = to_factors[k, 0] - to_factors[k, 1] * xy * l22 * l22
+        to_xy = -to_factors[k, 1] * l22 * l22 * l11
+        to_square = -_HALF * l11 * l11 * l11 * to_l11
+        to_cross = _times(_TWO * to_square, cross)
+        to_w = _cross(to_cross, ux)
+        to_l22 = (
+            to_factors[k, 2] - _TWO * to_factors[k, 1] * xy * l22 * l11 + _TWO * spread * l22 * to_square
+            + _dot(to_w, uy)
+        )  # fmt: skip
+        to_xx = _DILATION * l22 * l22 * to_square
+        to_yy = to_xx - _HALF * l22 * l22 * l22 * to_l22
+        to_ux = _plus(_plus(_cross(w, to_cross), _TWO * to_xx, ux), to_xy, uy)
+        to_uy = _plus(_plus(_times(l22, to_w), _TWO * to_yy, uy), to_xy, ux)
+        # u_j = scale_j sum_k row_k matrix_kj, for both rows
+        vx, vy = (to_ux[0] * s[0], to_ux[1] * s[1], to_ux[2] * s[2]), (to_uy[0] * s[0], to_uy[1] * s[1], to_uy[2] * s[2])
+        to_row_x = _dot(matrix[0:3], vx), _dot(matrix[3:6], vx), _dot(matrix[6:9], vx)
+        to_row_y = _dot(matrix[0:3], vy), _dot(matrix[3:6], vy), _dot(matrix[6:9], vy)
+        for j in range(3):
+            column = (matrix[j], matrix[3 + j], matrix[6 + j])
+            to_scales[i, j] = to_ux[j] * _dot(row_x, column) + to_uy[j] * _dot(row_y, column)
+        r0, r1, r2 = (
+            _plus(_times(row_x[0], vx), row_y[0], vy),
+            _plus(_times(row_x[1], vx), row_y[1], vy),
+            _plus(_times(row_x[2], vx), row_y[2], vy),
+        )
+        to_w_ = _TWO * (qz * (r1[0] - r0[1]) + qy * (r0[2] - r2[0]) + qx * (r2[1] - r1[2]))
+        to_x_ = _TWO * (qy * (r0[1] + r1[0]) + qz * (r0[2] + r2[0]) + qw * (r2[1] - r1[2]) - _TWO * qx * (r1[1] + r2[2]))
+        to_y_ = _TWO * (qx * (r0[1] + r1[0]) + qz * (r1[2] + r2[1]) + qw * (r0[2] - r2[0]) - _TWO * qy * (r0[0] + r2[2]))
+        to_z_ = _TWO * (qx * (r0[2] + r2[0]) + qy * (r1[2] + r2[1]) + qw * (r1[0] - r0[1]) - _TWO * qz * (r0[0] + r1[1]))
+        along = qw * to_w_ + qx * to_x_ + qy * to_y_ + qz * to_z_  # a quaternion's length does not matter
+        to_quaternions[i, 0] = scale * (to_w_ - along * qw)
+        to_quaternions[i, 1] = scale * (to_x_ - along * qx)
+        to_quaternions[i, 2] = scale * (to_y_ - along * qy)
+        to_quaternions[i, 3] = scale * (to_z_ - along * qz)
+        # row = f / z (axis - clipped slope forward); centre = f slope + c
+        forward = view[2, 0], view[2, 1], view[2, 2]
+        to_slope_x, to_slope_y = lens[0] * to_centers[k, 0], lens[1] * to_centers[k, 1]
+        if abs(slope_x) <= lens[4]:
+            to_slope_x -= lens[0] / z * _dot(forward, to_row_x)
+        if abs(slope_y) <= lens[5]:
+            to_slope_y -= lens[1] / z * _dot(forward, to_row_y)
+        to_z = to_depths[k] - (_dot(row_x, to_row_x) + _dot(row_y, to_row_y)) / z
+        to_z -= (slope_x * to_slope_x + slope_y * to_slope_y) / z
+        to_x, to_y = to_slope_x / z, to_slope_y / z
+        for j in range(3):
+            to_means[i, j] = view[0, j] * to_x + view[1, j] * to_y + view[2, j] * to_z
+        if degree < 0:
+            for c in range(3):
+                to_sh[i, 0, c] = to_colors[k, c]
+            continue
+        r = to_colors[k, 0] if colors[k, 0] > _ZERO else _ZERO
+        g = to_colors[k, 1] if colors[k, 1] > _ZERO else _ZERO
+        b = to_colors[k, 2] if colors[k, 2] > _ZERO else _ZERO
+        (dx, dy, dz), inverse = _towards(means, i, position)
+        basis(dx, dy, dz, degree, values)
+        for j in range((degree + 1) * (degree + 1)):
+            to_sh[i, j, 0], to_sh[i, j, 1], to_sh[i, j, 2] = values[j] * r, values[j] * g, values[j] * b
+            values[j] = r * sh[i, j, 0] + g * sh[i, j, 1] + b * sh[i, j, 2]
+        tx, ty, tz = basis_gradient(dx, dy, dz, degree, values)
+        along = dx * tx + dy * ty + dz * tz
+        to_means[i, 0] += inverse * (tx - along * dx)
+        to_means[i, 1] += inverse * (ty - along * dy)
+        to_means[i, 2] += inverse * (tz - along * dz)
+
+
+class Projected(NamedTuple):
+    """M Gaussians that a camera may see; see `Projection`, and `Splats` for the colours."""
+
+    means: Tensor
+    factors: Tensor
+    covariances: Tensor
+    depths: Tensor
+    colors: Tensor
+    finite: bool
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, indices: Tensor, camera: Camera,
+        degree: int,
+    ) -> tuple[Any, ...]:  # fmt: skip
+        count = indices.shape[0]
+        limits = (FRUSTUM_MARGIN * 0.5 * size / f for size, f in ((camera.width, camera.fx), (camera.height, camera.fy)))
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *limits], f4)
+        inputs = (indices, means, quaternions, scales, sh)
+        ctx.arguments = (
+            *(x.detach().contiguous().numpy() for x in inputs), degree, camera.world_to_camera.numpy(), lens,
+            camera.position.numpy(),
+        )  # fmt: skip
+        centers, factors, covariances, depths, colors = (
+            means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,))
+        )
+        outputs = (centers, factors, covariances, depths, colors)
+        finite = all(in_threads(_forward, count, *ctx.arguments, *(x.numpy() for x in outputs), least=1024))
+        ctx.save_for_backward(colors)
+        ctx.mark_non_differentiable(covariances)
+        return (*outputs, finite)
+
+    @staticmethod
+    @without_autocast
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
+        (colors,) = ctx.saved_tensors
+        to_centers, to_factors, _, to_depths, to_colors, _ = gradients
+        upstream = tuple(x.contiguous().numpy() for x in (colors, to_centers, to_factors, to_depths, to_colors))
+        inputs = [torch.zeros(x.shape) for x in ctx.arguments[1:5]]
+        outputs = tuple(x.numpy() for x in inputs)
+        in_threads(_backward, colors.shape[0], *ctx.arguments, *upstream, *outputs, least=1024)
+        return (*inputs, None, None, None)
+
+
+def project(
+    means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, indices: Tensor, camera: Camera, degree: int
+) -> Projected:
+    """Project some of N Gaussians and evaluate their colours.
+
+    Args:
+        means: world coordinates, shape (N, 3).
+        quaternions: orientation, shape (N, 4).
+        scales: standard deviations along the axes, positive, shape (N, 3).
+        sh: spherical-harmonic coefficients, shape (N, K, 3), or colours, shape (N, 1, 3).
+        indices: which of them, all in front of the camera, shape (M,).
+        camera: the view.
+        degree: highest band of ``sh``; -1 if these are colours.
+    """
+    return Projected(*_Project.apply(means, quaternions, scales, sh, indices, camera, degree))  # type: ignore[no-untyped-call]

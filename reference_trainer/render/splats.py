@@ -1,0 +1,168 @@
+"""What the engines hand on: projected Gaussians, the lists of the tiles, and a rendered view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from reference_trainer.render.constants import TILE
+
+if TYPE_CHECKING:
+    from reference_trainer.render.engine import Engine
+
+__all__ = ["MomentImages", "Projection", "Rendering", "Splats", "TileLists", "screen_radii"]
+
+_SMALLEST_SPREAD = 0.1**0.5  # px^2: half the difference of the variances along the axes is taken for no less
+
+
+def screen_radii(covariances: Tensor) -> Tensor:
+    """Three standard deviations of the longer axis, rounded up; as in the INRIA code, more for round splats.
+
+    Args:
+        covariances: ``(xx, xy, yy)``, square pixels, shape (M, 3).
+
+    Returns:
+        Radii in pixels, shape (M,), of the type of the covariances.
+
+    Example:
+        >>> screen_radii(torch.tensor([[1.0, 0.0, 1.0], [9.0, 0.0, 1.0]])).tolist()  # 3 sqrt(1.32), 3 sqrt(9)
+        [4.0, 9.0]
+    """
+    xx, xy, yy = covariances.unbind(-1)
+    spread = torch.hypot(0.5 * (xx - yy), xy).clamp_min(_SMALLEST_SPREAD)
+    return torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt())
+
+
+class Projection(NamedTuple):
+    """Projected Gaussians.
+
+    The inverse 2D covariance is kept as its triangular factor: the squared Mahalanobis distance of an offset (dx, dy)
+    is ``(l11 dx + l21 dy)^2 + (l22 dy)^2``. The inverse covariance of a needle at 45 degrees has large entries that
+    cancel; its factor does not cancel, so float32 is enough.
+
+    Args:
+        means: pixel coordinates, shape (M, 2).
+        factors: ``(l11, l21, l22)``, shape (M, 3).
+        covariances: ``(xx, xy, yy)`` of the dilated 2D covariance, square pixels, shape (M, 3).
+        depths: along the camera's z axis, shape (M,).
+    """
+
+    means: Tensor
+    factors: Tensor
+    covariances: Tensor
+    depths: Tensor
+
+    @property
+    def radii(self) -> Tensor:
+        """See `screen_radii`; shape (M,)."""
+        return screen_radii(self.covariances.detach())
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """For every tile the Gaussians that can reach `MIN_ALPHA` at one of its pixels, nearest first.
+
+    Args:
+        width: image width, pixels.
+        height: image height, pixels.
+        starts: where each tile's list starts, row by row over the image, and where the last ends, shape (tiles + 1,).
+        gaussians: their numbers, tile after tile, shape (P,).
+        touched: whether a Gaussian is in any list, shape (M,) bool.
+        slots: of every entry a number of its own, those of a Gaussian in sequence, shape (P,); the loops need them.
+        offsets: the first of each Gaussian's numbers, and the count of all, shape (M + 1,); likewise.
+    """
+
+    width: int
+    height: int
+    starts: Tensor
+    gaussians: Tensor
+    touched: Tensor
+    slots: Tensor | None = None
+    offsets: Tensor | None = None
+
+    @property
+    def columns(self) -> int:
+        """Tiles in a row of the image."""
+        return -(-self.width // TILE)
+
+    @property
+    def rows(self) -> int:
+        """Tiles in a column of the image."""
+        return -(-self.height // TILE)
+
+    @property
+    def lengths(self) -> Tensor:
+        """List length of each tile, shape (tiles,)."""
+        return self.starts.diff()
+
+    def only(self, kept: Tensor) -> TileLists:
+        """Return the lists without some Gaussians; without the numbers that the loops need.
+
+        Args:
+            kept: whether a Gaussian stays, shape (M,) bool.
+        """
+        stays = kept[self.gaussians]
+        before = torch.nn.functional.pad(stays.cumsum(0), (1, 0))
+        return replace(
+            self,
+            starts=before[self.starts],
+            gaussians=self.gaussians[stays],
+            touched=self.touched & kept,
+            slots=None,
+            offsets=None,
+        )
+
+
+class Splats(NamedTuple):
+    """Gaussians made ready for one camera: projected, coloured, and listed per tile.
+
+    Args:
+        indices: which of the N Gaussians were projected, shape (M,).
+        projection: their ellipses.
+        opacities: activated, shape (M,).
+        colors: towards this camera, shape (M, 3).
+        lists: the splats of every tile.
+        engine: what made them, and draws them.
+    """
+
+    indices: Tensor
+    projection: Projection
+    opacities: Tensor
+    colors: Tensor
+    lists: TileLists
+    engine: Engine
+
+
+class Rendering(NamedTuple):
+    """A rendered view.
+
+    Args:
+        image: colours over the background, not clamped, shape (3, H, W).
+        alpha: accumulated alpha, shape (H, W).
+        depth: sum of weight times camera depth, not divided by alpha, shape (H, W); None unless asked for.
+        splats: what was drawn. ``splats.projection.means`` keeps its gradient (pixels) for densification.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    depth: Tensor | None
+    splats: Splats
+
+
+class MomentImages(NamedTuple):
+    """Moments of every pixel over the random factors.
+
+    Args:
+        mean: expected colours over the background, shape (3, H, W).
+        variance: variances of the colours, shape (3, H, W), at least 0.
+        alpha_mean: expected accumulated alpha, shape (H, W); None if it was not asked for.
+        alpha_variance: its variance, shape (H, W); likewise.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    alpha_mean: Tensor | None
+    alpha_variance: Tensor | None
