@@ -22,6 +22,7 @@ Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
 Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="")]
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
 Given = Annotated[frozenset[str], tyro.conf.Suppress]  # filled in from the command line itself, see given_fields
+EngineChoice = Literal["auto", "torch", "loops"]
 Strategy = Literal["baseline", "dropout", "noise", "both", "analytic-dropout", "analytic-noise"]
 
 
@@ -80,8 +81,8 @@ class Train:
     given: Given = frozenset()
     device: str = "cpu"
     """"cpu" or "cuda"."""
-    compile: bool = False
-    """Compile the exact moments (of analytic training): half a minute at first, then twice as fast."""
+    engine: EngineChoice = "auto"
+    """What draws: "loops" (compiled, float32 on a CPU), "torch" (anything), or whichever fits."""
     monitor_every: int = 500
     """Steps between measurements of CA and PSNR for TensorBoard; 0 for none."""
     lpips: str | None = None
@@ -91,7 +92,7 @@ class Train:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.render.compiled import use_compiled
+        from reference_trainer.render import use_engine
         from reference_trainer.runs.run import run_experiment, summary
         from reference_trainer.training.determinism import deterministic
 
@@ -100,7 +101,7 @@ class Train:
                 "--deterministic needs --renderer torch: gsplat's kernels add gradients in whatever order they come, "
                 "which PyTorch cannot change."
             )
-        use_compiled(self.compile)
+        use_engine(self.engine)
         with deterministic(self.device) if self.deterministic else nullcontext():
             results = run_experiment(
                 self.scene,

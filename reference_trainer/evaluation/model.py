@@ -11,9 +11,16 @@ from ca_reg import CAScore, RenderFn
 from ca_reg.functional import Multiplier, expected_opacity
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render import Rendering, Splats, draw, masked, splat
-from reference_trainer.render.moments import variance_shares
-from reference_trainer.render import MomentImages, render_moments
+from reference_trainer.render import (
+    MomentImages,
+    Rendering,
+    Splats,
+    draw,
+    masked,
+    render_moments,
+    splat,
+    variance_shares,
+)
 from reference_trainer.scenes.scene import View
 
 __all__ = ["MaskedRenders", "Model"]

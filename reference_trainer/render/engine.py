@@ -45,9 +45,7 @@ class Engine(Protocol):
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
         """Return splats with opacities (M,) that are nowhere higher; those below `MIN_ALPHA` cost nothing."""
 
-    def composite(
-        self, splats: Splats, background: Tensor, *, depth: bool
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draw splats front to back over a background (3,): image (3, H, W), alpha (H, W), depth (H, W) if asked."""
 
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
@@ -75,7 +73,7 @@ def use_engine(name: str) -> None:
     """Choose the engine of this process and of those that it starts (through the environment, ``CA_REG_ENGINE``).
 
     Args:
-        name: ``torch`` or ``loops``; ``auto``, the default, takes the loops for float32 on a CPU where numba is installed.
+        name: ``torch``, ``loops``, or ``auto``, the default: the loops for float32 on a CPU where numba is installed.
 
     Raises:
         ValueError: if there is no such engine.
@@ -90,7 +88,7 @@ def use_engine(name: str) -> None:
     if name not in ENGINES:
         raise ValueError(f"there is no engine {name!r}; choose one of {', '.join(ENGINES)}.")
     if name == "loops" and not _has_numba():
-        raise ImportError("the engine of compiled loops needs numba: pip install 'ca_reg[trainer]', or use --engine torch.")
+        raise ImportError("the compiled loops need numba: pip install 'ca_reg[trainer]', or use the engine torch.")
     os.environ[_VARIABLE] = name
 
 

@@ -93,7 +93,7 @@ def variance_shares(
 
 
 def _behind(background: Tensor | None, splats: Splats) -> Tensor:
-    """Return the colours behind the last splat, (3, H, W), of one colour (3,), one for each pixel, or None for black."""
+    """Return what is behind the last splat, (3, H, W), given one colour (3,), one for each pixel, or None for black."""
     shape = (3, splats.lists.height, splats.lists.width)
     if background is None:
         return splats.colors.new_zeros(shape)

@@ -10,8 +10,7 @@ from ca_reg import CAPenalty
 from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.render import Splats, splat
-from reference_trainer.render import MomentImages, render_moments
+from reference_trainer.render import MomentImages, Splats, render_moments, splat
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["ExpectedRender", "multiplier_of", "render_expectation"]

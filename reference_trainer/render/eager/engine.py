@@ -49,9 +49,7 @@ class TorchEngine:
         """Take those that are too faint out of the lists."""
         return splats._replace(opacities=opacities, lists=splats.lists.only(opacities >= MIN_ALPHA))
 
-    def composite(
-        self, splats: Splats, background: Tensor, *, depth: bool
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draw splats front to back."""
         values = [splats.colors.T, splats.projection.depths[None]] if depth else [splats.colors.T]
         shape = (splats.lists.height, splats.lists.width)

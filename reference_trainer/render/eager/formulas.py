@@ -1,7 +1,7 @@
 """The formulas of compositing, tile by tile: what is drawn, its exact moments, their shares, and two statistics.
 
-Each takes a `Block`, the rows of its entries and what is behind its tiles, and is differentiated by PyTorch. ``T`` tiles
-of 64 pixels, ``L`` entries of each, nearest first.
+Each takes a `Block`, the rows of its entries and what is behind its tiles, and is differentiated by PyTorch. There are
+T tiles of 64 pixels with L entries each, nearest first.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from ca_reg.functional import color_variance
 from reference_trainer.render.constants import MAX_ALPHA, MIN_TRANSMITTANCE
 from reference_trainer.render.eager.walk import Block
 
-__all__ = ["blend_weights", "color_variances", "composite", "first_order", "moments", "summands"]
+__all__ = ["blend_weights", "color_variances", "composite", "first_order", "moments", "over", "summands"]
 
 
 def _clamped(raw: Tensor) -> Tensor:
@@ -60,10 +60,20 @@ def composite(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
         rows: geometry and values of the entries, shape (6 + C, T, L).
         behind: shape (T, C, 64).
     """
-    weights = blend_weights(block.alphas(rows[:6]))
+    return over(blend_weights(block.alphas(rows[:6])), rows[6:], behind)
+
+
+def over(weights: Tensor, values: Tensor, behind: Tensor) -> Tensor:
+    """Return what splats show over what is behind them, and the accumulated alpha, (T, C + 1, 64).
+
+    Args:
+        weights: of the splats, shape (T, 64, L).
+        values: of the splats, shape (C, T, L).
+        behind: shape (T, C, 64), or one that broadcasts to it.
+    """
     alpha = weights.sum(-1)[:, None]
-    values = rows[6:].transpose(0, 1) @ weights.transpose(1, 2)
-    return torch.cat([values + (1 - alpha) * behind, alpha], dim=1)
+    shown = values.transpose(0, 1) @ weights.transpose(1, 2)
+    return torch.cat([shown + (1 - alpha) * behind, alpha], dim=1)
 
 
 def _random(block: Block, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -18,7 +17,7 @@ from reference_trainer.render.constants import BLOCK_PAIRS_CPU, BLOCK_PAIRS_CUDA
 from reference_trainer.render.precision import without_autocast
 from reference_trainer.render.splats import Splats, TileLists
 
-__all__ = ["PIXELS", "Block", "blocks", "geometry_rows", "pad_entries", "tile", "untile", "walk"]
+__all__ = ["PIXELS", "Block", "blocks", "geometry_rows", "pad_entries", "pixel_offsets", "tile", "untile", "walk"]
 
 PIXELS = TILE * TILE
 _ABSENT = -1e4  # binary logarithm of the opacity of padding: its alpha is exactly 0
@@ -65,16 +64,21 @@ class Block(NamedTuple):
             ],
             dim=1,
         )
-        exponents = _monomials(geometry.dtype, geometry.device) @ polynomial
+        exponents = _monomials(geometry) @ polynomial
         return torch.nn.functional.threshold(exponents, math.log2(MIN_ALPHA), -math.inf).exp2()
 
 
-@lru_cache(maxsize=8)
-def _monomials(dtype: torch.dtype, device: torch.device) -> Tensor:
+def pixel_offsets(like: Tensor) -> Tensor:
+    """Return x and y of a tile's pixels from its centre, in the dtype and on the device of a tensor, (2, 64, 1)."""
+    axis = torch.arange(TILE, dtype=like.dtype, device=like.device) - (TILE - 1) / 2
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    return torch.stack([x, y]).view(2, PIXELS, 1)
+
+
+def _monomials(like: Tensor) -> Tensor:
     """Evaluate 1, x, y, x^2, x y, y^2 at a tile's pixels, measured from its centre, shape (64, 6)."""
-    axis = torch.arange(TILE, dtype=dtype, device=device) - (TILE - 1) / 2
-    y, x = (grid.reshape(-1) for grid in torch.meshgrid(axis, axis, indexing="ij"))
-    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
+    x, y = pixel_offsets(like)
+    return torch.cat([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
 
 
 def geometry_rows(splats: Splats) -> Tensor:
@@ -124,12 +128,11 @@ class _Walk(torch.autograd.Function):
     """A formula block by block, whose gradient is taken of one block after the other."""
 
     @staticmethod
-    def forward(
-        ctx: Any, formula: Formula, rows: Tensor, behind: Tensor, lists: TileLists, extra: int
-    ) -> Tensor:
+    def forward(ctx: Any, formula: Formula, rows: Tensor, behind: Tensor, lists: TileLists, extra: int) -> Tensor:
         entries, tiles = pad_entries(rows), tile(behind, lists)
         result = torch.nn.functional.pad(tiles, (0, 0, 0, extra))
-        for block in blocks(lists, rows.device):
+        ctx.blocks = list(blocks(lists, rows.device))
+        for block in ctx.blocks:
             result[block.tiles] = formula(block, entries[:, block.gaussians], tiles[block.tiles])
         ctx.formula, ctx.lists = formula, lists
         ctx.save_for_backward(rows, behind)
@@ -142,7 +145,7 @@ class _Walk(torch.autograd.Function):
         lists: TileLists = ctx.lists
         entries, tiles, upstream = pad_entries(rows), tile(behind, lists), tile(gradients[0], lists)
         to_entries, to_tiles = torch.zeros_like(entries), upstream[:, : behind.shape[0]].clone()
-        for block in blocks(lists, rows.device):
+        for block in ctx.blocks:
             inputs = [x.detach().requires_grad_() for x in (entries[:, block.gaussians], tiles[block.tiles])]
             with torch.enable_grad():
                 result = ctx.formula(block, *inputs)

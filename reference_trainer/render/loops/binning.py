@@ -167,9 +167,7 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
     starts = _ends(of_parts.sum(0))
     places = starts[:-1] + of_parts.cumsum(0) - of_parts
     gaussians, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
-    in_threads(
-        _fill_lists, _PARTS, order, rows, strips, spans, columns, places, offsets, gaussians, slots, least=1
-    )
+    in_threads(_fill_lists, _PARTS, order, rows, strips, spans, columns, places, offsets, gaussians, slots, least=1)
     return TileLists(
         width=width,
         height=height,

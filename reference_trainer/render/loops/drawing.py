@@ -48,7 +48,8 @@ class Rows(NamedTuple):
     @classmethod
     def of(cls, lists: TileLists) -> Rows:
         """Return the arrays of lists that were made by the loops."""
-        assert lists.slots is not None and lists.offsets is not None
+        assert lists.slots is not None
+        assert lists.offsets is not None
         return cls(*(x.numpy() for x in (lists.starts, lists.gaussians, lists.slots, lists.offsets)))
 
 

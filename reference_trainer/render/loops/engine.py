@@ -46,9 +46,7 @@ class LoopEngine:
         """Keep the lists: the loops pass over those that are too faint."""
         return splats._replace(opacities=opacities)
 
-    def composite(
-        self, splats: Splats, background: Tensor, *, depth: bool
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draw splats front to back; depth as the red of a second picture."""
         geometry = (splats.projection.means, splats.projection.factors, splats.opacities)
         image, light = composite(*geometry, splats.colors, background, splats.lists)

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.render.constants import MAX_ALPHA, TILE
+from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
 from reference_trainer.render.loops.arithmetic import PIXELS, X, Y
-from reference_trainer.render.loops.compiling import inlined, kernel
+from reference_trainer.render.loops.compiling import kernel
 from reference_trainer.render.loops.drawing import (
     Rows,
     alpha_at,
@@ -282,10 +282,19 @@ class _Moments(torch.autograd.Function):
         to_rows = np.empty((rows.slots.shape[0], 11), f4)
         to_behind = to_mean.new_empty(3, *to_mean.shape[1:])
         upstream = (to_mean.contiguous().numpy(), to_variance.contiguous().numpy())
-        in_threads(_backward, ctx.lists.columns * ctx.lists.rows, *rows[:3], *ctx.fixed, *upstream, to_rows, to_behind.numpy(), least=4)
+        in_threads(
+            _backward,
+            ctx.lists.columns * ctx.lists.rows,
+            *rows[:3],
+            *ctx.fixed,
+            *upstream,
+            to_rows,
+            to_behind.numpy(),
+            least=4,
+        )
         sums = opacities.new_empty(opacities.shape[0], 11)
         in_threads(row_sums, opacities.shape[0], rows.offsets, to_rows, sums.numpy())
-        to_opacities = sums[:, 5] / opacities
+        to_opacities = sums[:, 5] / opacities.clamp_min(MIN_ALPHA)
         return sums[:, :2], sums[:, 2:5], to_opacities, sums[:, 6:9], sums[:, 9:], to_behind, None
 
 
@@ -318,7 +327,12 @@ def shares(
     """Return every splat's share of the weighted variance of the pixels, shape (M,), float64.
 
     Args:
-        means: as for `moments`, and so on to ``behind``.
+        means: pixel coordinates, shape (M, 2).
+        factors: of the inverse covariances, see `Projection`, shape (M, 3).
+        opacities: activated, shape (M,).
+        colors: shape (M, 3).
+        multiplier: mean and variance of every splat's factor, shape (M, 2).
+        behind: colours behind everything, shape (3, H, W).
         weights: of the pixels, shape (H, W).
         lists: the splats of every tile.
     """

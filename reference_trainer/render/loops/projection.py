@@ -45,7 +45,12 @@ def visible(means: Tensor, opacities: Tensor, camera: Camera) -> tuple[Tensor, b
         camera: the view.
     """
     seen = np.empty(means.shape[0], np.bool_)
-    arguments = (means.numpy(), opacities.numpy(), camera.world_to_camera.numpy(), seen)
+    arguments = (
+        means.contiguous().numpy(),
+        opacities.contiguous().numpy(),
+        camera.world_to_camera.contiguous().numpy(),
+        seen,
+    )
     finite = all(in_threads(_visible, means.shape[0], *arguments, least=4096))
     return torch.from_numpy(np.flatnonzero(seen)), finite
 
@@ -206,7 +211,10 @@ def _backward(
         to_ux = _plus(_plus(_cross(w, to_cross), _TWO * to_xx, ux), to_xy, uy)
         to_uy = _plus(_plus(_times(l22, to_w), _TWO * to_yy, uy), to_xy, ux)
         # u_j = scale_j sum_k row_k matrix_kj, for both rows
-        vx, vy = (to_ux[0] * s[0], to_ux[1] * s[1], to_ux[2] * s[2]), (to_uy[0] * s[0], to_uy[1] * s[1], to_uy[2] * s[2])
+        vx, vy = (
+            (to_ux[0] * s[0], to_ux[1] * s[1], to_ux[2] * s[2]),
+            (to_uy[0] * s[0], to_uy[1] * s[1], to_uy[2] * s[2]),
+        )
         to_row_x = _dot(matrix[0:3], vx), _dot(matrix[3:6], vx), _dot(matrix[6:9], vx)
         to_row_y = _dot(matrix[0:3], vy), _dot(matrix[3:6], vy), _dot(matrix[6:9], vy)
         for j in range(3):
@@ -217,15 +225,17 @@ def _backward(
             _plus(_times(row_x[1], vx), row_y[1], vy),
             _plus(_times(row_x[2], vx), row_y[2], vy),
         )
-        to_w_ = _TWO * (qz * (r1[0] - r0[1]) + qy * (r0[2] - r2[0]) + qx * (r2[1] - r1[2]))
-        to_x_ = _TWO * (qy * (r0[1] + r1[0]) + qz * (r0[2] + r2[0]) + qw * (r2[1] - r1[2]) - _TWO * qx * (r1[1] + r2[2]))
-        to_y_ = _TWO * (qx * (r0[1] + r1[0]) + qz * (r1[2] + r2[1]) + qw * (r0[2] - r2[0]) - _TWO * qy * (r0[0] + r2[2]))
-        to_z_ = _TWO * (qx * (r0[2] + r2[0]) + qy * (r1[2] + r2[1]) + qw * (r1[0] - r0[1]) - _TWO * qz * (r0[0] + r1[1]))
-        along = qw * to_w_ + qx * to_x_ + qy * to_y_ + qz * to_z_  # a quaternion's length does not matter
-        to_quaternions[i, 0] = scale * (to_w_ - along * qw)
-        to_quaternions[i, 1] = scale * (to_x_ - along * qx)
-        to_quaternions[i, 2] = scale * (to_y_ - along * qy)
-        to_quaternions[i, 3] = scale * (to_z_ - along * qz)
+        x12, x20, x01 = r2[1] - r1[2], r0[2] - r2[0], r1[0] - r0[1]
+        y12, y20, y01 = r2[1] + r1[2], r0[2] + r2[0], r1[0] + r0[1]
+        to_qw = _TWO * (qx * x12 + qy * x20 + qz * x01)
+        to_qx = _TWO * (qy * y01 + qz * y20 + qw * x12 - _TWO * qx * (r1[1] + r2[2]))
+        to_qy = _TWO * (qx * y01 + qz * y12 + qw * x20 - _TWO * qy * (r0[0] + r2[2]))
+        to_qz = _TWO * (qx * y20 + qy * y12 + qw * x01 - _TWO * qz * (r0[0] + r1[1]))
+        along = qw * to_qw + qx * to_qx + qy * to_qy + qz * to_qz  # a quaternion's length does not matter
+        to_quaternions[i, 0] = scale * (to_qw - along * qw)
+        to_quaternions[i, 1] = scale * (to_qx - along * qx)
+        to_quaternions[i, 2] = scale * (to_qy - along * qy)
+        to_quaternions[i, 3] = scale * (to_qz - along * qz)
         # row = f / z (axis - clipped slope forward); centre = f slope + c
         forward = view[2, 0], view[2, 1], view[2, 2]
         to_slope_x, to_slope_y = lens[0] * to_centers[k, 0], lens[1] * to_centers[k, 1]
@@ -275,13 +285,11 @@ class _Project(torch.autograd.Function):
         degree: int,
     ) -> tuple[Any, ...]:  # fmt: skip
         count = indices.shape[0]
-        limits = (FRUSTUM_MARGIN * 0.5 * size / f for size, f in ((camera.width, camera.fx), (camera.height, camera.fy)))
-        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *limits], f4)
-        inputs = (indices, means, quaternions, scales, sh)
-        ctx.arguments = (
-            *(x.detach().contiguous().numpy() for x in inputs), degree, camera.world_to_camera.numpy(), lens,
-            camera.position.numpy(),
-        )  # fmt: skip
+        limits = (0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
+        lens = [camera.fx, camera.fy, camera.cx, camera.cy, *(FRUSTUM_MARGIN * limit for limit in limits)]
+        arrays = (x.detach().contiguous().numpy() for x in (indices, means, quaternions, scales, sh))
+        view = (x.contiguous().numpy() for x in (camera.world_to_camera, camera.position))
+        ctx.arguments = (*arrays, degree, next(view), np.array(lens, f4), next(view))
         centers, factors, covariances, depths, colors = (
             means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,))
         )

@@ -13,10 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from reference_trainer.render import splat
+from reference_trainer.render import Splats, splat
 from reference_trainer.render.constants import MIN_ALPHA, TILE
 from reference_trainer.render.footprints import PIXELS, block_size
-from reference_trainer.render import Splats
 from reference_trainer.studies.speed.measure import PASSES
 from reference_trainer.studies.speed.workloads import Workload
 

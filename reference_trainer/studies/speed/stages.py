@@ -9,8 +9,8 @@ from torch import Tensor
 
 from reference_trainer.render.blending import composite
 from reference_trainer.render.constants import TILE
-from reference_trainer.render.eager.projection import project
 from reference_trainer.render.eager.binning import bin_gaussians
+from reference_trainer.render.eager.projection import project
 from reference_trainer.studies.speed.workloads import Workload
 from reference_trainer.studies.timing import now
 
