@@ -9,11 +9,14 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import expected_absolute_error
+from reference_trainer.render.engine import engine_for
 
 __all__ = ["expected_photometric_loss", "photometric_loss", "ssim_map"]
 
 _RADIUS = 5
 _SIGMA = 1.5
+_SIDE = [math.exp(-(offset**2) / (2 * _SIGMA**2)) for offset in range(_RADIUS + 1)]
+_WEIGHTS = [weight / (2 * sum(_SIDE) - 1) for weight in _SIDE]  # of the window's centre and one side; they add up to 1
 _C1 = 0.01**2
 _C2 = 0.03**2
 
@@ -158,13 +161,13 @@ class _SSIMMap(torch.autograd.Function):
 
 
 def _blur(maps: Tensor) -> Tensor:
-    """Blur maps (..., H, W) with the zero-padded window.
+    """Blur maps (..., H, W) with the zero-padded window."""
+    if engine_for(maps).name == "loops":
+        from reference_trainer.render.loops.blur import blur
 
-    Sums of shifted slices: on CPU faster than a depthwise convolution, whose speed also hangs on the memory layout.
-    """
-    weights = [math.exp(-(offset**2) / (2 * _SIGMA**2)) for offset in range(_RADIUS + 1)]
-    norm = weights[0] + 2 * sum(weights[1:])
-    centre, *sides = (weight / norm for weight in weights)
+        return blur(maps, _WEIGHTS)
+    # Sums of shifted slices: on a CPU faster than a depthwise convolution, whose speed depends on the memory layout.
+    centre, *sides = _WEIGHTS
     for axis in (-2, -1):
         size = maps.shape[axis]
         blurred = maps * centre
