@@ -28,8 +28,8 @@ MIN_TRANSMITTANCE: Final = 1e-4
 TILE: Final = 8
 """Side of a tile in pixels. Own choice: at the INRIA value of 16, about 1.6 times as many pairs are evaluated."""
 
-BLOCK_PAIRS_CPU: Final = 1 << 18
-"""Pixel-Gaussian pairs that the torch engine holds at once on a CPU: temporaries of 1 MiB stay in the cache."""
+BLOCK_PAIRS_CPU: Final = 1 << 19
+"""Pixel-Gaussian pairs that the torch engine holds at once on a CPU: temporaries of 2 MiB."""
 
 BLOCK_PAIRS_CUDA: Final = 1 << 25
 """The same on a GPU: temporaries of 128 MiB keep it busy and the number of launches low."""
