@@ -58,7 +58,7 @@ class LoopEngine:
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
         """Composite mean and variance back to front."""
         geometry = (splats.projection.means, splats.projection.factors, splats.opacities)
-        return moments(*geometry, splats.colors, multiplier, behind, splats.lists)
+        return moments(*geometry, splats.colors, multiplier, behind, splats.lists, alpha=alpha)
 
     def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
         """Sum the summands of the variance over the pixels."""

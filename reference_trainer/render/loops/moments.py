@@ -106,107 +106,123 @@ def _longest(first: int, last: int, starts: Array) -> int:
     return longest
 
 
-@kernel
-def _backward(
-    first: int, last: int, starts: Array, gaussians: Array, slots: Array, table: Array, factors: Array, behind: Array,
-    to_mean: Array, to_variance: Array, rows: Array, to_behind: Array,
-) -> None:  # fmt: skip
-    """Carry gradients back: to what is in front of a splat by what is behind it, then to the splat itself.
+def _make_backward(complete: bool) -> Any:
+    """Return the kernel of the gradients.
 
-    With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
-    hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}: walked back to front, as division would fail at 0.
+    Args:
+        complete: with those of the accumulated alpha, and of the moments of the factors: a quarter slower.
     """
-    _, height, width = behind.shape
-    columns = (width + TILE - 1) // TILE
-    longest = _longest(first, last, starts)
-    kept = np.empty(longest * 6 * PIXELS, f4)  # of every entry raw alpha, four contrasts, hidden
-    s = np.empty(14 * PIXELS, f4)
-    for tile in range(first, last):
-        top, left = tile // columns * TILE, tile % columns * TILE
-        tile_x, tile_y = f4(left + TILE // 2), f4(top + TILE // 2)
-        for p in range(PIXELS):
-            y, x = top + p // TILE, left + p % TILE
-            inside = y < height and x < width
-            for c in range(3):
-                s[_MEAN + c * PIXELS + p] = behind[c, y, x] if inside else _ZERO
-            for c in range(4):
-                s[_TO_MEAN + c * PIXELS + p] = to_mean[c, y, x] if inside else _ZERO
-                s[_TO_VARIANCE + c * PIXELS + p] = to_variance[c, y, x] if inside else _ZERO
-            s[_LIGHT + p], s[_HIDDEN + p], s[_FRONT + p] = _ONE, _ZERO, _ONE
-        begin = starts[tile]
-        for k in range(starts[tile + 1] - begin - 1, -1, -1):
-            i = gaussians[begin + k]
-            if is_faint(table, i):
-                continue
-            polynomial = footprint(table, i, tile_x, tile_y)
-            r, g, b = table[i, 6], table[i, 7], table[i, 8]
-            factor, varies = factors[i, 0], factors[i, 1]
-            of_entry = kept[k * 6 * PIXELS : (k + 1) * 6 * PIXELS]
+
+    @kernel
+    def _backward(
+        first: int, last: int, starts: Array, gaussians: Array, slots: Array, table: Array, factors: Array,
+        behind: Array, to_mean: Array, to_variance: Array, rows: Array, to_behind: Array,
+    ) -> None:  # fmt: skip
+        """Carry gradients back: to what is in front of a splat by what is behind it, then to the splat itself.
+
+        With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
+        hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}: walked back to front, as division would fail at 0.
+        """
+        _, height, width = behind.shape
+        columns = (width + TILE - 1) // TILE
+        longest = _longest(first, last, starts)
+        kept = np.empty(longest * 6 * PIXELS, f4)  # of every entry raw alpha, four contrasts, hidden
+        s = np.empty(14 * PIXELS, f4)
+        for tile in range(first, last):
+            top, left = tile // columns * TILE, tile % columns * TILE
+            tile_x, tile_y = f4(left + TILE // 2), f4(top + TILE // 2)
             for p in range(PIXELS):
-                raw = alpha_at(polynomial, X[p], Y[p])
-                alpha = raw if raw < _MAX else _MAX
-                expected, spread = factor * alpha, varies * alpha * alpha
-                passed = _ONE - expected
-                d0, d1, d2, d3 = r - s[_MEAN + p], g - s[_MEAN_1 + p], b - s[_MEAN_2 + p], s[_LIGHT + p]
-                hidden = s[_HIDDEN + p]
-                of_entry[p], of_entry[PIXELS + p], of_entry[2 * PIXELS + p] = raw, d0, d1
-                of_entry[3 * PIXELS + p], of_entry[4 * PIXELS + p], of_entry[5 * PIXELS + p] = d2, d3, hidden
-                weight = s[_TO_VARIANCE + p] * d0 * d0 + s[_TO_VARIANCE_1 + p] * d1 * d1
-                weight += s[_TO_VARIANCE_2 + p] * d2 * d2 + s[_TO_VARIANCE_3 + p] * d3 * d3
-                s[_HIDDEN + p] = hidden * (passed * passed + spread) + weight * spread
-                s[_MEAN + p] += expected * d0
-                s[_MEAN_1 + p] += expected * d1
-                s[_MEAN_2 + p] += expected * d2
-                s[_LIGHT + p] = passed * d3
-        for k in range(starts[tile + 1] - begin):
-            i = gaussians[begin + k]
-            row = rows[slots[begin + k]]
-            if is_faint(table, i):
-                row[:] = _ZERO
-                continue
-            factor, varies = factors[i, 0], factors[i, 1]
-            g0, gx, gy, gxx, gxy, gyy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
-            to_r, to_g, to_b, to_factor, to_varies = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
-            of_entry = kept[k * 6 * PIXELS : (k + 1) * 6 * PIXELS]
-            for p in range(PIXELS):
-                x, y = X[p], Y[p]
-                raw, d0, d1 = of_entry[p], of_entry[PIXELS + p], of_entry[2 * PIXELS + p]
-                d2, d3, hidden = of_entry[3 * PIXELS + p], of_entry[4 * PIXELS + p], of_entry[5 * PIXELS + p]
-                u0, u1, u2, u3 = s[_TO_MEAN + p], s[_TO_MEAN_1 + p], s[_TO_MEAN_2 + p], s[_TO_MEAN_3 + p]
-                w0, w1 = s[_TO_VARIANCE + p] * d0, s[_TO_VARIANCE_1 + p] * d1
-                w2, w3 = s[_TO_VARIANCE_2 + p] * d2, s[_TO_VARIANCE_3 + p] * d3
-                alpha = raw if raw < _MAX else _MAX
-                expected, spread = factor * alpha, varies * alpha * alpha
-                passed, front = _ONE - expected, s[_FRONT + p]
-                to_shrink = hidden * front
-                to_spread = (w0 * d0 + w1 * d1 + w2 * d2 + w3 * d3) * front + to_shrink
-                to_expected = u0 * d0 + u1 * d1 + u2 * d2 + u3 * d3 - _TWO * passed * to_shrink
-                twice = _TWO * front * spread
-                t0, t1, t2 = u0 * expected + w0 * twice, u1 * expected + w1 * twice, u2 * expected + w2 * twice
-                s[_TO_MEAN + p] = u0 - t0
-                s[_TO_MEAN_1 + p] = u1 - t1
-                s[_TO_MEAN_2 + p] = u2 - t2
-                s[_TO_MEAN_3 + p] = u3 - u3 * expected - w3 * twice
-                s[_FRONT + p] = front * (passed * passed + spread)
-                to_r += t0
-                to_g += t1
-                to_b += t2
-                to_factor += to_expected * alpha
-                to_varies += to_spread * alpha * alpha
-                d = raw * (_TWO * varies * to_spread * alpha + to_expected * factor)
-                g0 += d
-                gx += d * x
-                gy += d * y
-                gxx += d * x * x
-                gxy += d * x * y
-                gyy += d * y * y
-            footprint_gradient(table, i, tile_x, tile_y, (g0, gx, gy, gxx, gxy, gyy), row)
-            row[6], row[7], row[8], row[9], row[10] = to_r, to_g, to_b, to_factor, to_varies
-        for p in range(PIXELS):
-            y, x = top + p // TILE, left + p % TILE
-            if y < height and x < width:
+                y, x = top + p // TILE, left + p % TILE
+                inside = y < height and x < width
                 for c in range(3):
-                    to_behind[c, y, x] = s[_TO_MEAN + c * PIXELS + p]
+                    s[_MEAN + c * PIXELS + p] = behind[c, y, x] if inside else _ZERO
+                for c in range(4):
+                    s[_TO_MEAN + c * PIXELS + p] = to_mean[c, y, x] if inside else _ZERO
+                    s[_TO_VARIANCE + c * PIXELS + p] = to_variance[c, y, x] if inside else _ZERO
+                s[_LIGHT + p], s[_HIDDEN + p], s[_FRONT + p] = _ONE, _ZERO, _ONE
+            begin = starts[tile]
+            for k in range(starts[tile + 1] - begin - 1, -1, -1):
+                i = gaussians[begin + k]
+                if is_faint(table, i):
+                    continue
+                polynomial = footprint(table, i, tile_x, tile_y)
+                r, g, b = table[i, 6], table[i, 7], table[i, 8]
+                factor, varies = factors[i, 0], factors[i, 1]
+                of_entry = kept[k * 6 * PIXELS : (k + 1) * 6 * PIXELS]
+                for p in range(PIXELS):
+                    raw = alpha_at(polynomial, X[p], Y[p])
+                    alpha = raw if raw < _MAX else _MAX
+                    expected, spread = factor * alpha, varies * alpha * alpha
+                    passed = _ONE - expected
+                    d0, d1, d2, d3 = r - s[_MEAN + p], g - s[_MEAN_1 + p], b - s[_MEAN_2 + p], s[_LIGHT + p]
+                    hidden = s[_HIDDEN + p]
+                    of_entry[p], of_entry[PIXELS + p], of_entry[2 * PIXELS + p] = raw, d0, d1
+                    of_entry[3 * PIXELS + p], of_entry[4 * PIXELS + p], of_entry[5 * PIXELS + p] = d2, d3, hidden
+                    weight = s[_TO_VARIANCE + p] * d0 * d0 + s[_TO_VARIANCE_1 + p] * d1 * d1
+                    weight += s[_TO_VARIANCE_2 + p] * d2 * d2
+                    if complete:
+                        weight += s[_TO_VARIANCE_3 + p] * d3 * d3
+                    s[_HIDDEN + p] = hidden * (passed * passed + spread) + weight * spread
+                    s[_MEAN + p] += expected * d0
+                    s[_MEAN_1 + p] += expected * d1
+                    s[_MEAN_2 + p] += expected * d2
+                    s[_LIGHT + p] = passed * d3
+            for k in range(starts[tile + 1] - begin):
+                i = gaussians[begin + k]
+                row = rows[slots[begin + k]]
+                if is_faint(table, i):
+                    row[:] = _ZERO
+                    continue
+                factor, varies = factors[i, 0], factors[i, 1]
+                g0, gx, gy, gxx, gxy, gyy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+                to_r, to_g, to_b, to_factor, to_varies = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+                of_entry = kept[k * 6 * PIXELS : (k + 1) * 6 * PIXELS]
+                for p in range(PIXELS):
+                    x, y = X[p], Y[p]
+                    raw, d0, d1 = of_entry[p], of_entry[PIXELS + p], of_entry[2 * PIXELS + p]
+                    d2, d3, hidden = of_entry[3 * PIXELS + p], of_entry[4 * PIXELS + p], of_entry[5 * PIXELS + p]
+                    u0, u1, u2 = s[_TO_MEAN + p], s[_TO_MEAN_1 + p], s[_TO_MEAN_2 + p]
+                    u3 = s[_TO_MEAN_3 + p] if complete else _ZERO
+                    w0, w1 = s[_TO_VARIANCE + p] * d0, s[_TO_VARIANCE_1 + p] * d1
+                    w2, w3 = s[_TO_VARIANCE_2 + p] * d2, s[_TO_VARIANCE_3 + p] * d3 if complete else _ZERO
+                    alpha = raw if raw < _MAX else _MAX
+                    expected, spread = factor * alpha, varies * alpha * alpha
+                    passed, front = _ONE - expected, s[_FRONT + p]
+                    to_shrink = hidden * front
+                    to_spread = (w0 * d0 + w1 * d1 + w2 * d2 + w3 * d3) * front + to_shrink
+                    to_expected = u0 * d0 + u1 * d1 + u2 * d2 + u3 * d3 - _TWO * passed * to_shrink
+                    twice = _TWO * front * spread
+                    t0, t1, t2 = u0 * expected + w0 * twice, u1 * expected + w1 * twice, u2 * expected + w2 * twice
+                    s[_TO_MEAN + p] = u0 - t0
+                    s[_TO_MEAN_1 + p] = u1 - t1
+                    s[_TO_MEAN_2 + p] = u2 - t2
+                    s[_FRONT + p] = front * (passed * passed + spread)
+                    to_r += t0
+                    to_g += t1
+                    to_b += t2
+                    if complete:
+                        s[_TO_MEAN_3 + p] = u3 - u3 * expected - w3 * twice
+                        to_factor += to_expected * alpha
+                        to_varies += to_spread * alpha * alpha
+                    d = raw * (_TWO * varies * to_spread * alpha + to_expected * factor)
+                    g0 += d
+                    gx += d * x
+                    gy += d * y
+                    gxx += d * x * x
+                    gxy += d * x * y
+                    gyy += d * y * y
+                footprint_gradient(table, i, tile_x, tile_y, (g0, gx, gy, gxx, gxy, gyy), row)
+                row[6], row[7], row[8], row[9], row[10] = to_r, to_g, to_b, to_factor, to_varies
+            for p in range(PIXELS):
+                y, x = top + p // TILE, left + p % TILE
+                if y < height and x < width:
+                    for c in range(3):
+                        to_behind[c, y, x] = s[_TO_MEAN + c * PIXELS + p]
+
+    return _backward
+
+
+_backward, _complete_backward = _make_backward(False), _make_backward(True)
 
 
 @kernel
@@ -264,14 +280,14 @@ class _Moments(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, multiplier: Tensor,
-        behind: Tensor, lists: TileLists,
+        behind: Tensor, lists: TileLists, alpha: bool,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         table, rows = make_table(means, factors, opacities, colors), Rows.of(lists)
         mean, variance = (behind.new_empty(4, *behind.shape[1:]) for _ in range(2))
         fixed = (table, multiplier.detach().contiguous().numpy(), behind.detach().contiguous().numpy())
         arguments = (rows.starts, rows.gaussians, *fixed, mean.numpy(), variance.numpy())
         in_threads(_forward, lists.columns * lists.rows, *arguments, least=4)
-        ctx.fixed, ctx.rows, ctx.lists = fixed, rows, lists
+        ctx.fixed, ctx.rows, ctx.lists, ctx.alpha = fixed, rows, lists, alpha
         ctx.save_for_backward(opacities)
         return mean, variance
 
@@ -279,11 +295,12 @@ class _Moments(torch.autograd.Function):
     @without_autocast
     def backward(ctx: Any, to_mean: Tensor, to_variance: Tensor) -> tuple[Tensor | None, ...]:
         (opacities,), rows = ctx.saved_tensors, ctx.rows
+        complete = ctx.alpha or ctx.needs_input_grad[4]
         to_rows = np.empty((rows.slots.shape[0], 11), f4)
         to_behind = to_mean.new_empty(3, *to_mean.shape[1:])
         upstream = (to_mean.contiguous().numpy(), to_variance.contiguous().numpy())
         in_threads(
-            _backward,
+            _complete_backward if complete else _backward,
             ctx.lists.columns * ctx.lists.rows,
             *rows[:3],
             *ctx.fixed,
@@ -295,12 +312,12 @@ class _Moments(torch.autograd.Function):
         sums = opacities.new_empty(opacities.shape[0], 11)
         in_threads(row_sums, opacities.shape[0], rows.offsets, to_rows, sums.numpy())
         to_opacities = sums[:, 5] / opacities.clamp_min(MIN_ALPHA)
-        return sums[:, :2], sums[:, 2:5], to_opacities, sums[:, 6:9], sums[:, 9:], to_behind, None
+        return sums[:, :2], sums[:, 2:5], to_opacities, sums[:, 6:9], sums[:, 9:], to_behind, None, None
 
 
 def moments(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, multiplier: Tensor, behind: Tensor,
-    lists: TileLists,
+    lists: TileLists, *, alpha: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return mean and variance of every pixel under random factors on the alphas; differentiable.
 
@@ -312,11 +329,12 @@ def moments(
         multiplier: mean and variance of every splat's factor, shape (M, 2).
         behind: colours behind everything, shape (3, H, W).
         lists: the splats of every tile.
+        alpha: whether the gradients of the accumulated alpha count.
 
     Returns:
         Mean and variance of red, green, blue and accumulated alpha, shape (4, H, W) each.
     """
-    result: tuple[Tensor, Tensor] = _Moments.apply(means, factors, opacities, colors, multiplier, behind, lists)  # type: ignore[no-untyped-call]
+    result: tuple[Tensor, Tensor] = _Moments.apply(means, factors, opacities, colors, multiplier, behind, lists, alpha)  # type: ignore[no-untyped-call]
     return result
 
 
