@@ -11,7 +11,7 @@ from ca_reg import OpacityNoise
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.expectation import multiplier_of, render_expectation
+from reference_trainer.training.expectation import expected_draw, render_expectation
 from reference_trainer.training.trainer import Trainer
 
 BLACK = torch.zeros(3, dtype=torch.float64)
@@ -49,7 +49,8 @@ def test_the_penalty_is_the_weighted_mean_variance():
 def test_the_multiplier_is_that_of_what_training_samples():
     opacities = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
     config = TrainConfig(dropout=0.2, noise=0.6, analytic=True)
-    multiplier = multiplier_of(config, opacities)
+    rendered, multiplier = expected_draw(config, opacities)
+    assert torch.equal(rendered, opacities)
     noise = OpacityNoise(0.6)
     generator = torch.Generator().manual_seed(0)
     n = 200_000
