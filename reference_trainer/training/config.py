@@ -22,7 +22,7 @@ class TrainConfig:
     dropout: float = 0.0
     """Rate p of Gaussian dropout, in [0, 1); at test time opacities are scaled by 1 - p."""
     compensate: bool = False
-    """Inverted dropout: survivors are scaled by 1 / (1 - p) while training, nothing at test time."""
+    """Inverted dropout: survivors scaled by 1 / (1 - p) in training, nothing at test time."""
     noise: float = 0.0
     """Standard deviation sigma of the multiplicative opacity noise; the paper uses up to 0.8."""
     clip_noise: bool = False
@@ -66,7 +66,7 @@ class TrainConfig:
     initial_opacity: float = 0.1
     """Opacity of the initial Gaussians."""
     densify_from: int = 500
-    """First step that may densify."""
+    """Densification begins after this step."""
     densify_until: int | None = None
     """Step before which densification, pruning and resets end; None: the last step."""
     densify_every: int = 100
@@ -93,7 +93,7 @@ class TrainConfig:
     opacity_reset_over_white: bool = False
     """Over a white background opacities are lowered at step ``densify_from`` as well."""
     opacity_decay: float = 1.0
-    """Opacities are multiplied by this at every step from ``densify_from`` on; 1 does nothing."""
+    """Opacities are multiplied by this at every step after ``densify_from``; 1 does nothing."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
