@@ -54,13 +54,28 @@ def test_mean_variance_and_their_gradients_are_those_of_all_masks(p, compensate)
         torch.testing.assert_close(exact, enumerated, rtol=1e-9, atol=1e-12)
 
 
+def one_white(opacity: float) -> tuple[Gaussians, Camera]:
+    """A white Gaussian that is centred on a pixel, so that its falloff there is 1; in the corner it is 0.73."""
+    white = Gaussians.from_points(
+        torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1, 3), torch.tensor([1.2]), sh_degree=0, opacity=opacity
+    )
+    return white.map(lambda x: x.double()), Camera(torch.eye(4), 6.0, 6.0, 2.5, 2.5, 5, 5)
+
+
+def test_opaque_gaussians_are_drawn_more_opaque_at_test_time_than_inverted_dropout_trains_them():
+    """As docs/theory.md says; plain dropout has no such gap."""
+    white, camera = one_white(0.95)
+    for compensate, trained, drawn in ((True, 0.495, 0.95), (False, 0.475, 0.475)):
+        config = TrainConfig(dropout=0.5, compensate=compensate, analytic=True)
+        mean = render_expectation(white, camera, BLACK, config, sh_degree=0).image[0, 2, 2].item()
+        tested = render_gaussians(white, camera, BLACK, opacities=white.opacities * config.test_time_scale).image
+        assert (mean, tested[0, 2, 2].item()) == (pytest.approx(trained, rel=1e-6), pytest.approx(drawn, rel=1e-6))
+
+
 @pytest.mark.parametrize("p", [0.0, 0.5])
 def test_the_clamp_of_noisy_alphas_is_all_that_is_left_out(p):
     """Where a falloff exceeds 0.99 the noise reaches the clamp of alpha; it moves the mean by at most 1/99."""
-    camera = Camera(torch.eye(4), 6.0, 6.0, 2.5, 2.5, 5, 5)  # centred on a pixel, so its falloff is 1
-    white = Gaussians.from_points(
-        torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1, 3), torch.tensor([1.2]), sh_degree=0, opacity=0.95
-    ).map(lambda x: x.double())
+    white, camera = one_white(0.95)
     config = TrainConfig(dropout=p, compensate=True, noise=0.8, analytic=True)
     z, width = torch.linspace(-8, 8, 4001, dtype=torch.float64), 16 / 4000
     drawn = (0.95 / (1 - p) * (1 + 0.8 * z)).clamp(0, 1)
@@ -70,7 +85,7 @@ def test_the_clamp_of_noisy_alphas_is_all_that_is_left_out(p):
     mean = (1 - p) * torch.einsum("k,khw->hw", weights, images)
     error = render_expectation(white, camera, BLACK, config, sh_degree=0).image[0] - mean
     assert 4e-4 < error.abs().max() < 1 / 99
-    assert error[0, 0].abs() < 1e-4  # in the corner the falloff is 0.73
+    assert error[0, 0].abs() < 1e-4
 
 
 def test_the_penalty_is_the_weighted_mean_variance():
