@@ -17,8 +17,10 @@ class GaussianDropout(Regularizer):
     """Drop a random subset of Gaussians in training; scale the opacities in evaluation (paper, Gaussian dropout).
 
     ``train()``: ``opacity * keep``. ``eval()``: ``opacity * (1 - p)``, the mean over all masks. With ``compensate`` the
-    survivors are multiplied by ``1 / (1 - p)`` in training instead, and evaluation leaves the opacities as they are;
-    the two schemes are not equivalent, because compositing is not linear in the opacities. The module has no
+    survivors are multiplied by ``1 / (1 - p)`` in training instead, and evaluation leaves the opacities as they are.
+    The two schemes are not equivalent: compositing is not linear in the opacities, and rasterizers clamp the alpha of
+    survivors, so that Gaussians of an opacity above ``0.99 (1 - p)`` are more opaque in evaluation than the mean over
+    all masks. The module has no
     parameters; put it between the activation of the opacities and the rasterizer.
 
     Dropped Gaussians must leave no trace in density control: pass the radii through :meth:`mask_radii`.

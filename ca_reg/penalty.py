@@ -56,7 +56,9 @@ class CAPenalty(Regularizer):
 
     Limits: the factors must be independent, one per Gaussian. The clamp and the cut-off of alphas that a factor changed
     are left out, see :class:`~ca_reg.functional.Multiplier`; plain dropout is exact but for the early stop of a sampled
-    render.
+    render. Compensated dropout is, too, if the call gets what its survivors hand the rasterizer, ``opacity / (1 - p)``,
+    and ``multiplier`` is ``Multiplier.dropout(p)``; ``image`` is then not the render for test time where opacities
+    exceed ``0.99 (1 - p)``.
 
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1), neither dropped nor scaled; images are (3, H, W).
     The first call looks at the opacities.

@@ -57,7 +57,8 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: float = 0.0, compensate: 
         p: the rate that ``keep`` was drawn with; used only by ``compensate``.
         compensate: multiply the survivors by ``1 / (1 - p)``, so that the mean over masks is ``opacity`` and nothing
             needs to be scaled at test time. Survivors may then exceed 1; they are not clamped here, because every
-            3DGS rasterizer clamps the alpha of a splat at 0.99 or 0.999.
+            3DGS rasterizer clamps the alpha of a splat at 0.99 or 0.999. With that clamp the mean alpha is lower than
+            that of ``opacity`` where this exceeds ``0.99 (1 - p)``.
 
     Returns:
         The masked opacities, a new tensor of the same shape and dtype.

@@ -72,11 +72,14 @@ class Multiplier:
         """Return the multiplier of :func:`~ca_reg.functional.gaussian_dropout` (paper, Eq. dropout_train).
 
         Exact for renderers that clamp alpha, because a factor of 0 or 1 commutes with the clamp. With ``compensate``
-        it is exact where ``alpha <= 0.99 (1 - p)``: survivors above that are clamped by the renderer but not here.
+        it is exact where ``alpha <= 0.99 (1 - p)`` only: survivors above that are clamped by the renderer but not here,
+        which moves mean and variance without a useful bound. Exact for compensated dropout, whatever the alphas, is
+        this: hand the renderer ``opacity / (1 - p)``, as its survivors have it, and take the multiplier *without*
+        ``compensate``.
 
         Args:
             p: drop rate in [0, 1).
-            compensate: survivors are multiplied by ``1 / (1 - p)``.
+            compensate: survivors are multiplied by ``1 / (1 - p)``, without the renderer's clamp.
 
         Raises:
             TypeError: if ``p`` is not a number.
@@ -105,12 +108,16 @@ class Multiplier:
         return cls(1.0, unit * sigma * sigma)
 
     @classmethod
-    def clamped_noise(cls, opacity: Tensor, sigma: float, *, clip: bool = False) -> Multiplier:
+    def clamped_noise(cls, opacity: Tensor, sigma: float, *, clip: bool = False, gain: float = 1.0) -> Multiplier:
         """Return the multiplier of :func:`~ca_reg.functional.opacity_noise`, the clamp to [0, 1] included.
 
         Per Gaussian, ``xi = clamp(o (1 + eps), 0, 1) / o`` is one plus ``sigma`` times a standard normal number that is
         cut at ``-1 / sigma`` and at ``(1 / o - 1) / sigma``, whose moments are elementary. The upper cut lowers the
         mean of opacities near 1, the lower one raises the mean of all. Differentiable in ``opacity``.
+
+        After compensated dropout the noise acts on the opacities of the survivors, ``o / (1 - p)``, which may exceed 1.
+        With ``gain = 1 / (1 - p)`` the result is their factor, to be put on what the renderer is then to be given,
+        ``min(gain o, 1)``; times ``Multiplier.dropout(p)``, without its ``compensate``, it is that of both.
 
         Left out is what the renderer does to the noisy alpha. With R the range of the colours and the background:
 
@@ -123,13 +130,16 @@ class Multiplier:
             opacity: activated opacities ``o`` in [0, 1], any shape.
             sigma: standard deviation of the relative noise, at least 0.
             clip: the draw is clipped to [-sigma, sigma] before it is applied.
+            gain: what the opacities are multiplied by before the noise, at least 1.
 
         Returns:
-            Mean and variance per Gaussian, shape and dtype of ``opacity``. At ``o = 0`` the limit of small opacities.
+            Mean and variance per Gaussian of ``clamp(gain o (1 + eps), 0, 1) / min(gain o, 1)``, shape and dtype of
+            ``opacity``. At ``o = 0`` the limit of small opacities.
 
         Raises:
-            TypeError: if ``opacity`` is not a floating-point tensor or ``sigma`` not a number.
-            ValueError: if an opacity is outside [0, 1], ``sigma`` negative or not finite, or a variance overflows.
+            TypeError: if ``opacity`` is not a floating-point tensor, or ``sigma`` or ``gain`` not a number.
+            ValueError: if an opacity is outside [0, 1], ``sigma`` negative or not finite, ``gain`` below 1 or not
+                finite, or a variance overflows.
 
         Example:
             >>> noise = Multiplier.clamped_noise(torch.tensor([0.01, 1.0]), 0.2)
@@ -140,22 +150,34 @@ class Multiplier:
             raise TypeError("opacity must be a floating-point torch tensor of activated opacities.")
         check_opacity_range(opacity)
         check_finite(sigma, "sigma", minimum=0.0)
+        check_finite(gain, "gain", minimum=1.0)
         if sigma == 0:
             return cls(torch.ones_like(opacity), torch.zeros_like(opacity))
         cut = 1.0 if clip else _FAR
+        # Above 1 the variance is a small difference, and survivors reach any opacity: float64.
+        raised = opacity if gain == 1 else gain * opacity.double()
         # At half the opacity from which on the cut is ``cut``: keeps 0 * inf out of the gradient at o = 0.
-        bounded = opacity.clamp(min=0.5 / (1.0 + cut * sigma))
-        up, up_square = _upper_half(((1.0 - bounded) / (sigma * bounded)).clamp(max=cut))
-        down, down_square = (x.item() for x in _upper_half(torch.tensor(min(1.0 / sigma, cut), dtype=torch.float64)))
-        shift = up - down
-        # Half of the draws are on either side, so shift^2 is at most half of the mean square: at most one bit is lost.
-        return cls(1.0 + sigma * shift, sigma * sigma * (up_square + down_square - shift.square()))
+        raised = raised.clamp(min=0.5 / (1.0 + cut * sigma))
+        highest = ((1.0 - raised) / (sigma * raised)).clamp(max=cut)
+        lowest = torch.tensor(min(1.0 / sigma, cut), dtype=torch.float64)
+        if gain > 1:  # a clipped draw may leave all of a survivor's opacities at 1: then both cuts are one
+            lowest = (-highest).clamp(min=lowest.item())
+        (up, up_square), (down, down_square) = _upper_half(highest), _upper_half(lowest)
+        shift, over = up - down, raised.clamp(min=1.0)
+        # At gain 1 half of the draws are on either side, so shift^2 is at most half of the mean square.
+        variance = (sigma * over).square() * (up_square + down_square - shift.square()).clamp(min=0.0)
+        return cls((over * (1.0 + sigma * shift)).to(opacity.dtype), variance.to(opacity.dtype))
 
 
 def _upper_half(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and mean square of ``min(max(z, 0), x)`` for a standard normal z and x >= 0; sums of positive terms."""
+    """``x^k Q(x)`` plus the integral of ``t^k phi(t)`` over [0, x] for k = 1, 2; sums of positive terms for x >= 0.
+
+    There they are mean and mean square of ``min(max(z, 0), x)`` for a standard normal z. What is cut at ``-a`` and at
+    any ``b >= -a`` has the mean ``first(b) - first(a)`` and the mean square ``second(b) + second(a)``.
+    """
     tail = 0.5 * torch.erfc(x / math.sqrt(2.0))
     half_square = 0.5 * x.square()
-    mean = x * tail - torch.expm1(-half_square) / math.sqrt(2.0 * math.pi)
+    first = x * tail - torch.expm1(-half_square) / math.sqrt(2.0 * math.pi)
     # The incomplete gamma function is 2 * integral of t^2 phi(t) over [0, x], whose form with erf cancels for small x.
-    return mean, x.square() * tail + 0.5 * torch.special.gammainc(torch.full_like(x, 1.5), half_square)
+    gamma = torch.special.gammainc(torch.full_like(x, 1.5), half_square)
+    return first, x.square() * tail + 0.5 * torch.copysign(gamma, x)

@@ -18,7 +18,7 @@ def bake_ply(source: Path, target: Path, *, dropout: float) -> None:
     Args:
         source: the PLY of a model that was trained with dropout, opacities plain.
         target: the file to write; it must not exist.
-        dropout: the rate of the training, in (0, 1).
+        dropout: the rate of the training, in (0, 1). A model of inverted dropout is rendered as it is: do not bake it.
 
     Raises:
         ValueError: if the rate is out of range, or the opacities of the source are scaled already.

@@ -29,32 +29,28 @@ class DensityStatistics:
         gradient_sum: summed norms of the loss gradient with respect to the projected centre, in units of half the image
             size per unit (the INRIA code's normalised device coordinates), shape (N,).
         steps: the number of steps that drew it, shape (N,).
-        largest_radius: in pixels, shape (N,).
     """
 
     gradient_sum: Tensor
     steps: Tensor
-    largest_radius: Tensor
 
     @classmethod
     def zeros(cls, count: int, device: torch.device | str = "cpu") -> DensityStatistics:
         """Return empty statistics of ``count`` Gaussians."""
-        return cls(*(torch.zeros(count, device=device) for _ in range(3)))
+        return cls(*(torch.zeros(count, device=device) for _ in range(2)))
 
-    def update(self, indices: Tensor, gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
+    def update(self, indices: Tensor, gradient: Tensor, width: int, height: int) -> None:
         """Count one step.
 
         Args:
             indices: the Gaussians that were drawn, shape (M,).
             gradient: of the loss with respect to their projected centres, per pixel, shape (M, 2).
-            radii: in pixels, shape (M,).
             width: image width, pixels.
             height: image height, pixels.
         """
         half_size = gradient.new_tensor([0.5 * width, 0.5 * height])
         self.gradient_sum[indices] += (gradient * half_size).norm(dim=1).to(self.gradient_sum)
         self.steps[indices] += 1
-        self.largest_radius[indices] = torch.maximum(self.largest_radius[indices], radii.to(self.largest_radius))
 
     @property
     def mean_gradient(self) -> Tensor:
@@ -69,7 +65,7 @@ def densify(
     gradient_threshold: float,
     size_threshold: float,
     generator: torch.Generator | None = None,
-) -> Tensor:
+) -> None:
     """Clone small and split large Gaussians whose mean gradient reaches a threshold (Kerbl et al. 2023, Sec. 5.2).
 
     A clone is an exact copy. A split Gaussian is replaced by two smaller ones drawn from it.
@@ -80,9 +76,6 @@ def densify(
         gradient_threshold: see `DensityStatistics.gradient_sum`.
         size_threshold: Gaussians whose largest standard deviation exceeds it are split, others cloned; world units.
         generator: for the positions of the children.
-
-    Returns:
-        For each Gaussian after the change, its largest radius so far (0 for new ones), shape (N',).
     """
     gaussians = optimizer.gaussians.map(torch.Tensor.detach)
     selected = statistics.mean_gradient >= gradient_threshold
@@ -103,26 +96,15 @@ def densify(
     optimizer.select(~split)
     optimizer.append(clones)
     optimizer.append(children)
-    radii = statistics.largest_radius
-    return torch.cat([radii[~split], radii.new_zeros(len(clones) + len(children))])
 
 
-def prune(
-    optimizer: GaussianOptimizer,
-    *,
-    min_opacity: float,
-    max_scale: float | None = None,
-    largest_radius: Tensor | None = None,
-    max_radius: float | None = None,
-) -> int:
+def prune(optimizer: GaussianOptimizer, *, min_opacity: float, max_scale: float | None = None) -> int:
     """Remove Gaussians that are too faint or too large.
 
     Args:
         optimizer: holds the Gaussians; changed.
         min_opacity: fainter ones go; compared with the plain opacity, without any regularizer.
         max_scale: Gaussians with a larger standard deviation go, world units; None keeps them.
-        largest_radius: largest radius in any view so far, pixels, shape (N,); needed for ``max_radius``.
-        max_radius: Gaussians that were larger on screen go, pixels; None keeps them.
 
     Returns:
         How many were removed.
@@ -132,8 +114,6 @@ def prune(
         keep = gaussians.opacities >= min_opacity
         if max_scale is not None:
             keep &= gaussians.scales.amax(dim=1) <= max_scale
-        if max_radius is not None and largest_radius is not None:
-            keep &= largest_radius <= max_radius
         removed = int((~keep).sum())
     if removed:
         optimizer.select(keep)

@@ -54,9 +54,9 @@ def model_of(trainer: Trainer) -> Model:
         gaussians=trainer.gaussians.map(Tensor.detach),
         background=trainer.background,
         dropout=0.0 if config.compensate else config.dropout,
-        opacity_scale=config.test_time_scale,
+        opacity_scale=config.test_time_scale if trainer.regularized else 1.0,
         sh_degree=trainer.sh_degree,
-        expected_noise=config.noise if config.scale_noise else 0.0,
+        expected_noise=config.noise if config.scale_noise and trainer.regularized else 0.0,
         clip_noise=config.clip_noise,
     )
 

@@ -75,6 +75,11 @@ class Scene:
     background: Tensor
 
     @property
+    def is_white(self) -> bool:
+        """Whether the background is white."""
+        return bool((self.background == 1).all())
+
+    @property
     def extent(self) -> float:
         """Radius of the training rig: 1.1 x the largest distance of a training camera from their mean position.
 

@@ -54,6 +54,7 @@ def shortened(config: TrainConfig, iterations: int) -> TrainConfig:
         iterations=iterations,
         sh_every=max(1, round(config.sh_every * factor)),
         densify_from=round(config.densify_from * factor),
+        prune_size_from=round(config.prune_size_from * factor),
         opacity_reset_from=round(config.opacity_reset_from * factor),
     )
 

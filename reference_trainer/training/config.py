@@ -22,7 +22,7 @@ class TrainConfig:
     dropout: float = 0.0
     """Rate p of Gaussian dropout, in [0, 1); at test time opacities are scaled by 1 - p."""
     compensate: bool = False
-    """Inverted dropout: survivors are scaled by 1 / (1 - p) while training, nothing at test time."""
+    """Inverted dropout: survivors scaled by 1 / (1 - p) in training, nothing at test time."""
     noise: float = 0.0
     """Standard deviation sigma of the multiplicative opacity noise; the paper uses up to 0.8."""
     clip_noise: bool = False
@@ -34,7 +34,7 @@ class TrainConfig:
     ca_weight: float = 0.0
     """With analytic: weight of the mean pixel variance, the exact co-adaptation, on top of the expected loss."""
     regularize_from: int = 0
-    """First step that uses dropout and noise."""
+    """Number of steps before dropout and noise begin; less than ``iterations`` if there are any."""
 
     renderer: Literal["torch", "gsplat"] = "torch"
     """What draws in training: "torch", this package's renderer, or "gsplat", which needs it and a CUDA device."""
@@ -66,9 +66,9 @@ class TrainConfig:
     initial_opacity: float = 0.1
     """Opacity of the initial Gaussians."""
     densify_from: int = 500
-    """First step that may densify."""
+    """Densification begins after this step."""
     densify_until: int | None = None
-    """Last step that may densify; None: the last step."""
+    """Step before which densification, pruning and resets end; None: the last step."""
     densify_every: int = 100
     """Steps between densifications; 0 never densifies."""
     densify_gradient: float = 5e-4
@@ -77,6 +77,10 @@ class TrainConfig:
     """Gaussians larger than this fraction of the scene's extent are split, smaller ones cloned."""
     prune_opacity: float = 0.005
     """Fainter Gaussians are removed at each densification."""
+    prune_size: float | None = None
+    """Gaussians larger than this fraction of the scene's extent are removed as well; None keeps them."""
+    prune_size_from: int = 3_000
+    """Only densifications after this step remove large Gaussians."""
     max_gaussians: int | None = None
     """Densification stops above this number; None: no limit."""
 
@@ -86,8 +90,10 @@ class TrainConfig:
     """First reset."""
     opacity_reset_every: int = 3_000
     """Steps between resets; 0 never resets."""
+    opacity_reset_over_white: bool = False
+    """Over a white background opacities are lowered at step ``densify_from`` as well."""
     opacity_decay: float = 1.0
-    """Opacities are multiplied by this at every step from ``densify_from`` on; 1 does nothing."""
+    """Opacities are multiplied by this at every step after ``densify_from``; 1 does nothing."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -114,13 +120,22 @@ class TrainConfig:
             raise ValueError(f"renderer must be 'torch' or 'gsplat', got {self.renderer!r}.")
         if self.analytic and self.renderer != "torch":
             raise ValueError("analytic training needs the moments of the torch renderer: leave out renderer.")
-        for name in ("seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every"):
+        for name in (
+            "seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from"
+        ):  # fmt: skip
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
+        if self.regularize_from >= self.iterations and not self.dropout == 0 == self.noise:
+            raise ValueError(
+                f"regularize_from must be below iterations ({self.iterations}), got {self.regularize_from}: no step "
+                "would use dropout or noise, and opacities would be scaled for them at test time."
+            )
         if self.sh_every < 1:
             raise ValueError(f"sh_every must be at least 1, got {self.sh_every}: set sh_degree=0 for constant colours.")
         if self.initial_points not in ("all", "seen"):
             raise ValueError(f"initial_points must be all or seen, got {self.initial_points!r}.")
+        if self.prune_size is not None and not self.prune_size > 0:
+            raise ValueError(f"prune_size must be positive, or None to keep what is large, got {self.prune_size}.")
         for name in ("means_rate", "means_rate_final", "initial_scale"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
@@ -147,8 +162,10 @@ PRESETS: dict[str, TrainConfig] = {
         sh_every=1_000,
         densify_until=15_000,
         densify_gradient=2e-4,
+        prune_size=0.1,
         opacity_reset=0.01,
         opacity_reset_from=3_000,
+        opacity_reset_over_white=True,
     ),
     "binocular": TrainConfig(
         iterations=30_000,
@@ -159,7 +176,7 @@ PRESETS: dict[str, TrainConfig] = {
         opacity_decay=0.995,
     ),
 }
-"""Schedules of published code bases: FSGS, the INRIA 3DGS, and Binocular3DGS without its consistency loss."""
+"""Schedules of FSGS, of the INRIA 3DGS of 2023, and of Binocular3DGS; docs/presets.md says what differs from them."""
 
 
 def with_preset(name: str, **changes: object) -> TrainConfig:

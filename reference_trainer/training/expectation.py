@@ -13,7 +13,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import MomentImages, Splats, render_moments, splat
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["ExpectedRender", "multiplier_of", "render_expectation"]
+__all__ = ["ExpectedRender", "expected_draw", "render_expectation"]
 
 
 class ExpectedRender(NamedTuple):
@@ -32,12 +32,28 @@ class ExpectedRender(NamedTuple):
     splats: Splats
 
 
-def multiplier_of(config: TrainConfig, opacities: Tensor) -> Multiplier:
-    """Return the factor that the configured dropout and noise put on every opacity, shape (N,)."""
-    dropout = Multiplier.dropout(config.dropout, compensate=config.compensate)
+def expected_draw(config: TrainConfig, opacities: Tensor) -> tuple[Tensor, Multiplier]:
+    """Return the opacities to render, and the random factor on the alphas, that are the configured draws together.
+
+    After compensated dropout the rasterizer gets ``o / (1 - p)`` of the survivors and clamps their alphas at 0.99; the
+    factor of that is the one of plain dropout. The noise acts on ``o / (1 - p)`` too, and leaves at most 1.
+
+    Dropout of either kind is exact. With noise the renderer's clamp of the noisy alphas is left out, which moves a
+    colour by at most 1/99 of the range of the colours, see `Multiplier.clamped_noise`.
+
+    Args:
+        config: dropout and noise.
+        opacities: activated, shape (N,).
+
+    Returns:
+        Opacities, shape (N,), above 1 where those of survivors are, and the factor.
+    """
+    gain = 1 / (1 - config.dropout) if config.compensate else 1.0
+    dropout, survivors = Multiplier.dropout(config.dropout), opacities * gain
     if config.noise == 0:
-        return dropout
-    return dropout * Multiplier.clamped_noise(opacities, config.noise, clip=config.clip_noise)
+        return survivors, dropout
+    noise = Multiplier.clamped_noise(opacities, config.noise, clip=config.clip_noise, gain=gain)
+    return survivors.clamp(max=1), dropout * noise
 
 
 def render_expectation(
@@ -52,7 +68,7 @@ def render_expectation(
         config: dropout, noise and the weight of the penalty.
         sh_degree: highest band of spherical harmonics to use.
     """
-    opacities = gaussians.opacities
+    opacities, multiplier = expected_draw(config, gaussians.opacities)
     splats = splat(
         gaussians.means,
         gaussians.quaternions,
@@ -68,6 +84,6 @@ def render_expectation(
     def moments_fn(opacity: Tensor, view: Splats, multiplier: Multiplier, behind: Any) -> MomentImages:
         return render_moments(view, multiplier, background=background, alpha=False)
 
-    ca_penalty = CAPenalty(moments_fn, lambda opacity: multiplier_of(config, opacity), weight=config.ca_weight)
+    ca_penalty = CAPenalty(moments_fn, multiplier, weight=config.ca_weight)
     image, variance, penalty = ca_penalty(opacities, splats)
     return ExpectedRender(image, variance, penalty, splats)

@@ -30,7 +30,7 @@ def sh_bands(scene: Scene, config: TrainConfig) -> Finding:
 
     Lower degrees for few views save time, but were not shown to be as good.
     """
-    name, reached = "SH bands", (config.iterations - 1) // config.sh_every
+    name, reached = "SH bands", config.iterations // config.sh_every
     if config.sh_degree == 0:
         return Finding(name, "left out", "asked for (sh_degree=0)")
     if reached < config.sh_degree:
@@ -83,6 +83,8 @@ def densification(scene: Scene, config: TrainConfig) -> Finding:
 def opacity_reset(scene: Scene, config: TrainConfig) -> Finding:
     """Lowering all opacities."""
     name, first = "opacity reset", config.opacity_reset_from
+    if config.opacity_reset_over_white and scene.is_white:
+        first = min(first, config.densify_from)
     until = config.iterations if config.densify_until is None else min(config.densify_until, config.iterations)
     if config.opacity_reset_every == 0:
         return Finding(name, "left out", "asked for (opacity_reset_every=0)")

@@ -21,7 +21,7 @@ from reference_trainer.training.config import TrainConfig
 __all__ = ["TrainingState", "read_state"]
 
 _ENTRIES = ("config", "scene", "train_views", "step", "seconds", "statistics", "gaussians", "moments")
-_STATISTICS = ("gradient_sum", "steps", "largest_radius")
+_STATISTICS = ("gradient_sum", "steps")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 

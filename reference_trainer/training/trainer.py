@@ -85,8 +85,13 @@ class Trainer:
 
     @property
     def sh_degree(self) -> int:
-        """The highest band of spherical harmonics in use at this step."""
-        return min(self.config.sh_degree, self.step // self.config.sh_every)
+        """The highest band of spherical harmonics that the last step used."""
+        return self._sh_degree(self.step)
+
+    @property
+    def regularized(self) -> bool:
+        """Whether the last step used the regularizers; of a model that has not begun, whether the first one will."""
+        return max(self.step - 1, 0) >= self.config.regularize_from
 
     def train(
         self,
@@ -208,6 +213,10 @@ class Trainer:
             sh_rest=config.color_rate / 20,
         )
 
+    def _sh_degree(self, number: int) -> int:
+        """Highest band of spherical harmonics of the step with this number, the first being 1."""
+        return min(self.config.sh_degree, number // self.config.sh_every)
+
     def _means_rate(self, step: int) -> float:
         """Learning rate of the means: falls exponentially over the run, in world units."""
         config = self.config
@@ -234,7 +243,7 @@ class Trainer:
             view.camera,
             self.background,
             opacities=self._regularized(),
-            sh_degree=self.sh_degree,
+            sh_degree=self._sh_degree(self.step + 1),
             renderer=self.renderer,
         )
         return (
@@ -245,7 +254,8 @@ class Trainer:
 
     def _expected_loss(self, view: View) -> tuple[Tensor, Tensor, Splats]:
         """Loss and image in expectation over the regularizers."""
-        out = render_expectation(self.gaussians, view.camera, self.background, self.config, sh_degree=self.sh_degree)
+        degree = self._sh_degree(self.step + 1)
+        out = render_expectation(self.gaussians, view.camera, self.background, self.config, sh_degree=degree)
         loss = expected_photometric_loss(out.image, out.variance, view.image, self.config.lambda_dssim)
         return loss + out.penalty, out.image, out.splats
 
@@ -254,9 +264,7 @@ class Trainer:
         gradient = splats.projection.means.grad
         assert gradient is not None
         drawn = splats.lists.touched
-        self.statistics.update(
-            splats.indices[drawn], gradient[drawn], splats.projection.radii[drawn], camera.width, camera.height
-        )
+        self.statistics.update(splats.indices[drawn], gradient[drawn], camera.width, camera.height)
 
     def _control_density(self) -> None:
         """Densify, prune, reset and decay as the schedule says for the steps that are done.
@@ -266,8 +274,10 @@ class Trainer:
         """
         config, step = self.config, self.step
         until = config.iterations if config.densify_until is None else config.densify_until
+        if config.opacity_decay < 1 and step > config.densify_from:
+            decay_opacity(self.optimizer, config.opacity_decay)
         every = config.densify_every
-        if every and config.densify_from < step <= until and step % every == 0:
+        if every and config.densify_from < step < until and step % every == 0:
             # The renderer would tell, but only after pruning has taken for faint what is not a number.
             if not all(bool(x.isfinite().all()) for _, x in self.gaussians.named()):
                 raise TrainingStoppedError(
@@ -278,31 +288,24 @@ class Trainer:
                 raise TrainingStoppedError(
                     f"all Gaussians were pruned after step {step}: lower prune_opacity or noise, raise opacity_reset."
                 )
-        if config.opacity_decay < 1 and step > config.densify_from:
-            decay_opacity(self.optimizer, config.opacity_decay)
-        since = step - config.opacity_reset_from
-        if config.opacity_reset_every and since >= 0 and since % config.opacity_reset_every == 0 and step < until:
-            reset_opacity(self.optimizer, config.opacity_reset)
+        if config.opacity_reset_every and step < until:
+            since = step - config.opacity_reset_from
+            early = config.opacity_reset_over_white and step == config.densify_from > 0
+            if (since >= 0 and since % config.opacity_reset_every == 0) or (early and self.scene.is_white):
+                reset_opacity(self.optimizer, config.opacity_reset)
 
     def _densify(self) -> None:
         config = self.config
-        room = config.max_gaussians is None or len(self.gaussians) < config.max_gaussians
-        radii = self.statistics.largest_radius
-        if room:
-            radii = densify(
+        if config.max_gaussians is None or len(self.gaussians) < config.max_gaussians:
+            densify(
                 self.optimizer,
                 self.statistics,
                 gradient_threshold=config.densify_gradient,
                 size_threshold=config.dense_fraction * self.scene.extent,
                 generator=stream(config.seed, self.step, "split", self.device),
             )
-        # Once opacities have been reset, what is still large on the screen or in the world is a floater.
-        after_reset = config.opacity_reset_every > 0 and self.step > config.opacity_reset_every
-        prune(
-            self.optimizer,
-            min_opacity=config.prune_opacity,
-            max_scale=0.1 * self.scene.extent if after_reset else None,
-            largest_radius=radii,
-            max_radius=20.0 if after_reset else None,
-        )
+        max_scale = None
+        if config.prune_size is not None and self.step > config.prune_size_from:
+            max_scale = config.prune_size * self.scene.extent
+        prune(self.optimizer, min_opacity=config.prune_opacity, max_scale=max_scale)
         self.statistics = DensityStatistics.zeros(len(self.gaussians), self.device)

@@ -221,12 +221,12 @@ def test_padding_does_not_matter():
         x[:, where] = y
     before = pixel_moments(alphas, colors, noise, background=background)
     after = pixel_moments(padded, wide[0], Multiplier(*wide[1:]), background=background)
-    torch.testing.assert_close(after.mean, before.mean, rtol=0, atol=0)
-    torch.testing.assert_close(after.variance, before.variance, rtol=1e-15, atol=0)
+    torch.testing.assert_close(after.mean, before.mean, **EXACT)
+    torch.testing.assert_close(after.variance, before.variance, **EXACT)
     shares = contributions(padded, wide[0], Multiplier(*wide[1:]), background=background)
-    assert torch.equal(shares[:, where], contributions(alphas, colors, noise, background=background))
+    torch.testing.assert_close(shares[:, where], contributions(alphas, colors, noise, background=background), **EXACT)
     neutral = neutral_background(padded, wide[0], Multiplier(wide[1], 0.0))
-    torch.testing.assert_close(neutral, neutral_background(alphas, colors, noise), rtol=1e-15, atol=0)
+    torch.testing.assert_close(neutral, neutral_background(alphas, colors, noise), **EXACT)
 
 
 def test_an_empty_list_shows_the_background():
@@ -246,7 +246,7 @@ def test_shapes_without_a_pixel_axis_or_with_several_agree():
     dropout = Multiplier.dropout(0.3)
     flat = pixel_moments(alphas, colors, dropout, background=background[0])
     grid = pixel_moments(alphas.view(2, 3, 5), colors.view(2, 3, 5, 3), dropout, background=background[0])
-    assert torch.equal(grid.variance.view(6, 3), flat.variance)
+    torch.testing.assert_close(grid.variance.view(6, 3), flat.variance, **EXACT)
     one = pixel_moments(alphas[2], colors[2], dropout, background=background[0])
     torch.testing.assert_close(one.mean, flat.mean[2], **EXACT)
     torch.testing.assert_close(one.variance, flat.variance[2], **EXACT)
@@ -257,8 +257,8 @@ def test_channels_are_independent_and_colours_scale_and_shift():
     dropout, order = Multiplier.dropout(0.3), [2, 0, 1]
     plain = pixel_moments(alphas, colors, dropout, background=background)
     turned = pixel_moments(alphas, colors[..., order], dropout, background=background[:, order])
-    assert torch.equal(turned.mean, plain.mean[:, order])
-    assert torch.equal(turned.variance, plain.variance[:, order])
+    torch.testing.assert_close(turned.mean, plain.mean[:, order], **EXACT)
+    torch.testing.assert_close(turned.variance, plain.variance[:, order], **EXACT)
     affine = pixel_moments(alphas, 2 - 3 * colors, dropout, background=2 - 3 * background)
     torch.testing.assert_close(affine.mean, 2 - 3 * plain.mean, **EXACT)
     torch.testing.assert_close(affine.variance, 9 * plain.variance, **EXACT)

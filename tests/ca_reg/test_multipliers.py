@@ -12,15 +12,16 @@ SIGMAS = [1e-3, 0.05, 0.3, 0.8, 1.0, 2.5, 10.0, 1e3]
 OPACITIES = [1e-12, 1e-4, 0.1, 0.3, 0.4, 0.5, 0.8, 0.95, 0.99, 1 - 1e-4, 1 - 1e-12, 1.0]
 
 
-def quadrature(opacity, sigma, clip):
-    """E and Var of clamp(o (1 + eps), 0, 1) / o by Gauss-Legendre panels that end at every kink."""
+def quadrature(opacity, sigma, clip, gain=1.0):
+    """E and Var of clamp(g o (1 + eps), 0, 1) / min(g o, 1) by Gauss-Legendre panels that end at every kink."""
+    opacity = gain * opacity
     kinks = [-1.0, 1.0, -1 / sigma, (1 / opacity - 1) / sigma]
     panels = np.unique(np.clip([*kinks, *np.linspace(-12, 12, 25)], -12, 12))
     x, w = np.polynomial.legendre.leggauss(24)
     half = np.diff(panels)[:, None] / 2
     z = panels[:-1, None] + half * (1 + x)
     weight = half * w * np.exp(-z * z / 2) / math.sqrt(2 * math.pi)
-    factor = np.clip(1 + sigma * (np.clip(z, -1, 1) if clip else z), 0, 1 / opacity)
+    factor = np.clip(1 + sigma * (np.clip(z, -1, 1) if clip else z), 0, 1 / opacity) * max(opacity, 1.0)
     mean = (weight * factor).sum()
     return mean, (weight * (factor - mean) ** 2).sum()
 
@@ -35,6 +36,19 @@ def test_clamped_noise_agrees_with_quadrature(clip, dtype, tolerance):
         assert noise.mean.dtype == noise.variance.dtype == dtype
         np.testing.assert_allclose(noise.mean.numpy(), expected[:, 0], rtol=tolerance)
         np.testing.assert_allclose(noise.variance.numpy(), expected[:, 1], rtol=tolerance)
+
+
+@pytest.mark.parametrize("clip", [False, True])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-6)])
+@pytest.mark.parametrize("gain", [1.25, 2.0, 100.0])
+def test_clamped_noise_of_survivors_agrees_with_quadrature(gain, dtype, tolerance, clip):
+    opacity = torch.tensor(OPACITIES, dtype=dtype)
+    for sigma in (0.05, 0.3, 0.8, 2.5):
+        expected = np.array([quadrature(o, sigma, clip, gain) for o in opacity.double().tolist()])
+        noise = Multiplier.clamped_noise(opacity, sigma, clip=clip, gain=gain)
+        np.testing.assert_allclose(noise.mean.numpy(), expected[:, 0], rtol=tolerance)
+        # What the draws leave below 1 is a difference of numbers of the size of (gain o)^2.
+        np.testing.assert_allclose(noise.variance.numpy(), expected[:, 1], rtol=tolerance, atol=4e-15 * gain**2)
 
 
 @pytest.mark.parametrize("clip", [False, True])
@@ -100,12 +114,13 @@ def test_a_product_with_small_variances_does_not_cancel():
 
 
 @pytest.mark.parametrize("clip", [False, True])
-def test_clamped_noise_is_differentiable(clip):
-    # Away from the kink that the clipped draw has at o = 1 / (1 + sigma).
+@pytest.mark.parametrize("gain", [1.0, 1.7])
+def test_clamped_noise_is_differentiable(gain, clip):
+    # Away from the kinks that the clipped draw has at g o = 1 / (1 + sigma), and the factor at g o = 1.
     opacity = torch.tensor([0.05, 0.3, 0.5, 0.8, 0.97], dtype=torch.float64, requires_grad=True)
 
     def moments(o):
-        noise = Multiplier.clamped_noise(o, 0.8, clip=clip)
+        noise = Multiplier.clamped_noise(o, 0.8, clip=clip, gain=gain)
         return noise.mean, noise.variance
 
     assert torch.autograd.gradcheck(moments, (opacity,))
@@ -131,6 +146,11 @@ def test_gradients_stay_finite_at_the_ends_of_the_range(sigma, dtype):
         (lambda: Multiplier.clamped_noise(torch.tensor([torch.nan]), 0.1), ValueError, "opacity must be activated"),
         (lambda: Multiplier.clamped_noise(torch.tensor([1]), 0.1), TypeError, "floating-point"),
         (lambda: Multiplier.clamped_noise(torch.tensor([0.5]), math.inf), ValueError, "sigma must be finite"),
+        (
+            lambda: Multiplier.clamped_noise(torch.tensor([0.5]), 0.1, gain=0.9),
+            ValueError,
+            "gain must be .* at least 1",
+        ),
         (lambda: Multiplier(-1.0, 0.0), ValueError, "mean of a multiplier"),
         (lambda: Multiplier(1.0, torch.tensor([0.1, -0.1])), ValueError, "variance of a multiplier"),
         (lambda: Multiplier(torch.tensor(math.nan), 0.0), ValueError, "mean of a multiplier"),

@@ -36,6 +36,8 @@ def busy() -> TrainConfig:
         densify_gradient=1e-4,
         dense_fraction=0.12,
         prune_opacity=0.02,
+        prune_size=0.1,
+        prune_size_from=9,
         opacity_reset_from=10,
         opacity_reset_every=9,
     )

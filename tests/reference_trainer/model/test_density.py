@@ -27,9 +27,9 @@ def optimizer_of(gaussians: Gaussians) -> GaussianOptimizer:
 
 
 def seen(gradients: list[float]) -> DensityStatistics:
-    """Statistics with these mean gradients from two steps, and radii 1, 2, 3, ..."""
+    """Statistics with these mean gradients from two steps."""
     sums = 2 * torch.tensor(gradients)
-    return DensityStatistics(sums, torch.full_like(sums, 2), 1 + torch.arange(len(gradients)).float())
+    return DensityStatistics(sums, torch.full_like(sums, 2))
 
 
 def sizes(*largest: float) -> torch.Tensor:
@@ -44,7 +44,7 @@ def test_small_ones_are_cloned_large_ones_split_and_quiet_ones_stay():
     optimizer = optimizer_of(start)
     # The threshold itself selects; a Gaussian of just the size threshold (the last) is cloned.
     statistics = seen([0.5, 0.5, 0.49, 0.49, 0.9])
-    radii = densify(optimizer, statistics, gradient_threshold=0.5, size_threshold=float(start.scales[4].max()))
+    densify(optimizer, statistics, gradient_threshold=0.5, size_threshold=float(start.scales[4].max()))
     new = optimizer.gaussians
     assert len(new) == 5 - 1 + 2 + 2
     stayed, clones, children = torch.arange(4), torch.tensor([4, 5]), torch.tensor([6, 7])
@@ -57,14 +57,12 @@ def test_small_ones_are_cloned_large_ones_split_and_quiet_ones_stay():
             assert (x[children] != old[[1, 1]]).all()
         else:
             assert torch.equal(x[children], old[[1, 1]]), name
-    assert radii.tolist() == [1, 3, 4, 5, 0, 0, 0, 0]
 
 
 def test_nothing_to_do_changes_nothing():
     start = some(3)
     optimizer = optimizer_of(start)
-    radii = densify(optimizer, seen([0.1, 0.2, 0.3]), gradient_threshold=0.5, size_threshold=0.1)
-    assert radii.tolist() == [1, 2, 3]
+    densify(optimizer, seen([0.1, 0.2, 0.3]), gradient_threshold=0.5, size_threshold=0.1)
     assert torch.equal(optimizer.gaussians.means, start.means)
 
 
@@ -104,7 +102,7 @@ def test_children_scatter_like_their_parent():
     log_scales = torch.tensor([[0.7, 0.2, 1.5]]).log()
     start = some(n, quaternions=turn.repeat(n, 1), log_scales=log_scales.repeat(n, 1), means=torch.zeros(n, 3))
     optimizer = optimizer_of(start)
-    statistics = DensityStatistics(torch.ones(n), torch.ones(n), torch.zeros(n))
+    statistics = DensityStatistics(torch.ones(n), torch.ones(n))
     densify(
         optimizer, statistics, gradient_threshold=0.5, size_threshold=0.1, generator=torch.Generator().manual_seed(0)
     )
@@ -124,10 +122,9 @@ def test_children_scatter_like_their_parent():
 # Pruning
 
 
-def test_pruning_by_opacity_size_and_radius():
+def test_pruning_by_opacity_and_size():
     opacities = torch.tensor([0.004, 0.006, 0.9, 0.9, 0.9])
     start = some(5, opacity_logits=inverse_sigmoid(opacities), log_scales=sizes(0.1, 0.1, 0.5, 0.1, 0.1))
-    radii = torch.tensor([5.0, 5.0, 5.0, 21.0, 20.0])
 
     def survivors(**limits) -> list[int]:
         optimizer = optimizer_of(start)
@@ -139,8 +136,6 @@ def test_pruning_by_opacity_size_and_radius():
     assert survivors(min_opacity=0.0) == [0, 1, 2, 3, 4]
     assert survivors(min_opacity=0.005) == [1, 2, 3, 4]
     assert survivors(min_opacity=0.005, max_scale=0.3) == [1, 3, 4]
-    assert survivors(min_opacity=0.005, largest_radius=radii, max_radius=20.0) == [1, 2, 4]
-    assert survivors(min_opacity=0.005, max_scale=0.3, largest_radius=radii, max_radius=20.0) == [1, 4]
     assert survivors(min_opacity=0.95) == []
 
 
@@ -177,21 +172,20 @@ def test_extreme_opacities_stay_finite_under_decay_and_reset(logit):
 def test_gradients_are_counted_in_half_image_sizes_and_averaged_over_the_steps_that_drew_them():
     statistics = DensityStatistics.zeros(3)
     gradient = torch.tensor([[3e-2, 0.0], [0.0, 4e-2]])
-    statistics.update(torch.tensor([0, 2]), gradient, torch.tensor([7.0, 3.0]), width=200, height=50)
-    statistics.update(torch.tensor([2]), torch.tensor([[3e-2, 4e-2]]), torch.tensor([2.0]), width=200, height=200)
+    statistics.update(torch.tensor([0, 2]), gradient, width=200, height=50)
+    statistics.update(torch.tensor([2]), torch.tensor([[3e-2, 4e-2]]), width=200, height=200)
     torch.testing.assert_close(statistics.mean_gradient, torch.tensor([3.0, 0.0, (1.0 + 5.0) / 2]))
     assert statistics.steps.tolist() == [1, 0, 2]
-    assert statistics.largest_radius.tolist() == [7, 0, 3]
 
 
-def drawn(scene, gaussians: Gaussians, view, opacities) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Render with gradients as the trainer does; return indices, gradients and radii of what was drawn."""
+def drawn(scene, gaussians: Gaussians, view, opacities) -> tuple[torch.Tensor, torch.Tensor]:
+    """Render with gradients as the trainer does; return indices and gradients of what was drawn."""
     gaussians = gaussians.map(lambda x: x.detach().clone().requires_grad_())
     rendering = render_gaussians(gaussians, view.camera, scene.background, opacities=opacities)
     (rendering.image - view.image).square().sum().backward()
     splats = rendering.splats
     touched = splats.lists.touched
-    return splats.indices[touched], splats.projection.means.grad[touched], splats.projection.radii[touched]
+    return splats.indices[touched], splats.projection.means.grad[touched]
 
 
 def test_dropped_gaussians_leave_no_trace(tiny_scene):
@@ -205,10 +199,9 @@ def test_dropped_gaussians_leave_no_trace(tiny_scene):
         where = keep.nonzero().squeeze(1)
         size = (view.camera.width, view.camera.height)
         with_dropped.update(*drawn(tiny_scene, model, view, model.opacities * keep), *size)
-        index, gradient, radii = drawn(tiny_scene, model[keep], view, None)
-        expected.update(where[index], gradient, radii, *size)
+        index, gradient = drawn(tiny_scene, model[keep], view, None)
+        expected.update(where[index], gradient, *size)
     assert torch.equal(with_dropped.steps, expected.steps)
-    assert torch.equal(with_dropped.largest_radius, expected.largest_radius)
     torch.testing.assert_close(with_dropped.gradient_sum, expected.gradient_sum, rtol=1e-4, atol=1e-7)
     assert int((with_dropped.steps == 0).sum()) > 0
     assert int((with_dropped.steps == 3).sum()) > 0
@@ -220,6 +213,6 @@ def test_dropout_does_not_dilute_the_mean_gradient():
     g = torch.Generator().manual_seed(0)
     for _ in range(40):
         index = (torch.rand(50, generator=g) >= 0.5).nonzero().squeeze(1)
-        statistics.update(index, torch.tensor([[0.01, 0.0]]).expand(len(index), 2), torch.ones(len(index)), 200, 100)
+        statistics.update(index, torch.tensor([[0.01, 0.0]]).expand(len(index), 2), 200, 100)
     assert int(statistics.steps.max()) < 40  # everyone was dropped at times
     torch.testing.assert_close(statistics.mean_gradient, torch.ones(50))

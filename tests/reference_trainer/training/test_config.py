@@ -50,6 +50,8 @@ def test_test_time_scale(compensate, scale):
         ("initial_opacity", 0.0),
         ("densify_from", -1),
         ("densify_every", -1),
+        ("prune_size", 0.0),
+        ("prune_size_from", -1),
         ("opacity_reset", 0.0),
         ("opacity_reset_every", -5),
         ("opacity_decay", 0.0),
@@ -70,6 +72,15 @@ def test_scaling_by_the_mean_of_the_noise_needs_noise_at_the_plain_opacities():
         TrainConfig(scale_noise=True, noise=0.8, dropout=0.2, compensate=True)
     assert TrainConfig(scale_noise=True, noise=0.8, dropout=0.2).test_time_scale == 0.8
     assert TrainConfig(scale_noise=True, noise=0.8, compensate=True).noise == 0.8
+
+
+@pytest.mark.parametrize("regularizer", [{"dropout": 0.2}, {"noise": 0.8}])
+def test_regularizers_that_never_begin_are_refused(regularizer):
+    """They would scale opacities at test time, of a model that never met them."""
+    with pytest.raises(ValueError, match=r"regularize_from must be below iterations \(5\), got 5"):
+        TrainConfig(iterations=5, regularize_from=5, **regularizer)
+    assert TrainConfig(iterations=5, regularize_from=4, **regularizer).regularize_from == 4
+    assert TrainConfig(iterations=5, regularize_from=5).regularize_from == 5
 
 
 def test_an_expectation_needs_something_random():

@@ -1,6 +1,7 @@
 """Analytic training: against sampled renders, enumeration, and itself."""
 
 import dataclasses
+import math
 from itertools import product
 
 import pytest
@@ -8,10 +9,11 @@ import torch
 from oracles import random_scene
 
 from ca_reg import OpacityNoise
+from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.expectation import multiplier_of, render_expectation
+from reference_trainer.training.expectation import expected_draw, render_expectation
 from reference_trainer.training.trainer import Trainer
 
 BLACK = torch.zeros(3, dtype=torch.float64)
@@ -24,19 +26,66 @@ def model(n: int, seed: int = 2) -> tuple[Gaussians, object]:
     return dataclasses.replace(gaussians, opacity_logits=logits), scene.camera
 
 
-def test_the_render_is_the_enumerated_mean_and_variance():
-    gaussians, camera = model(7)
-    masks = torch.tensor(list(product([0.0, 1.0], repeat=7)), dtype=torch.float64)
-    probability = (0.3 + 0.4 * masks).prod(1)
-    images = torch.stack(
-        [render_gaussians(gaussians, camera, BLACK, opacities=gaussians.opacities * mask).image for mask in masks]
+@pytest.mark.parametrize(("p", "compensate"), [(0.3, False), (0.2, True), (0.5, True)])
+def test_mean_variance_and_their_gradients_are_those_of_all_masks(p, compensate):
+    """At 0.5 most survivors are clamped at 0.99, somewhere or everywhere; the gradient passes the clamp in both."""
+    start, camera = model(6)
+    config = TrainConfig(dropout=p, compensate=compensate, analytic=True)
+    masks = torch.tensor(list(product([0.0, 1.0], repeat=6)), dtype=torch.float64)
+    probability = (p + (1 - 2 * p) * masks).prod(1)
+    found = []
+    for enumerate_masks in (True, False):
+        gaussians = start.map(lambda x: x.detach().clone().requires_grad_())
+        if enumerate_masks:
+            drawn = gaussians.opacities / (1 - p if compensate else 1)
+            images = torch.stack(
+                [render_gaussians(gaussians, camera, BLACK, opacities=drawn * mask).image for mask in masks]
+            )
+            mean = torch.einsum("k,kchw->chw", probability, images)
+            variance = torch.einsum("k,kchw->chw", probability, (images - mean) ** 2)
+        else:
+            out = render_expectation(gaussians, camera, BLACK, config, sh_degree=0)
+            mean, variance = out.image, out.variance
+            assert out.penalty.item() == 0
+        (mean.square().sum() + 3 * variance.sum()).backward()
+        found.append((mean, variance, *(x.grad for name, x in gaussians.named() if name != "sh_rest")))
+    assert (found[0][1] > 1e-3).double().mean() > 0.1
+    for enumerated, exact in zip(*found, strict=True):
+        torch.testing.assert_close(exact, enumerated, rtol=1e-9, atol=1e-12)
+
+
+def one_white(opacity: float) -> tuple[Gaussians, Camera]:
+    """A white Gaussian that is centred on a pixel, so that its falloff there is 1; in the corner it is 0.73."""
+    white = Gaussians.from_points(
+        torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1, 3), torch.tensor([1.2]), sh_degree=0, opacity=opacity
     )
-    mean = torch.einsum("k,kchw->chw", probability, images)
-    variance = torch.einsum("k,kchw->chw", probability, (images - mean) ** 2)
-    out = render_expectation(gaussians, camera, BLACK, TrainConfig(dropout=0.3, analytic=True), sh_degree=0)
-    torch.testing.assert_close(out.image, mean, rtol=0, atol=1e-12)
-    torch.testing.assert_close(out.variance, variance, rtol=0, atol=1e-12)
-    assert out.penalty.item() == 0
+    return white.map(lambda x: x.double()), Camera(torch.eye(4), 6.0, 6.0, 2.5, 2.5, 5, 5)
+
+
+def test_opaque_gaussians_are_drawn_more_opaque_at_test_time_than_inverted_dropout_trains_them():
+    """As docs/theory.md says; plain dropout has no such gap."""
+    white, camera = one_white(0.95)
+    for compensate, trained, drawn in ((True, 0.495, 0.95), (False, 0.475, 0.475)):
+        config = TrainConfig(dropout=0.5, compensate=compensate, analytic=True)
+        mean = render_expectation(white, camera, BLACK, config, sh_degree=0).image[0, 2, 2].item()
+        tested = render_gaussians(white, camera, BLACK, opacities=white.opacities * config.test_time_scale).image
+        assert (mean, tested[0, 2, 2].item()) == (pytest.approx(trained, rel=1e-6), pytest.approx(drawn, rel=1e-6))
+
+
+@pytest.mark.parametrize("p", [0.0, 0.5])
+def test_the_clamp_of_noisy_alphas_is_all_that_is_left_out(p):
+    """Where a falloff exceeds 0.99 the noise reaches the clamp of alpha; it moves the mean by at most 1/99."""
+    white, camera = one_white(0.95)
+    config = TrainConfig(dropout=p, compensate=True, noise=0.8, analytic=True)
+    z, width = torch.linspace(-8, 8, 4001, dtype=torch.float64), 16 / 4000
+    drawn = (0.95 / (1 - p) * (1 + 0.8 * z)).clamp(0, 1)
+    levels, which = torch.unique((drawn * 100).round() / 100, return_inverse=True)
+    weights = torch.zeros_like(levels).index_add_(0, which, width * torch.exp(-z * z / 2) / math.sqrt(2 * math.pi))
+    images = torch.stack([render_gaussians(white, camera, BLACK, opacities=level[None]).image[0] for level in levels])
+    mean = (1 - p) * torch.einsum("k,khw->hw", weights, images)
+    error = render_expectation(white, camera, BLACK, config, sh_degree=0).image[0] - mean
+    assert 4e-4 < error.abs().max() < 1 / 99
+    assert error[0, 0].abs() < 1e-4
 
 
 def test_the_penalty_is_the_weighted_mean_variance():
@@ -49,7 +98,8 @@ def test_the_penalty_is_the_weighted_mean_variance():
 def test_the_multiplier_is_that_of_what_training_samples():
     opacities = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
     config = TrainConfig(dropout=0.2, noise=0.6, analytic=True)
-    multiplier = multiplier_of(config, opacities)
+    rendered, multiplier = expected_draw(config, opacities)
+    assert torch.equal(rendered, opacities)
     noise = OpacityNoise(0.6)
     generator = torch.Generator().manual_seed(0)
     n = 200_000

