@@ -6,8 +6,7 @@ from oracles import random_scene
 
 from ca_reg.functional import Multiplier, contributions
 from reference_trainer.render import splat
-from reference_trainer.render.moments import variance_shares
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render.moments import render_moments, variance_shares
 
 
 def dense_shares(splats, multiplier, weights, background):
