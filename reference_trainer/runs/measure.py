@@ -11,7 +11,7 @@ import torch
 from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric, evaluate
 from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.pictures import save_gif, save_png
+from reference_trainer.evaluation.pictures import file_names, save_gif, save_png
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import remove_leftovers, write_text
@@ -136,7 +136,8 @@ def render_run(
         cameras = {f"{i:04d}": camera for i, camera in enumerate(path)}
     else:
         views = trainer.scene.test if what == "test" else trainer.scene.train
-        cameras = {Path(view.name).stem: view.camera for view in views}
+        names = file_names([view.name for view in views])
+        cameras = {name: view.camera for name, view in zip(names, views, strict=True)}
     opacities = model.test_opacities
     images = []
     for name, camera in cameras.items():

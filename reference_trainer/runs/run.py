@@ -105,7 +105,8 @@ def run_experiment(
             with, or goes on without one if it began without.
         given: with ``auto``, fields of ``config`` that the plan must not change although they are at their default.
         device: where to train.
-        monitor_every: steps between measurements of CA and PSNR; 0 for none.
+        monitor_every: steps between measurements of CA and PSNR; 0 for none. A training of fewer steps is measured at
+            its end.
         checkpoint_every: steps between checkpoints.
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         progress: whether to show a progress bar.
@@ -244,6 +245,7 @@ def _train(
     if not monitor_every:
         trainer.train(after_step=checkpoint, progress=progress)
         return
+    monitor_every = min(monitor_every, last)
 
     def render_now(opacity: Tensor, view: View) -> tuple[Tensor, Tensor]:
         return model_of(trainer).render(opacity, view)

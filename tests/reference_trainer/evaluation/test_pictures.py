@@ -6,7 +6,35 @@ import pytest
 import torch
 from PIL import Image
 
-from reference_trainer.evaluation.pictures import error_map, heat_map, save_png, side_by_side, to_uint8
+from reference_trainer.evaluation.pictures import (
+    PANEL,
+    error_map,
+    file_names,
+    heat_map,
+    save_png,
+    side_by_side,
+    to_uint8,
+)
+
+
+@pytest.mark.parametrize(
+    ("views", "names"),
+    [
+        (["0001.jpg", "sub/0002.png", "12.30.01.jpg", "train/r_3"], ["0001", "0002", "12.30.01", "r_3"]),
+        (["a/r_0.png", "b/r_0.png"], ["a_r_0", "b_r_0"]),
+        (["a.jpg", "a.png"], ["a", "a.png"]),
+        (["A/x.png", "b/X.png"], ["A_x", "b_X"]),  # one file, to some file systems
+        (["r.png", "r_panel.png"], ["r", "r_panel.png"]),
+        (["a/r.png", "b/r.png", "a_r.png"], ["a_r", "b_r", "a_r.png"]),
+        ([f"{x}/r.png" for x in ("a/b", "a_b", "a/b/r.png/..")], None),
+    ],
+)
+def test_no_two_views_share_a_file(views, names):
+    found = file_names(views)
+    assert names is None or found == names
+    files = [f"{name}{end}.png".casefold() for name in found for end in ("", PANEL)]
+    assert len(set(files)) == 2 * len(views)
+    assert not any("/" in name for name in found)
 
 
 def test_bytes_survive_the_way_to_float_and_back():
