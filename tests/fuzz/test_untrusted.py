@@ -5,19 +5,23 @@ import os
 import pickle
 import tracemalloc
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from fuzz import samples
+from PIL import EpsImagePlugin, Image
 
 from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.scenes.blender import read_transforms
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
+from reference_trainer.scenes.images import image_size, read_image
 from reference_trainer.scenes.llff import read_llff
 from reference_trainer.scenes.load import load_scene
 from reference_trainer.training.checkpoint import load_checkpoint
 
+ROOT = Path(__file__).parents[2]
 ESCAPES = ["../../etc/passwd", "/etc/passwd", "..", "images/../../secret.png", "./../secret.png", "a/../../../b.png"]
 READERS = {
     "checkpoint.pt": lambda folder: load_checkpoint(folder / "checkpoint.pt"),
@@ -68,6 +72,31 @@ def test_the_test_above_would_see_an_execution(tmp_path):
     write_pickle(tmp_path / "evil.pt", Call(os.mkdir, str(tmp_path / "executed")), "archive")
     torch.load(tmp_path / "evil.pt", weights_only=False)
     assert (tmp_path / "executed").is_dir()
+
+
+@pytest.mark.parametrize("read", [read_image, image_size])
+def test_postscript_under_the_name_of_a_picture_reaches_no_interpreter(tmp_path, monkeypatch, read):
+    # Pillow finds Ghostscript on the PATH and lets it run the program in the file.
+    interpreter = tmp_path / "gs"
+    interpreter.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\n")
+    interpreter.chmod(0o755)
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    Image.new("RGB", (4, 4)).save(tmp_path / "x.png", "EPS")
+    with Image.open(tmp_path / "x.png") as file, pytest.raises(OSError, match=r"."):
+        file.load()
+    assert (tmp_path / "started").exists()  # the test would see it
+    (tmp_path / "started").unlink()
+    with pytest.raises(ValueError, match=r"x\.png is not a readable image: .* PNG, JPEG, BMP, TIFF or WebP"):
+        read(tmp_path / "x.png")
+    assert not (tmp_path / "started").exists()
+
+
+def test_pictures_are_opened_in_one_place():
+    files = [file for package in ("reference_trainer", "ca_reg", "integrations") for file in (ROOT / package).rglob("*.py")]
+    opening = {file.name: file.read_text().count("Image.open(") for file in files}
+    assert len(files) > 100
+    assert {name: count for name, count in opening.items() if count} == {"images.py": 1}
 
 
 @pytest.mark.parametrize("name", ["checkpoint.pt", "lpips.pth"])
