@@ -19,6 +19,7 @@ from reference_trainer.scenes.colmap import colmap_frames, read_colmap
 from reference_trainer.scenes.images import image_size, read_image
 from reference_trainer.scenes.llff import read_llff
 from reference_trainer.scenes.load import load_scene
+from reference_trainer.tensor_files import load_tensors
 from reference_trainer.training.checkpoint import load_checkpoint
 
 ROOT = Path(__file__).parents[2]
@@ -115,6 +116,50 @@ def test_a_few_bytes_do_not_take_a_gigabyte(tmp_path, name, function):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1_000_000
+
+
+def nested(kind, levels):
+    """Return a pickle of a dict in which 2 ** levels empty containers are, in pairs of pairs, from one of each level."""
+    empty, before, after = {
+        "list": (b"]", b"](", b"e"),
+        "dict": (b"}", b"}(K\x00", b"K\x01%su"),
+        "OrderedDict": (b"}", b"ccollections\nOrderedDict\n)R(K\x00", b"K\x01%su"),
+        "tuple": (b")", b"", b"\x86"),
+        "key": (b")", b"", b"\x86"),
+    }[kind]
+    x = empty + b"q\x00"
+    for level in range(levels):
+        again = b"h" + bytes([level])
+        x = before + x + (after % again if b"%" in after else again + after) + b"q" + bytes([level + 1])
+    return b"\x80\x02}X\x01\x00\x00\x00x" + (b"}" + x + b"K\x00s" if kind == "key" else x) + b"s."
+
+
+@pytest.mark.parametrize("name", ["checkpoint.pt", "lpips.pth"])
+@pytest.mark.parametrize("kind", ["list", "dict", "tuple", "OrderedDict", "key"])
+def test_what_stands_at_two_places_is_not_unfolded(tmp_path, name, kind):
+    # With 40 levels any walk over it would last for years.
+    samples.write_checkpoint(tmp_path)
+    with zipfile.ZipFile(tmp_path / "checkpoint.pt") as good, zipfile.ZipFile(tmp_path / "evil.pt", "w") as evil:
+        for item in good.namelist():
+            evil.writestr(item, nested(kind, 40) if item.endswith("data.pkl") else good.read(item))
+    (tmp_path / "evil.pt").replace(tmp_path / name)
+    with pytest.raises(ValueError, match=r"holds one (list|dict|tuple|OrderedDict) at two places"):
+        READERS[name](tmp_path)
+
+
+def test_the_nested_pickles_are_what_they_are_said_to_be():
+    pair = pickle.loads(nested("list", 2))["x"]
+    assert pair == [[[], []], [[], []]]
+    assert pair[0] is pair[1]
+    assert pickle.loads(nested("OrderedDict", 1))["x"] == {0: {}, 1: {}}
+    assert pickle.loads(nested("key", 1))["x"] == {((), ()): 0}
+
+
+@pytest.mark.parametrize("archive", [True, False])
+def test_a_pickle_without_end_is_not_followed(tmp_path, archive):
+    torch.save({"x": [[] for _ in range(100_000)]}, tmp_path / "x.pt", _use_new_zipfile_serialization=archive)
+    with pytest.raises(ValueError, match="describes its tensors in more than"):
+        load_tensors(tmp_path / "x.pt")
 
 
 @pytest.mark.parametrize("name", ESCAPES)
