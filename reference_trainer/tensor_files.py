@@ -22,7 +22,9 @@ _ALLOWED = {
     "torch._utils _rebuild_tensor_v2",
     *(f"torch {kind}Storage" for kind in _STORAGES),
 }
-_LARGEST_PICKLE = 256_000  # bytes, without the tensors; those of a checkpoint have 5,000. One byte may make 72 of memory
+_LARGEST_PICKLE = (
+    256_000  # bytes, without the tensors; those of a checkpoint have 5,000. One byte may make 72 of memory
+)
 _PICKLES_OF_OLD_FILES = 5  # magic number, version, platform, content, names of the storages
 
 
@@ -115,8 +117,8 @@ def _check_old_file(data: io.BytesIO) -> None:
 def _check_pickle(file: IO[bytes], largest: int | None = None) -> None:
     """Refuse a pickle that names anything but tensors, is long, repeats a tuple, or has a size above the largest.
 
-    A tuple that holds another one twice, which holds a third one twice, and so on, has as many parts as it wants: making
-    a key of a dict of it would take that long already.
+    A tuple that holds another one twice, which holds a third one twice, and so on, has as many parts as it wants: as a
+    key of a dict it would take that long already.
     """
     start, last, tuples = file.tell(), "", set[object]()
     for opcode, argument, position in pickletools.genops(file):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from itertools import chain, count
@@ -166,8 +167,8 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
 
     Args:
         images: pictures of one size, each (3, H, W), colours in [0, 1].
-        labels: one line for each, Latin letters (the built-in font has few others); what is wider than the picture is
-            cut.
+        labels: one line for each, Latin letters (the built-in font has few others); a column is as wide as its widest
+            label.
         columns: pictures in a row; None puts all of them in one.
 
     Returns:
@@ -190,18 +191,22 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
     _, height, width = images[0].shape
     cell_height, rows = height + _LABEL_HEIGHT, -(-len(images) // columns)
     columns = min(columns, len(images))
-    grid = torch.ones(3, rows * (cell_height + _GAP) - _GAP, columns * (width + _GAP) - _GAP)
-    for index, (image, label) in enumerate(zip(images, labels, strict=True)):
-        top, left = index // columns * (cell_height + _GAP), index % columns * (width + _GAP)
-        grid[:, top : top + _LABEL_HEIGHT, left : left + width] = _label(label, width)
+    strips = [_label(label) for label in labels]
+    widths = [max(width, *(strip.shape[1] for strip in strips[column::columns])) for column in range(columns)]
+    grid = torch.ones(3, rows * (cell_height + _GAP) - _GAP, sum(widths) + (columns - 1) * _GAP)
+    for index, (image, strip) in enumerate(zip(images, strips, strict=True)):
+        row, column = divmod(index, columns)
+        top, left = row * (cell_height + _GAP), sum(widths[:column]) + column * _GAP
+        grid[:, top : top + _LABEL_HEIGHT, left : left + strip.shape[1]] = strip
         grid[:, top + _LABEL_HEIGHT : top + cell_height, left : left + width] = image.detach().cpu().clamp(0, 1)
     return grid
 
 
-def _label(text: str, width: int) -> Tensor:
-    """Return black text on white, shape (_LABEL_HEIGHT, width), in [0, 1]."""
+def _label(text: str) -> Tensor:
+    """Return black text on white, shape (_LABEL_HEIGHT, its width), in [0, 1]."""
     from PIL import Image, ImageDraw
 
+    width = math.ceil(ImageDraw.Draw(Image.new("L", (1, 1))).textlength(text)) + 4
     strip = Image.new("L", (width, _LABEL_HEIGHT), 255)
     ImageDraw.Draw(strip).text((2, 2), text, fill=0)
     return torch.frombuffer(bytearray(strip.tobytes()), dtype=torch.uint8).reshape(_LABEL_HEIGHT, width) / 255

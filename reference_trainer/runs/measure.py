@@ -19,6 +19,7 @@ from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.folder import VIEWS
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.threads import threads_for
 
 __all__ = ["evaluation_table", "measure", "of_run", "render_run"]
 
@@ -74,9 +75,17 @@ def measure(
     """
     keep = out / PARTIAL
     remove_leftovers(out / VIEWS)
-    result = evaluate(
-        model, scene, samples=samples, seed=seed, perceptual=perceptual, pictures=out / VIEWS, keep=keep, progress=say
-    )
+    with threads_for(scene.pixels):
+        result = evaluate(
+            model,
+            scene,
+            samples=samples,
+            seed=seed,
+            perceptual=perceptual,
+            pictures=out / VIEWS,
+            keep=keep,
+            progress=say,
+        )
     settings = model.ca_score(samples=samples, seed=seed).settings
     data = {
         "scene": scene.name,
@@ -141,9 +150,10 @@ def render_run(
     opacities = model.test_opacities
     images = []
     for name, camera in cameras.items():
-        rendering = render_gaussians(
-            model.gaussians, camera, model.background, opacities=opacities, sh_degree=model.sh_degree
-        )
+        with threads_for(camera.width * camera.height):
+            rendering = render_gaussians(
+                model.gaussians, camera, model.background, opacities=opacities, sh_degree=model.sh_degree
+            )
         images.append(rendering.image.clamp(0, 1).cpu())
         save_png(folder / f"{name}.png", images[-1])
     if what == "flight":

@@ -38,6 +38,7 @@ from reference_trainer.runs.lock import run_lock
 from reference_trainer.runs.settings import read_run_settings
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.threads import threads_for
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingInterrupted
@@ -128,7 +129,7 @@ def run_experiment(
     if (out / RESULTS).exists():
         return _complete(out, say)
     scene = options.load(seed=config.seed)  # before the folder is made: a mistyped scene must not claim it
-    with run_lock(out):
+    with run_lock(out), threads_for(scene.pixels):
         begun = begun_with(out, options, config, auto=auto, given=given)  # by another process since, perhaps to its end
         if (out / RESULTS).exists():
             return _complete(out, say)

@@ -12,7 +12,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["composite", "image_size", "list_images", "match_images", "path_inside", "read_image", "resize_image"]
+__all__ = [
+    "composite",
+    "image_size",
+    "is_image",
+    "list_images",
+    "match_images",
+    "path_inside",
+    "read_image",
+    "resize_image",
+]
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
 # Pillow would otherwise try all formats that it knows on a file, whatever its name, and hand PostScript to Ghostscript.
@@ -53,7 +62,9 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
         image = torch.empty(3, height, width)
         alpha = torch.empty(height, width) if has_alpha else None
         rows = max(1, _BAND // width)
-        for top in range(0, height, rows):  # in bands, so that nothing of the whole is held but the pixels and the result
+        for top in range(
+            0, height, rows
+        ):  # in bands, so that nothing of the whole is held but the pixels and the result
             band = file.crop((0, top, width, min(top + rows, height))).convert("RGBA" if has_alpha else "RGB")
             channels = torch.from_numpy(np.array(band)).permute(2, 0, 1).to(torch.float32) / 255
             image[:, top : top + rows] = channels[:3]
@@ -84,7 +95,9 @@ def _opened(path: str | Path) -> Iterator[Any]:
         with Image.open(path, formats=FORMATS) as file:
             yield file
     except UnidentifiedImageError as error:
-        raise ValueError(f"{path} is not a readable image: its content is none of PNG, JPEG, BMP, TIFF or WebP.") from error
+        raise ValueError(
+            f"{path} is not a readable image: its content is none of PNG, JPEG, BMP, TIFF or WebP."
+        ) from error
     except Exception as error:  # each of Pillow's decoders has its own
         raise ValueError(f"{path} is not a readable image: {error}") from error
 
@@ -147,10 +160,15 @@ def list_images(folder: str | Path) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no image folder {folder}.")
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    files = sorted(filter(is_image, folder.iterdir()))
     if not files:
         raise ValueError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}).")
     return files
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file is a picture by its name."""
+    return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:

@@ -94,7 +94,8 @@ def test_postscript_under_the_name_of_a_picture_reaches_no_interpreter(tmp_path,
 
 
 def test_pictures_are_opened_in_one_place():
-    files = [file for package in ("reference_trainer", "ca_reg", "integrations") for file in (ROOT / package).rglob("*.py")]
+    packages = ("reference_trainer", "ca_reg", "integrations")
+    files = [file for package in packages for file in (ROOT / package).rglob("*.py")]
     opening = {file.name: file.read_text().count("Image.open(") for file in files}
     assert len(files) > 100
     assert {name: count for name, count in opening.items() if count} == {"images.py": 1}
@@ -119,7 +120,7 @@ def test_a_few_bytes_do_not_take_a_gigabyte(tmp_path, name, function):
 
 
 def nested(kind, levels):
-    """Return a pickle of a dict in which 2 ** levels empty containers are, in pairs of pairs, from one of each level."""
+    """Return a pickle of a dict in which 2 ** levels empty containers are, made of one of each level."""
     empty, before, after = {
         "list": (b"]", b"](", b"e"),
         "dict": (b"}", b"}(K\x00", b"K\x01%su"),

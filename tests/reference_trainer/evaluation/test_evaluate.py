@@ -12,8 +12,8 @@ from ca_reg.functional import Multiplier, opacity_noise
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores, evaluate
 from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.evaluation.model import Model
-from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.evaluation.pictures import file_names
+from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.render import render
 from reference_trainer.scenes.images import read_image
 from reference_trainer.scenes.scene import Scene

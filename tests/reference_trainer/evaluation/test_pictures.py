@@ -127,3 +127,10 @@ def test_one_row_by_default_and_no_room_for_absent_columns():
 def test_wrong_arguments(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_label_wider_than_its_picture_is_not_cut():
+    wide, narrow = (side_by_side([torch.zeros(3, 4, w)] * 2, ["render 20.51 dB", "error"]) for w in (120, 20))
+    black = [int(picture[0, :16].lt(0.5).sum()) for picture in (wide, narrow)]
+    assert black[0] == black[1] > 50
+    assert narrow.shape[2] < 150
