@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from torch.nn.functional import pad
+
 from ca_reg.dynamics import plot_dynamics
 from reference_trainer.evaluation.pictures import PANEL, save_png, side_by_side
 from reference_trainer.files import replacing
@@ -40,4 +42,6 @@ def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split:
         split: ``"train"`` or ``"test"``.
     """
     panels = [read_image(folder / "views" / split / f"{view}{PANEL}.png")[0] for folder in runs.values()]
+    widest = max(panel.shape[2] for panel in panels)  # labels with more digits make narrow pictures' panels wider
+    panels = [pad(panel, (0, widest - panel.shape[2]), value=1.0) for panel in panels]
     save_png(path, side_by_side(panels, list(runs), columns=1))

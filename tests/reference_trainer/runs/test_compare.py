@@ -131,13 +131,14 @@ def test_failed_runs_are_listed_at_the_end(tmp_path):
 def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, lines):
     """As after --monitor-every 0, or fewer steps than that."""
     results = made(20.0) | {"config": {"seed": 0}, "views": [{"split": "test", "name": f"{x}/r_0.png"} for x in "ab"]}
-    folder = tmp_path / "baseline" / "seed_0"
-    for name in ("a_r_0", "b_r_0"):
-        save_png(folder / "views" / "test" / f"{name}_panel.png", torch.rand(3, 8, 90))
-    if lines is not None:
-        (folder / LOG_NAME).write_text(lines)
+    for strategy, width in (("baseline", 90), ("dropout", 84)):  # a label with a digit less makes a narrower panel
+        folder = tmp_path / strategy / "seed_0"
+        for name in ("a_r_0", "b_r_0"):
+            save_png(folder / "views" / "test" / f"{name}_panel.png", torch.rand(3, 8, width))
+        if lines is not None:
+            (folder / LOG_NAME).write_text(lines)
     said: list[str] = []
-    report({tmp_path: Comparison({"baseline": [results]}, {})}, say=said.append)
+    report({tmp_path: Comparison({"baseline": [results], "dropout": [results]}, {})}, say=said.append)
     assert any(line.startswith("no figure of CA and PSNR against the iteration: ") for line in said)
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["test_a_r_0.png", "test_b_r_0.png"]
 
