@@ -227,8 +227,8 @@ def score_ply_on_orbit(
     keep.unlink(missing_ok=True)
     say(table)
     say(
-        "An orbit sees the model from where no photograph may have been taken: compare these scores with others from the"
-        " same cameras alone; for those of the scene's own views give the scene (--scene FOLDER)."
+        "An orbit sees the model from where no photograph may have been taken: compare these scores with others from"
+        " the same cameras alone; for those of the scene's own views give the scene (--scene FOLDER)."
     )
     say(f"Scores and pictures are in {folder}")
     return result
