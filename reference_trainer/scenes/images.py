@@ -27,7 +27,7 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".
 # Pillow would otherwise try all formats that it knows on a file, whatever its name, and hand PostScript to Ghostscript.
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 LARGEST_IMAGE = 100_000_000  # pixels: a few bytes can announce any number, and each takes 20 bytes of memory
-_BAND = 1_000_000  # pixels that are converted at a time
+_BAND = 100_000  # pixels that are converted at a time
 
 
 def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
