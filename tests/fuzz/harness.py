@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from fuzz.mutations import CUT, Form, damage
+from fuzz.mutations import CUT, FOREIGN, Form, damage
 
 __all__ = ["Outcome", "Target", "fuzz", "leaves"]
 
@@ -126,6 +126,8 @@ def _one(target: Target, folder: Path, kind: str, size: int, expected: list[Any]
             yield f"{type(error).__name__} without the path"
         return
     outcome.read += 1
+    if kind == FOREIGN:
+        yield "accepted a file of another format"
     found = list(leaves(result))
     if target.finite and not all(map(_finite, found)):
         yield "values that are not finite"

@@ -16,7 +16,7 @@ import numpy as np
 from fuzz.state_mutations import STATE_MUTATIONS
 from PIL import Image
 
-__all__ = ["CUT", "Form", "damage"]
+__all__ = ["CUT", "FOREIGN", "Form", "damage"]
 
 Form = Literal["binary", "text", "json", "tensors", "state"]
 Mutation = Callable[[bytes, random.Random], bytes]
@@ -166,13 +166,13 @@ def _expand(data: bytes, rng: random.Random) -> bytes:
     return data[:at] + word * (100_000 // len(word)) + data[at:]
 
 
-_FOREIGN = ("EPS", "PDF", "GIF", "PPM", "TGA", "PCX", "ICO", "TIFF", "PNG", "JPEG", "BMP", "NPY", "ZIP", "pickle")
-CUT = "cut"
+_FOREIGN = ("EPS", "PDF", "GIF", "PPM", "TGA", "PCX", "ICO", "NPY", "ZIP", "pickle")  # that no reader takes as they are
+CUT, FOREIGN = "cut", "foreign"
 _BYTES: dict[str, Mutation] = {
     CUT: _cut, "flip bits": _flip_bits, "random bytes": _random_bytes, "absurd number": _absurd_word,
     "delete": _delete, "repeat": _repeat, "insert": _insert, "zeros": _zeros,
+    FOREIGN: _foreign,
 }  # fmt: skip
-_BYTES["foreign"] = _foreign
 _TEXT: dict[str, Mutation] = {"swap word": _swap_word, "change line": _change_line, "nest": _nest, "expand": _expand}
 _MUTATIONS: dict[Form, dict[str, Mutation]] = {
     "binary": _BYTES | {"swap word": _swap_word},

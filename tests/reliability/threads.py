@@ -1,4 +1,4 @@
-"""Time steps of training on small pictures with one thread and with two: ``python tests/reliability/threads.py 96 64``."""
+"""Time steps of training with one thread and with two: ``python tests/reliability/threads.py 96 64``."""
 
 from __future__ import annotations
 
