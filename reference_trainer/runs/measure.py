@@ -86,6 +86,7 @@ def measure(
             keep=keep,
             progress=say,
         )
+        computed_on = machine()
     settings = model.ca_score(samples=samples, seed=seed).settings
     data = {
         "scene": scene.name,
@@ -94,7 +95,7 @@ def measure(
         "ca_settings": asdict(settings),
         "background": model.background.tolist(),
         "expected_noise": model.expected_noise,
-        "machine": machine(),
+        "machine": computed_on,
     }
     write_json(out / "evaluation.json", data)
     table = evaluation_table(result)

@@ -213,13 +213,14 @@ def score_ply_on_orbit(
         result = evaluate_cameras(
             model, cameras, samples=samples, seed=seed, pictures=folder / VIEWS, keep=keep, progress=True, say=say
         )
+        computed_on = machine()
     data = {
         "ply": asdict(facts),
         "orbit": asdict(orbit) | {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged},
         **result.as_dict(),
         "ca_settings": asdict(model.ca_score(samples=samples, seed=seed).settings),
         "background": model.background.tolist(),
-        "machine": machine(),
+        "machine": computed_on,
     }
     write_json(folder / "evaluation.json", data)
     table = camera_table(result)
