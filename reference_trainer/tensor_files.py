@@ -129,11 +129,12 @@ def _check_pickle(file: IO[bytes], largest: int | None = None) -> None:
             raise ValueError(f"it describes its tensors in more than {_LARGEST_PICKLE} bytes")
         if name == "MEMOIZE" or name.startswith("DUP"):  # of protocols that torch does not write
             raise ValueError(f"its pickle has the operation {name}, which torch.save does not write")
-        if name.endswith("PUT") and last.startswith("TUPLE"):
-            tuples.add(argument)
         if name.endswith("GET") and argument in tuples:
             raise ValueError("it holds one tuple at two places")
-        last = name
+        if not name.endswith("PUT"):
+            last = name
+        elif last.startswith("TUPLE"):
+            tuples.add(argument)
 
 
 def _check_content(state: Any) -> None:

@@ -112,4 +112,4 @@ def read_points_binary(path: Path) -> ColmapPoints:
         track = cursor.array(_TRACK, cursor.count(_TRACK.itemsize, "track elements"), "a track")
         points.add(int(number), (x, y, z), (int(red), int(green), int(blue)), track["image"])
     cursor.finish()
-    return points.all()
+    return points.finish()

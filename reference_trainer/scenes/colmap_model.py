@@ -233,13 +233,13 @@ class PointRecords:
         self._images.frombytes(images.astype(np.int64).tobytes())
         self._ends.append(len(self._images))
 
-    def all(self) -> ColmapPoints:
+    def finish(self) -> ColmapPoints:
         """Return the points. Raises ValueError if a position is not finite."""
-        images = np.frombuffer(self._images, np.int64)
+        images = np.asarray(self._images, np.int64)
         return ColmapPoints(
-            np.frombuffer(self._ids, np.int64),
-            np.frombuffer(self._positions, np.float64).reshape(-1, 3),
-            np.frombuffer(self._colors, np.uint8).reshape(-1, 3),
+            np.asarray(self._ids, np.int64),
+            np.asarray(self._positions, np.float64).reshape(-1, 3),
+            np.asarray(self._colors, np.uint8).reshape(-1, 3),
             tuple(images[start:end] for start, end in zip([0, *self._ends], self._ends, strict=False)),
         )
 

@@ -124,4 +124,4 @@ def read_points_text(path: Path) -> ColmapPoints:
             points.add(int(words[0]), [float(word) for word in words[1:4]], color, track)
         except (ValueError, IndexError, OverflowError) as error:
             raise _damaged(path, number, error) from error
-    return points.all()
+    return points.finish()

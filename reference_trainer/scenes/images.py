@@ -62,9 +62,8 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
         image = torch.empty(3, height, width)
         alpha = torch.empty(height, width) if has_alpha else None
         rows = max(1, _BAND // width)
-        for top in range(
-            0, height, rows
-        ):  # in bands, so that nothing of the whole is held but the pixels and the result
+        # In bands, so that nothing of the whole is held but the decoded pixels and the result.
+        for top in range(0, height, rows):
             band = file.crop((0, top, width, min(top + rows, height))).convert("RGBA" if has_alpha else "RGB")
             channels = torch.from_numpy(np.array(band)).permute(2, 0, 1).to(torch.float32) / 255
             image[:, top : top + rows] = channels[:3]

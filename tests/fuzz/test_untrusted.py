@@ -127,16 +127,17 @@ def nested(kind, levels):
         "OrderedDict": (b"}", b"ccollections\nOrderedDict\n)R(K\x00", b"K\x01%su"),
         "tuple": (b")", b"", b"\x86"),
         "key": (b")", b"", b"\x86"),
+        "key, stored twice": (b")", b"", b"\x86q\xff"),
     }[kind]
     x = empty + b"q\x00"
     for level in range(levels):
         again = b"h" + bytes([level])
         x = before + x + (after % again if b"%" in after else again + after) + b"q" + bytes([level + 1])
-    return b"\x80\x02}X\x01\x00\x00\x00x" + (b"}" + x + b"K\x00s" if kind == "key" else x) + b"s."
+    return b"\x80\x02}X\x01\x00\x00\x00x" + (b"}" + x + b"K\x00s" if kind[:3] == "key" else x) + b"s."
 
 
 @pytest.mark.parametrize("name", ["checkpoint.pt", "lpips.pth"])
-@pytest.mark.parametrize("kind", ["list", "dict", "tuple", "OrderedDict", "key"])
+@pytest.mark.parametrize("kind", ["list", "dict", "tuple", "OrderedDict", "key", "key, stored twice"])
 def test_what_stands_at_two_places_is_not_unfolded(tmp_path, name, kind):
     # With 40 levels any walk over it would last for years.
     samples.write_checkpoint(tmp_path)
