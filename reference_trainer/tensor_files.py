@@ -22,7 +22,7 @@ _ALLOWED = {
     "torch._utils _rebuild_tensor_v2",
     *(f"torch {kind}Storage" for kind in _STORAGES),
 }
-_LARGEST_PICKLE = 256_000  # bytes, with the names of all views but no tensors. Each may make 140 of memory
+_LARGEST_PICKLE = 256_000  # bytes, with the names of all views but no tensors. Each may make 160 of memory
 _PICKLES_OF_OLD_FILES = 5  # magic number, version, platform, content, names of the storages
 
 

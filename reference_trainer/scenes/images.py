@@ -26,7 +26,7 @@ __all__ = [
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
 # Pillow would otherwise try all formats that it knows on a file, whatever its name, and hand PostScript to Ghostscript.
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
-LARGEST_IMAGE = 100_000_000  # pixels: a few bytes can announce any number, and each takes 20 bytes of memory
+LARGEST_IMAGE = 100_000_000  # pixels: a few bytes can announce any number, and each takes 25 bytes of memory
 _BAND = 100_000  # pixels that are converted at a time
 
 
@@ -59,16 +59,17 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
         if file.format == "TIFF":
             _check_strips(file)
         has_alpha = mode in ("RGBA", "LA", "PA") or "transparency" in file.info
-        image = torch.empty(3, height, width)
-        alpha = torch.empty(height, width) if has_alpha else None
-        rows = max(1, _BAND // width)
-        # In bands, so that nothing of the whole is held but the decoded pixels and the result.
-        for top in range(0, height, rows):
-            band = file.crop((0, top, width, min(top + rows, height))).convert("RGBA" if has_alpha else "RGB")
-            channels = torch.from_numpy(np.array(band)).permute(2, 0, 1).to(torch.float32) / 255
-            image[:, top : top + rows] = channels[:3]
-            if alpha is not None:
-                alpha[top : top + rows] = channels[3]
+        picture = file.convert("RGBA" if has_alpha else "RGB")
+    del file  # and what its decoder holds, before the result is made
+    image = torch.empty(3, height, width)
+    alpha = torch.empty(height, width) if has_alpha else None
+    rows = max(1, _BAND // width)
+    for top in range(0, height, rows):
+        band = np.array(picture.crop((0, top, width, min(top + rows, height))))
+        channels = torch.from_numpy(band).permute(2, 0, 1).to(torch.float32) / 255
+        image[:, top : top + rows] = channels[:3]
+        if alpha is not None:
+            alpha[top : top + rows] = channels[3]
     return image, alpha
 
 

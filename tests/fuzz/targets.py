@@ -105,6 +105,7 @@ def _trainer_fits(trainer: Any) -> None:
 TARGETS = (
     *(
         Target(f"COLMAP {name}.bin", f"{name}.bin", samples.write_colmap_binary, read_colmap, "binary",
+               expansion=15,
                check=_model_fits)
         for name in ("cameras", "images", "points3D")
     ),
@@ -152,16 +153,16 @@ TARGETS = (
            "text", finite=False, check=_gaussians_fit),
     Target("checkpoint", "checkpoint.pt", samples.write_checkpoint,
            lambda folder: load_checkpoint(folder / "checkpoint.pt"), "tensors", checksummed=True,
-           memory=40_000_000),
+           memory=50_000_000),
     Target("Trainer.load", "checkpoint.pt", samples.write_trainer, _two_steps, "state", check=_trainer_fits),
     Target("LPIPS weights", "lpips.pth", samples.write_lpips, _lpips_weights, "tensors", checksummed=True,
-           memory=40_000_000),
+           memory=50_000_000),
     Target("LPIPS weights, old format", "lpips.pth", partial(samples.write_lpips, archive=False), _lpips_weights,
            "binary"),
     *(
         Target(f"image, {form}", "picture", partial(samples.write_image, form=form),
                lambda folder: read_image(folder / "picture"), "binary", checksummed=form == "PNG",
-               memory=16 * LARGEST_IMAGE, check=_picture_fits)
+               memory=25 * LARGEST_IMAGE, check=_picture_fits)
         for form in ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
     ),
     Target("run config.json", "config.json", samples.write_run_settings,
