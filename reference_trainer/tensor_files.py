@@ -22,6 +22,7 @@ _ALLOWED = {
     "torch._utils _rebuild_tensor_v2",
     *(f"torch {kind}Storage" for kind in _STORAGES),
 }
+_LARGEST_PICKLE = 256_000  # bytes, with the names of all views but no tensors. Each may make 160 of memory
 _PICKLES_OF_OLD_FILES = 5  # magic number, version, platform, content, names of the storages
 
 
@@ -29,8 +30,9 @@ def load_tensors(path: str | Path, device: torch.device | str = "cpu", *, what: 
     """Read tensors, numbers and strings in nested dicts and lists; no code in the file is executed.
 
     Beyond what ``torch.load(weights_only=True)`` does, the checksums are compared, so that a damaged file is refused
-    and not read as other numbers, and nothing is read that would take more memory than the file has bytes. Files from
-    before PyTorch 1.6 have no checksums; they are read, too.
+    and not read as other numbers, and nothing is read that would take much more memory than the file has bytes: what
+    describes the tensors is small, and no list or dict in it stands at two places. Files from before PyTorch 1.6 have
+    no checksums; they are read, too.
 
     Args:
         path: the file.
@@ -56,7 +58,7 @@ def load_tensors(path: str | Path, device: torch.device | str = "cpu", *, what: 
         else:
             _check_old_file(data)
         state = torch.load(data, map_location="cpu", weights_only=True)
-        _check_tensors(state)
+        _check_content(state)
         return moved(state, device)
     except Exception as error:  # zipfile, pickletools and torch raise many types for damaged files
         reason = str(error).partition("\n")[0]  # torch goes on with advice to load the file without this safety
@@ -111,21 +113,39 @@ def _check_old_file(data: io.BytesIO) -> None:
 
 
 def _check_pickle(file: IO[bytes], largest: int | None = None) -> None:
-    """Refuse a pickle that names anything but tensors, or a size above the largest."""
-    for opcode, argument, _ in pickletools.genops(file):
-        if opcode.name == "STACK_GLOBAL" or (opcode.name == "GLOBAL" and argument not in _ALLOWED):
+    """Refuse a pickle that names anything but tensors, is long, repeats a tuple, or has a size above the largest.
+
+    A tuple that holds another one twice, which holds a third one twice, and so on, has as many parts as it wants: as a
+    key of a dict it would take that long already.
+    """
+    start, last, tuples = file.tell(), "", set[object]()
+    for opcode, argument, position in pickletools.genops(file):
+        name = opcode.name
+        if name == "STACK_GLOBAL" or (name == "GLOBAL" and argument not in _ALLOWED):
             raise ValueError(f"it holds {argument or 'an object'}, not only tensors, numbers and strings")
         if largest is not None and isinstance(argument, int) and argument > largest:
             raise ValueError(f"it announces {argument} numbers in {largest} bytes")
+        if (position or 0) - start > _LARGEST_PICKLE:
+            raise ValueError(f"it describes its tensors in more than {_LARGEST_PICKLE} bytes")
+        if name == "MEMOIZE" or name.startswith("DUP"):  # of protocols that torch does not write
+            raise ValueError(f"its pickle has the operation {name}, which torch.save does not write")
+        if name.endswith("GET") and argument in tuples:
+            raise ValueError("it holds one tuple at two places")
+        if not name.endswith("PUT"):
+            last = name
+        elif last.startswith("TUPLE"):
+            tuples.add(argument)
 
 
-def _check_tensors(state: Any) -> None:
-    """Refuse tensors that repeat their storage: a few bytes could stand for any size."""
+def _check_content(state: Any) -> None:
+    """Refuse what stands for more than it takes: tensors that repeat their storage, containers at two places."""
     pending, seen = [state], set[int]()
     while pending:
         x = pending.pop()
         if isinstance(x, Tensor) and x.numel() * x.element_size() > x.untyped_storage().nbytes():
             raise ValueError(f"a tensor of shape {tuple(x.shape)} has {x.untyped_storage().nbytes()} bytes")
-        if isinstance(x, Mapping | list | tuple) and id(x) not in seen:
+        if isinstance(x, Mapping | list | tuple) and x:
+            if id(x) in seen:
+                raise ValueError(f"it holds one {type(x).__name__} at two places")
             seen.add(id(x))
             pending.extend(x.values() if isinstance(x, Mapping) else x)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import tyro
 from reference_trainer.cli.ply import Bake
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
+from reference_trainer.devices import check_device
 from reference_trainer.training.config import PRESETS
 
 __all__ = ["main"]
@@ -25,7 +27,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     try:
-        _parse(arguments)()
+        command = _parse(arguments)
+        computing = command.what if isinstance(command, Study) else command
+        if hasattr(computing, "device"):
+            check_device(computing.device, here=not (isinstance(command, Compare) and command.elsewhere))
+        command()
     except BrokenPipeError:  # the reader of the output, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, OSError, ImportError, RuntimeError) as error:
@@ -36,29 +42,30 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(130)
 
 
-def _parse(arguments: Sequence[str]) -> Callable[[], None]:
+def _parse(arguments: Sequence[str]) -> Any:
     """Return the command with its options; exits where they cannot be understood."""
     peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
     peek.add_argument("--preset", choices=list(PRESETS), default="fsgs")
     preset = peek.parse_known_args(arguments)[0].preset
     config, given = PRESETS[preset], given_fields(arguments)
-    commands: Any = tyro.extras.subcommand_type_from_defaults(
-        {
-            "demo": Demo(),
-            "plan": Plan(config=config, preset=preset, given=given),
-            "train": Train(out=Path("runs/train"), config=config, preset=preset, given=given),
-            "evaluate": Evaluate(),
-            "bake": Bake(ply=tyro.MISSING, dropout=tyro.MISSING),
-            "render": Render(run=Path("runs/train")),
-            "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
-            "study": Study(tyro.MISSING),
-        },
-    )
-    command: Callable[[], None] = tyro.cli(
+    defaults: dict[str, Any] = {
+        "demo": Demo(),
+        "plan": Plan(config=config, preset=preset, given=given),
+        "train": Train(config=config, preset=preset, given=given),
+        "evaluate": Evaluate(),
+        "bake": Bake(ply=tyro.MISSING, dropout=tyro.MISSING),
+        "render": Render(run=Path("runs/train")),
+        "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
+        "study": Study(tyro.MISSING),
+    }
+    # In the list of the commands the first paragraph of each; the command's own help has all of it.
+    texts = {name: inspect.getdoc(type(command)) or "" for name, command in defaults.items()}
+    short = {name: text.partition("\n\n")[0] for name, text in texts.items() if name not in arguments}
+    commands: Any = tyro.extras.subcommand_type_from_defaults(defaults, descriptions=texts | short)
+    return tyro.cli(
         commands,
         prog="ca-reg",
         description="Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting.",
         args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
     )
-    return command

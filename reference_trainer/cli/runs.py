@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -19,6 +20,7 @@ from reference_trainer.training.config import PRESETS, TrainConfig
 __all__ = ["Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
+Folder = Annotated[str | None, tyro.conf.Positional]
 Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="")]
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
 Given = Annotated[frozenset[str], tyro.conf.Suppress]  # filled in from the command line itself, see given_fields
@@ -35,6 +37,13 @@ def given_fields(arguments: Sequence[str]) -> frozenset[str]:
     """
     words = {word.partition("=")[0].removeprefix("--").replace("-", "_") for word in arguments if word[:2] == "--"}
     return frozenset(f.name for f in fields(TrainConfig) if words & {f.name, f"no_{f.name}"})
+
+
+def _chosen(scene: SceneOptions, folder: str | None) -> SceneOptions:
+    """Return the options of a scene whose folder may also be given as the first argument."""
+    if folder is not None and scene.path not in (SceneOptions().path, folder):
+        raise ValueError(f"give the scene as the first argument or as --path, not both: got {folder} and {scene.path}.")
+    return scene if folder is None else replace(scene, path=folder)
 
 
 @dataclass(frozen=True)
@@ -70,7 +79,9 @@ class Train:
     The same command continues an interrupted run.
     """
 
-    out: Path
+    folder: Folder = None
+    """Scene folder, or "synthetic"; the same as --path."""
+    out: Path = Path("runs/train")
     """Folder of the run."""
     scene: Scene = field(default_factory=SceneOptions)
     config: Config = field(default_factory=lambda: PRESETS["fsgs"])
@@ -104,7 +115,7 @@ class Train:
         use_engine(self.engine)
         with deterministic(self.device) if self.deterministic else nullcontext():
             results = run_experiment(
-                self.scene,
+                _chosen(self.scene, self.folder),
                 self.config,
                 self.out,
                 auto=self.auto,
@@ -123,7 +134,7 @@ class Train:
 class Plan:
     """Say what training will use of a scene and what it leaves out, with the reasons; trains nothing."""
 
-    folder: Annotated[str | None, tyro.conf.Positional] = None
+    folder: Folder = None
     """Scene folder, or "synthetic"; the same as --path."""
     scene: Scene = field(default_factory=SceneOptions)
     config: Config = field(default_factory=lambda: PRESETS["fsgs"])
@@ -139,8 +150,9 @@ class Plan:
         from reference_trainer.training.plan import make_plan
 
         logging.getLogger("reference_trainer.scenes.load").setLevel(logging.INFO)  # how far lens distortion goes
-        options = self.scene if self.folder is None else replace(self.scene, path=self.folder)
-        plan = make_plan(options.load(seed=self.config.seed), self.config, given=self.given)
+        scene = _chosen(self.scene, self.folder).load(seed=self.config.seed)
+        plan = make_plan(scene, self.config, given=self.given)
+        print(f"{scene}\n")
         print(markdown_table(plan.rows(), ["item", "decision", "change", "reason"]))
         if self.out is not None:
             write_json(self.out, plan.as_dict())
@@ -164,7 +176,7 @@ class Evaluate:
     """
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """Folder of a run of `ca-reg train`."""
+    """Folder of a run of `ca-reg train`, or a PLY as for --ply."""
     ply: Path | None = None
     """A standard 3DGS PLY instead of a run, with its scene or without."""
     scene: Annotated[PlyScene, tyro.conf.arg(name="")] = field(default_factory=PlyScene)
@@ -192,6 +204,9 @@ class Evaluate:
 
         if self.run is not None and self.ply is not None:
             raise ValueError(f"give the folder of a run or --ply FILE, not both: got {self.run} and {self.ply}.")
+        if self.run is not None and self.run.suffix.lower() == ".ply" and not self.run.is_dir():
+            replace(self, run=None, ply=self.run)()
+            return
         if self.run is not None:
             model, scene, default = of_run(self.run, self.device, scale_noise=self.scale_noise)
             perceptual = lpips_option(self.lpips, device=self.device)
@@ -284,6 +299,11 @@ class Compare:
     """Steps between checkpoints: what a dead worker costs at most."""
     lpips: str | None = None
     """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether the runs may be done on other machines, whose devices are not known here."""
+        return self.engine != "processes" and bool(self.address or os.environ.get("RAY_ADDRESS"))
 
     def __call__(self) -> None:
         """Run the command."""

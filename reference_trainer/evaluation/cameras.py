@@ -13,10 +13,10 @@ from torch import Tensor
 
 from ca_reg import CAResult
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
+from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, mean_over
 from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.pictures import heat_map, save_png, side_by_side
+from reference_trainer.evaluation.pictures import PANEL, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.report import machine
 from reference_trainer.render.statistics import color_variance_map
 from reference_trainer.scenes.scene import View
@@ -51,9 +51,8 @@ class CameraEvaluation:
     views: list[CameraScores]
 
     def mean(self, quantity: str) -> float:
-        """Return the mean of a quantity over the cameras that have it; nan if none has."""
-        finite = [x for view in self.views if math.isfinite(x := getattr(view, quantity))]
-        return sum(finite) / len(finite) if finite else math.nan
+        """Return the mean of a quantity over the cameras that have it, see `mean_over`; nan if none has."""
+        return mean_over(self.views, quantity)
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain data, for JSON."""
@@ -137,7 +136,7 @@ def evaluate_cameras(
 
 def _files(stem: Path) -> tuple[Path, Path]:
     """Return the places of the render and of the panel of a camera."""
-    return stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}_panel.png")
+    return stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}{PANEL}.png")
 
 
 def _draw(image: Tensor, results: Sequence[CAResult], stem: Path) -> None:

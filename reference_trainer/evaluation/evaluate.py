@@ -16,12 +16,12 @@ from ca_reg import CAScore
 from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.pictures import error_map, heat_map, save_png, side_by_side
+from reference_trainer.evaluation.pictures import PANEL, error_map, file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.report import machine
 from reference_trainer.render.statistics import color_variance_map
 from reference_trainer.scenes.scene import Scene, View
 
-__all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "evaluate"]
+__all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "evaluate", "mean_over"]
 
 CA_PICTURE_RANGE = 0.02
 """Variance that gets the brightest colour in CA heat maps."""
@@ -67,10 +67,8 @@ class Evaluation:
     perceptual_metric: str | None
 
     def mean(self, split: str, quantity: str) -> float:
-        """Return the mean of a quantity over the views of a split that have it; nan if none has."""
-        values = [getattr(view, quantity) for view in self.views if view.split == split]
-        finite = [value for value in values if math.isfinite(value)]
-        return sum(finite) / len(finite) if finite else math.nan
+        """Return the mean of a quantity over the views of a split that have it, see `mean_over`; nan if none has."""
+        return mean_over([view for view in self.views if view.split == split], quantity)
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain data, for JSON."""
@@ -82,6 +80,24 @@ class Evaluation:
             "mean": {split: {name: self.mean(split, name) for name in quantities} for split in splits},
             "views": [asdict(view) for view in self.views],
         }
+
+
+def mean_over(views: Sequence[Any], quantity: str) -> float:
+    """Return the mean of a quantity over the views that have it; nan if none has.
+
+    Of ``ca_std_error`` it is the standard error of the mean of ``ca``: the masks of a view are drawn from the seed and
+    its position alone, independently of those of the others, so the squares of the errors add up. nan if a view that
+    has a score has no error, as with two samples.
+
+    Args:
+        views: objects with the quantity as an attribute, and ``ca``, all of one split.
+        quantity: its name.
+    """
+    if quantity == "ca_std_error":
+        errors = [view.ca_std_error for view in views if math.isfinite(view.ca)]
+        return math.hypot(*errors) / len(errors) if errors else math.nan
+    finite = [value for view in views if math.isfinite(value := getattr(view, quantity))]
+    return sum(finite) / len(finite) if finite else math.nan
 
 
 @torch.no_grad()
@@ -117,6 +133,7 @@ def evaluate(
     score = model.ca_score(samples=samples, seed=seed)
     half = model.ca_score(samples=samples, seed=seed, drop_rate=0.5)
     members = [(split, *each) for split in ("train", "test") for each in enumerate(getattr(scene, split))]
+    names = [name for views in (scene.train, scene.test) for name in file_names([view.name for view in views])]
     device = model.background.device
     metric = perceptual and [_identity(perceptual, view.image.to(device)) for _, _, view in members[:1]]
     depends_on = (model, scene.train, scene.test, samples, seed, metric, machine())
@@ -124,8 +141,8 @@ def evaluate(
     views: list[ViewScores] = []
     start, measured = time.perf_counter(), 0
     for number, (split, index, view) in enumerate(members):
-        stem = None if pictures is None else pictures / split / Path(view.name).stem
-        files = [] if stem is None else [stem.with_name(f"{stem.name}{end}.png") for end in ("", "_panel")]
+        folder = None if pictures is None else pictures / split
+        files = [] if folder is None else [folder / f"{names[number]}{end}.png" for end in ("", PANEL)]
         known = kept.get(f"{split} {index}", files)
         if known is not None:
             views.append(ViewScores(**known))

@@ -2,19 +2,57 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
+from itertools import chain, count
+from pathlib import Path, PurePosixPath
 
 import torch
 from torch import Tensor
 
 from reference_trainer.files import replacing
+from reference_trainer.scenes.images import IMAGE_SUFFIXES
 
-__all__ = ["error_map", "heat_map", "save_gif", "save_png", "side_by_side", "to_uint8"]
+__all__ = ["PANEL", "error_map", "file_names", "heat_map", "save_gif", "save_png", "side_by_side", "to_uint8"]
+
+PANEL = "_panel"
+"""What is appended to the name of a view's render to make that of its panel."""
 
 _GAP = 4  # pixels between pictures
 _LABEL_HEIGHT = 16  # pixels; the built-in font of pillow is about 11 high
 _UNDEFINED = 0.5  # grey of values that are not finite: no colour of the map
+
+
+def file_names(views: Sequence[str]) -> list[str]:
+    """Return a file name without extension for the pictures of each view; no two are equal, nor is one another's panel.
+
+    That is the view's own name without its folder, or with the folders where two views would share it, as in
+    ``a/r_0.png`` and ``b/r_0.png``. Upper and lower case count as equal, as they do to some file systems.
+
+    Args:
+        views: names of all views whose pictures go into one folder; they decide together.
+
+    Example:
+        >>> file_names(["images/0001.jpg", "a/r_0.png", "b/r_0.png"])
+        ['0001', 'a_r_0', 'b_r_0']
+    """
+    paths = [PurePosixPath(view) for view in views]
+    # Names of photographs may have dots elsewhere, and views from transforms files have no extension.
+    plain = [path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path for path in paths]
+    shared = Counter(path.name.casefold() for path in plain)
+    taken, names = set[str](), list[str]()
+    for path, short in zip(paths, plain, strict=True):
+        full = "_".join(short.parts)
+        offered = [short.name] if shared[short.name.casefold()] == 1 else []
+        offered += [full, "_".join(path.parts)]
+        for name in chain(offered, (f"{full}_{number}" for number in count(2))):
+            files = {name.casefold(), f"{name}{PANEL}".casefold()}
+            if not files & taken:
+                break
+        taken |= files
+        names.append(name)
+    return names
 
 
 def to_uint8(image: Tensor) -> Tensor:
@@ -129,8 +167,8 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
 
     Args:
         images: pictures of one size, each (3, H, W), colours in [0, 1].
-        labels: one line for each, Latin letters (the built-in font has few others); what is wider than the picture is
-            cut.
+        labels: one line for each, Latin letters (the built-in font has few others); a column is as wide as its widest
+            label.
         columns: pictures in a row; None puts all of them in one.
 
     Returns:
@@ -153,18 +191,22 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
     _, height, width = images[0].shape
     cell_height, rows = height + _LABEL_HEIGHT, -(-len(images) // columns)
     columns = min(columns, len(images))
-    grid = torch.ones(3, rows * (cell_height + _GAP) - _GAP, columns * (width + _GAP) - _GAP)
-    for index, (image, label) in enumerate(zip(images, labels, strict=True)):
-        top, left = index // columns * (cell_height + _GAP), index % columns * (width + _GAP)
-        grid[:, top : top + _LABEL_HEIGHT, left : left + width] = _label(label, width)
+    strips = [_label(label) for label in labels]
+    widths = [max(width, *(strip.shape[1] for strip in strips[column::columns])) for column in range(columns)]
+    grid = torch.ones(3, rows * (cell_height + _GAP) - _GAP, sum(widths) + (columns - 1) * _GAP)
+    for index, (image, strip) in enumerate(zip(images, strips, strict=True)):
+        row, column = divmod(index, columns)
+        top, left = row * (cell_height + _GAP), sum(widths[:column]) + column * _GAP
+        grid[:, top : top + _LABEL_HEIGHT, left : left + strip.shape[1]] = strip
         grid[:, top + _LABEL_HEIGHT : top + cell_height, left : left + width] = image.detach().cpu().clamp(0, 1)
     return grid
 
 
-def _label(text: str, width: int) -> Tensor:
-    """Return black text on white, shape (_LABEL_HEIGHT, width), in [0, 1]."""
+def _label(text: str) -> Tensor:
+    """Return black text on white, shape (_LABEL_HEIGHT, its width), in [0, 1]."""
     from PIL import Image, ImageDraw
 
+    width = math.ceil(ImageDraw.Draw(Image.new("L", (1, 1))).textlength(text)) + 4
     strip = Image.new("L", (width, _LABEL_HEIGHT), 255)
     ImageDraw.Draw(strip).text((2, 2), text, fill=0)
     return torch.frombuffer(bytearray(strip.tobytes()), dtype=torch.uint8).reshape(_LABEL_HEIGHT, width) / 255

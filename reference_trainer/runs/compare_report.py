@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ca_reg.monitor import LOG_NAME
+from reference_trainer.evaluation.pictures import file_names
 from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
 from reference_trainer.files import write_text
 from reference_trainer.runs.engines.engine import Failure
@@ -104,12 +104,13 @@ def _report(comparison: Comparison, out: Path, say: Callable[[str], None]) -> No
     say(comparison_table(comparison.runs))
     first = {name: out / name / f"seed_{of[0]['config']['seed']}" for name, of in comparison.runs.items()}
     say("")
-    if all((folder / LOG_NAME).exists() for folder in first.values()):
+    try:
         dynamics_figure(first, out / "dynamics.png")
         say(f"CA and PSNR against the iteration: {out / 'dynamics.png'}")
+    except (FileNotFoundError, ValueError) as error:  # runs of --monitor-every 0, or shorter than the first measurement
+        say(f"no figure of CA and PSNR against the iteration: {error}")
     views = next(iter(comparison.runs.values()))[0]["views"]
-    for view in (view for view in views if view["split"] == "test"):
-        stem = Path(view["name"]).stem
-        comparison_figure(first, out / f"test_{stem}.png", view=stem)
-        say(f"photograph, render, error and CA map of each strategy: {out / f'test_{stem}.png'}")
+    for name in file_names([view["name"] for view in views if view["split"] == "test"]):
+        comparison_figure(first, out / f"test_{name}.png", view=name)
+        say(f"photograph, render, error and CA map of each strategy: {out / f'test_{name}.png'}")
     say(f"table and all numbers: {out / TABLE}, {out / REPORT}; curves: tensorboard --logdir {out}")

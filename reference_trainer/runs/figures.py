@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from torch.nn.functional import pad
+
 from ca_reg.dynamics import plot_dynamics
-from reference_trainer.evaluation.pictures import save_png, side_by_side
+from reference_trainer.evaluation.pictures import PANEL, save_png, side_by_side
 from reference_trainer.files import replacing
 from reference_trainer.scenes.images import read_image
 
@@ -36,8 +38,10 @@ def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split:
     Args:
         runs: folder of each run by label.
         path: the PNG to write.
-        view: name of the view, without extension.
+        view: what the files of the view are called, see `file_names`.
         split: ``"train"`` or ``"test"``.
     """
-    panels = [read_image(folder / "views" / split / f"{view}_panel.png")[0] for folder in runs.values()]
+    panels = [read_image(folder / "views" / split / f"{view}{PANEL}.png")[0] for folder in runs.values()]
+    widest = max(panel.shape[2] for panel in panels)  # labels with more digits make narrow pictures' panels wider
+    panels = [pad(panel, (0, widest - panel.shape[2]), value=1.0) for panel in panels]
     save_png(path, side_by_side(panels, list(runs), columns=1))

@@ -11,7 +11,7 @@ import torch
 from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric, evaluate
 from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.pictures import save_gif, save_png
+from reference_trainer.evaluation.pictures import file_names, save_gif, save_png
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import remove_leftovers, write_text
@@ -19,6 +19,7 @@ from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.folder import VIEWS
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.threads import threads_for
 
 __all__ = ["evaluation_table", "measure", "of_run", "render_run"]
 
@@ -74,9 +75,18 @@ def measure(
     """
     keep = out / PARTIAL
     remove_leftovers(out / VIEWS)
-    result = evaluate(
-        model, scene, samples=samples, seed=seed, perceptual=perceptual, pictures=out / VIEWS, keep=keep, progress=say
-    )
+    with threads_for(scene.pixels):
+        result = evaluate(
+            model,
+            scene,
+            samples=samples,
+            seed=seed,
+            perceptual=perceptual,
+            pictures=out / VIEWS,
+            keep=keep,
+            progress=say,
+        )
+        computed_on = machine()
     settings = model.ca_score(samples=samples, seed=seed).settings
     data = {
         "scene": scene.name,
@@ -85,7 +95,7 @@ def measure(
         "ca_settings": asdict(settings),
         "background": model.background.tolist(),
         "expected_noise": model.expected_noise,
-        "machine": machine(),
+        "machine": computed_on,
     }
     write_json(out / "evaluation.json", data)
     table = evaluation_table(result)
@@ -136,13 +146,15 @@ def render_run(
         cameras = {f"{i:04d}": camera for i, camera in enumerate(path)}
     else:
         views = trainer.scene.test if what == "test" else trainer.scene.train
-        cameras = {Path(view.name).stem: view.camera for view in views}
+        names = file_names([view.name for view in views])
+        cameras = {name: view.camera for name, view in zip(names, views, strict=True)}
     opacities = model.test_opacities
     images = []
     for name, camera in cameras.items():
-        rendering = render_gaussians(
-            model.gaussians, camera, model.background, opacities=opacities, sh_degree=model.sh_degree
-        )
+        with threads_for(camera.width * camera.height):
+            rendering = render_gaussians(
+                model.gaussians, camera, model.background, opacities=opacities, sh_degree=model.sh_degree
+            )
         images.append(rendering.image.clamp(0, 1).cpu())
         save_png(folder / f"{name}.png", images[-1])
     if what == "flight":

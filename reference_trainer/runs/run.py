@@ -38,6 +38,7 @@ from reference_trainer.runs.lock import run_lock
 from reference_trainer.runs.settings import read_run_settings
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.threads import threads_for
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingInterrupted
@@ -105,7 +106,8 @@ def run_experiment(
             with, or goes on without one if it began without.
         given: with ``auto``, fields of ``config`` that the plan must not change although they are at their default.
         device: where to train.
-        monitor_every: steps between measurements of CA and PSNR; 0 for none.
+        monitor_every: steps between measurements of CA and PSNR; 0 for none. A training of fewer steps is measured at
+            its end.
         checkpoint_every: steps between checkpoints.
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         progress: whether to show a progress bar.
@@ -127,7 +129,7 @@ def run_experiment(
     if (out / RESULTS).exists():
         return _complete(out, say)
     scene = options.load(seed=config.seed)  # before the folder is made: a mistyped scene must not claim it
-    with run_lock(out):
+    with run_lock(out), threads_for(scene.pixels):
         begun = begun_with(out, options, config, auto=auto, given=given)  # by another process since, perhaps to its end
         if (out / RESULTS).exists():
             return _complete(out, say)
@@ -244,6 +246,7 @@ def _train(
     if not monitor_every:
         trainer.train(after_step=checkpoint, progress=progress)
         return
+    monitor_every = min(monitor_every, last)
 
     def render_now(opacity: Tensor, view: View) -> tuple[Tensor, Tensor]:
         return model_of(trainer).render(opacity, view)

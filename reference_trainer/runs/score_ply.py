@@ -25,6 +25,7 @@ from reference_trainer.scenes.load import BACKGROUNDS
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.scenes.orbit import bounding_sphere
 from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.threads import threads_for
 
 __all__ = ["PlyFacts", "camera_table", "of_ply", "score_ply", "score_ply_on_orbit"]
 
@@ -208,22 +209,28 @@ def score_ply_on_orbit(
     folder = out or _folder(ply)
     keep = folder / PARTIAL
     remove_leftovers(folder / VIEWS)
-    result = evaluate_cameras(
-        model, cameras, samples=samples, seed=seed, pictures=folder / VIEWS, keep=keep, progress=True, say=say
-    )
+    with threads_for(orbit.size**2):
+        result = evaluate_cameras(
+            model, cameras, samples=samples, seed=seed, pictures=folder / VIEWS, keep=keep, progress=True, say=say
+        )
+        computed_on = machine()
     data = {
         "ply": asdict(facts),
         "orbit": asdict(orbit) | {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged},
         **result.as_dict(),
         "ca_settings": asdict(model.ca_score(samples=samples, seed=seed).settings),
         "background": model.background.tolist(),
-        "machine": machine(),
+        "machine": computed_on,
     }
     write_json(folder / "evaluation.json", data)
     table = camera_table(result)
     write_text(folder / "evaluation.md", f"{facts}\n\n{table}")
     keep.unlink(missing_ok=True)
     say(table)
+    say(
+        "An orbit sees the model from where no photograph may have been taken: compare these scores with others from"
+        " the same cameras alone; for those of the scene's own views give the scene (--scene FOLDER)."
+    )
     say(f"Scores and pictures are in {folder}")
     return result
 

@@ -1,12 +1,17 @@
 """Scenes: photographs with cameras and initial points, from COLMAP, LLFF and Blender files or built in.
 
-``load_scene`` is the way in; ``Scene`` is all that the rest of the program sees.
+``load_scene`` is the way in; ``Scene`` is all that the rest of the program sees. What is asked for is imported then, so
+that the command line knows the options of a scene without torch.
 """
 
-from reference_trainer.scenes.load import load_scene
-from reference_trainer.scenes.points import check_no_leak, mean_neighbor_distance
-from reference_trainer.scenes.scene import PointCloud, Scene, View
-from reference_trainer.scenes.synthetic import synthetic_scene
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from reference_trainer.scenes.load import load_scene
+    from reference_trainer.scenes.points import check_no_leak, mean_neighbor_distance
+    from reference_trainer.scenes.scene import PointCloud, Scene, View
+    from reference_trainer.scenes.synthetic import synthetic_scene
 
 __all__ = [
     "PointCloud",
@@ -17,3 +22,19 @@ __all__ = [
     "mean_neighbor_distance",
     "synthetic_scene",
 ]
+
+_MODULES = {
+    "load_scene": "load",
+    "check_no_leak": "points",
+    "mean_neighbor_distance": "points",
+    "PointCloud": "scene",
+    "Scene": "scene",
+    "View": "scene",
+    "synthetic_scene": "synthetic",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -12,7 +12,10 @@ from reference_trainer.scenes.colmap_text import read_cameras_text, read_images_
 from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.images import match_images
 
-__all__ = ["colmap_frames", "read_colmap"]
+__all__ = ["COLMAP_FOLDERS", "colmap_frames", "find_colmap", "read_colmap"]
+
+COLMAP_FOLDERS = ("sparse/0", "sparse")
+"""Where a scene folder has its reconstruction, unless the three files lie in the folder itself; the first counts."""
 
 T = TypeVar("T")
 
@@ -38,6 +41,14 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points)
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from error
+
+
+def find_colmap(root: Path) -> Path | None:
+    """Return the folder of the reconstruction of a scene, None if it has none."""
+    for folder in (*(root / name for name in COLMAP_FOLDERS), root):
+        if all(any((folder / f"{stem}{end}").is_file() for end in (".bin", ".txt")) for stem in ("cameras", "images")):
+            return folder
+    return root / COLMAP_FOLDERS[0] if (root / COLMAP_FOLDERS[0]).is_dir() else None  # to be told what is missing there
 
 
 def colmap_frames(model: ColmapModel, folder: str | Path) -> list[Frame]:

@@ -7,7 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from reference_trainer.scenes.colmap_model import CAMERA_MODELS, ColmapCamera, ColmapImage, ColmapPoints
+from reference_trainer.scenes.colmap_model import (
+    CAMERA_MODELS,
+    ColmapCamera,
+    ColmapImage,
+    ColmapPoints,
+    PointRecords,
+)
 
 __all__ = ["read_cameras_binary", "read_images_binary", "read_points_binary"]
 
@@ -100,18 +106,10 @@ def read_images_binary(path: Path) -> list[ColmapImage]:
 def read_points_binary(path: Path) -> ColmapPoints:
     """Read ``points3D.bin``. Raises ValueError if it is damaged."""
     cursor = _Cursor(path)
-    ids, positions, colors, tracks = [], [], [], []
+    points = PointRecords()
     for _ in range(cursor.count(43 + 8, "points")):
         number, x, y, z, red, green, blue, _error = cursor.take("q3d3Bd", "a point")
-        ids.append(number)
-        positions.append((x, y, z))
-        colors.append((red, green, blue))
         track = cursor.array(_TRACK, cursor.count(_TRACK.itemsize, "track elements"), "a track")
-        tracks.append(track["image"].astype(np.int64))
+        points.add(int(number), (x, y, z), (int(red), int(green), int(blue)), track["image"])
     cursor.finish()
-    return ColmapPoints(
-        np.array(ids, np.int64).reshape(-1),
-        np.array(positions, np.float64).reshape(-1, 3),
-        np.array(colors, np.uint8).reshape(-1, 3),
-        tuple(tracks),
-    )
+    return points.finish()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from reference_trainer.camera import Camera
 
-__all__ = ["CAMERA_MODELS", "CameraModel", "ColmapCamera", "ColmapImage", "ColmapModel", "ColmapPoints"]
+__all__ = ["CAMERA_MODELS", "CameraModel", "ColmapCamera", "ColmapImage", "ColmapModel", "ColmapPoints", "PointRecords"]
 
 
 @dataclass(frozen=True)
@@ -207,6 +209,39 @@ class ColmapPoints:
         bad = self.ids[~np.isfinite(self.positions).all(axis=1)]
         if len(bad):
             raise ValueError(f"{len(bad)} of {len(self.ids)} points have no finite position, such as point {bad[0]}.")
+
+
+class PointRecords:
+    """The points of a file while it is read, in few bytes each: as Python objects they would take ten times as many."""
+
+    def __init__(self) -> None:
+        self._ids, self._positions, self._colors = array("q"), array("d"), array("B")
+        self._images, self._ends = array("q"), array("q")
+
+    def add(self, number: int, position: Sequence[float], color: Sequence[int], images: NDArray[np.integer]) -> None:
+        """Take in a point, and the numbers of the images in its track.
+
+        Raises:
+            ValueError: if it has not three coordinates and three colours.
+            OverflowError: if a number is beyond 64 bits, or a colour no byte.
+        """
+        if len(position) != 3 or len(color) != 3:
+            raise ValueError(f"a point has three coordinates and three colours, got {[*position]} and {[*color]}.")
+        self._ids.append(number)
+        self._positions.extend(position)
+        self._colors.extend(color)
+        self._images.frombytes(images.astype(np.int64).tobytes())
+        self._ends.append(len(self._images))
+
+    def finish(self) -> ColmapPoints:
+        """Return the points. Raises ValueError if a position is not finite."""
+        images = np.asarray(self._images, np.int64)
+        return ColmapPoints(
+            np.asarray(self._ids, np.int64),
+            np.asarray(self._positions, np.float64).reshape(-1, 3),
+            np.asarray(self._colors, np.uint8).reshape(-1, 3),
+            tuple(images[start:end] for start, end in zip([0, *self._ends], self._ends, strict=False)),
+        )
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["composite", "image_size", "list_images", "match_images", "path_inside", "read_image", "resize_image"]
+__all__ = [
+    "composite",
+    "image_size",
+    "is_image",
+    "list_images",
+    "match_images",
+    "path_inside",
+    "read_image",
+    "resize_image",
+]
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
-LARGEST_IMAGE = 100_000_000  # pixels: a few bytes can announce any number, and each takes 16 bytes of memory
+# Pillow would otherwise try all formats that it knows on a file, whatever its name, and hand PostScript to Ghostscript.
+FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
+LARGEST_IMAGE = 100_000_000  # pixels: a few bytes can announce any number, and each takes 25 bytes of memory
+_BAND = 100_000  # pixels that are converted at a time
 
 
 def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
@@ -25,7 +37,7 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
     ignored, as COLMAP does, because the cameras belong to the stored pixels.
 
     Args:
-        path: the file; any format that Pillow reads.
+        path: the file: PNG, JPEG, BMP, TIFF or WebP, which its content tells and not its name.
 
     Returns:
         Colours in [0, 1], shape (3, H, W), float32, and the coverage in [0, 1], shape (H, W), or None if the file has
@@ -47,9 +59,18 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
         if file.format == "TIFF":
             _check_strips(file)
         has_alpha = mode in ("RGBA", "LA", "PA") or "transparency" in file.info
-        pixels = np.array(file.convert("RGBA" if has_alpha else "RGB"))
-    channels = torch.from_numpy(pixels).permute(2, 0, 1).to(torch.float32) / 255
-    return channels[:3].contiguous(), channels[3].contiguous() if has_alpha else None
+        picture = file.convert("RGBA" if has_alpha else "RGB")
+    del file  # and what its decoder holds, before the result is made
+    image = torch.empty(3, height, width)
+    alpha = torch.empty(height, width) if has_alpha else None
+    rows = max(1, _BAND // width)
+    for top in range(0, height, rows):
+        band = np.array(picture.crop((0, top, width, min(top + rows, height))))
+        channels = torch.from_numpy(band).permute(2, 0, 1).to(torch.float32) / 255
+        image[:, top : top + rows] = channels[:3]
+        if alpha is not None:
+            alpha[top : top + rows] = channels[3]
+    return image, alpha
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
@@ -66,13 +87,17 @@ def image_size(path: str | Path) -> tuple[int, int]:
 @contextmanager
 def _opened(path: str | Path) -> Iterator[Any]:
     """Open an image with Pillow and turn its many errors into one."""
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no image file {path}.")
     try:
-        with Image.open(path) as file:
+        with Image.open(path, formats=FORMATS) as file:
             yield file
+    except UnidentifiedImageError as error:
+        raise ValueError(
+            f"{path} is not a readable image: its content is none of PNG, JPEG, BMP, TIFF or WebP."
+        ) from error
     except Exception as error:  # each of Pillow's decoders has its own
         raise ValueError(f"{path} is not a readable image: {error}") from error
 
@@ -135,10 +160,15 @@ def list_images(folder: str | Path) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no image folder {folder}.")
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    files = sorted(filter(is_image, folder.iterdir()))
     if not files:
         raise ValueError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}).")
     return files
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file is a picture by its name."""
+    return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:

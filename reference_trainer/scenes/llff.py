@@ -61,8 +61,8 @@ def _rows(path: Path) -> NDArray[np.float64]:
     except Exception as error:  # numpy evaluates the header as Python literals, with as many kinds of errors
         raise ValueError(f"{path} is not a NumPy array of numbers: {error}") from error
     data = file.read()
-    if len(shape) != 2 or shape[1] != 17 or dtype.kind not in "fiu":
-        raise ValueError(f"{path} must hold finite numbers of shape (N, 17), got shape {shape} of {dtype}.")
+    if len(shape) != 2 or shape[1] != 17 or dtype.kind != "f" or dtype.itemsize not in (4, 8):
+        raise ValueError(f"{path} must hold floats of 4 or 8 bytes of shape (N, 17), got shape {shape} of {dtype}.")
     if len(data) != shape[0] * 17 * dtype.itemsize:
         raise ValueError(f"{path} is damaged: {shape[0]} rows of 17 {dtype} do not make {len(data)} bytes.")
     with np.errstate(over="ignore"):  # becomes infinite, which is reported

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from reference_trainer.scenes.blender import read_transforms
-from reference_trainer.scenes.colmap import colmap_frames, read_colmap
+from reference_trainer.scenes.colmap import COLMAP_FOLDERS, colmap_frames, find_colmap, read_colmap
 from reference_trainer.scenes.frames import Frame, load_view
+from reference_trainer.scenes.images import is_image
 from reference_trainer.scenes.initial_points import choose_points
 from reference_trainer.scenes.llff import read_llff
 from reference_trainer.scenes.points import check_no_leak
@@ -45,8 +46,8 @@ def load_scene(
 
     Args:
         path: the scene folder, or ``"synthetic"`` for the built-in scene.
-        format: ``"blender"`` (``transforms_train.json``), ``"colmap"`` (``sparse/0``), ``"llff"``
-            (``poses_bounds.npy``), or ``"auto"`` for the first of these that is there.
+        format: ``"blender"`` (``transforms_train.json``), ``"colmap"`` (``sparse/0``, ``sparse`` or the
+            folder itself), ``"llff"`` (``poses_bounds.npy``), or ``"auto"`` for the first of these that is there.
         images: the image folder within the scene, such as ``"images_8"``; cameras are scaled to its pictures. By
             default ``images``, else the ``images_<factor>`` with the smallest factor. Not for Blender scenes.
         views: number of training views. By default the split file's own choice, else 3, and 8 for Blender scenes.
@@ -108,6 +109,7 @@ def load_scene(
         test=tuple(load_view(frame, background=colour, downscale=downscale) for frame in test),
         points=cloud,
         background=colour,
+        source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
     )
 
 
@@ -121,11 +123,16 @@ def detect_format(path: str | Path) -> str:
     root = Path(path)
     if not root.is_dir():
         raise FileNotFoundError(f"there is no scene folder {root}; for the built-in scene, say 'synthetic'.")
-    signs = {"blender": "transforms_train.json", "colmap": "sparse/0", "llff": "poses_bounds.npy"}
-    for format, sign in signs.items():
-        if (root / sign).exists():
-            return format
-    raise ValueError(f"{root} has none of {', '.join(signs.values())}; it has {_contents(root)}.")
+    if (root / "transforms_train.json").exists():
+        return "blender"
+    if find_colmap(root) is not None:
+        return "colmap"
+    if (root / "poses_bounds.npy").exists():
+        return "llff"
+    raise ValueError(
+        f"{root} has none of transforms_train.json, a COLMAP model ({', '.join(COLMAP_FOLDERS)} or the folder itself) "
+        f"and poses_bounds.npy; it has {_contents(root)}."
+    )
 
 
 def _blender_frames(root: Path, views: int) -> tuple[list[Frame], list[Frame]]:
@@ -139,9 +146,14 @@ def _blender_frames(root: Path, views: int) -> tuple[list[Frame], list[Frame]]:
 def _photo_frames(root: Path, format: str, images: str | None) -> list[Frame]:
     """Read the frames of a scene of photographs in one folder."""
     folder = root / (images or _image_folder(root))
+    if not folder.is_dir():
+        found = sorted(each.name for each in root.iterdir() if each.is_dir() and any(map(is_image, each.iterdir())))
+        raise FileNotFoundError(
+            f"there is no folder {folder} (--images); the folders of {root} with pictures are {found}."
+        )
     if format == "llff":
         return read_llff(root / "poses_bounds.npy", folder)
-    return colmap_frames(read_colmap(root / "sparse" / "0"), folder)
+    return colmap_frames(read_colmap(find_colmap(root) or root / COLMAP_FOLDERS[0]), folder)
 
 
 def _image_folder(root: Path) -> str:

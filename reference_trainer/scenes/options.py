@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from torch import Tensor
+if TYPE_CHECKING:  # torch takes seconds, and the help of a command needs none of it
+    from torch import Tensor
 
-from reference_trainer.camera import Camera
-from reference_trainer.scenes.load import load_scene
-from reference_trainer.scenes.orbit import World, orbit_views
-from reference_trainer.scenes.scene import Scene
+    from reference_trainer.camera import Camera
+    from reference_trainer.scenes.scene import Scene
 
-__all__ = ["OrbitOptions", "SceneOptions"]
+__all__ = ["OrbitOptions", "SceneOptions", "World"]
+
+World = Literal["y-down", "y-up", "z-up", "z-down", "x-up", "x-down"]
+"""Which axis of the world is vertical, and which way it points."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,8 @@ class SceneOptions:
 
     def load(self, *, seed: int = 0) -> Scene:
         """Load the scene; ``seed`` decides random initial points. Errors are those of `load_scene`."""
+        from reference_trainer.scenes.load import load_scene
+
         return load_scene(
             self.path,
             format=self.format,
@@ -85,6 +90,8 @@ class OrbitOptions:
 
     def views(self, means: Tensor, opacities: Tensor) -> list[Camera]:
         """Place the cameras around Gaussians; arguments and errors are those of `orbit_views`."""
+        from reference_trainer.scenes.orbit import orbit_views
+
         return orbit_views(
             means,
             opacities,

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from reference_trainer.camera import Camera
+from reference_trainer.scenes.options import World
 
-__all__ = ["BoundingSphere", "World", "bounding_sphere", "orbit_views"]
-
-World = Literal["y-down", "y-up", "z-up", "z-down", "x-up", "x-down"]
-"""Which axis of the world is vertical, and which way it points."""
+__all__ = ["BoundingSphere", "bounding_sphere", "orbit_views"]
 
 ELEVATION = math.radians(20)
 """Height of the cameras over the horizon of the centre: objects are mostly looked at from a little above."""

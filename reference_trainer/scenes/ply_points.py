@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 
@@ -38,9 +39,11 @@ def ply_points(path: str | Path) -> PointCloud:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no point cloud {path}.")
-    data = path.read_bytes()
-    end = _END.search(data, 0, _HEADER_LIMIT)
-    header, body = (data[: end.start()], data[end.end() :]) if end else (b"", b"")
+    with path.open("rb") as file:
+        start = file.read(_HEADER_LIMIT)
+        end = _END.search(start)
+        file.seek(end.end() if end else 0)
+        header, body = (start[: end.start()], file.read()) if end else (b"", b"")
     words = [line.split() for line in header.decode("ascii", errors="replace").splitlines() if line.strip()]
     try:
         if not end or words[0] != ["ply"]:
@@ -78,11 +81,19 @@ def _vertices(body: bytes, form: str, dtype: np.dtype[np.void], count: int, *, a
             raise ValueError(f"it announces {count} vertices of {dtype.itemsize} bytes but has {len(body)} bytes")
         return np.frombuffer(body, dtype, count)
     if form == "ascii":
-        lines = body.decode("ascii").split("\n")
-        rows = [tuple(line.split()) for line in lines[: max(count, 0)] if line.strip()]
-        if len(lines) <= count == len(rows):
+        names = dtype.names or ()
+        if count < 0 or 2 * count * len(names) > len(body) + 1:  # a digit and a separator at least
+            raise ValueError(f"it announces {count} vertices but has {len(body)} bytes")
+        vertices, text, line = np.empty(count, dtype), io.BytesIO(body), b"\n"
+        for row in range(count):
+            line = text.readline()
+            words = line.decode("ascii").split()
+            if len(words) != len(names):
+                raise ValueError(f"the line of vertex {row} has {len(words)} numbers instead of {len(names)}")
+            vertices[row] = tuple(words)
+        if not line.endswith(b"\n"):
             raise ValueError("its last line has no end: it is cut short")
-        if len(rows) != count or (alone and any(line.strip() for line in lines[count:])):
-            raise ValueError(f"it announces {count} vertices but has {'more' if len(rows) == count else len(rows)}")
-        return np.array(rows, dtype)
+        if alone and text.read().strip():
+            raise ValueError(f"it announces {count} vertices but has more")
+        return vertices
     raise ValueError(f"its format is {form}; convert it to binary_little_endian or ascii")

@@ -118,7 +118,7 @@ def _focus_depth(cameras: Sequence[Camera]) -> float:
             return depth
     raise ValueError(
         "cannot tell how far the scene is: the optical axes of the training cameras do not meet in front of them. "
-        "Start from points, not from random ones."
+        "Start from points, not from random ones: --points (points=) takes a COLMAP folder or a .ply file of the scene."
     )
 
 

@@ -11,6 +11,8 @@ from reference_trainer.camera import Camera
 
 __all__ = ["PointCloud", "Scene", "View"]
 
+_NAMES_SHOWN = 12
+
 
 @dataclass(frozen=True)
 class View:
@@ -66,6 +68,7 @@ class Scene:
         test: held-out views, never used in training.
         points: initial points, or None to let the trainer draw random ones.
         background: the colour (3,) behind everything, in [0, 1].
+        source: where the photographs come from.
     """
 
     name: str
@@ -73,6 +76,23 @@ class Scene:
     test: tuple[View, ...]
     points: PointCloud | None
     background: Tensor
+    source: str = "built in"
+
+    def __str__(self) -> str:
+        """Say what a user looks at first: which photographs, their size, and the names of the views."""
+        sizes = sorted({(view.camera.width, view.camera.height) for view in (*self.train, *self.test)})
+        size = " to ".join(f"{width}x{height}" for width, height in dict.fromkeys((sizes[0], sizes[-1])))
+        lines = [f"photographs: {self.source}, used at {size} pixels"]
+        for kind, views in (("training", self.train), ("test", self.test)):
+            names = [view.name for view in views]
+            shown = names if len(names) <= _NAMES_SHOWN else [*names[: _NAMES_SHOWN - 1], "...", names[-1]]
+            lines.append(f"{len(names)} {kind} view{'s' * (len(names) != 1)}{': ' * bool(names)}{', '.join(shown)}")
+        return "\n".join(lines)
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of the largest view."""
+        return max(view.camera.width * view.camera.height for view in (*self.train, *self.test))
 
     @property
     def is_white(self) -> bool:

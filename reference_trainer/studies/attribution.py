@@ -15,7 +15,7 @@ from torch import Tensor
 from ca_reg import CAResult, Reason, attribute, total_effects
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
 from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.pictures import heat_map, save_png, side_by_side
+from reference_trainer.evaluation.pictures import file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.rank_correlation import spearman
 from reference_trainer.evaluation.report import machine, markdown_table, write_json
 from reference_trainer.files import replacing, write_text
@@ -239,8 +239,8 @@ def study_attribution(
     }
     for name, gaussians in colored.items():  # with the scaling baked in, as in a run's PLY for viewers
         save_for_viewers(dataclasses.replace(model, gaussians=gaussians), out / f"{name}.ply", pad_to_degree=3)
-    for view, result in zip(views, results, strict=True):
-        save_png(out / "views" / f"{Path(view.name).stem}.png", _picture(model, colored.values(), view, result))
+    for name, view, result in zip(file_names(list(data["views"])), views, results, strict=True):
+        save_png(out / "views" / f"{name}.png", _picture(model, colored.values(), view, result))
     write_json(out / "attribution.json", data)
     table = _table(data)
     ends = dict(zip(("low", "high"), scales["share"], strict=True))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+import sys
 import time
 import tracemalloc
 import warnings
@@ -15,12 +17,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from fuzz.mutations import CUT, Form, damage
+from fuzz.mutations import CUT, FOREIGN, Form, damage
 
 __all__ = ["Outcome", "Target", "fuzz", "leaves"]
 
 SECONDS = 1.0  # of the processor: the machine may be busy
-MEMORY_PER_BYTE = 10
+OTHER_PROGRAMS = ("subprocess.Popen", "os.system", "os.exec", "os.fork", "os.forkpty", "os.posix_spawn", "os.startfile")
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ class Target:
         checksummed: the format has checksums, so that whatever is accepted must be what was written.
         finite: whether everything that was read must be finite.
         grows: the file is written line by line, so that a part of it is a good file.
-        memory: bytes of memory that are fine besides those in proportion to the file's size.
+        expansion: bytes of memory that are fine for every byte of the file.
+        memory: and besides those.
         check: raises AssertionError if shapes do not fit together.
     """
 
@@ -48,6 +51,7 @@ class Target:
     checksummed: bool = False
     finite: bool = True
     grows: bool = False
+    expansion: int = 10
     memory: int = 4_000_000
     check: Callable[[Any], None] = lambda result: None
 
@@ -71,8 +75,8 @@ class Outcome:
 def fuzz(target: Target, folder: Path, seeds: range) -> Outcome:
     """Damage the file once for each seed, read it, and compare with what a reader owes its caller.
 
-    It must return something complete or raise ValueError or OSError with the path, within a second, and with memory
-    proportional to the file's size.
+    It must return something complete or raise ValueError or OSError with the path, within a second, with memory
+    proportional to the file's size, and without another program.
     """
     folder.mkdir(parents=True, exist_ok=True)
     target.write(folder)
@@ -96,6 +100,8 @@ def _one(target: Target, folder: Path, kind: str, size: int, expected: list[Any]
     """Read one damaged file and yield what is wrong about it."""
     tracemalloc.reset_peak()
     before, start = tracemalloc.get_traced_memory()[0], time.process_time()
+    programs = _programs_started()
+    programs.clear()
     result, error = None, None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # as in use; the tests' settings make errors of them
@@ -108,8 +114,10 @@ def _one(target: Target, folder: Path, kind: str, size: int, expected: list[Any]
     outcome.slowest, outcome.peak = max(outcome.slowest, seconds), max(outcome.peak, peak)
     if seconds > SECONDS:
         yield f"took {seconds:.0f} s"
-    if peak > MEMORY_PER_BYTE * size + target.memory:
-        yield f"took more than {MEMORY_PER_BYTE} x its size in memory"
+    if peak > target.expansion * size + target.memory:
+        yield f"took more than {target.expansion} x its size in memory"
+    if programs:
+        yield f"started another program ({programs[0]})"
     if error is not None:
         outcome.refused += 1
         if not isinstance(error, ValueError | OSError):
@@ -118,6 +126,8 @@ def _one(target: Target, folder: Path, kind: str, size: int, expected: list[Any]
             yield f"{type(error).__name__} without the path"
         return
     outcome.read += 1
+    if kind == FOREIGN:
+        yield "accepted a file of another format"
     found = list(leaves(result))
     if target.finite and not all(map(_finite, found)):
         yield "values that are not finite"
@@ -127,6 +137,14 @@ def _one(target: Target, folder: Path, kind: str, size: int, expected: list[Any]
         target.check(result)
     except AssertionError as failed:
         yield f"inconsistent: {str(failed).partition(chr(10))[0]}"
+
+
+@functools.cache
+def _programs_started() -> list[str]:
+    """Return a list that every start of a program by this process is appended to, from the first call on."""
+    started: list[str] = []
+    sys.addaudithook(lambda event, arguments: started.append(event) if event in OTHER_PROGRAMS else None)
+    return started
 
 
 def leaves(x: Any) -> Iterator[Any]:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import json
+import pickle
 import random
 import re
 import struct
+import zipfile
 from collections.abc import Callable
 from typing import Any, Literal
 
+import numpy as np
 from fuzz.state_mutations import STATE_MUTATIONS
+from PIL import Image
 
-__all__ = ["CUT", "Form", "damage"]
+__all__ = ["CUT", "FOREIGN", "Form", "damage"]
 
-Form = Literal["binary", "text", "json", "state"]
+Form = Literal["binary", "text", "json", "tensors", "state"]
 Mutation = Callable[[bytes, random.Random], bytes]
 
 _INTEGERS = (0, 1, 2, 255, 10**6, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
@@ -34,7 +39,7 @@ _WORDS = (
 _VALUES: tuple[Any, ...] = (
     *(None, True, False, 0, -1, 0.5, 10**400, 10**18, 1e308, float("nan"), float("inf"), "", "x", "\x00", "1"),
     *("../../etc/passwd", "/etc/passwd", ".", "..", "a" * 5000, "é\ud800", [], {}, [[]], [None], {"a": 1}, [1, "x"]),
-    *([[1e400] * 4] * 4, [0] * 100),
+    *([[1e400] * 4] * 4, [0] * 100, [[]] * 20_000, [{"": 0}] * 10_000, [""] * 20_000),
 )
 
 
@@ -138,16 +143,42 @@ def _change_node(data: bytes, rng: random.Random) -> bytes:
     return b"\n".join(lines)
 
 
-CUT = "cut"
+def _foreign(data: bytes, rng: random.Random) -> bytes:
+    """Put a file of another format under the name: what it is shows in its content alone."""
+    image, kind = Image.new(rng.choice(("L", "RGB")), (8, 8)), rng.choice(_FOREIGN)
+    file = io.BytesIO()
+    if kind == "pickle":
+        return pickle.dumps({"x": [1, 2.5]})
+    if kind == "NPY":
+        np.save(file, np.zeros((2, 17)))
+    elif kind == "ZIP":
+        with zipfile.ZipFile(file, "w") as archive:
+            archive.writestr("x", data)
+    else:
+        image.save(file, kind)
+    return file.getvalue()
+
+
+def _expand(data: bytes, rng: random.Random) -> bytes:
+    """Insert a hundred thousand bytes of the shortest values that a text can hold, at the end of a line or anywhere."""
+    word = rng.choice((b"0 ", b"\n", b"0\n", b"[],", b"{},", b'{"":0},', b'"",', b"0 0 0 0 0 0 0 0\n", b"[", b"0,"))
+    at = rng.choice((rng.randrange(len(data)), data.rfind(b"\n") + 1, data.find(b"[") + 1))
+    return data[:at] + word * (100_000 // len(word)) + data[at:]
+
+
+_FOREIGN = ("EPS", "PDF", "GIF", "PPM", "TGA", "PCX", "ICO", "NPY", "ZIP", "pickle")  # that no reader takes as they are
+CUT, FOREIGN = "cut", "foreign"
 _BYTES: dict[str, Mutation] = {
     CUT: _cut, "flip bits": _flip_bits, "random bytes": _random_bytes, "absurd number": _absurd_word,
     "delete": _delete, "repeat": _repeat, "insert": _insert, "zeros": _zeros,
+    FOREIGN: _foreign,
 }  # fmt: skip
-_TEXT: dict[str, Mutation] = {"swap word": _swap_word, "change line": _change_line, "nest": _nest}
+_TEXT: dict[str, Mutation] = {"swap word": _swap_word, "change line": _change_line, "nest": _nest, "expand": _expand}
 _MUTATIONS: dict[Form, dict[str, Mutation]] = {
     "binary": _BYTES | {"swap word": _swap_word},
     "text": _BYTES | _TEXT,
     "json": _BYTES | _TEXT | {"change node": _change_node, "change node again": _change_node},
+    "tensors": _BYTES | {"share": STATE_MUTATIONS["share"]},
     "state": STATE_MUTATIONS,
 }
 

@@ -113,6 +113,15 @@ def _count(state: dict[str, Any], rng: random.Random) -> None:
             node[key] = node[key][index]
 
 
+def _share(state: dict[str, Any], rng: random.Random) -> None:
+    """Put in a pair of pairs of pairs, each the same one twice: few bytes that stand for 2 ** 40 containers."""
+    x: Any = rng.choice(([], {}, ()))
+    for _ in range(40):
+        x = rng.choice(([x, x], {"a": x, "b": x}, (x, x)))
+    node, key = rng.choice(_places(state, tensors=False))
+    node[key] = x
+
+
 def _setting(state: dict[str, Any], rng: random.Random) -> None:
     """Change the settings, or the text that they stand in."""
     config = json.loads(state["config"])
@@ -151,6 +160,6 @@ STATE_MUTATIONS = {
     name: _saved(change)
     for name, change in (
         ("entry", _entry), ("values", _values), ("shape", _shape), ("kind", _kind), ("memory", _memory),
-        ("count", _count), ("setting", _setting),
+        ("count", _count), ("setting", _setting), ("share", _share),
     )
 }  # fmt: skip

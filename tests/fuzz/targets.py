@@ -26,6 +26,7 @@ from reference_trainer.training.trainer import Trainer, TrainingStoppedError
 
 __all__ = ["TARGETS"]
 
+JSON = 40  # bytes of Python objects for one of text: {"":0}, is 7 and a dict 232
 NAMES = [f"r_{i}.png" for i in range(samples.VIEWS)]
 
 
@@ -104,11 +105,13 @@ def _trainer_fits(trainer: Any) -> None:
 TARGETS = (
     *(
         Target(f"COLMAP {name}.bin", f"{name}.bin", samples.write_colmap_binary, read_colmap, "binary",
+               expansion=15,
                check=_model_fits)
         for name in ("cameras", "images", "points3D")
     ),
     *(
-        Target(f"COLMAP {name}.txt", f"{name}.txt", samples.write_colmap_text, read_colmap, "text", check=_model_fits)
+        Target(f"COLMAP {name}.txt", f"{name}.txt", samples.write_colmap_text, read_colmap, "text",
+               expansion=40, check=_model_fits)
         for name in ("cameras", "images", "points3D")
     ),
     Target(
@@ -125,6 +128,7 @@ TARGETS = (
         samples.write_blender,
         lambda folder: read_transforms(folder / "transforms.json"),
         "json",
+        expansion=JSON,
         check=_frames_fit,
     ),
     *(
@@ -134,6 +138,7 @@ TARGETS = (
             samples.write_split,
             lambda folder, views=views: file_split(folder / "split.json", NAMES, views),  # type: ignore[misc]
             "json",
+            expansion=JSON,
             check=_split_fits,
         )
         for views in (None, 1, 2)
@@ -147,18 +152,21 @@ TARGETS = (
     Target("PLY model, ASCII", "model.ply", samples.write_model_ascii, lambda folder: load_ply(folder / "model.ply"),
            "text", finite=False, check=_gaussians_fit),
     Target("checkpoint", "checkpoint.pt", samples.write_checkpoint,
-           lambda folder: load_checkpoint(folder / "checkpoint.pt"), "binary", checksummed=True),
+           lambda folder: load_checkpoint(folder / "checkpoint.pt"), "tensors", checksummed=True,
+           memory=50_000_000),
     Target("Trainer.load", "checkpoint.pt", samples.write_trainer, _two_steps, "state", check=_trainer_fits),
-    Target("LPIPS weights", "lpips.pth", samples.write_lpips, _lpips_weights, "binary", checksummed=True),
+    Target("LPIPS weights", "lpips.pth", samples.write_lpips, _lpips_weights, "tensors", checksummed=True,
+           memory=50_000_000),
     Target("LPIPS weights, old format", "lpips.pth", partial(samples.write_lpips, archive=False), _lpips_weights,
            "binary"),
     *(
         Target(f"image, {form}", "picture", partial(samples.write_image, form=form),
                lambda folder: read_image(folder / "picture"), "binary", checksummed=form == "PNG",
-               memory=20 * LARGEST_IMAGE, check=_picture_fits)
+               memory=25 * LARGEST_IMAGE, check=_picture_fits)
         for form in ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
     ),
     Target("run config.json", "config.json", samples.write_run_settings,
-           lambda folder: read_run_settings(folder / "config.json"), "json"),
-    Target("monitor log", "ca.jsonl", samples.write_log, read_dynamics, "json", finite=False, grows=True),
+           lambda folder: read_run_settings(folder / "config.json"), "json", expansion=JSON),
+    Target("monitor log", "ca.jsonl", samples.write_log, read_dynamics, "json", finite=False, grows=True,
+           expansion=JSON),
 )  # fmt: skip

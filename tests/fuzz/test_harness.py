@@ -1,5 +1,7 @@
 """The harness must see what it looks for: readers that do wrong on purpose."""
 
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -52,6 +54,11 @@ def busy(folder):
         (keep_memory, 9, "took more than 10 x its size in memory"),
         (busy, 1, "took 1 s"),
         (lambda folder: [float("nan")], 9, "values that are not finite"),
+        (
+            lambda folder: subprocess.run([sys.executable, "--version"], capture_output=True),
+            1,
+            "started another program (subprocess.Popen)",
+        ),
     ],
 )
 def test_what_is_wrong_is_reported(tmp_path, wrong, inputs, said):
@@ -63,7 +70,8 @@ def test_what_is_wrong_is_reported(tmp_path, wrong, inputs, said):
 def test_half_a_file_is_reported(tmp_path):
     defects = fuzz(target(numbers), tmp_path, range(100)).defects
     assert defects
-    assert {text for _, text in defects} == {"cut: accepted with other content"}
+    others = "foreign: accepted a file of another format"
+    assert {text for _, text in defects} == {"cut: accepted with other content", others}
     # A format with checksums may not be read wrongly at all.
     assert len(fuzz(target(numbers, checksummed=True), tmp_path, range(100)).defects) > len(defects)
 

@@ -5,19 +5,24 @@ import os
 import pickle
 import tracemalloc
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from fuzz import samples
+from PIL import EpsImagePlugin, Image
 
 from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.scenes.blender import read_transforms
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
+from reference_trainer.scenes.images import image_size, read_image
 from reference_trainer.scenes.llff import read_llff
 from reference_trainer.scenes.load import load_scene
+from reference_trainer.tensor_files import load_tensors
 from reference_trainer.training.checkpoint import load_checkpoint
 
+ROOT = Path(__file__).parents[2]
 ESCAPES = ["../../etc/passwd", "/etc/passwd", "..", "images/../../secret.png", "./../secret.png", "a/../../../b.png"]
 READERS = {
     "checkpoint.pt": lambda folder: load_checkpoint(folder / "checkpoint.pt"),
@@ -70,6 +75,32 @@ def test_the_test_above_would_see_an_execution(tmp_path):
     assert (tmp_path / "executed").is_dir()
 
 
+@pytest.mark.parametrize("read", [read_image, image_size])
+def test_postscript_under_the_name_of_a_picture_reaches_no_interpreter(tmp_path, monkeypatch, read):
+    # Pillow finds Ghostscript on the PATH and lets it run the program in the file.
+    interpreter = tmp_path / "gs"
+    interpreter.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\n")
+    interpreter.chmod(0o755)
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    Image.new("RGB", (4, 4)).save(tmp_path / "x.png", "EPS")
+    with Image.open(tmp_path / "x.png") as file, pytest.raises(OSError, match=r"."):
+        file.load()
+    assert (tmp_path / "started").exists()  # the test would see it
+    (tmp_path / "started").unlink()
+    with pytest.raises(ValueError, match=r"x\.png is not a readable image: .* PNG, JPEG, BMP, TIFF or WebP"):
+        read(tmp_path / "x.png")
+    assert not (tmp_path / "started").exists()
+
+
+def test_pictures_are_opened_in_one_place():
+    packages = ("reference_trainer", "ca_reg", "integrations")
+    files = [file for package in packages for file in (ROOT / package).rglob("*.py")]
+    opening = {file.name: file.read_text().count("Image.open(") for file in files}
+    assert len(files) > 100
+    assert {name: count for name, count in opening.items() if count} == {"images.py": 1}
+
+
 @pytest.mark.parametrize("name", ["checkpoint.pt", "lpips.pth"])
 @pytest.mark.parametrize("function", [bytearray, torch.Tensor, torch.UntypedStorage])
 def test_a_few_bytes_do_not_take_a_gigabyte(tmp_path, name, function):
@@ -86,6 +117,51 @@ def test_a_few_bytes_do_not_take_a_gigabyte(tmp_path, name, function):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1_000_000
+
+
+def nested(kind, levels):
+    """Return a pickle of a dict in which 2 ** levels empty containers are, made of one of each level."""
+    empty, before, after = {
+        "list": (b"]", b"](", b"e"),
+        "dict": (b"}", b"}(K\x00", b"K\x01%su"),
+        "OrderedDict": (b"}", b"ccollections\nOrderedDict\n)R(K\x00", b"K\x01%su"),
+        "tuple": (b")", b"", b"\x86"),
+        "key": (b")", b"", b"\x86"),
+        "key, stored twice": (b")", b"", b"\x86q\xff"),
+    }[kind]
+    x = empty + b"q\x00"
+    for level in range(levels):
+        again = b"h" + bytes([level])
+        x = before + x + (after % again if b"%" in after else again + after) + b"q" + bytes([level + 1])
+    return b"\x80\x02}X\x01\x00\x00\x00x" + (b"}" + x + b"K\x00s" if kind[:3] == "key" else x) + b"s."
+
+
+@pytest.mark.parametrize("name", ["checkpoint.pt", "lpips.pth"])
+@pytest.mark.parametrize("kind", ["list", "dict", "tuple", "OrderedDict", "key", "key, stored twice"])
+def test_what_stands_at_two_places_is_not_unfolded(tmp_path, name, kind):
+    # With 40 levels any walk over it would last for years.
+    samples.write_checkpoint(tmp_path)
+    with zipfile.ZipFile(tmp_path / "checkpoint.pt") as good, zipfile.ZipFile(tmp_path / "evil.pt", "w") as evil:
+        for item in good.namelist():
+            evil.writestr(item, nested(kind, 40) if item.endswith("data.pkl") else good.read(item))
+    (tmp_path / "evil.pt").replace(tmp_path / name)
+    with pytest.raises(ValueError, match=r"holds one (list|dict|tuple|OrderedDict) at two places"):
+        READERS[name](tmp_path)
+
+
+def test_the_nested_pickles_are_what_they_are_said_to_be():
+    pair = pickle.loads(nested("list", 2))["x"]
+    assert pair == [[[], []], [[], []]]
+    assert pair[0] is pair[1]
+    assert pickle.loads(nested("OrderedDict", 1))["x"] == {0: {}, 1: {}}
+    assert pickle.loads(nested("key", 1))["x"] == {((), ()): 0}
+
+
+@pytest.mark.parametrize("archive", [True, False])
+def test_a_pickle_without_end_is_not_followed(tmp_path, archive):
+    torch.save({"x": [[] for _ in range(100_000)]}, tmp_path / "x.pt", _use_new_zipfile_serialization=archive)
+    with pytest.raises(ValueError, match="describes its tensors in more than"):
+        load_tensors(tmp_path / "x.pt")
 
 
 @pytest.mark.parametrize("name", ESCAPES)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
 from reference_trainer import cli
 from reference_trainer.cli import main
@@ -11,7 +12,9 @@ from reference_trainer.runs import compare as compare_module
 from reference_trainer.runs import run as run_module
 from reference_trainer.runs import score_ply as score_module
 from reference_trainer.runs.compare_report import Comparison
+from reference_trainer.runs.engines import choice as choice_module
 from reference_trainer.runs.engines.engine import Failure
+from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.studies import attribution as attribution_module
 from reference_trainer.studies import pruning as pruning_module
@@ -61,6 +64,82 @@ def test_help(command, options, capsys):
     assert "usage: ca-reg" in text
     for option in options:
         assert option in text
+
+
+def test_the_list_of_commands_says_what_each_does(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = plain(capsys.readouterr().out)
+    for line in (
+        "demo Train the built-in scene",
+        "plan Say what",
+        "train Train one model",
+        "evaluate Measure a run",
+        "bake Scale the opacities",
+        "render Render a run",
+        "compare Train baseline",
+        "study Measure something",
+    ):
+        assert f"• {line}" in text  # fmt: skip
+    assert "Finished runs are kept" not in text  # which the help of the command says
+
+
+def test_help_and_mistakes_need_no_torch():
+    code = """if True:
+        import contextlib, io, sys
+        from reference_trainer.cli import main
+        commands = ("demo", "plan", "train", "evaluate", "bake", "render", "compare", "study", "study growth")
+        for words in ([], *(command.split() for command in commands), ["train", "--nonsense"]):
+            with contextlib.suppress(SystemExit), contextlib.redirect_stderr(io.StringIO()):
+                main([*words, "--help"])
+        assert "torch" not in sys.modules and "numpy" not in sys.modules
+    """
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("command", ["evaluate", "render", "train", "compare", "study growth", "study attribution x"])
+def test_a_card_that_is_not_there(command, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    text = refused([*command.split(), "--device", "cuda"], capsys)
+    assert re.fullmatch(r"ca-reg: --device cuda: PyTorch \S+ finds 0 CUDA devices; take cpu.", text)
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [("gpu", "must be cpu, cuda or the number of a card as in cuda:1, got 'gpu'"), ("meta", "cannot compute there"),
+     ("cuda:7", "finds 2 CUDA devices"), ("", "must be cpu, cuda")],
+)  # fmt: skip
+def test_a_device_that_is_none(device, message, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    text = refused(["render", "--device", device], capsys)
+    assert message in text
+    assert len(text) < 200
+
+
+def test_a_cluster_may_have_the_card(monkeypatch, tmp_path):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(choice_module, "choose_engine", lambda *a, **k: Processes(1))
+    monkeypatch.setattr(compare_module, "compare", lambda *a: {tmp_path: Comparison({}, {})})
+    main(["compare", "--out", str(tmp_path), "--device", "cuda", "--address", "head:6379"])
+
+
+@pytest.mark.parametrize("arguments", [["garden"], ["--path", "garden"], ["garden", "--path", "garden"]])
+def test_the_scene_of_a_training_may_be_given_either_way(arguments, monkeypatch, capsys, tmp_path):
+    asked = []
+    monkeypatch.setattr(run_module, "run_experiment", lambda scene, config, out, **rest: asked.append(scene))
+    monkeypatch.setattr(run_module, "summary", lambda results: "")
+    main(["train", *arguments, "--views", "5", "--out", str(tmp_path)])
+    assert asked == [SceneOptions("garden", views=5)]
+    assert "not both: got garden and fern" in refused(["train", "garden", "--path", "fern"], capsys)
+
+
+def test_a_ply_is_known_by_its_name(monkeypatch):
+    asked: list = []
+    monkeypatch.setattr(score_module, "score_ply_on_orbit", lambda ply, *rest, **named: asked.append(str(ply)))
+    main(["evaluate", "somewhere/a.PLY"])
+    assert asked == ["somewhere/a.PLY"]
 
 
 def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):

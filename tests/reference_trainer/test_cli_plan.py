@@ -34,6 +34,16 @@ def test_plan_prints_every_item_and_writes_it(capsys, tmp_path):
         assert item.reason in said
 
 
+def test_plan_says_first_which_pictures_and_views(capsys):
+    main(["plan", "synthetic", "--downscale", "8"])
+    assert capsys.readouterr().out.splitlines()[:4] == [
+        "photographs: built in, used at 20x15 pixels",
+        "3 training views: train_0, train_1, train_2",
+        "3 test views: test_0, test_1, test_outside",
+        "",
+    ]
+
+
 def test_the_scene_may_be_given_either_way(monkeypatch):
     loaded: list[SceneOptions] = []
     monkeypatch.setattr(SceneOptions, "load", lambda self, **k: loaded.append(self) or (_ for _ in ()).throw(OSError))

@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
-import torch
-
 __all__ = ["Answer", "Death", "Engine", "Failure", "Task", "Value", "attempt"]
 
 
@@ -96,6 +94,8 @@ def attempt(task: Task, threads: int) -> Value | Failure:
         >>> attempt(Task("many", int, ("many",)), torch.get_num_threads()).error
         "ValueError: invalid literal for int() with base 10: 'many'"
     """
+    import torch  # which the options of the command line, that name the engines, do without
+
     torch.set_num_threads(threads)
     try:
         return Value(task.function(*task.arguments))

@@ -10,6 +10,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
 from reference_trainer.runs.engines.engine import Answer, Death, Task, attempt
+from reference_trainer.threads import thread_count
 
 __all__ = ["Processes"]
 
@@ -24,7 +25,7 @@ class Processes:
     checkpoint and ends. Ctrl-C itself reaches the parent alone, which tells the workers once; a second one kills them.
 
     Args:
-        jobs: tasks at a time; each may use its share of the processors.
+        jobs: tasks at a time; each may use its share of the processors, or ``OMP_NUM_THREADS`` if that is set.
 
     Raises:
         ValueError: if ``jobs`` is not positive.
@@ -34,7 +35,7 @@ class Processes:
         if jobs < 1:
             raise ValueError(f"expected at least 1 job, got {jobs}.")
         self.jobs = jobs
-        self._threads = max(1, (os.cpu_count() or 1) // jobs)
+        self._threads = thread_count(jobs=jobs)
         self._running: dict[Connection, tuple[int, SpawnProcess]] = {}
 
     def start(self, number: int, task: Task) -> None:

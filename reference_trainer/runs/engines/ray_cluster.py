@@ -6,6 +6,7 @@ import os
 from typing import Any
 
 from reference_trainer.runs.engines.engine import Answer, Death, Failure, Task, attempt
+from reference_trainer.threads import chosen_threads
 
 __all__ = ["RayCluster"]
 
@@ -85,9 +86,10 @@ class RayCluster:
             self._mine = True
         machines = [node["Resources"].get("CPU", 0.0) for node in ray.nodes() if node["Alive"]]
         share = min(sum(machines) // self.jobs, max(machines, default=1.0))
-        self._threads = max(1, int(share))
+        processors = max(1, int(share))
+        self._threads = chosen_threads() or processors
         # Ray's own retries are off: `run_all` retries, counts and reports the same way for every engine.
-        self._attempt = ray.remote(num_cpus=self._threads, num_gpus=self._gpus, max_retries=0)(attempt)
+        self._attempt = ray.remote(num_cpus=processors, num_gpus=self._gpus, max_retries=0)(attempt)
 
     def _answer(self, reference: Any) -> Answer:
         """Return what a task that has ended says, or why it says nothing."""

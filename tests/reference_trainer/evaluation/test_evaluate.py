@@ -12,8 +12,10 @@ from ca_reg.functional import Multiplier, opacity_noise
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores, evaluate
 from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.evaluation.model import Model
+from reference_trainer.evaluation.pictures import file_names
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.render import render
+from reference_trainer.scenes.images import read_image
 from reference_trainer.scenes.scene import Scene
 
 
@@ -177,6 +179,26 @@ def test_means_leave_out_what_does_not_exist():
     assert math.isnan(result.mean("validation", "psnr"))
 
 
+def test_the_error_of_the_mean_is_that_of_independent_views(tiny_scene, gaussians):
+    model = Model(gaussians, tiny_scene.background)
+    result = evaluate(model, tiny_scene)
+    score = model.ca_score()  # counts views by itself, and knows the error of their mean
+    for view in tiny_scene.test:
+        score.update(gaussians.opacities, view)
+    summary = score.compute()
+    assert result.mean("test", "ca") == pytest.approx(summary.value)
+    assert result.mean("test", "ca_std_error") == pytest.approx(summary.std_error)
+    assert result.as_dict()["mean"]["test"]["ca_std_error"] == result.mean("test", "ca_std_error")
+
+
+def test_a_view_without_a_score_has_no_part_in_the_error_and_one_without_an_error_leaves_it_open():
+    views = [dataclasses.replace(of("v", "test", 1.0), ca_std_error=error) for error in (3.0, 4.0)]
+    empty = of("empty", "test", math.nan)
+    assert Evaluation([*views, empty], 10, None).mean("test", "ca_std_error") == 2.5
+    unknown = dataclasses.replace(views[0], ca_std_error=math.nan)
+    assert math.isnan(Evaluation([*views, unknown], 10, None).mean("test", "ca_std_error"))
+
+
 def test_as_dict_is_plain_data():
     result = Evaluation([of("a", "test", 1.0), of("b", "train", 3.0)], 10, "lpips")
     data = json.loads(json.dumps(result.as_dict()))
@@ -184,6 +206,17 @@ def test_as_dict_is_plain_data():
     assert data["mean"]["test"]["ssim"] == 1.0
     assert data["mean"]["train"]["ca_half"] == 3.0
     assert [view["name"] for view in data["views"]] == ["a", "b"]
+
+
+def test_views_of_the_same_name_in_two_folders_keep_their_pictures(tiny_scene, gaussians, tmp_path):
+    names = ["a/r_0.png", "b/r_0.png", "b/r_0_panel.jpg"]
+    train = tuple(dataclasses.replace(v, name=n) for v, n in zip(tiny_scene.train, names, strict=True))
+    scene = dataclasses.replace(tiny_scene, train=train, test=())
+    result = evaluate(Model(gaussians, scene.background), scene, samples=2, pictures=tmp_path)
+    files = [tmp_path / "train" / f"{name}.png" for name in file_names(names)]
+    assert len(list((tmp_path / "train").iterdir())) == 6
+    for file, view, scores in zip(files, train, result.views, strict=True):
+        assert psnr(read_image(file)[0], view.image) == pytest.approx(scores.psnr, abs=0.05)  # 8 bits instead of floats
 
 
 def test_every_view_gets_its_pictures(tiny_scene, gaussians, tmp_path):

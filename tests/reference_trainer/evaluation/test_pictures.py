@@ -6,7 +6,35 @@ import pytest
 import torch
 from PIL import Image
 
-from reference_trainer.evaluation.pictures import error_map, heat_map, save_png, side_by_side, to_uint8
+from reference_trainer.evaluation.pictures import (
+    PANEL,
+    error_map,
+    file_names,
+    heat_map,
+    save_png,
+    side_by_side,
+    to_uint8,
+)
+
+
+@pytest.mark.parametrize(
+    ("views", "names"),
+    [
+        (["0001.jpg", "sub/0002.png", "12.30.01.jpg", "train/r_3"], ["0001", "0002", "12.30.01", "r_3"]),
+        (["a/r_0.png", "b/r_0.png"], ["a_r_0", "b_r_0"]),
+        (["a.jpg", "a.png"], ["a", "a.png"]),
+        (["A/x.png", "b/X.png"], ["A_x", "b_X"]),  # one file, to some file systems
+        (["r.png", "r_panel.png"], ["r", "r_panel.png"]),
+        (["a/r.png", "b/r.png", "a_r.png"], ["a_r", "b_r", "a_r.png"]),
+        ([f"{x}/r.png" for x in ("a/b", "a_b", "a/b/r.png/..")], None),
+    ],
+)
+def test_no_two_views_share_a_file(views, names):
+    found = file_names(views)
+    assert names is None or found == names
+    files = [f"{name}{end}.png".casefold() for name in found for end in ("", PANEL)]
+    assert len(set(files)) == 2 * len(views)
+    assert not any("/" in name for name in found)
 
 
 def test_bytes_survive_the_way_to_float_and_back():
@@ -99,3 +127,10 @@ def test_one_row_by_default_and_no_room_for_absent_columns():
 def test_wrong_arguments(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_label_wider_than_its_picture_is_not_cut():
+    wide, narrow = (side_by_side([torch.zeros(3, 4, w)] * 2, ["render 20.51 dB", "error"]) for w in (120, 20))
+    black = [int(picture[0, :16].lt(0.5).sum()) for picture in (wide, narrow)]
+    assert black[0] == black[1] > 50
+    assert narrow.shape[2] < 150

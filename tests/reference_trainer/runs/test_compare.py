@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 import sweep_tasks
+import torch
 from stand_ins.engine import Here
 
 from ca_reg.monitor import LOG_NAME
+from reference_trainer.evaluation.pictures import save_png
 from reference_trainer.runs import demo as demo_module
 from reference_trainer.runs.compare import compare, scene_folders, strategies
 from reference_trainer.runs.compare_report import REPORT, TABLE, Comparison, comparison_table, report
@@ -123,6 +125,22 @@ def test_failed_runs_are_listed_at_the_end(tmp_path):
         "1 of 1 runs FAILED; the same command tries them again:",
         f"FAILED a, seed 0: ValueError: no ({tmp_path / REPORT} has the traceback)",
     ]
+
+
+@pytest.mark.parametrize("lines", [None, ""])
+def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, lines):
+    """As after --monitor-every 0, or fewer steps than that."""
+    results = made(20.0) | {"config": {"seed": 0}, "views": [{"split": "test", "name": f"{x}/r_0.png"} for x in "ab"]}
+    for strategy, width in (("baseline", 90), ("dropout", 84)):  # a label with a digit less makes a narrower panel
+        folder = tmp_path / strategy / "seed_0"
+        for name in ("a_r_0", "b_r_0"):
+            save_png(folder / "views" / "test" / f"{name}_panel.png", torch.rand(3, 8, width))
+        if lines is not None:
+            (folder / LOG_NAME).write_text(lines)
+    said: list[str] = []
+    report({tmp_path: Comparison({"baseline": [results], "dropout": [results]}, {})}, say=said.append)
+    assert any(line.startswith("no figure of CA and PSNR against the iteration: ") for line in said)
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["test_a_r_0.png", "test_b_r_0.png"]
 
 
 def test_a_worker_that_does_not_share_the_folder_does_not_train(tmp_path, options):

@@ -7,6 +7,7 @@ from PIL import Image
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
 from reference_trainer.model.ply import load_ply
+from reference_trainer.runs import measure as measure_module
 from reference_trainer.runs.folder import BAKED_PLY, PLY
 from reference_trainer.runs.measure import evaluation_table, measure, of_run, render_run
 from reference_trainer.runs.run import run_experiment
@@ -104,6 +105,17 @@ def test_views_are_rendered_as_the_run_drew_them(run, what, names):
     assert found == (names or [f"train_{i}" for i in range(3)])
     for name in found:
         assert (folder / f"{name}.png").read_bytes() == (out / "views" / what / f"{name}.png").read_bytes()
+
+
+def test_views_of_the_same_name_in_two_folders_are_all_rendered(run, tmp_path, monkeypatch):
+    trainer = measure_module.load_run(run[0])
+    names = ("a/r_0.png", "b/r_0.png", "r_1.png")
+    test = tuple(dataclasses.replace(v, name=n) for v, n in zip(trainer.scene.test, names, strict=True))
+    trainer.scene = dataclasses.replace(trainer.scene, test=test)
+    monkeypatch.setattr(measure_module, "load_run", lambda *arguments: trainer)
+    render_run(run[0], "test", tmp_path, say=lambda text: None)
+    for name, view in (("a_r_0", "test_0"), ("b_r_0", "test_1"), ("r_1", "test_outside")):
+        assert (tmp_path / f"{name}.png").read_bytes() == (run[0] / "views" / "test" / f"{view}.png").read_bytes()
 
 
 def test_a_flight_begins_and_ends_at_training_cameras(run, tmp_path):

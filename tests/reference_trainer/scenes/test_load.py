@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 
@@ -55,6 +56,42 @@ def test_image_folder_and_downscale(photo_scene):
         file.unlink()
     (photo_scene / "images").rmdir()
     assert load_scene(photo_scene, points="random:5").train[0].image.shape == (3, 12, 16)
+
+
+@pytest.mark.parametrize("place", ["sparse", "."])
+@pytest.mark.parametrize("format", ["auto", "colmap"])
+def test_a_reconstruction_beside_its_usual_place(photo_scene, place, format):
+    expected = load_scene(photo_scene, points="random:5")
+    for file in (photo_scene / "sparse" / "0").iterdir():
+        file.rename(photo_scene / place / file.name)
+    (photo_scene / "sparse" / "0").rmdir()
+    found = load_scene(photo_scene, format=format, points="random:5")
+    assert [view.name for view in found.train] == [view.name for view in expected.train]
+    assert torch.equal(found.test[0].camera.world_to_camera, expected.test[0].camera.world_to_camera)
+    with pytest.raises(ValueError, match="have seen"):
+        load_scene(photo_scene, points=place, views=1, split="llff")
+
+
+def test_a_folder_of_pictures_that_is_not_there(photo_scene):
+    with pytest.raises(
+        FileNotFoundError, match=r"no folder .*images_8 \(--images\).*with pictures are \['images', 'images_4'\]"
+    ):
+        load_scene(photo_scene, images="images_8")
+
+
+def test_a_scene_says_what_a_user_checks_first(photo_scene, blender_scene):
+    assert str(load_scene(photo_scene, images="images_4", points="random:5")).splitlines() == [
+        f"photographs: {photo_scene / 'images_4'}, used at 16x12 pixels",
+        "2 training views: b.png, c.png",
+        "1 test view: a b.png",
+    ]
+    scene = load_scene(blender_scene)
+    assert str(scene).startswith(
+        f"photographs: {blender_scene / 'test'}, {blender_scene / 'train'}, used at 8x6 pixels"
+    )
+    many = dataclasses.replace(scene, train=scene.train * 5, test=())
+    assert str(many).splitlines()[1:] == [f"15 training views: {'train/r_0, train/r_1, train/r_2, ' * 3}train/r_0, "
+                                          "train/r_1, ..., train/r_2", "0 test views"]  # fmt: skip
 
 
 def test_points_that_saw_test_views_are_refused(photo_scene):
@@ -153,7 +190,7 @@ def test_detect_format(photo_scene, blender_scene, tmp_path):
         ({"views": 0}, "views must be"),
         ({"views": 5}, "no training set of 5 views"),
         ({"split": "other"}, r"no split 'other'; choose auto, llff or a JSON file of the scene: \['split'\]"),
-        ({"images": "pictures"}, "no image folder"),
+        ({"images": "pictures"}, "no folder"),
         ({"points": "sparse/1"}, r"choose auto, random or one of \['sparse/0'\]"),
         ({"points": "../sparse/0"}, "leads out of the scene"),
         ({"points": "random:many"}, "random:<count>"),

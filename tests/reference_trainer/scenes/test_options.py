@@ -3,7 +3,7 @@ import inspect
 
 import torch
 
-from reference_trainer.scenes import options as options_module
+from reference_trainer.scenes import load as load_module
 from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
 
@@ -21,7 +21,7 @@ def test_every_option_arrives(monkeypatch):
         "downscale": 2.0, "background": "white", "allow_test_points": True,
     }  # fmt: skip
     received: dict = {}
-    monkeypatch.setattr(options_module, "load_scene", lambda path, **rest: received.update(path=path, **rest))
+    monkeypatch.setattr(load_module, "load_scene", lambda path, **rest: received.update(path=path, **rest))
     SceneOptions(**given).load(seed=11)
     assert received == given | {"seed": 11}
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import sweep_tasks
 
-from reference_trainer.runs.engines import processes as processes_module
 from reference_trainer.runs.engines.engine import Failure, Task, Value
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all
@@ -71,7 +70,8 @@ def test_a_worker_that_leaves_without_an_answer():
 
 @pytest.mark.slow
 def test_every_task_has_a_process_with_its_share_of_the_processors(monkeypatch):
-    monkeypatch.setattr(processes_module.os, "cpu_count", lambda: 6)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(6)), raising=False)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     tasks = [Task(str(n), sweep_tasks.environment, ()) for n in range(2)]
     values = [outcome.value for _, outcome in run_all(Processes(2), tasks)]
     assert len({pid for pid, _ in values} | {os.getpid()}) == 3

@@ -78,9 +78,13 @@ def engine_on(stand_in, monkeypatch, jobs, **keywords):
     ],
 )
 def test_a_task_reserves_its_share_of_the_processors(processors, jobs, share, monkeypatch):
-    stand_in = StandIn(processors)
-    engine_on(stand_in, monkeypatch, jobs, address="host:6379", gpus=0.5)
-    assert stand_in.asked["threads"] == share
+    for chosen in (None, "5"):  # what the user has set wins, and reserves no more
+        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+        if chosen:
+            monkeypatch.setenv("OMP_NUM_THREADS", chosen)
+        stand_in = StandIn(processors)
+        engine_on(stand_in, monkeypatch, jobs, address="host:6379", gpus=0.5)
+        assert stand_in.asked["threads"] == int(chosen or share)
     assert stand_in.asked["remote"] == {"num_cpus": share, "num_gpus": 0.5, "max_retries": 0}
 
 

@@ -1,0 +1,43 @@
+"""Where to compute, as the command line names it."""
+
+from __future__ import annotations
+
+__all__ = ["check_device"]
+
+
+def check_device(name: str, *, here: bool = True) -> None:
+    """Refuse a device that PyTorch cannot compute on.
+
+    Args:
+        name: such as ``"cpu"``, ``"cuda"`` or ``"cuda:1"``.
+        here: whether this machine must have it; else only the name is looked at.
+
+    Raises:
+        ValueError: if it is no device, or there is none here.
+
+    Example:
+        >>> check_device("cpu")
+        >>> check_device("gpu")
+        Traceback (most recent call last):
+        ...
+        ValueError: --device must be cpu, cuda or the number of a card as in cuda:1, got 'gpu'.
+    """
+    import torch
+
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        message = f"--device must be cpu, cuda or the number of a card as in cuda:1, got {name!r}."
+        raise ValueError(message) from error
+    if not here:
+        return
+    if device.type == "cuda":  # nothing is allocated: workers may be those that compute
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if (device.index or 0) >= count:
+            raise ValueError(f"--device {name}: PyTorch {torch.__version__} finds {count} CUDA devices; take cpu.")
+        return
+    try:
+        float(torch.ones((), dtype=torch.float64, device=device))  # scores need float64, which mps lacks
+    except Exception as error:  # every backend has its own
+        reason = str(error).partition("\n")[0].partition(". ")[0].rstrip(".")
+        raise ValueError(f"--device {name}: PyTorch {torch.__version__} cannot compute there ({reason}).") from error
