@@ -24,12 +24,14 @@ class Field:
     Args:
         index: tells the fields of one training apart, from 0.
         step: the step that it starts in, 0 if that is not known.
+        steps: what tells that a step begins.
     """
 
-    def __init__(self, index: int, step: int) -> None:
+    def __init__(self, index: int, step: int, steps: Steps) -> None:
         self.index = index
         self.renders = 0
         self.step = step
+        self._by_parameters = steps == "parameters"
         self._updates_end_step: bool | None = None
         self._versions: tuple[tuple[int, int], ...] = ()
 
@@ -48,23 +50,25 @@ class Field:
         It is called once per step, but its argument may have an offset (DNGaussian), so that calls are counted from the
         first argument on. FSGS and CoR-GS call it at the end of a step, which shows at the first call.
 
+        If the parameters tell the steps, only the first call counts: it says where a resumed training goes on.
+
         Returns:
-            Whether the step that has ended had a training render; True for the first call.
+            Whether the step that has ended had a training render; True if none has.
         """
-        rendered = self._updates_end_step is None or self.renders > 0
+        rendered = self._updates_end_step is None or self._by_parameters or self.renders > 0
         if self._updates_end_step is None:
             self._updates_end_step = self.renders > 0
             self.begin(max(iteration, 1) + self._updates_end_step)
-        else:
+        elif not self._by_parameters:
             self.begin(self.step + 1)
         return rendered
 
-    def count_render(self, parameters: tuple[Tensor, ...], steps: Steps) -> None:
+    def count_render(self, parameters: tuple[Tensor, ...]) -> None:
         """Count a training render.
 
         Args:
-            parameters: of the Gaussians; whoever trains them changes their versions.
-            steps: whether such a change begins a step, or must not be within one.
+            parameters: of the Gaussians. Whoever trains them changes their versions; that begins a step, or must not
+                happen within one.
 
         Raises:
             RuntimeError: if steps go by without anyone saying so.
@@ -72,7 +76,7 @@ class Field:
         versions = tuple((id(x), x._version) for x in parameters)
         trained = self.renders > 0 and versions != self._versions
         self._versions = versions
-        if trained and steps == "parameters":
+        if trained and self._by_parameters:
             self.begin(self.training_step + 1)
         elif trained or (self.step == 0 and self.renders >= _RENDERS_WITHOUT_STEP):
             raise RuntimeError(
@@ -88,10 +92,12 @@ class Iterations:
     """The fields of one training, found by their model or, where that is not known, by a parameter.
 
     Args:
+        steps: what tells that a step begins.
         lose_step: called when a step of a field goes by without a training render.
     """
 
-    def __init__(self, lose_step: Callable[[], None]) -> None:
+    def __init__(self, steps: Steps, lose_step: Callable[[], None]) -> None:
+        self._steps = steps
         self._fields: list[tuple[weakref.ref[Any], Field]] = []
         self._vacant: list[Field] = []
         self._step: int | None = None
@@ -110,7 +116,7 @@ class Iterations:
             index, step = gone.index, gone.step + (gone.renders > 0)
         else:
             index, step = len(self._fields), max((field.step for _, field in self._fields), default=0)
-        field = Field(index, step if self._step is None else self._step)
+        field = Field(index, step if self._step is None else self._step, self._steps)
         self._fields.append((weakref.ref(owner), field))
         return field
 

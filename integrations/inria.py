@@ -124,11 +124,10 @@ class RasterizerHook:
         self._scope = scope
         self._seed = int(seed)
         self._rasterizer = rasterizer
-        self._steps = steps
         self._viewer = viewer
         self._allow_zeros = allow_zeros
         self._watch_training = Watch(patience, self._explain)
-        self._iterations = Iterations(self._lose_step)
+        self._iterations = Iterations(steps, self._lose_step)
         self._models: tuple[type, ...] = ()
         self._patches: list[ClassPatch] = []
         self._watch: AfterImport | None = None
@@ -288,7 +287,7 @@ class RasterizerHook:
         parameters = tuple(x for x in (means if means.is_leaf else None, leaf_of(opacities)) if x is not None)
         # Without a model a parameter tells the fields apart; where none is found, all calls belong to one field.
         field = self._iterations.field(model if model is not None else parameters[0] if parameters else self)
-        field.count_render(parameters, self._steps)
+        field.count_render(parameters)
         if self._scope == "main" and field.renders > 1:
             return self._leave(call, Skip.FURTHER_VIEW)
         self._refuse_a_second_regularizer(render)

@@ -174,7 +174,7 @@ def test_gsplats_own_density_control_decides_as_if_dropped_gaussians_were_not_th
 
 def test_packed_mode_of_old_versions_is_refused(params, cameras):
     wrapped = regularized(rasterization_1_4, GaussianDropout(0.4))
-    with pytest.raises(RuntimeError, match=r"packed=False, or install gsplat>=1\.5"):
+    with pytest.raises(RuntimeError, match=r"pass packed=False, or.* install gsplat>=1\.5"):
         wrapped(**activated(params), **cameras)
 
 
