@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -115,7 +116,7 @@ def _set_step(module: nn.Module, step: int) -> None:
 def _kept(module: nn.Module, before: Tensor, after: Tensor) -> Tensor | None:
     """Return what a module has not dropped, (N,) bool; None if it dropped nothing."""
     if hasattr(module, "keep"):
-        keep: Tensor | None = module.keep
+        keep: Any = module.keep
         return None if keep is None else keep.reshape(-1)
     if isinstance(module, OpacityNoise):
         return None  # what its clamp leaves at 0 is still counted as seen, as in the paper's code

@@ -121,7 +121,7 @@ class Iterations:
         return field
 
     def evaluation_step(self, owner: Any) -> int:
-        """Return the step of a model or of a parameter, else of any: after all schedules if nothing was ever trained."""
+        """Return the step of a model or a parameter, else of any; after all schedules if nothing was ever trained."""
         trained = [(ref(), field.training_step) for ref, field in self._fields if field.step or field.renders]
         steps = [step for known, step in trained if known is owner] or [step for _, step in trained]
         return max(steps, default=_FINISHED)

@@ -86,6 +86,8 @@ class Regularized:
         evaluated: number of calls that were rendered as evaluation.
     """
 
+    _eager: Any = None
+
     def __init__(
         self,
         rasterization: Rasterization,
@@ -111,18 +113,23 @@ class Regularized:
         self._steps = steps
         self._watch = watch
         self._packed_is_safe = False
+        # A compiled caller is cut here. On the class, so that instances can be pickled; now, because it imports dynamo.
+        Regularized._eager = Regularized._eager or torch.compiler.disable(Regularized._rasterize)
         functools.update_wrapper(self, rasterization)
 
     def __call__(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Rasterize with regularized opacities; takes and returns what ``rasterization`` does."""
-        return self._rasterize(self._signature.bind(*args, **kwargs), trains=self.regularizer.training)
+        out: tuple[Any, ...] = self._eager(args, kwargs, trains=self.regularizer.training)
+        return out
 
     def evaluate(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Rasterize with the opacities of ``eval()``, whatever the mode; takes and returns what ``rasterization`` does."""
-        return self._rasterize(self._signature.bind(*args, **kwargs), trains=False)
+        """Rasterize with the opacities of ``eval()``, whatever the mode; otherwise like a call."""
+        out: tuple[Any, ...] = self._eager(args, kwargs, trains=False)
+        return out
 
-    def _rasterize(self, bound: inspect.BoundArguments, *, trains: bool) -> tuple[Any, ...]:
+    def _rasterize(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, trains: bool) -> tuple[Any, ...]:
         """Rasterize in a mode."""
+        bound = self._signature.bind(*args, **kwargs)
         opacities: Tensor = bound.arguments["opacities"]
         given = opacities.reshape(-1)
         keep: Tensor | None = None
@@ -148,8 +155,9 @@ class Regularized:
         """Zero the radii of dropped Gaussians; ``keep`` is [..., N]."""
         if "radii" not in info:
             raise RuntimeError(
-                f"{getattr(self.rasterization, '__name__', self.rasterization)} returns no radii, so that dropped "
-                "Gaussians cannot be hidden from density control: train with gsplat.rasterization or rasterization_2dgs."
+                f"{getattr(self.rasterization, '__name__', self.rasterization)} returns no radii, so that "
+                "dropped Gaussians cannot be hidden from density control: train with gsplat.rasterization or "
+                "gsplat.rasterization_2dgs."
             )
         gaussians, radii = info.get("gaussian_ids"), info["radii"]
         if gaussians is None:
@@ -176,7 +184,9 @@ class Installation:
         functions: all that was replaced, by name: what is in the place of each.
     """
 
-    def __init__(self, functions: Mapping[str, Regularized], replaced: dict[tuple[str, str], Any], watch: Watch) -> None:
+    def __init__(
+        self, functions: Mapping[str, Regularized], replaced: dict[tuple[str, str], Any], watch: Watch
+    ) -> None:
         self.functions = functions
         self.rasterization = functions["rasterization"]
         self._replaced = replaced
@@ -215,7 +225,7 @@ def install(regularizer: nn.Module, *, generator: torch.Generator | None = None,
 
     They are ``rasterization`` and what else is named ``rasterization...`` and takes opacities (2DGS), in ``gsplat`` and
     in ``gsplat.rendering``. Do it before the script is imported: what has imported a name already keeps the old
-    function. Nobody tells the regularizer the step of such a script, so its step is the number of training calls so far.
+    function. Nobody tells the regularizer the step of such a script: its step is the number of training calls so far.
 
     Args:
         regularizer: as for :func:`regularized`.
@@ -290,4 +300,3 @@ def load_gsplat(device: torch.device | None = None) -> Any:
 def unregularized(rasterization: Rasterization) -> Rasterization:
     """Return the function underneath if ``rasterization`` is regularized, else itself."""
     return rasterization.rasterization if isinstance(rasterization, Regularized) else rasterization
-

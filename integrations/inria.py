@@ -118,8 +118,8 @@ class RasterizerHook:
             raise ValueError("regularizer is empty; without one there is nothing to install.")
         if without := self._chain.without_generator():
             raise TypeError(
-                f"the forward of {', '.join(without)} takes no argument generator: the hook repeats the draws of a step "
-                "and leaves the global random numbers alone. Add generator=None to it, and draw from it."
+                f"the forward of {', '.join(without)} takes no argument generator, by which the hook repeats the draws of "
+                "a step and leaves the global random numbers alone. Add generator=None to it, and draw from it."
             )
         self._scope = scope
         self._seed = int(seed)
@@ -130,6 +130,7 @@ class RasterizerHook:
         self._iterations = Iterations(steps, self._lose_step)
         self._models: tuple[type, ...] = ()
         self._patches: list[ClassPatch] = []
+        self._hooked: list[str] = []  # names of the classes, for messages
         self._watch: AfterImport | None = None
         self.tally = Tally()
 
@@ -208,12 +209,10 @@ class RasterizerHook:
 
     def _explain(self) -> str:
         """Say what may be the cause, and what to do."""
-        owners = [patch.owner for patch in self._patches if patch.name == "forward"]
-        classes = " and ".join(f"{owner.__module__}.{owner.__qualname__}" for owner in owners)
+        hooked = " and ".join(self._hooked) or "nothing, because no known rasterizer was imported"
         return (
-            f"Hooked is {classes or 'nothing, because no known rasterizer was imported'}; so far: "
-            f"{'; '.join(self.tally.lines())}. If the training renders with another class, pass it as rasterizer=... to "
-            "RasterizerHook; if the rates are 0 for longer than the training, let the schedule begin earlier (--start); "
+            f"Hooked is {hooked}; so far: {'; '.join(self.tally.lines())}. If the training renders with another class, "
+            "pass it as rasterizer=... to RasterizerHook; if the rates are 0 for longer than the training, let the schedule begin earlier (--start); "
             "if steps without a regularized render are meant, raise patience (--patience; 0 for any number). Without "
             "--dropout and --noise the script runs plain."
         )
@@ -259,16 +258,17 @@ class RasterizerHook:
             function = getattr(function, "__wrapped__", None)
 
         def make(forward: Callable[..., Any]) -> Callable[..., Any]:
-            # A compiled render is cut here: what follows reads the variables of its caller.
-            @torch.compiler.disable
             @functools.wraps(forward)
             def regularized_forward(*args: Any, **kwargs: Any) -> Any:
                 return self._rasterize(ForwardCall(forward, signature.bind(*args, **kwargs)))
 
-            vars(regularized_forward)["ca_reg_hook"] = self
-            return regularized_forward
+            # A compiled render is cut here: what follows reads the variables of its caller.
+            eager: Callable[..., Any] = torch.compiler.disable(regularized_forward)
+            vars(eager)["ca_reg_hook"] = self
+            return eager
 
         self._patches.append(ClassPatch(rasterizer, "forward", make))
+        self._hooked.append(f"{rasterizer.__module__}.{rasterizer.__qualname__}")
 
     def _rasterize(self, call: ForwardCall) -> Any:
         """Decide what a call of the rasterizer is for, and make it."""
@@ -309,7 +309,7 @@ class RasterizerHook:
             self.tally.scaled += 1
         if torch.is_grad_enabled() and opacities.requires_grad:
             opacities = opacities.view_as(opacities)
-            opacities.register_hook(self._refuse_to_train_on_a_viewer)
+            opacities.register_hook(self._refuse_to_train_on_a_viewer)  # type: ignore[no-untyped-call]
         call.arguments["opacities"] = opacities
         return call()
 

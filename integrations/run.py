@@ -90,7 +90,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--outputs",
         type=lambda text: int(text) if text.isdigit() else text,
         choices=(2, 3, 4, "depth", "inverse-depth"),
-        help="what the stand-in returns, if the source does not tell: length of the tuple, or the third of three values",
+        help="what the stand-in returns, if the source does not tell: length of the tuple, or the third of three",
     )
     add("--steps", choices=get_args(Steps), default="updates", help="what tells the steps: calls of "
         "update_learning_rate (default), or changes of the parameters")  # fmt: skip
@@ -98,7 +98,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--patience", type=int, default=100, metavar="STEPS", help="end the run after so many steps that were not "
         "regularized (default: 100); 0 for never")  # fmt: skip
     add("--allow-zeros", action="store_true", help="opacities of 0 are no dropout of the code base's own")
-    add("-m", dest="module", nargs=argparse.REMAINDER, help="run a module, as python -m does; all that follows is its")
+    add("-m", dest="module", nargs=argparse.REMAINDER, help="run a module as python -m does; all that follows is its")
     add("script", type=Path, nargs="?", help="train.py or render.py of the code base")
     add("arguments", nargs=argparse.REMAINDER, help="of the script")
     options = parser.parse_args(arguments)

@@ -63,7 +63,9 @@ def read_interface(repository: Path, outputs: Outputs | None = None) -> Interfac
     found = _count_outputs(tree, source, settings) if outputs is None else outputs
     if rasterizer.endswith("_abs"):
         if found != 3:
-            raise ValueError(f"{rasterizer} returns 3 values (colour, radii, weights), got outputs={found} for {source}.")
+            raise ValueError(
+                f"{rasterizer} returns 3 values (colour, radii, weights), got outputs={found} for {source}."
+            )
         return Interface(rasterizer, ("weights",), _neighbor_indices(repository))
     if found == 3:
         if "antialiasing" not in settings:

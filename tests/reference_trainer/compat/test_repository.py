@@ -43,7 +43,9 @@ def test_the_outputs_are_read_at_the_call(tmp_path, body, outputs):
 @pytest.mark.parametrize("third", ["depth", "inverse_depth", "is_used"])
 def test_a_third_value_that_no_field_of_the_settings_tells_is_asked_for(tmp_path, third):
     root = _repository(tmp_path, HEAD + "def render(x, s):\n" + SETTINGS.format("sh_degree") + THREE.format(third))
-    with pytest.raises(ValueError, match=r"third of three values .* 'depth' or 'inverse-depth', in the launcher --outputs"):
+    with pytest.raises(
+        ValueError, match=r"third of three values .* 'depth' or 'inverse-depth', in the launcher --outputs"
+    ):
         read_interface(root)
     with pytest.raises(ValueError, match="third of three values"):
         read_interface(root, outputs=3)
@@ -62,7 +64,7 @@ def test_a_third_value_that_no_field_of_the_settings_tells_is_asked_for(tmp_path
 )
 def test_what_cannot_be_told_is_asked_for(tmp_path, body):
     root = _repository(tmp_path, HEAD + "def render(x, settings, rasterizer=None):\n" + body)
-    with pytest.raises(ValueError, match="Give outputs=2, 4, .* in the launcher --outputs"):
+    with pytest.raises(ValueError, match=r"Give outputs=2, 4, .* in the launcher --outputs"):
         read_interface(root)
     assert read_interface(root, outputs=4).members == ("depth", "alpha")
 
