@@ -114,7 +114,8 @@ class Regularized:
         self._watch = watch
         self._packed_is_safe = False
         # A compiled caller is cut here. On the class, so that instances can be pickled; now, because it imports dynamo.
-        Regularized._eager = Regularized._eager or torch.compiler.disable(Regularized._rasterize)
+        if Regularized._eager is None:
+            Regularized._eager = torch.compiler.disable(Regularized._rasterize)  # type: ignore[no-untyped-call]
         functools.update_wrapper(self, rasterization)
 
     def __call__(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:

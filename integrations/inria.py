@@ -118,8 +118,8 @@ class RasterizerHook:
             raise ValueError("regularizer is empty; without one there is nothing to install.")
         if without := self._chain.without_generator():
             raise TypeError(
-                f"the forward of {', '.join(without)} takes no argument generator, by which the hook repeats the draws of "
-                "a step and leaves the global random numbers alone. Add generator=None to it, and draw from it."
+                f"the forward of {', '.join(without)} takes no argument generator, by which the hook repeats the draws "
+                "of a step and leaves the global random numbers alone. Add generator=None to it, and draw from it."
             )
         self._scope = scope
         self._seed = int(seed)
@@ -212,9 +212,9 @@ class RasterizerHook:
         hooked = " and ".join(self._hooked) or "nothing, because no known rasterizer was imported"
         return (
             f"Hooked is {hooked}; so far: {'; '.join(self.tally.lines())}. If the training renders with another class, "
-            "pass it as rasterizer=... to RasterizerHook; if the rates are 0 for longer than the training, let the schedule begin earlier (--start); "
-            "if steps without a regularized render are meant, raise patience (--patience; 0 for any number). Without "
-            "--dropout and --noise the script runs plain."
+            "pass it as rasterizer=... to RasterizerHook; if the rates are 0 for longer than the training, let the "
+            "schedule begin earlier (--start); if steps without a regularized render are meant, raise patience "
+            "(--patience; 0 for any number). Without --dropout and --noise the script runs plain."
         )
 
     def _lose_step(self) -> None:
@@ -263,7 +263,7 @@ class RasterizerHook:
                 return self._rasterize(ForwardCall(forward, signature.bind(*args, **kwargs)))
 
             # A compiled render is cut here: what follows reads the variables of its caller.
-            eager: Callable[..., Any] = torch.compiler.disable(regularized_forward)
+            eager: Callable[..., Any] = torch.compiler.disable(regularized_forward)  # type: ignore[no-untyped-call]
             vars(eager)["ca_reg_hook"] = self
             return eager
 
