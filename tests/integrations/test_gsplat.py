@@ -335,6 +335,7 @@ def test_a_training_past_the_installation_is_an_error(fake_gsplat, params, camer
     assert made == 2
 
 
+@pytest.mark.slow
 # Dynamo asks every tensor that crosses a cut for its gradient.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 def test_a_compiled_call_is_regularized(params, cameras):

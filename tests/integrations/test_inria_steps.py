@@ -244,6 +244,7 @@ def test_an_is_train_beside_an_iteration_is_no_dropout(rasterizer):
     assert hook.tally.regularized == 1
 
 
+@pytest.mark.slow
 # Dynamo asks every tensor that crosses a cut for its gradient.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 def test_a_compiled_training_is_regularized(rasterizer, model_class):

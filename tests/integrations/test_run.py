@@ -222,6 +222,7 @@ def test_a_module_runs_as_python_would_run_it(repository, capsys, monkeypatch):
     assert "[ca_reg] package.train: exit 0\n[ca_reg] 2 renders regularized" in captured.err
 
 
+@pytest.mark.slow
 def test_workers_that_start_afresh_find_the_stand_ins(repository):
     """As those of data loaders do on macOS and Windows: nothing but the search path is handed on."""
     (repository / "diff_gaussian_rasterization.py").unlink()
