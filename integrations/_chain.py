@@ -95,7 +95,7 @@ def _flatten(module: nn.Module) -> list[nn.Module]:
     """Return the members of a chain in order."""
     if not isinstance(module, nn.Module):
         raise TypeError(f"regularizer must be a torch module, got {type(module).__name__}.")
-    if type(module) is nn.Sequential:
+    if isinstance(module, nn.Sequential) and type(module).forward is nn.Sequential.forward:
         return [member for child in module for member in _flatten(child)]
     return [module]
 

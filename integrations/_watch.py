@@ -26,6 +26,7 @@ class Watch:
         explain: returns what the user should know and do.
 
     Attributes:
+        patience: as given.
         steps: of optimizers of Gaussians, since it was made.
 
     Raises:
@@ -37,7 +38,7 @@ class Watch:
         check_count(patience, "patience", minimum=0)
         self.steps = 0
         self._idle = 0
-        self._patience = patience
+        self.patience = patience
         self._explain = explain
         self._handle: Any = None
 
@@ -67,5 +68,5 @@ class Watch:
             self._check(self._idle, "optimizer steps of the Gaussians in a row, and no render was regularized")
 
     def _check(self, count: int, what: str) -> None:
-        if 0 < self._patience < count:
+        if 0 < self.patience < count:
             raise RuntimeError(f"{count} {what}. {self._explain()}")

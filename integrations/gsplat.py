@@ -217,7 +217,7 @@ class Installation:
             RuntimeError: if Gaussians were trained, and no call was regularized.
         """
         self.uninstall()
-        if error is None and self._watch.steps and not self.trained:
+        if error is None and self._watch.patience and self._watch.steps and not self.trained:
             raise RuntimeError(f"The training was not regularized. {_explain()}")
 
 

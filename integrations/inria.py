@@ -202,8 +202,10 @@ class RasterizerHook:
     def problem(self) -> str | None:
         """Say what went wrong unnoticed, and the way out; None if all is well.
 
-        See :meth:`Tally.shortfall`.
+        See :meth:`Tally.shortfall`. With a patience of 0 nothing is wrong.
         """
+        if not self._watch_training.patience:
+            return None
         shortfall = self.tally.shortfall(self._watch_training.steps)
         return None if shortfall is None else f"{shortfall} {self._explain()}"
 

@@ -96,7 +96,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "update_learning_rate (default), or changes of the parameters")  # fmt: skip
     add("--viewer", default="MiniCam", metavar="CLASS", help="class of a viewer's cameras (default: MiniCam), or none")
     add("--patience", type=int, default=100, metavar="STEPS", help="end the run after so many steps that were not "
-        "regularized (default: 100); 0 for never")  # fmt: skip
+        "regularized (default: 100), or fail at its end; 0 for neither")  # fmt: skip
     add("--allow-zeros", action="store_true", help="opacities of 0 are no dropout of the code base's own")
     add("-m", dest="module", nargs=argparse.REMAINDER, help="run a module as python -m does; all that follows is its")
     add("script", type=Path, nargs="?", help="train.py or render.py of the code base")

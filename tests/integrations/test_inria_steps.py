@@ -177,6 +177,8 @@ def test_a_short_training_past_the_hook_is_an_error_at_its_end(rasterizer):
     hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer)
     with pytest.raises(RuntimeError, match="The training was not regularized"), hook:
         train(model, other, optimizer_of(model))
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, patience=0):
+        train(model, other, optimizer_of(model))
 
 
 @pytest.mark.parametrize("name", ["opacity", "poses"])
