@@ -14,7 +14,6 @@ from typing import Any
 __all__ = ["calling_render", "find_instance", "is_viewer", "own_dropout", "own_noise"]
 
 _OUTWARD = 8  # frames to search: torch.nn.Module puts two between the rasterizer and its caller
-_VIEWER_CAMERA = "MiniCam"  # made by network_gui alone, from what the viewer sent
 
 
 def calling_render() -> Mapping[str, Any]:
@@ -36,24 +35,27 @@ def find_instance(variables: Mapping[str, Any], classes: tuple[type, ...]) -> An
     return next((x for x in variables.values() if isinstance(x, classes)), None)
 
 
-def is_viewer(variables: Mapping[str, Any]) -> bool:
-    """Whether a viewer asked for the render: such renders are made with gradients on, before that of the training."""
-    return any(type(x).__name__ == _VIEWER_CAMERA for x in variables.values())
+def is_viewer(variables: Mapping[str, Any], camera: str | None) -> bool:
+    """Whether a viewer asked for the render: such renders are made with gradients on, before that of the training.
+
+    Args:
+        variables: of the calling render.
+        camera: name of the class of a viewer's cameras; None if there is no viewer.
+    """
+    return camera is not None and any(type(x).__name__ == camera for x in variables.values())
 
 
 def own_dropout(variables: Mapping[str, Any]) -> str | None:
-    """Say which dropout of its own the calling render applies to the opacities, and how to switch it off; or None."""
-    factor = variables.get("dropout_factor") or 0.0
-    if factor > 0:
+    """Say which dropout by index the calling render has (the paper's code), and how to switch it off; or None."""
+    factor = variables.get("dropout_factor")
+    if isinstance(factor, (int, float)) and factor > 0:
         return f"dropout_factor={factor:g}; switch it off with --dropout_factor 0"
-    if variables.get("is_train") and "iteration" in variables:
-        return "is_train=True, DropGaussian's own dropout; leave out GaussianDropout (--dropout) here"
     return None
 
 
 def own_noise(variables: Mapping[str, Any]) -> str | None:
     """Say which opacity noise of its own the calling render adds, and how to switch it off; or None."""
-    sigma = variables.get("sigma_noise") or 0.0
-    if sigma > 0 and variables.get("train", True):
+    sigma = variables.get("sigma_noise")
+    if isinstance(sigma, (int, float)) and sigma > 0 and variables.get("train", True):
         return f"sigma_noise={sigma:g}; switch it off with --sigma_noise 0"
     return None

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import weakref
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal
 
 from torch import Tensor
 
-__all__ = ["Field", "Iterations"]
+__all__ = ["Field", "Iterations", "Steps", "leaf_of"]
+
+Steps = Literal["updates", "parameters"]
+"""What tells the steps: calls of ``update_learning_rate``, or the parameters, when they have changed."""
 
 _FINISHED = 2**31  # the step of a field that is only evaluated: every schedule has come to its end
 _RENDERS_WITHOUT_STEP = 256  # of one field; no code base renders so many views in one step
+_NODES = 1000  # of the graph behind the opacities to search for a parameter
 
 
 class Field:
@@ -19,85 +24,131 @@ class Field:
     Args:
         index: tells the fields of one training apart, from 0.
         step: the step that it starts in, 0 if that is not known.
+        steps: what tells that a step begins.
     """
 
-    def __init__(self, index: int, step: int) -> None:
+    def __init__(self, index: int, step: int, steps: Steps) -> None:
         self.index = index
         self.renders = 0
-        self._step = step
+        self.step = step
+        self._by_parameters = steps == "parameters"
         self._updates_end_step: bool | None = None
-        self._version: int | None = None
+        self._versions: tuple[tuple[int, int], ...] = ()
 
     @property
     def training_step(self) -> int:
         """The step, from 1."""
-        return max(self._step, 1)
-
-    @property
-    def evaluation_step(self) -> int:
-        """The step; after all schedules if nothing was ever trained, as in a script that only renders."""
-        return self.training_step if self._step or self.renders else _FINISHED
+        return max(self.step, 1)
 
     def begin(self, step: int) -> None:
         """Enter a step."""
-        self._step = step
-        self.renders = 0
+        self.step, self.renders = step, 0
 
-    def update(self, iteration: int) -> None:
+    def update(self, iteration: int) -> bool:
         """Take note of a call of update_learning_rate.
 
         It is called once per step, but its argument may have an offset (DNGaussian), so that calls are counted from the
         first argument on. FSGS and CoR-GS call it at the end of a step, which shows at the first call.
+
+        If the parameters tell the steps, only the first call counts: it says where a resumed training goes on.
+
+        Returns:
+            Whether the step that has ended had a training render; True if none has.
         """
+        rendered = self._updates_end_step is None or self._by_parameters or self.renders > 0
         if self._updates_end_step is None:
             self._updates_end_step = self.renders > 0
             self.begin(max(iteration, 1) + self._updates_end_step)
-        else:
-            self.begin(self._step + 1)
+        elif not self._by_parameters:
+            self.begin(self.step + 1)
+        return rendered
 
-    def count_render(self, means: Tensor) -> None:
+    def count_render(self, parameters: tuple[Tensor, ...]) -> None:
         """Count a training render.
+
+        Args:
+            parameters: of the Gaussians. Whoever trains them changes their versions; that begins a step, or must not
+                happen within one.
 
         Raises:
             RuntimeError: if steps go by without anyone saying so.
         """
-        self.renders += 1
-        self._version = means._version if self._version is None else self._version
-        unknown = self._step == 0
-        if unknown and (means._version != self._version or self.renders > _RENDERS_WITHOUT_STEP):
+        versions = tuple((id(x), x._version) for x in parameters)
+        trained = self.renders > 0 and versions != self._versions
+        self._versions = versions
+        if trained and self._by_parameters:
+            self.begin(self.training_step + 1)
+        elif trained or (self.step == 0 and self.renders >= _RENDERS_WITHOUT_STEP):
             raise RuntimeError(
-                "cannot tell the training steps apart: scene.gaussian_model.GaussianModel.update_learning_rate was not "
-                "called for the Gaussians that are rendered. Call hook.step(iteration) at the start of every iteration."
+                "cannot tell the training steps apart: the Gaussians were trained on after their last render, but "
+                "scene.gaussian_model.GaussianModel.update_learning_rate was not called for them since. Only the first "
+                'step would be regularized. Take the changes of the parameters for the steps: steps="parameters", in '
+                "the launcher --steps parameters; or call hook.step(iteration) at the start of every iteration."
             )
+        self.renders += 1
 
 
 class Iterations:
-    """The fields of one training, found by their model or, where that is not known, by their positions."""
+    """The fields of one training, found by their model or, where that is not known, by a parameter.
 
-    def __init__(self) -> None:
+    Args:
+        steps: what tells that a step begins.
+        lose_step: called when a step of a field goes by without a training render.
+    """
+
+    def __init__(self, steps: Steps, lose_step: Callable[[], None]) -> None:
+        self._steps = steps
         self._fields: list[tuple[weakref.ref[Any], Field]] = []
+        self._vacant: list[Field] = []
         self._step: int | None = None
+        self._lose_step = lose_step
 
     def field(self, owner: Any) -> Field:
-        """Return the field of a model or of a tensor of positions; a new one at first sight."""
-        # Densification replaces the positions: the fields of dead tensors make room for their successors.
+        """Return the field of a model or of a parameter; a new one at first sight."""
+        # Densification replaces the parameters: new ones succeed those that are gone, one step later.
+        self._vacant += [field for ref, field in self._fields if ref() is None]
         self._fields = [(ref, field) for ref, field in self._fields if ref() is not None]
         for ref, field in self._fields:
             if ref() is owner:
                 return field
-        taken = {field.index for _, field in self._fields}
-        index = next(i for i in range(len(taken) + 1) if i not in taken)
-        field = Field(index, self._step or 0)
+        if self._vacant:
+            gone = self._vacant.pop(0)
+            index, step = gone.index, gone.step + (gone.renders > 0)
+        else:
+            index, step = len(self._fields), max((field.step for _, field in self._fields), default=0)
+        field = Field(index, step if self._step is None else self._step, self._steps)
         self._fields.append((weakref.ref(owner), field))
         return field
 
+    def evaluation_step(self, owner: Any) -> int:
+        """Return the step of a model or a parameter, else of any; after all schedules if nothing was ever trained."""
+        trained = [(ref(), field.training_step) for ref, field in self._fields if field.step or field.renders]
+        steps = [step for known, step in trained if known is owner] or [step for _, step in trained]
+        return max(steps, default=_FINISHED)
+
     def update(self, model: Any, iteration: int) -> None:
         """Take note of a call of update_learning_rate, unless the steps are said explicitly."""
-        if self._step is None:
-            self.field(model).update(iteration)
+        if self._step is None and not self.field(model).update(iteration):
+            self._lose_step()
 
     def step(self, step: int) -> None:
         """Enter a step with all fields."""
+        rendered = self._step is None or any(field.renders for _, field in self._fields)
         self._step = step
         for _, field in self._fields:
             field.begin(step)
+        if not rendered:
+            self._lose_step()
+
+
+def leaf_of(x: Tensor) -> Tensor | None:
+    """Return a parameter that a tensor was computed from, always the same one of the same computation; None if none."""
+    if x.is_leaf:
+        return x
+    nodes: list[Any] = [x.grad_fn]
+    for node in nodes:
+        if isinstance(leaf := getattr(node, "variable", None), Tensor):
+            return leaf
+        if len(nodes) < _NODES:
+            nodes += [node for node, _ in node.next_functions if node is not None]
+    return None

@@ -17,8 +17,8 @@ __all__ = [
     "MODULES",
     "ForwardCall",
     "check_installed",
-    "find_radii",
     "forward_signature",
+    "hide_dropped",
     "rasterizer_class",
     "rasterizer_classes",
     "white_alpha",
@@ -96,33 +96,41 @@ def forward_signature(rasterizer: type) -> inspect.Signature:
     return signature
 
 
-def find_radii(returned: Any, count: int) -> int:
-    """Return which member of a rasterizer's tuple holds the radii, told by type and shape.
+def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
+    """Zero what a rasterizer counted for dropped Gaussians: in every integer it returned per Gaussian, radii first.
+
+    Densification takes these for what was seen. Besides the radii some rasterizers return flags (3dgs-mcmc) or counts
+    (taming-3dgs). Floating-point sums of a Gaussian of opacity 0 are 0 already.
 
     Args:
-        returned: (color, radii), (color, radii, depth, alpha), (color, radii, per-Gaussian weights), ...
-        count: number of Gaussians N. Radii are integers of shape (N,), or (N, 2) where the axes have radii each.
+        returned: (color, radii), (color, radii, depth, alpha), (color, radii, flags), ...
+        keep: what was not dropped, shape (N,) bool.
+
+    Returns:
+        The same tuple with integers, or bools, of shape (N,), (N, 1) or (N, 2) zeroed where ``keep`` is False.
 
     Raises:
         TypeError: if no tuple came.
-        ValueError: if none or several of its members can be the radii.
+        ValueError: if none of its members counts the Gaussians.
     """
     if not isinstance(returned, tuple):
         raise TypeError(f"the rasterizer returned {type(returned).__name__}, expected a tuple with colours and radii.")
-    found = [
-        i
-        for i, x in enumerate(returned)
-        if isinstance(x, Tensor)
-        and not (x.is_floating_point() or x.dtype == torch.bool)
-        and x.shape in ((count,), (count, 2))
-    ]
-    if len(found) != 1:
-        shapes = ", ".join(f"{x.dtype} {tuple(x.shape)}" if isinstance(x, Tensor) else str(type(x)) for x in returned)
+    count = len(keep)
+    shapes = ((count,), (count, 1), (count, 2))
+    counts = [isinstance(x, Tensor) and not x.dtype.is_floating_point and x.shape in shapes for x in returned]
+    if not any(counts):
+        found = ", ".join(f"{x.dtype} {tuple(x.shape)}" if isinstance(x, Tensor) else str(type(x)) for x in returned)
         raise ValueError(
-            f"the rasterizer returned ({shapes}) for {count} Gaussians, expected exactly one integer tensor of shape "
-            f"({count},), the radii: without them dropped Gaussians cannot be hidden from densification."
+            f"the rasterizer returned ({found}) for {count} Gaussians, expected an integer tensor of shape ({count},), "
+            "the radii: without them dropped Gaussians cannot be hidden from densification."
         )
-    return found[0]
+    members = [
+        x * keep.view(-1, *[1] * (x.ndim - 1)).to(x.device) if is_count else x
+        for x, is_count in zip(returned, counts, strict=True)
+    ]
+    # A named tuple stays one.
+    made: tuple[Any, ...] = returned._make(members) if hasattr(returned, "_make") else tuple(members)
+    return made
 
 
 def white_alpha(call: ForwardCall) -> Tensor:

@@ -1,7 +1,8 @@
-"""Run a script as `python script.py arguments...` would."""
+"""Run a script as `python script.py arguments...` would, or a module as `python -m module arguments...`."""
 
 from __future__ import annotations
 
+import os
 import runpy
 import sys
 from collections.abc import Sequence
@@ -10,23 +11,26 @@ from pathlib import Path
 __all__ = ["run_script", "set_command_line"]
 
 
-def set_command_line(script: Path, arguments: Sequence[str]) -> None:
+def set_command_line(script: Path | str, arguments: Sequence[str]) -> None:
     """Give the script its command line, and its folder as the first place to import from.
 
     Args:
-        script: path of the file.
+        script: path of the file; or name of the module, whose first place is the present folder.
         arguments: what follows the name of the script on its command line.
     """
     sys.argv = [str(script), *arguments]
     # The first place is now the folder that `python -m` was called in; with -P (Python 3.11) there is no such place.
     if not getattr(sys.flags, "safe_path", False):
-        sys.path[0] = str(script.resolve().parent)
+        sys.path[0] = str(script.resolve().parent) if isinstance(script, Path) else os.getcwd()
 
 
-def run_script(script: Path) -> None:
+def run_script(script: Path | str) -> None:
     """Run a script as the main program; whatever it raises is raised here, SystemExit and KeyboardInterrupt included.
 
     Args:
-        script: path of the file.
+        script: path of the file, or name of the module.
     """
-    runpy.run_path(str(script), run_name="__main__")
+    if isinstance(script, Path):
+        runpy.run_path(str(script), run_name="__main__")
+    else:
+        runpy.run_module(script, run_name="__main__", alter_sys=True)

@@ -65,8 +65,7 @@ class CoAdaptation(_Splatfacto):  # type: ignore[misc]
 
     def get_outputs(self, camera: Any) -> dict[str, Any]:
         """Render a camera: with regularized opacities in training, with scaled ones in evaluation."""
-        self._regularized.regularizer.train(self.training)
-        with _rasterizing_by(self._regularized):
+        with _rasterizing_by(self._regularized if self.training else self._regularized.evaluate):
             outputs: dict[str, Any] = super().get_outputs(camera)
         if not self.training and self.crop_box is None and "rgb" in outputs:
             self._cameras[outputs["rgb"]] = camera

@@ -31,6 +31,7 @@ class Tally:
         skipped: renders left alone, by the reason.
         first_step: of the regularized renders; None if there were none.
         last_step: of the regularized renders; None if there were none.
+        lost: training steps without a render that could be regularized.
     """
 
     regularized: int = 0
@@ -38,12 +39,32 @@ class Tally:
     skipped: Counter[Skip] = field(default_factory=Counter)
     first_step: int | None = None
     last_step: int | None = None
+    lost: int = 0
 
     def count_regularized(self, step: int) -> None:
         """Count a regularized render of a step."""
         self.regularized += 1
         self.first_step = step if self.first_step is None else self.first_step
         self.last_step = step
+
+    def shortfall(self, optimizer_steps: int) -> str | None:
+        """Say that a run was not, or hardly, regularized; None if it was.
+
+        A training is if nine of ten steps had a render that was regularized, or that the schedule left alone at some
+        steps; a script that only renders, if it made a test render.
+
+        Args:
+            optimizer_steps: of Gaussians, which tell a training from a script that only renders.
+        """
+        rendered = self.regularized + self.skipped[Skip.RATE_ZERO]
+        if not (rendered or optimizer_steps or self.lost):
+            tested = self.scaled or self.skipped[Skip.NOTHING_TO_SCALE]
+            return None if tested else "No render was regularized or scaled."
+        if not self.regularized:
+            return "The training was not regularized."
+        if self.lost > rendered / 9:
+            return f"{self.lost} training steps had no render that could be regularized."
+        return None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts for JSON."""
@@ -54,6 +75,7 @@ class Tally:
             "skipped": skipped,
             "first_step": self.first_step,
             "last_step": self.last_step,
+            "lost": self.lost,
         }
 
     def lines(self) -> list[str]:
@@ -61,6 +83,8 @@ class Tally:
         steps = "" if self.first_step is None else f", steps {self.first_step} to {self.last_step}"
         lines = [f"{self.regularized} renders regularized{steps}", f"{self.scaled} renders scaled for evaluation"]
         lines += [f"{count} renders left alone: {reason.value}" for reason, count in self.skipped.most_common()]
+        if self.lost:
+            lines.append(f"{self.lost} training steps without a render that could be regularized")
         if not self.regularized + self.scaled:
             lines.append("NOTHING was regularized or scaled")
         return lines

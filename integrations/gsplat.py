@@ -13,19 +13,23 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
-from collections.abc import Callable, Iterator, MutableMapping
-from contextlib import contextmanager
+import itertools
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from types import TracebackType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from ._chain import Chain
+from ._watch import Watch
 
 __all__ = ["Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized"]
 
 Rasterization = Callable[..., tuple[Any, ...]]
 """``gsplat.rasterization``, or a function with its arguments that returns its ``info`` last."""
 
-_HOLDERS = ("gsplat", "gsplat.rendering")  # the two public places that scripts import the function from
+_HOLDERS = ("gsplat", "gsplat.rendering")  # the two public places that scripts import the functions from
 
 
 def regularized(
@@ -35,10 +39,12 @@ def regularized(
 
     A call trains if the regularizer is in ``train()``, gradients are enabled, and the opacities require one; any other
     call evaluates, whatever the mode of the module: test views under ``no_grad`` get the scaled opacities of ``eval()``
-    without a word from the script. All cameras of a call see the same draw. A schedule needs ``set_step``, as always.
+    without a word from the script. Evaluation leaves the module as it is, so that another thread may train with it. All
+    cameras of a call see the same draw. A schedule needs ``set_step``, as always.
 
-    What a draw leaves at opacity 0 leaves no trace in density control: its ``info["radii"]`` are 0, in the shapes of
-    gsplat 1.4 ([C, N]) and later ([C, N, 2]). In packed mode gsplat itself does not list it, from 1.5 on.
+    Dropped Gaussians leave no trace in density control: their ``info["radii"]`` are 0, in the shapes of gsplat 1.4
+    ([C, N]) and later ([C, N, 2]). In packed mode gsplat itself does not list them, from 1.5 on. A module says what it
+    dropped by its mask ``keep``, (N,) bool; one without that attribute drops what it sets to 0.
 
     Convention: activated opacities, [..., N]; several batches are drawn as one set of Gaussians.
 
@@ -50,7 +56,8 @@ def regularized(
     Raises:
         TypeError: if ``rasterization`` has no argument ``opacities``, or ``regularizer`` is not a module.
         ValueError: if ``rasterization`` is regularized already.
-        RuntimeError: at the first packed call in training, if gsplat lists Gaussians of opacity 0 (before 1.5).
+        RuntimeError: at a call in training that drops Gaussians, if there are no radii to zero: in packed mode where
+            gsplat lists Gaussians of opacity 0 (before 1.5, and 2DGS), or where ``info`` has none.
 
     Example:
         >>> from ca_reg import GaussianDropout
@@ -79,21 +86,23 @@ class Regularized:
         evaluated: number of calls that were rendered as evaluation.
     """
 
+    _eager: Any = None
+
     def __init__(
         self,
         rasterization: Rasterization,
         regularizer: nn.Module,
         generator: torch.Generator | None = None,
         *,
-        counts_steps: bool = False,
+        steps: Iterator[int] | None = None,
+        watch: Watch | None = None,
     ) -> None:
         if isinstance(rasterization, Regularized):
             raise ValueError(
                 "this rasterization is regularized already, and opacities would be dropped twice: compose regularizers "
                 "with nn.Sequential, or take its .rasterization."
             )
-        if not isinstance(regularizer, nn.Module):
-            raise TypeError(f"regularizer must be a torch module, got {type(regularizer).__name__}.")
+        self._chain = Chain(regularizer)
         self._signature = inspect.signature(rasterization)
         if "opacities" not in self._signature.parameters:
             raise TypeError(f"expected gsplat.rasterization, got {rasterization!r}, which has no argument opacities.")
@@ -101,117 +110,174 @@ class Regularized:
         self.regularizer = regularizer
         self.trained = self.evaluated = 0
         self._generator = generator
-        self._counts_steps = counts_steps
+        self._steps = steps
+        self._watch = watch
         self._packed_is_safe = False
+        # A compiled caller is cut here. On the class, so that instances can be pickled; now, because it imports dynamo.
+        if Regularized._eager is None:
+            Regularized._eager = torch.compiler.disable(Regularized._rasterize)  # type: ignore[no-untyped-call]
         functools.update_wrapper(self, rasterization)
 
     def __call__(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Rasterize with regularized opacities; takes and returns what ``rasterization`` does."""
+        out: tuple[Any, ...] = self._eager(args, kwargs, trains=self.regularizer.training)
+        return out
+
+    def evaluate(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Rasterize with the opacities of ``eval()``, whatever the mode; otherwise like a call."""
+        out: tuple[Any, ...] = self._eager(args, kwargs, trains=False)
+        return out
+
+    def _rasterize(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, trains: bool) -> tuple[Any, ...]:
+        """Rasterize in a mode."""
         bound = self._signature.bind(*args, **kwargs)
         opacities: Tensor = bound.arguments["opacities"]
         given = opacities.reshape(-1)
-        trains = self.regularizer.training and torch.is_grad_enabled() and opacities.requires_grad
-        used = self._train(given) if trains else self._evaluate(given)
+        keep: Tensor | None = None
+        if trains and torch.is_grad_enabled() and opacities.requires_grad:
+            if self._steps is not None:
+                self._chain.set_step(next(self._steps))
+            self.trained += 1
+            used, keep = self._chain.draw(given, self._generator)
+            if self._watch is not None:
+                self._watch.regularized()
+        else:
+            self.evaluated += 1
+            used = self._chain.evaluate(given, generator=self._generator)
         if used is not given:
             bound.arguments["opacities"] = used.view(opacities.shape)
         *images, info = self.rasterization(*bound.args, **bound.kwargs)
         # Several ranks exchange their Gaussians inside the call, after gsplat (1.5 on) has left out those of opacity 0.
-        if trains and used is not given and not bound.arguments.get("distributed"):
-            self._forget_undrawn(info, (used.detach() > 0).view(opacities.shape))
+        if keep is not None and not bound.arguments.get("distributed"):
+            self._hide_dropped(info, keep.view(opacities.shape))
         return (*images, info)
 
-    def _train(self, opacities: Tensor) -> Tensor:
-        if self._counts_steps:
-            for module in self.regularizer.modules():
-                if callable(set_step := getattr(module, "set_step", None)):
-                    set_step(self.trained)
-        self.trained += 1
-        return self._apply(opacities)
-
-    def _evaluate(self, opacities: Tensor) -> Tensor:
-        self.evaluated += 1
-        with _evaluating(self.regularizer):
-            return self._apply(opacities)
-
-    def _apply(self, opacities: Tensor) -> Tensor:
-        if self._generator is None:
-            out: Tensor = self.regularizer(opacities)
-            return out
-        members = self.regularizer if isinstance(self.regularizer, nn.Sequential) else (self.regularizer,)
-        for member in members:
-            opacities = member(opacities, generator=self._generator)
-        return opacities
-
-    def _forget_undrawn(self, info: MutableMapping[str, Any], drawn: Tensor) -> None:
-        """Zero the radii of Gaussians of opacity 0; ``drawn`` is [..., N]."""
+    def _hide_dropped(self, info: MutableMapping[str, Any], keep: Tensor) -> None:
+        """Zero the radii of dropped Gaussians; ``keep`` is [..., N]."""
+        if "radii" not in info:
+            raise RuntimeError(
+                f"{getattr(self.rasterization, '__name__', self.rasterization)} returns no radii, so that "
+                "dropped Gaussians cannot be hidden from density control: train with gsplat.rasterization or "
+                "gsplat.rasterization_2dgs."
+            )
         gaussians, radii = info.get("gaussian_ids"), info["radii"]
         if gaussians is None:
-            per_camera = drawn.unsqueeze(-2)  # [..., 1, N]
+            per_camera = keep.unsqueeze(-2)  # [..., 1, N]
             info["radii"] = radii * (per_camera if radii.ndim == per_camera.ndim else per_camera.unsqueeze(-1))
         elif not self._packed_is_safe:
             # Looked at once: on a GPU the look costs a wait, and it is the version of gsplat that decides.
             batches = info.get("batch_ids")
-            listed = gaussians if batches is None else batches * drawn.shape[-1] + gaussians
-            if not bool(drawn.reshape(-1)[listed.long()].all()):
+            listed = gaussians if batches is None else batches * keep.shape[-1] + gaussians
+            if not bool(keep.reshape(-1)[listed.long()].all()):
                 raise RuntimeError(
-                    "this rasterization lists Gaussians of opacity 0 in packed mode, as gsplat before 1.5 does, and "
-                    "density control would count them as seen: pass packed=False, or install gsplat>=1.5."
+                    "this rasterization lists Gaussians of opacity 0 in packed mode, as gsplat before 1.5 and "
+                    "rasterization_2dgs do, and density control would count them as seen: pass packed=False, or, for "
+                    "gsplat.rasterization, install gsplat>=1.5."
                 )
             self._packed_is_safe = True
 
 
 class Installation:
-    """A replaced ``gsplat.rasterization``, to be undone by :meth:`uninstall` or at the end of a ``with`` block.
+    """What :func:`install` changed; undone by :meth:`uninstall` or at the end of a ``with`` block.
 
     Attributes:
-        rasterization: what is in its place; counts the calls.
+        rasterization: what is in the place of ``gsplat.rasterization``; counts its calls.
+        functions: all that was replaced, by name: what is in the place of each.
     """
 
-    def __init__(self, rasterization: Regularized, replaced: dict[str, Any]) -> None:
-        self.rasterization = rasterization
+    def __init__(
+        self, functions: Mapping[str, Regularized], replaced: dict[tuple[str, str], Any], watch: Watch
+    ) -> None:
+        self.functions = functions
+        self.rasterization = functions["rasterization"]
         self._replaced = replaced
+        self._watch = watch
+
+    @property
+    def trained(self) -> int:
+        """Number of calls, of all functions, that were regularized as training."""
+        return sum(function.trained for function in self.functions.values())
 
     def uninstall(self) -> None:
         """Put back what was there; a second call does nothing."""
+        self._watch.stop()
         while self._replaced:
-            name, original = self._replaced.popitem()
-            importlib.import_module(name).rasterization = original  # type: ignore[attr-defined]
+            (holder, name), original = self._replaced.popitem()
+            setattr(importlib.import_module(holder), name, original)
 
     def __enter__(self) -> Installation:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Undo it.
+
+        Raises:
+            RuntimeError: if Gaussians were trained, and no call was regularized.
+        """
         self.uninstall()
+        if error is None and self._watch.patience and self._watch.steps and not self.trained:
+            raise RuntimeError(f"The training was not regularized. {_explain()}")
 
 
-def install(regularizer: nn.Module, *, generator: torch.Generator | None = None) -> Installation:
-    """Replace ``gsplat.rasterization`` and ``gsplat.rendering.rasterization``, for scripts that are not edited.
+def install(regularizer: nn.Module, *, generator: torch.Generator | None = None, patience: int = 100) -> Installation:
+    """Replace gsplat's functions for scripts that are not edited.
 
-    Do it before the script is imported: what has imported the name already keeps the old function. Nobody tells the
-    regularizer the step of such a script, so its step is the number of training calls so far.
+    They are ``rasterization`` and what else is named ``rasterization...`` and takes opacities (2DGS), in ``gsplat`` and
+    in ``gsplat.rendering``. Do it before the script is imported: what has imported a name already keeps the old
+    function. Nobody tells the regularizer the step of such a script: its step is the number of training calls so far.
 
     Args:
         regularizer: as for :func:`regularized`.
         generator: as for :func:`regularized`.
+        patience: how many steps of an optimizer with a group of parameters named ``opacities`` may go by in a row
+            without a regularized call, before a RuntimeError ends the training; 0 for any number.
 
     Raises:
         ImportError: if gsplat is missing.
         TypeError: as :func:`regularized`.
-        ValueError: if it is installed already.
+        ValueError: if it is installed already, or ``patience`` is negative.
 
     Example:
         >>> import runpy
         >>> from ca_reg import GaussianDropout
         >>> with install(GaussianDropout(0.2)) as installation:  # doctest: +SKIP
         ...     runpy.run_path("simple_trainer.py", run_name="__main__")
-        >>> installation.rasterization.trained  # doctest: +SKIP
+        >>> installation.trained  # doctest: +SKIP
         30000
     """
-    replacement = Regularized(load_gsplat().rasterization, regularizer, generator, counts_steps=True)
-    replaced = {name: importlib.import_module(name).rasterization for name in _HOLDERS}
-    for name in _HOLDERS:
-        importlib.import_module(name).rasterization = replacement  # type: ignore[attr-defined]
-    return Installation(replacement, replaced)
+    load_gsplat()
+    watch, steps = Watch(patience, _explain), itertools.count()
+    replaced = {
+        (holder, name): function
+        for holder in _HOLDERS
+        for name, function in vars(importlib.import_module(holder)).items()
+        if name.startswith("rasterization") and _takes_opacities(function)
+    }
+    made = {
+        id(function): Regularized(function, regularizer, generator, steps=steps, watch=watch)
+        for function in replaced.values()
+    }
+    functions = {name: made[id(function)] for (_, name), function in replaced.items()}
+    for (holder, name), function in replaced.items():
+        setattr(importlib.import_module(holder), name, made[id(function)])
+    watch.start()
+    return Installation(functions, replaced, watch)
+
+
+def _takes_opacities(function: Any) -> bool:
+    """Whether this is a function with an argument of that name."""
+    return callable(function) and "opacities" in inspect.signature(function).parameters
+
+
+def _explain() -> str:
+    """Say what may be the cause, and what to do."""
+    return (
+        "Either the script had imported the functions of gsplat before install() replaced them, or it renders without "
+        "them, or its opacities need no gradient, or the regularizer is in eval(). Install first; else wrap what it "
+        "calls with regularized(). If steps without regularization are meant, raise patience."
+    )
 
 
 def load_gsplat(device: torch.device | None = None) -> Any:
@@ -235,15 +301,3 @@ def load_gsplat(device: torch.device | None = None) -> Any:
 def unregularized(rasterization: Rasterization) -> Rasterization:
     """Return the function underneath if ``rasterization`` is regularized, else itself."""
     return rasterization.rasterization if isinstance(rasterization, Regularized) else rasterization
-
-
-@contextmanager
-def _evaluating(regularizer: nn.Module) -> Iterator[None]:
-    """Put a module into ``eval()`` for a while; each of its parts gets its own mode back."""
-    modes = [(module, module.training) for module in regularizer.modules()]
-    regularizer.eval()
-    try:
-        yield
-    finally:
-        for module, training in modes:
-            module.training = training

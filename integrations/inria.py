@@ -9,7 +9,7 @@ common: they hand activated opacities to ``GaussianRasterizer``, and take what w
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import ModuleType, TracebackType
 from typing import Any, Literal, get_args
 
@@ -17,30 +17,32 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ca_reg._regularizer import Regularizer
 from ca_reg.modules import GaussianDropout, OpacityNoise
 
 from ._after_import import AfterImport
 from ._caller import calling_render, find_instance, is_viewer, own_dropout, own_noise
-from ._iterations import Field, Iterations
+from ._chain import Chain
+from ._iterations import Field, Iterations, Steps, leaf_of
 from ._override import is_overridden
 from ._patch import ClassPatch
 from ._rasterizer import (
     MODULES,
     ForwardCall,
     check_installed,
-    find_radii,
     forward_signature,
+    hide_dropped,
     rasterizer_class,
 )
 from ._tally import Skip, Tally
+from ._watch import Watch
 
-__all__ = ["RasterizerHook", "Scope"]
+__all__ = ["RasterizerHook", "Scope", "Steps"]
 
 Scope = Literal["main", "all"]
 """Which training renders of an iteration are regularized: the first of every model, or all with one mask."""
 
 _MODEL_MODULE = "scene.gaussian_model"
+_MANY_ZEROS = 1e-3  # share of opacities that are 0 by no rounding
 
 
 class RasterizerHook:
@@ -52,25 +54,36 @@ class RasterizerHook:
     depth renders with constant opacities or detached positions; :attr:`tally` counts them with the reason.
 
     The training step, which schedules and masks follow, is read off ``GaussianModel.update_learning_rate`` in
-    ``scene.gaussian_model``; a code base without it says it with :meth:`step`. The masks depend on the seed, the model
-    and the step alone, and the global random numbers are untouched: with and without the hook a script picks the same
-    cameras.
+    ``scene.gaussian_model``; a code base without it says it with :meth:`step`, or lets the parameters tell. The masks
+    depend on the seed, the model and the step alone, and the global random numbers are untouched: with and without the
+    hook a script picks the same cameras.
+
+    A training that goes by without being regularized is an error, raised in its :meth:`step`, its
+    ``update_learning_rate``, its ``optimizer.step()`` or its ``backward()``; see ``patience``.
 
     Args:
-        regularizer: a ``ca_reg`` regularizer or an ``nn.Sequential`` of them. The hook sets its mode and its step.
+        regularizer: a module from activated opacities (N,) or (N, 1) to those to render, whose ``forward`` takes
+            ``generator=``, or an ``nn.Sequential`` of them. What it drops it says by its mask ``keep``, (N,) bool; one
+            without that attribute drops what it sets to 0. The hook sets its mode, and its step by ``set_step``.
         scope: "main" regularizes the first training render of every model and iteration, as the paper's code does, and
             leaves second views and pseudo views alone; "all" regularizes all with one mask, for code bases with several
             views in an iteration (MVGS).
         seed: of the masks and the noise.
         rasterizer: the class to hook; by default those of ``diff_gaussian_rasterization`` and
             ``diff_gaussian_rasterization_abs``, as soon as they are imported.
+        steps: "updates" takes calls of ``update_learning_rate`` for the steps; "parameters" takes the first render
+            after a change of the positions or opacities for the beginning of one.
+        viewer: name of the class of the cameras that a viewer renders with; None if there is no viewer.
+        patience: how many steps may go by without a regularized render: optimizer steps of Gaussians in a row, or
+            training steps in all; 0 for any number.
+        allow_zeros: do not take exact zeros among the incoming opacities for a dropout of the code base's own.
 
     Attributes:
         tally: what was done so far.
 
     Raises:
-        TypeError: if ``regularizer`` holds anything but regularizers.
-        ValueError: if ``scope`` is unknown, or there is no regularizer.
+        TypeError: if ``regularizer`` is no module, or takes no ``generator``.
+        ValueError: if ``scope`` or ``steps`` is unknown, ``patience`` negative, or there is no regularizer.
 
     Example:
         >>> class GaussianRasterizer(nn.Module):
@@ -86,19 +99,38 @@ class RasterizerHook:
     """
 
     def __init__(
-        self, regularizer: nn.Module, *, scope: Scope = "main", seed: int = 0, rasterizer: type | None = None
+        self,
+        regularizer: nn.Module,
+        *,
+        scope: Scope = "main",
+        seed: int = 0,
+        rasterizer: type | None = None,
+        steps: Steps = "updates",
+        viewer: str | None = "MiniCam",
+        patience: int = 100,
+        allow_zeros: bool = False,
     ) -> None:
-        if scope not in get_args(Scope):
-            raise ValueError(f"scope must be one of {', '.join(get_args(Scope))}, got {scope!r}.")
-        self._chain = _regularizers(regularizer)
-        if not self._chain:
+        for name, value, choices in (("scope", scope, get_args(Scope)), ("steps", steps, get_args(Steps))):
+            if value not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}.")
+        self._chain = Chain(regularizer)
+        if not self._chain.modules:
             raise ValueError("regularizer is empty; without one there is nothing to install.")
+        if without := self._chain.without_generator():
+            raise TypeError(
+                f"the forward of {', '.join(without)} takes no argument generator, by which the hook repeats the draws "
+                "of a step and leaves the global random numbers alone. Add generator=None to it, and draw from it."
+            )
         self._scope = scope
         self._seed = int(seed)
         self._rasterizer = rasterizer
-        self._iterations = Iterations()
+        self._viewer = viewer
+        self._allow_zeros = allow_zeros
+        self._watch_training = Watch(patience, self._explain)
+        self._iterations = Iterations(steps, self._lose_step)
         self._models: tuple[type, ...] = ()
         self._patches: list[ClassPatch] = []
+        self._hooked: list[str] = []  # names of the classes, for messages
         self._watch: AfterImport | None = None
         self.tally = Tally()
 
@@ -120,6 +152,7 @@ class RasterizerHook:
             if self._rasterizer is not None:
                 self._wrap(self._rasterizer)
             watch.start()
+            self._watch_training.start()
         except BaseException:
             self.uninstall()
             raise
@@ -138,6 +171,7 @@ class RasterizerHook:
             patch.check_removable()
         self._watch.stop()
         self._watch = None
+        self._watch_training.stop()
         while self._patches:
             self._patches.pop().remove()
 
@@ -148,12 +182,47 @@ class RasterizerHook:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Uninstall the hook."""
+        """Uninstall the hook.
+
+        Raises:
+            RuntimeError: if a training came to its end without being regularized, see :meth:`problem`.
+        """
         self.uninstall()
+        if error is None and self._watch_training.steps and (problem := self.problem()):
+            raise RuntimeError(problem)
 
     def step(self, step: int) -> None:
-        """Say which training step begins, counted from 1; ``update_learning_rate`` is no longer looked at."""
+        """Say which training step begins, counted from 1; ``update_learning_rate`` is no longer looked at.
+
+        Raises:
+            RuntimeError: if too many steps went by without a training render.
+        """
         self._iterations.step(step)
+
+    def problem(self) -> str | None:
+        """Say what went wrong unnoticed, and the way out; None if all is well.
+
+        See :meth:`Tally.shortfall`. With a patience of 0 nothing is wrong.
+        """
+        if not self._watch_training.patience:
+            return None
+        shortfall = self.tally.shortfall(self._watch_training.steps)
+        return None if shortfall is None else f"{shortfall} {self._explain()}"
+
+    def _explain(self) -> str:
+        """Say what may be the cause, and what to do."""
+        hooked = " and ".join(self._hooked) or "nothing, because no known rasterizer was imported"
+        return (
+            f"Hooked is {hooked}; so far: {'; '.join(self.tally.lines())}. If the training renders with another class, "
+            "pass it as rasterizer=... to RasterizerHook; if the rates are 0 for longer than the training, let the "
+            "schedule begin earlier (--start); if steps without a regularized render are meant, raise patience "
+            "(--patience; 0 for any number). Without --dropout and --noise the script runs plain."
+        )
+
+    def _lose_step(self) -> None:
+        """Take note of a training step without a render."""
+        self.tally.lost += 1
+        self._watch_training.check_lost(self.tally.lost)
 
     def _found_rasterizer(self, module: ModuleType) -> None:
         """Wrap the rasterizer of a module that was imported, unless another class was asked for."""
@@ -195,10 +264,13 @@ class RasterizerHook:
             def regularized_forward(*args: Any, **kwargs: Any) -> Any:
                 return self._rasterize(ForwardCall(forward, signature.bind(*args, **kwargs)))
 
-            vars(regularized_forward)["ca_reg_hook"] = self
-            return regularized_forward
+            # A compiled render is cut here: what follows reads the variables of its caller.
+            eager: Callable[..., Any] = torch.compiler.disable(regularized_forward)  # type: ignore[no-untyped-call]
+            vars(eager)["ca_reg_hook"] = self
+            return eager
 
         self._patches.append(ClassPatch(rasterizer, "forward", make))
+        self._hooked.append(f"{rasterizer.__module__}.{rasterizer.__qualname__}")
 
     def _rasterize(self, call: ForwardCall) -> Any:
         """Decide what a call of the rasterizer is for, and make it."""
@@ -206,21 +278,22 @@ class RasterizerHook:
             return self._leave(call, Skip.SCORE)
         means, opacities = call.arguments["means3D"], call.arguments["opacities"]
         render = calling_render()
-        # Without a model and with computed positions (a deformed field) all calls belong to one field: this hook's.
         model = find_instance(render, self._models)
-        owner = model if model is not None else means if means.is_leaf else self
-        field = self._iterations.field(owner)
-        if not torch.is_grad_enabled() or is_viewer(render):
+        if not torch.is_grad_enabled() or is_viewer(render, self._viewer):
             self._refuse_a_second_regularizer(render)
-            return self._evaluate(call, field)
+            return self._evaluate(call, self._iterations.evaluation_step(means if model is None else model))
         if not opacities.requires_grad:
             return self._leave(call, Skip.CONSTANT_OPACITY)
         if not means.requires_grad:
             return self._leave(call, Skip.DETACHED_MEANS)
-        field.count_render(means)
+        parameters = tuple(x for x in (means if means.is_leaf else None, leaf_of(opacities)) if x is not None)
+        # Without a model a parameter tells the fields apart; where none is found, all calls belong to one field.
+        field = self._iterations.field(model if model is not None else parameters[0] if parameters else self)
+        field.count_render(parameters)
         if self._scope == "main" and field.renders > 1:
             return self._leave(call, Skip.FURTHER_VIEW)
         self._refuse_a_second_regularizer(render)
+        self._refuse_zeros(opacities)
         return self._train(call, field)
 
     def _leave(self, call: ForwardCall, reason: Skip) -> Any:
@@ -228,54 +301,62 @@ class RasterizerHook:
         self.tally.skipped[reason] += 1
         return call()
 
-    def _evaluate(self, call: ForwardCall, field: Field) -> Any:
+    def _evaluate(self, call: ForwardCall, step: int) -> Any:
         """Make a call with the test-time opacities."""
-        given = opacities = call.arguments["opacities"]
-        for module in self._chain:
-            module.eval().set_step(field.evaluation_step)
-            opacities = module(opacities)
+        given: Tensor = call.arguments["opacities"]
+        opacities = self._chain.evaluate(given, step)
         if opacities is given:
-            return self._leave(call, Skip.NOTHING_TO_SCALE)
-        self.tally.scaled += 1
+            self.tally.skipped[Skip.NOTHING_TO_SCALE] += 1
+        else:
+            self.tally.scaled += 1
+        if torch.is_grad_enabled() and opacities.requires_grad:
+            opacities = opacities.view_as(opacities)
+            opacities.register_hook(self._refuse_to_train_on_a_viewer)  # type: ignore[no-untyped-call]
         call.arguments["opacities"] = opacities
         return call()
 
     def _train(self, call: ForwardCall, field: Field) -> Any:
         """Make a call with regularized opacities, and hide the dropped Gaussians from densification."""
-        given = opacities = call.arguments["opacities"]
+        given: Tensor = call.arguments["opacities"]
         # The same for every render of an iteration, so that all of them drop the same Gaussians.
         entropy = np.random.SeedSequence([self._seed, field.index, field.training_step]).generate_state(1, np.uint64)
-        generator = torch.Generator(given.device).manual_seed(int(entropy[0] >> np.uint64(1)))
-        for module in self._chain:
-            module.train().set_step(field.training_step)
-            opacities = module(opacities, generator=generator)
+        generator = torch.Generator(given.device).manual_seed(int(entropy[0]) >> 1)
+        for module in self._chain.modules:
+            module.train()
+        self._chain.set_step(field.training_step)
+        opacities, keep = self._chain.draw(given, generator)
+        self._watch_training.regularized()
         if opacities is given:
             return self._leave(call, Skip.RATE_ZERO)
         self.tally.count_regularized(field.training_step)
         call.arguments["opacities"] = opacities
         returned = call()
-        dropouts = [module for module in self._chain if isinstance(module, GaussianDropout)]
-        if all(module.keep is None for module in dropouts):
-            return returned
-        position = find_radii(returned, given.shape[0])
-        radii: Tensor = returned[position]
-        for module in dropouts:
-            radii = module.mask_radii(radii)
-        return (*returned[:position], radii, *returned[position + 1 :])
+        return returned if keep is None else hide_dropped(returned, keep)
 
-    def _refuse_a_second_regularizer(self, render: Any) -> None:
+    def _refuse_a_second_regularizer(self, render: Mapping[str, Any]) -> None:
         """Raise if the calling render regularizes as well, so that everything would be done twice."""
         for kind, own in ((GaussianDropout, own_dropout(render)), (OpacityNoise, own_noise(render))):
-            if own is not None and any(isinstance(module, kind) for module in self._chain):
+            applies = self._chain.drops if kind is GaussianDropout else self._chain.perturbs
+            if own is not None and applies:
                 raise RuntimeError(f"{kind.__name__} would be applied twice: the calling render has {own}.")
 
+    def _refuse_zeros(self, opacities: Tensor) -> None:
+        """Raise if Gaussians arrive dropped: activated opacities are above 0."""
+        if self._allow_zeros or not self._chain.drops:
+            return
+        zeros = int((opacities.detach() == 0).sum())
+        if zeros > _MANY_ZEROS * opacities.numel():
+            raise RuntimeError(
+                f"Gaussians would be dropped twice: {zeros} of {opacities.numel()} opacities of a training render are "
+                "0 already, which is a dropout of the code base's own (DropGaussian has one that cannot be switched "
+                "off). Switch it off, or leave out GaussianDropout (--dropout) here. If these zeros are something "
+                "else: allow_zeros=True, in the launcher --allow-zeros."
+            )
 
-def _regularizers(module: nn.Module) -> list[Regularizer]:
-    """Return the regularizers of a chain in order."""
-    if isinstance(module, Regularizer):
-        return [module]
-    if isinstance(module, nn.Sequential):
-        return [regularizer for child in module for regularizer in _regularizers(child)]
-    raise TypeError(
-        f"regularizer must be GaussianDropout, OpacityNoise or an nn.Sequential of them, got {type(module).__name__}."
-    )
+    def _refuse_to_train_on_a_viewer(self, gradient: Tensor) -> None:
+        """Raise: a gradient came back from a render for a viewer."""
+        raise RuntimeError(
+            f"a render for a viewer is trained on: its camera is a {self._viewer}, which the hook takes for that of a "
+            "viewer, so that it was scaled and not regularized. If the training views are of this class, say that "
+            "there is no viewer: viewer=None, in the launcher --viewer none."
+        )

@@ -4,7 +4,10 @@
 
 runs ``train.py`` as Python itself would, with a :class:`~ca_reg.integrations.inria.RasterizerHook` in force, and says
 at the end, however that comes about, what was regularized. The options of this launcher stand before the script, all
-that follows belongs to the script.
+that follows belongs to the script; ``-m module arguments...`` runs a module instead.
+
+The exit code is that of the script, and not 0 if the script succeeded but was not regularized; a training of which this
+shows earlier is ended.
 """
 
 from __future__ import annotations
@@ -13,7 +16,8 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
@@ -23,7 +27,7 @@ from ca_reg.modules import GaussianDropout, OpacityNoise
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
 from ._script import run_script, set_command_line
-from .inria import RasterizerHook, Scope
+from .inria import RasterizerHook, Scope, Steps
 
 __all__ = ["main"]
 
@@ -37,16 +41,32 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = _parse(arguments)
     hook = None
     if options.regularizers:
-        hook = RasterizerHook(nn.Sequential(*options.regularizers), scope=options.scope, seed=options.seed)
+        hook = RasterizerHook(
+            nn.Sequential(*options.regularizers),
+            scope=options.scope,
+            seed=options.seed,
+            steps=options.steps,
+            viewer=None if options.viewer == "none" else options.viewer,
+            patience=options.patience,
+            allow_zeros=options.allow_zeros,
+        )
     set_command_line(options.script, options.arguments)
     with _reported(options, hook), ExitStack() as undo:
         if options.cpu:
             from reference_trainer.compat import stand_in
 
-            undo.enter_context(stand_in(options.script.resolve().parent, outputs=options.outputs))
+            root = options.script.resolve().parent if isinstance(options.script, Path) else Path.cwd()
+            undo.enter_context(stand_in(root, outputs=options.outputs))
         if hook is not None:
-            hook.install()  # for as long as the process lives: a script may have wrapped the class once more
+            hook.install()
+            undo.callback(_uninstall, hook)
         run_script(options.script)
+
+
+def _uninstall(hook: RasterizerHook) -> None:
+    """Uninstall a hook unless the script has wrapped the class once more."""
+    with suppress(RuntimeError):
+        hook.uninstall()
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -54,7 +74,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m ca_reg.integrations.run",
         description="Run a training or render script of the INRIA 3DGS family, regularized, with no edit.",
-        usage="%(prog)s [options] script.py [arguments of the script]",
+        usage="%(prog)s [options] {script.py | -m module} [arguments of the script]",
         allow_abbrev=False,
     )
     add = parser.add_argument
@@ -66,12 +86,33 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--seed", type=int, default=0, help="of masks and noise (default: 0); the script's random numbers are its own")
     add("--report", type=Path, metavar="FILE", help="write what was done as JSON, too")
     add("--cpu", action="store_true", help="run without CUDA: a stand-in for the rasterizer of the code base")
-    add("--outputs", type=int, choices=(2, 3, 4), help="length of the tuple that the stand-in returns")
-    add("script", type=Path, help="train.py or render.py of the code base")
+    add(
+        "--outputs",
+        type=lambda text: int(text) if text.isdigit() else text,
+        choices=(2, 3, 4, "depth", "inverse-depth"),
+        help="what the stand-in returns, if the source does not tell: length of the tuple, or the third of three",
+    )
+    add("--steps", choices=get_args(Steps), default="updates", help="what tells the steps: calls of "
+        "update_learning_rate (default), or changes of the parameters")  # fmt: skip
+    add("--viewer", default="MiniCam", metavar="CLASS", help="class of a viewer's cameras (default: MiniCam), or none")
+    add("--patience", type=int, default=100, metavar="STEPS", help="end the run after so many steps that were not "
+        "regularized (default: 100), or fail at its end; 0 for neither")  # fmt: skip
+    add("--allow-zeros", action="store_true", help="opacities of 0 are no dropout of the code base's own")
+    add("-m", dest="module", nargs=argparse.REMAINDER, help="run a module as python -m does; all that follows is its")
+    add("script", type=Path, nargs="?", help="train.py or render.py of the code base")
     add("arguments", nargs=argparse.REMAINDER, help="of the script")
     options = parser.parse_args(arguments)
-    if not options.script.is_file():
-        parser.error(f"there is no script {options.script}")
+    if options.module is not None:
+        if not options.module:
+            parser.error("-m needs the name of a module")
+        options.script, *options.arguments = options.module
+        # Of the package alone: to find a module in it would import it, before the hook is there.
+        if find_spec(options.script.partition(".")[0]) is None:
+            parser.error(f"there is no module {options.script}")
+    elif options.script is None or not options.script.is_file():
+        parser.error(f"there is no script {options.script or ''}".rstrip())
+    if options.patience < 0:
+        parser.error("--patience must be at least 0")
     if options.report is not None:
         options.report = options.report.absolute()  # the script may change the folder
         if not options.report.parent.is_dir():
@@ -105,13 +146,16 @@ def _regularizers(options: argparse.Namespace) -> list[nn.Module]:
 
 @contextmanager
 def _reported(options: argparse.Namespace, hook: RasterizerHook | None) -> Iterator[None]:
-    """Say at the end, whatever it is, what was done."""
-    ended = "finished"
+    """Say at the end, whatever it is, what was done; exit with 1 if that is not what was asked for."""
+    ended, problem = "finished", None
     try:
         yield
+        problem = hook and hook.problem()
     except SystemExit as error:
         ended = f"exit {error.code or 0}"
-        raise
+        problem = None if error.code else hook and hook.problem()
+        if not problem:
+            raise
     except BaseException as error:
         ended = f"{type(error).__name__}: {error}".rstrip(": ")
         raise
@@ -127,13 +171,17 @@ def _reported(options: argparse.Namespace, hook: RasterizerHook | None) -> Itera
             "seed": options.seed,
             "cpu": options.cpu,
             "ended": ended,
+            "problem": problem,
             "renders": None if hook is None else hook.tally.as_dict(),
         }
         lines = ["no regularization was asked for; the script ran plain"] if hook is None else hook.tally.lines()
-        for line in [f"{options.script.name}: {ended}", *lines]:
+        name = options.script.name if isinstance(options.script, Path) else options.script
+        for line in [f"{name}: {ended}", *lines, *([f"ERROR: {problem}"] if problem else [])]:
             print(f"[ca_reg] {line}", file=sys.stderr)
         if options.report is not None:
             options.report.write_text(json.dumps(report, indent=2) + "\n")
+    if problem:
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ def rasterize(
     *,
     sh: Tensor | None = None,
     colors: Tensor | None = None,
-    outputs: int,
+    members: tuple[str, ...],
 ) -> tuple[Tensor, ...]:
     """Render as a rasterizer of the INRIA family would.
 
@@ -46,13 +46,13 @@ def rasterize(
         quaternions: orientation, wxyz, shape (N, 4).
         sh: spherical-harmonic coefficients, shape (N, K, 3), or
         colors: colours, shape (N, 3).
-        outputs: length of the result; 3 for a ``screen`` of four columns.
+        members: what the result has after image and radii: ``depth`` or ``inverse_depth``, ``alpha``; for a ``screen``
+            of four columns ``weights`` alone.
 
     Returns:
-        The image (3, H, W), not clamped; radii in pixels, shape (N,) int32, 0 for what is out of view. Then nothing for
-        2 outputs; inverse depth (1, H, W) for 3; depth and alpha, both (1, H, W), for 4. Depths are sums of weight
-        times (inverse) camera depth. For a ``screen`` of four columns, instead: the sum of every Gaussian's weights
-        over the pixels, shape (N,), without a gradient.
+        The image (3, H, W), not clamped; radii in pixels, shape (N,) int32, 0 for what is out of view; and the members.
+        Depth and inverse depth are sums of weight times (inverse) camera depth; they and alpha have shape (1, H, W).
+        Weights are every Gaussian's sum of weights over the pixels, shape (N,), without a gradient.
 
     Raises:
         ValueError: if ``screen`` has another shape, or antialiasing is asked for.
@@ -78,20 +78,17 @@ def rasterize(
     # Zeros are added, whose gradient is that of the positions.
     projection = splats.projection
     projection = projection._replace(means=projection.means + (sink - sink.detach())[:, :2])
-    absolute = columns == 4
-    if outputs == 3 and not absolute:
+    if "inverse_depth" in members:
         # The lists are sorted already, so that the depths are only summed.
         projection = projection._replace(depths=projection.depths.reciprocal())
-    depth = outputs > 2 and not absolute
-    rendering = draw(splats._replace(projection=projection), background=settings.bg, depth=depth)
+    planes = members if columns == 3 else ()
+    rendering = draw(splats._replace(projection=projection), background=settings.bg, depth=bool(planes))
     radii = visible_radii(means, quaternions, scales, camera)
-    if absolute:
+    if columns == 4:
         weights = means.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
         return with_absolute_gradients(rendering.image, sink[:, 2:], splats, settings.bg), radii, weights
-    result = [rendering.image, radii]
-    if rendering.depth is not None:
-        result += [rendering.depth[None], rendering.alpha[None]]
-    return tuple(result[:outputs])
+    found = {"alpha": rendering.alpha, "depth": rendering.depth, "inverse_depth": rendering.depth}
+    return (rendering.image, radii, *(found[member][None] for member in planes))  # type: ignore[index]
 
 
 def _weighted(x: Tensor, weight: Tensor) -> Tensor:
@@ -106,17 +103,17 @@ def _per_pixel(width: int, height: int, screen: Tensor) -> Tensor:
     return screen.new_tensor([*half, 0.0] if screen.shape[1] == 3 else half * 2)
 
 
-def rasterizer_module(name: str, outputs: int) -> ModuleType:
+def rasterizer_module(name: str, members: tuple[str, ...]) -> ModuleType:
     """Make a module with the interface of a rasterizer package.
 
     Its class is new for every call: a patch of its ``forward`` ends with the module.
 
     Args:
         name: ``diff_gaussian_rasterization``, or ``diff_gaussian_rasterization_abs``.
-        outputs: how many values the rasterizer returns, see `rasterize`.
+        members: what the rasterizer returns after image and radii, see `rasterize`.
 
     Example:
-        >>> module = rasterizer_module("diff_gaussian_rasterization", 2)
+        >>> module = rasterizer_module("diff_gaussian_rasterization", ())
         >>> module.GaussianRasterizationSettings._fields[:2]
         ('image_height', 'image_width')
     """
@@ -158,7 +155,7 @@ def rasterizer_module(name: str, outputs: int) -> ModuleType:
                 raise ValueError(f"means2D of {name} must have {columns} columns, got shape {tuple(means2D.shape)}.")
             return rasterize(
                 self.raster_settings, means3D, means2D, opacities, scales, rotations,
-                sh=shs, colors=colors_precomp, outputs=outputs,
+                sh=shs, colors=colors_precomp, members=members,
             )  # fmt: skip
 
     GaussianRasterizer.__module__, GaussianRasterizer.__qualname__ = name, "GaussianRasterizer"

@@ -5,12 +5,21 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
-__all__ = ["Interface", "read_interface"]
+__all__ = ["Interface", "Outputs", "read_interface"]
+
+Outputs = Literal[2, 3, 4, "depth", "inverse-depth"]
+"""What a rasterizer returns: (colour, radii), and then nothing (2), one plane (3, or which), or depth and alpha (4)."""
 
 RASTERIZERS = ("diff_gaussian_rasterization", "diff_gaussian_rasterization_abs")
-OUTPUTS_OF_SETTINGS = {"confidence": 4, "antialiasing": 3}  # fields that only one variant of the settings has
+MEMBERS: dict[int | str, tuple[str, ...]] = {
+    2: (),
+    "depth": ("depth",),
+    "inverse-depth": ("inverse_depth",),
+    4: ("depth", "alpha"),
+}
+SAY_IT = "outputs=2, 4, 'depth' or 'inverse-depth', in the launcher --outputs"
 
 
 class Interface(NamedTuple):
@@ -18,45 +27,63 @@ class Interface(NamedTuple):
 
     Args:
         rasterizer: module name.
-        outputs: how many values the rasterizer returns.
+        members: what the rasterizer returns after colour and radii.
         neighbor_indices: whether ``distCUDA2`` returns the neighbours' numbers as well.
     """
 
     rasterizer: str
-    outputs: int
+    members: tuple[str, ...]
     neighbor_indices: bool
 
 
-def read_interface(repository: Path, outputs: int | None = None) -> Interface:
+def read_interface(repository: Path, outputs: Outputs | None = None) -> Interface:
     """Read ``gaussian_renderer/__init__.py`` and ``scene/`` without importing them.
 
     The number of outputs is that of the names to which the result of the rasterizer is assigned; if it is not taken
-    apart there, a field of the settings may tell.
+    apart there, a field of the settings may tell. A third of three outputs is what the settings tell, too: those with
+    ``antialiasing`` (INRIA since October 2024) go with inverse depths, and no other field says what it is.
 
     Args:
         repository: the root of the foreign repository.
-        outputs: 2, 3 or 4 to say it instead.
+        outputs: to say it instead.
 
     Raises:
-        ValueError: if the number cannot be told, or is none of 2, 3 and 4.
+        ValueError: if the outputs cannot be told, or no rasterizer has them.
     """
     source = repository / "gaussian_renderer" / "__init__.py"
     tree = ast.parse(source.read_text(encoding="utf-8")) if source.is_file() else ast.Module([], [])
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     rasterizer = next((name for name in RASTERIZERS if name in imported), RASTERIZERS[0])
-    if outputs is None:
-        outputs = _outputs(tree, source)
-    if outputs not in (2, 3, 4):
-        raise ValueError(f"a rasterizer returns 2, 3 or 4 values, got outputs={outputs} for {source}.")
-    if rasterizer.endswith("_abs") and outputs != 3:
-        raise ValueError(f"{rasterizer} returns 3 values (colour, radii, weights), got outputs={outputs} for {source}.")
-    return Interface(rasterizer, outputs, _neighbor_indices(repository))
+    settings = {
+        keyword.arg
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and _called(node) == "GaussianRasterizationSettings"
+        for keyword in node.keywords
+    }
+    found = _count_outputs(tree, source, settings) if outputs is None else outputs
+    if rasterizer.endswith("_abs"):
+        if found != 3:
+            raise ValueError(
+                f"{rasterizer} returns 3 values (colour, radii, weights), got outputs={found} for {source}."
+            )
+        return Interface(rasterizer, ("weights",), _neighbor_indices(repository))
+    if found == 3:
+        if "antialiasing" not in settings:
+            raise ValueError(
+                f"cannot tell what the third of three values is that the rasterizer of {source} returns: an inverse "
+                "depth in INRIA's code, whose settings have a field antialiasing, which these have not; a depth, or a "
+                f"number per Gaussian, in others. If it is a depth, say which: {SAY_IT}."
+            )
+        found = "inverse-depth"
+    if found not in MEMBERS:
+        raise ValueError(f"no known rasterizer returns outputs={found} for {source}. Give {SAY_IT}.")
+    return Interface(rasterizer, MEMBERS[found], _neighbor_indices(repository))
 
 
-def _outputs(tree: ast.Module, source: Path) -> int:
+def _count_outputs(tree: ast.Module, source: Path, settings: set[str | None]) -> int | str:
     """Count the names that the results of the rasterizer are assigned to."""
     if not source.is_file():
-        raise ValueError(f"there is no {source} to read the rasterizer's outputs from: give outputs=2, 3 or 4.")
+        raise ValueError(f"there is no {source} to read the rasterizer's outputs from. Give {SAY_IT}.")
     assignments = [node for node in ast.walk(tree) if isinstance(node, ast.Assign)]
     rasterizers = {
         target.id
@@ -71,17 +98,13 @@ def _outputs(tree: ast.Module, source: Path) -> int:
         if _called(node.value) in rasterizers
         for target in node.targets
         if isinstance(target, ast.Tuple) and not any(isinstance(name, ast.Starred) for name in target.elts)
-    } or {
-        OUTPUTS_OF_SETTINGS[keyword.arg]
-        for node in ast.walk(tree)
-        if _called(node) == "GaussianRasterizationSettings" and isinstance(node, ast.Call)
-        for keyword in node.keywords
-        if keyword.arg in OUTPUTS_OF_SETTINGS
     }
+    if not counts:
+        counts = {count for field, count in {"confidence": 4, "antialiasing": 3}.items() if field in settings}
     if len(counts) != 1:
         raise ValueError(
             f"cannot tell how many values the rasterizer returns from {source}: its results are taken apart into "
-            f"{sorted(counts) or 'no fixed number of'} names. Give outputs=2, 3 or 4."
+            f"{sorted(counts) or 'no fixed number of'} names. Give {SAY_IT}."
         )
     return counts.pop()
 

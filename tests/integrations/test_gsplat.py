@@ -54,6 +54,12 @@ def rasterization_that_culls_nothing(*args, **kwargs):
     return image, alpha, info
 
 
+@functools.wraps(rasterization_1_4)
+def rasterization_without_radii(*args, **kwargs):
+    """As `gsplat.rasterization_inria_wrapper`, which returns an empty dict."""
+    return *rasterization_1_4(*args, **kwargs)[:2], {}
+
+
 def activated(params):
     return {
         "means": params["means"],
@@ -174,7 +180,7 @@ def test_gsplats_own_density_control_decides_as_if_dropped_gaussians_were_not_th
 
 def test_packed_mode_of_old_versions_is_refused(params, cameras):
     wrapped = regularized(rasterization_1_4, GaussianDropout(0.4))
-    with pytest.raises(RuntimeError, match=r"packed=False, or install gsplat>=1\.5"):
+    with pytest.raises(RuntimeError, match=r"pass packed=False, or.* install gsplat>=1\.5"):
         wrapped(**activated(params), **cameras)
 
 
@@ -263,6 +269,8 @@ def fake_gsplat(monkeypatch):
     """A package gsplat with the two places of the function."""
     gsplat, rendering = ModuleType("gsplat"), ModuleType("gsplat.rendering")
     gsplat.rasterization = rendering.rasterization = rasterization
+    gsplat.rasterization_2dgs = rendering.rasterization_2dgs = rasterization_that_culls_nothing
+    rendering.rasterization_inria_wrapper = rasterization_without_radii
     gsplat.rendering = rendering
     monkeypatch.setitem(sys.modules, "gsplat", gsplat)
     monkeypatch.setitem(sys.modules, "gsplat.rendering", rendering)
@@ -285,19 +293,80 @@ def test_install_reaches_an_unedited_script_and_restores_exactly(fake_gsplat, pa
         with pytest.raises(ValueError, match="dropped twice"):
             install(dropout)
     assert fake_gsplat.rasterization is fake_gsplat.rendering.rasterization is rasterization
-    assert installation.rasterization.trained == 3
+    assert installation.trained == installation.rasterization.trained == 3
     installation.uninstall()
     assert fake_gsplat.rasterization is rasterization
 
 
+def test_install_reaches_2dgs_and_refuses_what_returns_no_radii(fake_gsplat, params, cameras):
+    dropout = GaussianDropout(0.5)
+    with install(dropout) as installation:
+        fake_gsplat.rasterization(**activated(params), **cameras)
+        info = fake_gsplat.rendering.rasterization_2dgs(**activated(params), **cameras, packed=False)[2]
+        assert not info["radii"][:, ~dropout.keep].any()
+        assert dropout.step == 1  # one count for all functions
+        with pytest.raises(RuntimeError, match=r"returns no radii, .* train with gsplat\.rasterization"):
+            fake_gsplat.rendering.rasterization_inria_wrapper(**activated(params), **cameras)
+    assert installation.trained == 3
+    assert set(installation.functions) == {"rasterization", "rasterization_2dgs", "rasterization_inria_wrapper"}
+    assert fake_gsplat.rasterization_2dgs is rasterization_that_culls_nothing
+
+
+@pytest.mark.parametrize(("patience", "steps"), [(2, 9), (100, 2)])
+def test_a_training_past_the_installation_is_an_error(fake_gsplat, params, cameras, patience, steps):
+    kept = fake_gsplat.rasterization  # as a script that was imported first
+    groups = [{"params": [x], "name": name} for name, x in params.items()]
+    optimizers = [torch.optim.SGD([group], lr=0.1) for group in groups]  # one for each, as gsplat's trainers make them
+    made = 0
+
+    def train():
+        nonlocal made
+        for _ in range(steps):
+            loss_of(kept(**activated(params), **cameras)[0]).backward()
+            for optimizer in optimizers:
+                optimizer.step()
+            made += 1
+
+    with (
+        pytest.raises(RuntimeError, match=r"regularized.* before install"),
+        install(GaussianDropout(0.5), patience=patience),
+    ):
+        train()
+    assert made == 2
+
+
+@pytest.mark.slow
+# Dynamo asks every tensor that crosses a cut for its gradient.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+def test_a_compiled_call_is_regularized(params, cameras):
+    dropout = GaussianDropout(0.5)
+    wrapped = regularized(rasterization, dropout)
+
+    @torch.compile(backend="eager")
+    def loss(params):
+        return wrapped(**activated(params), **cameras)[0].sum() * 2
+
+    expected = []
+    for _ in range(2):
+        value = loss(params)
+        opacities = apply_dropout(params["opacities"].sigmoid(), dropout.keep)
+        plain = rasterization(**activated(params) | {"opacities": opacities}, **cameras)[0].sum() * 2
+        expected.append(plain.item())
+        assert value.item() == pytest.approx(plain.item(), rel=1e-5)
+    assert expected[0] != expected[1]
+    assert wrapped.trained == 2
+
+
 def test_the_package_is_replaced_and_restored():
     gsplat = pytest.importorskip("gsplat", exc_type=ImportError)
-    original = gsplat.rasterization
+    names = ("rasterization", "rasterization_2dgs", "rasterization_inria_wrapper", "rasterization_2dgs_inria_wrapper")
+    originals = {name: getattr(gsplat, name) for name in names}
     with install(GaussianDropout(0.2)) as installation:
-        assert gsplat.rasterization is gsplat.rendering.rasterization is installation.rasterization
-        assert inspect.signature(gsplat.rasterization) == inspect.signature(original)
-    assert gsplat.rasterization is gsplat.rendering.rasterization is original
-    regularized(gsplat.rasterization_2dgs, GaussianDropout(0.2))  # has the argument that is looked for
+        for name, original in originals.items():
+            assert getattr(gsplat, name) is getattr(gsplat.rendering, name) is installation.functions[name]
+            assert inspect.signature(getattr(gsplat, name)) == inspect.signature(original)
+    for name, original in originals.items():
+        assert getattr(gsplat, name) is getattr(gsplat.rendering, name) is original
 
 
 def test_an_error_inside_restores_as_well(fake_gsplat):

@@ -95,10 +95,12 @@ def test_renders_without_gradients_are_scaled_and_keep_their_radii(rasterizer):
 
 def test_a_script_that_only_renders_scales_by_the_final_rate(rasterizer):
     dropout = GaussianDropout(StartStop(0.3, start=500))
-    with torch.no_grad(), RasterizerHook(dropout, rasterizer=rasterizer) as hook:
-        model = Model()
-        make_render(rasterizer)(model.camera, model, PIPE, BLACK)
-    assert dropout.p == 0.3
+    model, render = Model(), make_render(rasterizer)
+    with torch.no_grad():
+        expected = render(model.camera, model, PIPE, BLACK, opacities=0.7 * model.get_opacity)
+        with RasterizerHook(dropout, rasterizer=rasterizer) as hook:
+            scaled = render(model.camera, model, PIPE, BLACK)
+    torch.testing.assert_close(scaled["render"], expected["render"])
     assert hook.tally.scaled == 1
 
 
@@ -214,7 +216,7 @@ def test_a_viewer_sees_the_test_render_and_is_not_the_main_view(rasterizer):
 
 def hooked_call(regularizer, rasterizer, **variables):
     """Rasterize in a function named render with these variables, as those of the code bases have them."""
-    body = "def render(rasterize, dropout_factor=0.0, sigma_noise=0.0, train=True, is_train=False, iteration=3):\n"
+    body = "def render(rasterize, dropout_factor=0.0, sigma_noise=0.0, train=True):\n"
     namespace = {"__name__": "gaussian_renderer"}
     exec(body + "    return rasterize()", namespace)
     model = Model()
@@ -229,7 +231,7 @@ def hooked_call(regularizer, rasterizer, **variables):
     [
         (GaussianDropout(0.2), {"dropout_factor": 0.2}, "GaussianDropout .* twice.*--dropout_factor 0"),
         (OpacityNoise(0.8), {"sigma_noise": 0.8}, "OpacityNoise .* twice.*--sigma_noise 0"),
-        (nn.Sequential(OpacityNoise(0.8), GaussianDropout(0.2)), {"is_train": True}, "DropGaussian's own dropout"),
+        (nn.Sequential(OpacityNoise(0.8), GaussianDropout(0.2)), {"dropout_factor": 0.2}, "--dropout_factor 0"),
     ],
 )
 def test_a_second_regularizer_of_the_same_kind_is_refused(rasterizer, regularizer, variables, message):
@@ -245,7 +247,7 @@ def test_a_second_scaling_at_test_time_is_refused(rasterizer):
 
 @pytest.mark.parametrize(
     ("regularizer", "variables"),
-    [(GaussianDropout(0.2), {"sigma_noise": 0.8}), (OpacityNoise(0.8), {"is_train": True})],
+    [(GaussianDropout(0.2), {"sigma_noise": 0.8}), (OpacityNoise(0.8), {"dropout_factor": 0.2})],
 )
 def test_regularizers_of_different_kinds_go_together(rasterizer, regularizer, variables):
     assert hooked_call(regularizer, rasterizer, **variables).regularized == 1

@@ -5,6 +5,7 @@ import difflib
 import importlib.util
 import io
 import sys
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from stand_ins.inria import PIPE, Model, make_render
 from torch import nn
 
 from ca_reg import GaussianDropout
-from ca_reg.integrations._rasterizer import find_radii
+from ca_reg.integrations._rasterizer import hide_dropped
 from ca_reg.integrations.inria import RasterizerHook
 
 BLACK = torch.zeros(3)
@@ -104,37 +105,65 @@ def test_arguments_are_checked(rasterizer):
         RasterizerHook(GaussianDropout(0.2), scope="first")
     with pytest.raises(ValueError, match="empty"):
         RasterizerHook(nn.Sequential())
-    with pytest.raises(TypeError, match="got Linear"):
+    with pytest.raises(ValueError, match="steps must be one of updates, parameters"):
+        RasterizerHook(GaussianDropout(0.2), steps="renders")
+    with pytest.raises(ValueError, match="patience must be at least 0"):
+        RasterizerHook(GaussianDropout(0.2), patience=-1)
+    with pytest.raises(TypeError, match="Linear takes no argument generator"):
         RasterizerHook(nn.Sequential(GaussianDropout(0.2), nn.Linear(1, 1)))
+    with pytest.raises(TypeError, match="must be a torch module, got float"):
+        RasterizerHook(0.2)
 
 
 @pytest.mark.parametrize(
-    ("shapes", "position"),
+    "names",
     [
-        (["image", "radii"], 1),
-        (["image", "radii", "weights"], 1),  # AbsGS: item 2 is per Gaussian
-        (["image", "radii", "plane"], 1),
-        (["image", "plane", "plane", "radii"], 3),
-        (["image", "radii 2d"], 1),
+        ["image", "radii"],
+        ["image", "radii", "weights"],  # AbsGS: item 2 is per Gaussian
+        ["image", "radii", "plane"],
+        ["image", "plane", "plane", "radii"],
+        ["image", "radii 2d"],
+        ["image", "radii", "used"],  # 3dgs-mcmc
+        ["image", "radii", "counts", "weights", "radii", "flags", "lists"],  # as long as those of taming-3dgs
     ],
 )
-def test_radii_are_told_by_type_and_shape(shapes, position):
+def test_all_that_is_counted_per_gaussian_is_hidden(names):
     n = 4  # as many Gaussians as rows of the picture
     members = {
-        "image": torch.zeros(3, n, 5),
-        "radii": torch.ones(n, dtype=torch.int32),
+        "image": torch.ones(3, n, 5),
+        "radii": torch.tensor([7, 5, 3, 2], dtype=torch.int32),
         "radii 2d": torch.ones(n, 2, dtype=torch.int32),
+        "used": torch.ones(n, dtype=torch.int32),
+        "counts": torch.ones(n, 1, dtype=torch.int64),
+        "flags": torch.ones(n, dtype=torch.bool),
         "weights": torch.ones(n),
-        "plane": torch.zeros(1, n, 5),
+        "plane": torch.ones(1, n, 5),
+        "lists": torch.ones(9, dtype=torch.int32),
     }
-    assert find_radii(tuple(members[name] for name in shapes), n) == position
+    counted = {"radii", "radii 2d", "used", "counts", "flags"}
+    keep = torch.tensor([True, False, True, False])
+    given = tuple(members[name] for name in names)
+    for name, before, after in zip(names, given, hide_dropped(given, keep), strict=True):
+        assert after.dtype == before.dtype
+        assert torch.equal(after[keep] if name in counted else after, before[keep] if name in counted else before)
+        assert not (name in counted and after[~keep].any())
+
+
+def test_a_named_tuple_stays_one():
+    class Rendered(NamedTuple):
+        color: torch.Tensor
+        radii: torch.Tensor
+
+    given = Rendered(torch.zeros(3, 4, 5), torch.ones(2, dtype=torch.int32))
+    assert hide_dropped(given, torch.tensor([False, True])).radii.tolist() == [0, 1]
 
 
 def test_a_tuple_without_radii_is_an_error():
-    with pytest.raises(ValueError, match=r"exactly one integer tensor of shape \(7,\)"):
-        find_radii((torch.zeros(3, 4, 5), torch.ones(7)), 7)
+    keep = torch.ones(7, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"expected an integer tensor of shape \(7,\)"):
+        hide_dropped((torch.zeros(3, 4, 5), torch.ones(7)), keep)
     with pytest.raises(TypeError, match="returned Tensor"):
-        find_radii(torch.zeros(3, 4, 5), 7)
+        hide_dropped(torch.zeros(3, 4, 5), keep)
 
 
 USER_FILE = """

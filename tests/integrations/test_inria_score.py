@@ -1,6 +1,7 @@
 """The score of INRIA-style models: opacities from outside, alpha from wherever it is."""
 
 import sys
+import threading
 from types import SimpleNamespace
 
 import pytest
@@ -81,6 +82,40 @@ def test_an_installed_hook_does_not_touch_scores_nor_lose_its_place(monkeypatch)
         assert hook.tally.regularized == 1
     torch.testing.assert_close(image, expected[0])
     torch.testing.assert_close(alpha, expected[1])
+
+
+def test_renders_of_other_threads_keep_their_own_opacities():
+    """Two scores and a plain render at once; the scores end in the order in which they began."""
+    model, rasterizer = Model(), make_rasterizer()
+    forward, render = vars(rasterizer)["forward"], make_render(rasterizer)
+    opacity = model.get_opacity.detach()
+    expected = [reference(model)(factor * opacity, model.camera)[0] for factor in (1.0, 0.5, 0.25)]
+    inside = [threading.Event() for _ in range(2)]
+    done = [threading.Event() for _ in range(2)]
+    found = {}
+
+    def score(number):
+        def slow(*arguments):
+            package = render(*arguments)
+            inside[number].set()
+            assert done[number].wait(timeout=30)
+            return package
+
+        fn = render_fn(slow, model, PIPE, BACKGROUND, rasterizer=rasterizer)
+        found[number] = fn(expected_factor[number] * opacity, model.camera)[0]
+
+    expected_factor = (0.5, 0.25)
+    threads = [threading.Thread(target=score, args=(number,)) for number in range(2)]
+    for number, thread in enumerate(threads):
+        thread.start()
+        assert inside[number].wait(timeout=30)
+    plain = render(model.camera, model, PIPE, BACKGROUND)["render"]
+    for number, thread in enumerate(threads):
+        done[number].set()
+        thread.join()
+    for image, wanted in zip((plain, found[0], found[1]), expected, strict=True):
+        torch.testing.assert_close(image, wanted)
+    assert vars(rasterizer)["forward"] is forward
 
 
 def test_installed_rasterizers_are_found(monkeypatch):

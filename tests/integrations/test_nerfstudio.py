@@ -126,14 +126,15 @@ def test_other_models_of_the_module_are_left_alone_even_in_other_threads():
     model, plain = make()
     expected = plain.get_outputs(CAMERA)["rgb"]
     inside, done = threading.Event(), threading.Event()
-    draw = model._regularized.regularizer.forward
+    noise = model._regularized.regularizer[0]
+    draw = noise.forward
 
     def wait(opacity):
         inside.set()
         assert done.wait(timeout=30)
         return draw(opacity)
 
-    model._regularized.regularizer.forward = wait
+    noise.forward = wait
     thread = threading.Thread(target=model.get_outputs, args=(CAMERA,))
     thread.start()
     assert inside.wait(timeout=30)

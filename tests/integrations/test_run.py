@@ -113,6 +113,7 @@ def test_a_script_is_regularized_and_the_report_says_how(repository, tmp_path, c
         "skipped": {"further_view": 3, "rate_zero": 1},
         "first_step": 2,
         "last_step": 3,
+        "lost": 0,
     }
     assert (written["dropout"], written["arguments"], written["ended"]) == (0.5, ["3"], "exit 0")
     assert "[ca_reg] 2 renders regularized, steps 2 to 3" in regularized.err
@@ -153,10 +154,101 @@ def test_the_report_comes_however_the_script_ends(repository, tmp_path, capsys, 
     assert "1 renders regularized" in capsys.readouterr().err
 
 
-def test_a_script_that_does_not_render_is_told_so(repository, capsys):
+def test_a_script_that_does_not_render_is_an_error(repository, tmp_path, capsys):
     (repository / "other.py").write_text("print('done')\n")
-    main(["--dropout", "0.2", str(repository / "other.py")])
-    assert "NOTHING was regularized or scaled" in capsys.readouterr().err
+    report = tmp_path / "report.json"
+    assert launch("--dropout", 0.2, "--report", report, repository / "other.py") == 1
+    err = capsys.readouterr().err
+    assert "NOTHING was regularized or scaled" in err
+    assert re.search(r"ERROR: No render was regularized.*Hooked is nothing.*--patience", err)
+    assert json.loads(report.read_text())["problem"].startswith("No render was regularized or scaled")
+
+
+def test_a_script_that_renders_for_tests_alone_is_none(repository, capsys):
+    text = (repository / "train.py").read_text().replace("range(1, iterations + 1)", "[]")
+    (repository / "render.py").write_text(text)
+    for regularizer in (("--dropout", 0.2), ("--noise", 0.8)):
+        assert launch(*regularizer, repository / "render.py", 0) == 0
+        for name in [m for m in sys.modules if m.partition(".")[0] in ("scene", "gaussian_renderer")]:
+            del sys.modules[name]
+
+
+OTHER_RASTERIZER = """
+import torch
+from scene import GaussianModel
+from stand_ins.inria import make_rasterizer, make_render
+
+import diff_gaussian_rasterization
+
+render, gaussians = make_render(make_rasterizer()), GaussianModel()
+optimizer = torch.optim.SGD([{"params": [gaussians._opacity], "name": "opacity"}], lr=0.1)
+for iteration in range(1, 31):
+    gaussians.update_learning_rate(iteration)
+    render(gaussians.camera, gaussians, None, torch.zeros(3))["render"].sum().backward()
+    optimizer.step()
+    print("step", iteration)
+"""
+
+
+def test_a_training_with_another_rasterizer_is_ended_early(repository, capsys):
+    (repository / "other.py").write_text(OTHER_RASTERIZER)
+    with pytest.raises(RuntimeError, match="6 optimizer steps of the Gaussians in a row"):
+        main(["--dropout", "0.2", "--patience", "5", str(repository / "other.py")])
+    assert capsys.readouterr().out.split()[-1] == "5"
+
+
+def test_a_short_one_fails_at_its_end(repository, capsys):
+    (repository / "other.py").write_text(OTHER_RASTERIZER)
+    assert launch("--dropout", "0.2", repository / "other.py") == 1
+    captured = capsys.readouterr()
+    assert captured.out.split()[-1] == "30"
+    assert re.search(r"ERROR: The training was not regularized\. Hooked is \S+GaussianRasterizer;", captured.err)
+
+
+def test_a_schedule_that_never_begins_is_an_error(repository, capsys):
+    assert launch("--dropout", 0.2, "--start", 9, repository / "train.py", 3) == 1
+    assert re.search("ERROR: The training was not regularized.*--start", capsys.readouterr().err)
+
+
+def test_a_module_runs_as_python_would_run_it(repository, capsys, monkeypatch):
+    monkeypatch.chdir(repository)
+    (repository / "package").mkdir()
+    (repository / "package" / "train.py").write_text((repository / "train.py").read_text())
+    sys.path.insert(0, "")
+    assert launch("--dropout", 0.5, "-m", "package.train", 2, "--dropout") == 0
+    captured = capsys.readouterr()
+    path = repository / "package" / "train.py"
+    assert captured.out.splitlines()[0] == f"argv ['2', '--dropout'] path {repository} file {path}"
+    assert "[ca_reg] package.train: exit 0\n[ca_reg] 2 renders regularized" in captured.err
+
+
+@pytest.mark.slow
+def test_workers_that_start_afresh_find_the_stand_ins(repository):
+    """As those of data loaders do on macOS and Windows: nothing but the search path is handed on."""
+    (repository / "diff_gaussian_rasterization.py").unlink()
+    (repository / "gaussian_renderer" / "__init__.py").write_text(
+        "from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer\n"
+        "from simple_knn._C import distCUDA2\n"
+        "def render(settings, x):\n"
+        "    rasterizer = GaussianRasterizer(raster_settings=settings)\n"
+        "    image, radii = rasterizer(means3D=x)\n"
+    )
+    (repository / "train.py").write_text(
+        "import gaussian_renderer, multiprocessing, torch\n"
+        "def work(queue):\n"
+        "    queue.put(gaussian_renderer.distCUDA2(torch.rand(9, 3, device='cuda')).device.type)\n"
+        "if __name__ == '__main__':\n"
+        "    context = multiprocessing.get_context('spawn')\n"
+        "    queue = context.SimpleQueue()\n"
+        "    worker = context.Process(target=work, args=(queue,))\n"
+        "    worker.start()\n"
+        "    worker.join()\n"
+        "    print(worker.exitcode, 'nothing' if queue.empty() else queue.get())\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, "-m", "ca_reg.integrations.run", "--cpu", "train.py"]
+    done = subprocess.run(command, cwd=repository, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == ["0", "cpu"], done.stderr
 
 
 def test_without_cuda_the_stand_in_comes_first(repository, capsys, monkeypatch):
@@ -188,6 +280,11 @@ def test_without_cuda_the_stand_in_comes_first(repository, capsys, monkeypatch):
     ("arguments", "message"),
     [
         (["nowhere.py"], "there is no script nowhere.py"),
+        ([], "there is no script"),
+        (["-m"], "-m needs the name of a module"),
+        (["-m", "nowhere.train"], "there is no module nowhere.train"),
+        (["--patience", "-1", "SCRIPT"], "--patience must be at least 0"),
+        (["--cpu", "--outputs", "5", "SCRIPT"], "invalid choice"),
         (["--dropout", "1.5", "SCRIPT"], r"p must be in \[0, 1\)"),
         (["--noise", "-1", "SCRIPT"], "sigma must be finite and at least 0"),
         (["--dropout", "0.2", "--ramp", "0", "SCRIPT"], "end_step must come after start_step"),

@@ -68,10 +68,11 @@ def make_rasterizer(form: str = "depth-alpha") -> type[nn.Module]:
             centres = out.splats.projection.means
             half = centres.new_tensor([0.5 * width, 0.5 * height])
             if centres.requires_grad and means2D.requires_grad:
+                indices = out.splats.indices  # a hook that held the rendering would keep its graph alive for ever
 
                 def deliver(gradient):
                     means2D.grad = torch.zeros_like(means2D)
-                    means2D.grad[out.splats.indices, :2] = gradient * half
+                    means2D.grad[indices, :2] = gradient * half
 
                 centres.register_hook(deliver)
             radii = radii_of_all(means3D, rotations, scales, camera)

@@ -7,7 +7,7 @@ from reference_trainer.compat.rasterizer import rasterizer_module
 
 
 def _call(settings, scene, screen):
-    rasterizer = rasterizer_module("diff_gaussian_rasterization_abs", 3).GaussianRasterizer(settings)
+    rasterizer = rasterizer_module("diff_gaussian_rasterization_abs", ("weights",)).GaussianRasterizer(settings)
     return rasterizer(
         means3D=scene.means, means2D=screen, opacities=scene.opacities, colors_precomp=scene.colors,
         scales=scene.scales, rotations=scene.quaternions,

@@ -9,9 +9,10 @@ from reference_trainer.compat.settings import camera_of
 from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
 
 NAME = "diff_gaussian_rasterization"
+DEPTH_ALPHA = ("depth", "alpha")
 
 
-def _call(settings, scene, outputs, *, screen=None, **changes):
+def _call(settings, scene, members=(), *, screen=None, **changes):
     """Call a stand-in with keywords, as the repositories do."""
     arguments = {
         "means3D": scene.means,
@@ -23,7 +24,7 @@ def _call(settings, scene, outputs, *, screen=None, **changes):
         "rotations": scene.quaternions,
         "cov3D_precomp": None,
     }
-    rasterizer = rasterizer_module(NAME, outputs).GaussianRasterizer(raster_settings=settings)
+    rasterizer = rasterizer_module(NAME, members).GaussianRasterizer(raster_settings=settings)
     return rasterizer(**{**arguments, **changes})
 
 
@@ -42,10 +43,10 @@ def test_every_output_equals_brute_force(settings_of):
         torch.cat([scene.colors, z, 1 / z], dim=1), scene.camera,
     )  # fmt: skip
     image = sums[:3] + (1 - alpha) * background[:, None, None]
-    expected = {2: [image], 3: [image, sums[4:]], 4: [image, sums[3:4], alpha[None]]}
-    for outputs, tensors in expected.items():
-        color, radii, *rest = _call(settings, scene, outputs)
-        assert len(rest) == outputs - 2
+    values = {"depth": sums[3:4], "inverse_depth": sums[4:], "alpha": alpha[None]}
+    for members in ((), ("depth",), ("inverse_depth",), DEPTH_ALPHA):
+        tensors = [image, *(values[member] for member in members)]
+        color, radii, *rest = _call(settings, scene, members)
         assert (radii > 0).any()
         for ours, slow in zip([color, *rest], tensors, strict=True):
             torch.testing.assert_close(ours, slow, rtol=0, atol=1e-9)
@@ -59,7 +60,7 @@ def test_gradients_equal_brute_force_also_those_on_the_screen(settings_of, moved
     weights = _weights(18, 26)
     leaves = scene._replace(**{k: getattr(scene, k).clone().requires_grad_() for k in scene._fields[:5]})
     screen = torch.zeros(40, 3).double().requires_grad_()
-    image, _, depth, alpha = _call(settings, leaves, 4, screen=screen)
+    image, _, depth, alpha = _call(settings, leaves, DEPTH_ALPHA, screen=screen)
     (torch.cat([image, depth, alpha]) * weights).sum().backward()
 
     slow = scene._replace(**{k: getattr(scene, k).clone().requires_grad_() for k in scene._fields[:5]})
@@ -83,14 +84,14 @@ def test_a_dropped_gaussian_has_a_radius_but_no_trace_and_no_gradient(settings_o
     leaves = [x.clone().requires_grad_() for x in scene.tensors()]
     screen = torch.zeros(60, 3).double().requires_grad_()
     dropped = scene._replace(**dict(zip(scene._fields[:5], leaves, strict=True)))._replace(opacities=leaves[3] * keep)
-    image, radii, depth, alpha = _call(settings_of(scene.camera), dropped, 4, screen=screen)
+    image, radii, depth, alpha = _call(settings_of(scene.camera), dropped, DEPTH_ALPHA, screen=screen)
     (image.square().sum() + depth.sum() + alpha.sum()).backward()
     for leaf in [*leaves, screen]:
         assert (leaf.grad[~keep] == 0).all()
         assert leaf.grad[keep].any()
     kept = scene._replace(**{k: getattr(scene, k)[keep] for k in scene._fields[:5]})
-    assert torch.equal(image, _call(settings_of(scene.camera), kept, 4)[0])
-    assert torch.equal(radii, _call(settings_of(scene.camera), scene, 4)[1])
+    assert torch.equal(image, _call(settings_of(scene.camera), kept)[0])
+    assert torch.equal(radii, _call(settings_of(scene.camera), scene)[1])
 
 
 def test_only_the_active_bands_of_spherical_harmonics_are_used(settings_of):
@@ -98,18 +99,18 @@ def test_only_the_active_bands_of_spherical_harmonics_are_used(settings_of):
     sh = torch.randn(30, 16, 3, generator=torch.Generator().manual_seed(6)).double()
     settings = settings_of(scene.camera, sh_degree=2)
     directions = torch.nn.functional.normalize(scene.means - settings.campos, dim=1)
-    with_colors = _call(settings, scene, 2, colors_precomp=evaluate_sh(sh[:, :9], directions, 2))[0]
-    torch.testing.assert_close(_call(settings, scene, 2, colors_precomp=None, shs=sh)[0], with_colors)
+    with_colors = _call(settings, scene, colors_precomp=evaluate_sh(sh[:, :9], directions, 2))[0]
+    torch.testing.assert_close(_call(settings, scene, colors_precomp=None, shs=sh)[0], with_colors)
 
 
 @pytest.mark.parametrize("count", [0, 5])
-@pytest.mark.parametrize("outputs", [2, 3, 4])
-def test_nothing_in_view_is_the_background_with_zero_gradients(settings_of, count, outputs):
+@pytest.mark.parametrize("members", [(), ("inverse_depth",), DEPTH_ALPHA])
+def test_nothing_in_view_is_the_background_with_zero_gradients(settings_of, count, members):
     scene = random_scene(5, 12, 9, seed=5)
     away = scene._replace(**{k: getattr(scene, k)[:count] for k in scene._fields[:5]})
     away = away._replace(means=(away.means - 10 * scene.camera.forward).requires_grad_())
     screen = torch.zeros(count, 3).double().requires_grad_()
-    image, radii, *_ = _call(settings_of(scene.camera, bg=torch.ones(3).double()), away, outputs, screen=screen)
+    image, radii, *_ = _call(settings_of(scene.camera, bg=torch.ones(3).double()), away, members, screen=screen)
     assert (image == 1).all()
     assert radii.tolist() == [0] * count
     image.sum().backward()
@@ -120,17 +121,17 @@ def test_single_precision_as_the_repositories_use_it(settings_of):
     scene = random_scene(100, 40, 30, seed=6)
     slow = brute_force(*scene)[0]
     single = scene.to(torch.float32)
-    image, radii = _call(settings_of(single.camera), single, 2)
+    image, radii = _call(settings_of(single.camera), single)
     # An alpha within rounding of the 1/255 cut may fall on the other side: allow that at few pixels.
     assert ((image.double() - slow).abs().amax(0) > 2e-4).double().mean() < 0.005
     assert image.dtype == torch.float32
-    assert torch.equal(radii, _call(settings_of(scene.camera), scene, 2)[1])
+    assert torch.equal(radii, _call(settings_of(scene.camera), scene)[1])
 
 
 def test_mark_visible_is_the_near_plane(settings_of):
     scene = random_scene(40, 20, 20, seed=3)
     settings = settings_of(scene.camera)
-    visible = rasterizer_module(NAME, 2).GaussianRasterizer(settings).markVisible(scene.means)
+    visible = rasterizer_module(NAME, ()).GaussianRasterizer(settings).markVisible(scene.means)
     camera = camera_of(settings)
     depths = scene.means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     assert torch.equal(visible, depths > 0.2)
@@ -139,14 +140,14 @@ def test_mark_visible_is_the_near_plane(settings_of):
 
 def test_a_patch_of_the_class_ends_with_its_module(settings_of):
     scene = random_scene(5, 8, 8, seed=3)
-    module = rasterizer_module(NAME, 2)
+    module = rasterizer_module(NAME, ())
     plain = module.GaussianRasterizer.__dict__["forward"]
     module.GaussianRasterizer.forward = lambda self, **arguments: plain(self, **arguments)[::-1]
     rasterizer = module.GaussianRasterizer(settings_of(scene.camera))
     tensors = dict(opacities=scene.opacities, colors_precomp=scene.colors, scales=scene.scales)
     patched = rasterizer(means3D=scene.means, means2D=scene.means, rotations=scene.quaternions, **tensors)
     assert patched[0].shape == (5,)
-    assert _call(settings_of(scene.camera), scene, 2)[0].shape == (3, 8, 8)
+    assert _call(settings_of(scene.camera), scene)[0].shape == (3, 8, 8)
 
 
 @pytest.mark.parametrize(
@@ -162,10 +163,10 @@ def test_a_patch_of_the_class_ends_with_its_module(settings_of):
 def test_errors_name_the_problem(settings_of, changes, words):
     scene = random_scene(4, 8, 8, seed=0)
     with pytest.raises(ValueError, match=words):
-        _call(settings_of(scene.camera), scene, 2, **changes)
+        _call(settings_of(scene.camera), scene, **changes)
 
 
 def test_antialiasing_is_refused(settings_of):
     scene = random_scene(4, 8, 8, seed=0)
     with pytest.raises(ValueError, match="antialiasing=False"):
-        _call(settings_of(scene.camera, antialiasing=True), scene, 3)
+        _call(settings_of(scene.camera, antialiasing=True), scene)

@@ -1,0 +1,268 @@
+"""The hook of the INRIA family notices what is not regularized: steps, viewers, zeros, other rasterizers."""
+
+import re
+
+import pytest
+import torch
+from stand_ins.inria import PIPE, Model, make_rasterizer, make_render, rasterize
+from torch import nn
+
+from ca_reg import GaussianDropout, LinearRamp, OpacityNoise, StartStop
+from ca_reg.integrations.inria import RasterizerHook
+
+BLACK = torch.zeros(3)
+
+
+def optimizer_of(model, name="opacity"):
+    """As the family makes it: a group of parameters for each name."""
+    groups = [{"params": [x], "name": name if x is model._opacity else "other"} for x in model.parameters()]
+    return torch.optim.Adam(groups, lr=1e-3)
+
+
+def train(model, render, optimizer, camera=None, views=1, **replaced):
+    """Make a step; return what the first view saw."""
+    optimizer.zero_grad()
+    packages = [render(camera or model.camera, model, PIPE, BLACK, **replaced) for _ in range(views)]
+    sum(package["render"].sum() for package in packages).backward()
+    optimizer.step()
+    return packages[0]["radii"] > 0
+
+
+def densify(model, optimizer):
+    """Replace the parameters in the model and in its optimizer, as the family does."""
+    for group, name in zip(optimizer.param_groups, ("_xyz", "_scaling", "_rotation", "_opacity"), strict=False):
+        optimizer.state.pop(group["params"][0])
+        group["params"][0] = nn.Parameter(group["params"][0].detach().clone())
+        setattr(model, name, group["params"][0])
+
+
+def computed_means(model):
+    """Positions of a deformed field."""
+    return {"means3D": model.get_xyz + 0.0 * model.get_scaling}
+
+
+@pytest.mark.parametrize("deformed", [False, True])
+def test_updates_of_every_tenth_step_are_noticed(rasterizer, model_class, deformed):
+    model, render = model_class(), make_render(rasterizer)
+    optimizer = optimizer_of(model)
+    replaced = computed_means(model) if deformed else {}
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer):
+        model.update_learning_rate(1)
+        train(model, render, optimizer, **replaced)
+        with pytest.raises(RuntimeError, match=r'update_learning_rate .* steps="parameters".*hook\.step\(iteration\)'):
+            train(model, render, optimizer, **(computed_means(model) if deformed else {}))
+
+
+def test_computed_positions_of_nobodys_steps_are_noticed(rasterizer):
+    model, render = Model(), make_render(rasterizer)
+    optimizer = optimizer_of(model)
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer):
+        train(model, render, optimizer, **computed_means(model))
+        with pytest.raises(RuntimeError, match="cannot tell the training steps apart"):
+            train(model, render, optimizer, **computed_means(model))
+
+
+@pytest.mark.parametrize("deformed", [False, True])
+@pytest.mark.parametrize("every", [0, 10])
+def test_the_parameters_tell_the_steps(rasterizer, model_class, deformed, every):
+    model, render = (model_class if every else Model)(), make_render(rasterizer)
+    optimizer, dropout = optimizer_of(model), GaussianDropout(StartStop(0.5, start=3))
+    seen, masks = [], []
+    with RasterizerHook(dropout, rasterizer=rasterizer, steps="parameters") as hook:
+        for iteration in range(1, 25):
+            if every and iteration % every == 1:
+                model.update_learning_rate(iteration)
+            if iteration == 12:
+                densify(model, optimizer)
+            masks.append(train(model, render, optimizer, views=2, **(computed_means(model) if deformed else {})))
+            seen.append(dropout.step)
+    assert seen == list(range(1, 25))
+    assert hook.tally.regularized == 22
+    assert all(not torch.equal(a, b) for i, a in enumerate(masks[2:]) for b in masks[2:][:i])
+
+
+def test_two_fields_with_computed_positions_are_two(rasterizer):
+    models, render = [Model(seed=0), Model(seed=0)], make_render(rasterizer)
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer) as hook:
+        hook.step(1)
+        first, second = (render(m.camera, m, PIPE, BLACK, **computed_means(m))["radii"] for m in models)
+    assert hook.tally.regularized == 2
+    assert not torch.equal(first, second)
+
+
+class MiniCam:
+    """As network_gui makes it."""
+
+    def __init__(self, camera):
+        self.__dict__.update(vars(camera))
+
+
+@pytest.mark.parametrize("regularizer", [GaussianDropout(0.5), OpacityNoise(0.5)])
+def test_training_on_the_views_of_a_viewer_is_an_error_at_once(rasterizer, model_class, regularizer):
+    model, render = model_class(), make_render(rasterizer)
+    optimizer, camera = optimizer_of(model), MiniCam(model.camera)
+    with RasterizerHook(regularizer, rasterizer=rasterizer):
+        model.update_learning_rate(1)
+        with pytest.raises(
+            RuntimeError, match=r"its camera is a MiniCam, .*viewer=None, in the launcher --viewer none"
+        ):
+            train(model, render, optimizer, camera)
+    with RasterizerHook(regularizer, rasterizer=rasterizer, viewer=None) as hook:
+        model.update_learning_rate(1)
+        train(model, render, optimizer, camera)
+    assert hook.tally.regularized == 1
+
+
+def follow(hook, step):
+    """Make steps in a hook until it raises; return its message and how many steps were made."""
+    number, message = 0, ""
+    while number < 30 and not message:
+        number += 1
+        try:
+            step(number)
+        except RuntimeError as error:
+            message = str(error)
+    hook.uninstall()
+    return message, number
+
+
+@pytest.mark.parametrize("updates", [True, False])
+def test_a_training_past_the_hook_is_ended_early(rasterizer, model_class, updates):
+    """As 2DGS trains where both rasterizers are installed."""
+    model, other = model_class(), make_render(make_rasterizer())
+    optimizer = optimizer_of(model)
+
+    def step(iteration):
+        if updates:
+            model.update_learning_rate(iteration)
+        train(model, other, optimizer)
+
+    hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, patience=3).install()
+    message, made = follow(hook, step)
+    assert made == 4
+    assert re.search(r"4 optimizer steps .* Hooked is .*GaussianRasterizer.*rasterizer=.*--patience", message)
+
+
+def test_steps_past_the_hook_among_others_are_counted(rasterizer, model_class):
+    model, ours, other = model_class(), make_render(rasterizer), make_render(make_rasterizer())
+    optimizer = optimizer_of(model)
+
+    def step(iteration):
+        model.update_learning_rate(iteration)
+        train(model, ours if iteration % 2 else other, optimizer)
+
+    hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, patience=4).install()
+    message, made = follow(hook, step)
+    assert made == 11
+    assert "5 training steps had no render" in message
+    assert (hook.tally.regularized, hook.tally.lost) == (5, 5)
+
+
+def test_said_steps_without_a_render_are_counted(rasterizer):
+    model, render = Model(), make_render(rasterizer)
+    hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, patience=2).install()
+
+    def step(number):
+        hook.step(number)
+        if number < 3:
+            render(model.camera, model, PIPE, BLACK)
+
+    message, made = follow(hook, step)
+    assert (made, hook.tally.lost) == (6, 3)
+    assert "3 training steps had no render" in message
+
+
+def test_a_short_training_past_the_hook_is_an_error_at_its_end(rasterizer):
+    model, other = Model(), make_render(make_rasterizer())
+    hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer)
+    with pytest.raises(RuntimeError, match="The training was not regularized"), hook:
+        train(model, other, optimizer_of(model))
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, patience=0):
+        train(model, other, optimizer_of(model))
+
+
+@pytest.mark.parametrize("name", ["opacity", "poses"])
+def test_other_optimizers_and_schedules_are_no_cause_for_alarm(rasterizer, model_class, name):
+    model, render = model_class(), make_render(rasterizer)
+    poses, optimizer = optimizer_of(model_class(), name="poses"), optimizer_of(model, name)
+    regularizer = GaussianDropout(LinearRamp(0.0, 0.5, 7, 8))
+    with RasterizerHook(regularizer, rasterizer=rasterizer, patience=2) as hook:
+        for iteration in range(1, 10):
+            model.update_learning_rate(iteration)
+            for _ in range(3):
+                for group in poses.param_groups:
+                    group["params"][0].grad = torch.zeros_like(group["params"][0])
+                poses.step()
+            train(model, render, optimizer)
+    assert hook.tally.regularized == 2
+    assert hook.problem() is None
+
+
+def test_the_hook_lets_go_of_the_optimizers(rasterizer):
+    model, other = Model(), make_render(make_rasterizer())
+    optimizer = optimizer_of(model)
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, patience=1):
+        pass
+    for _ in range(3):
+        train(model, other, optimizer)
+
+
+def drop(opacity):
+    """A dropout of a code base's own, by no name that is known."""
+    generator = torch.Generator().manual_seed(0)
+    return opacity * (torch.rand(opacity.shape, generator=generator) > 0.2)
+
+
+@pytest.mark.parametrize("regularizer", [GaussianDropout(0.2), nn.Sequential(OpacityNoise(0.8), GaussianDropout(0.2))])
+def test_a_dropout_of_ones_own_is_told_by_its_zeros(rasterizer, regularizer):
+    model, render = Model(), make_render(rasterizer)
+    with RasterizerHook(regularizer, rasterizer=rasterizer) as hook:
+        hook.step(1)
+        with pytest.raises(RuntimeError, match=r"dropped twice: 14 of 60 .* --allow-zeros"):
+            render(model.camera, model, PIPE, BLACK, opacities=drop(model.get_opacity))
+    with RasterizerHook(regularizer, rasterizer=rasterizer, allow_zeros=True) as hook:
+        hook.step(1)
+        render(model.camera, model, PIPE, BLACK, opacities=drop(model.get_opacity))
+    assert hook.tally.regularized == 1
+
+
+def test_zeros_and_noise_go_together(rasterizer):
+    model, render = Model(), make_render(rasterizer)
+    with RasterizerHook(OpacityNoise(0.8), rasterizer=rasterizer) as hook:
+        hook.step(1)
+        render(model.camera, model, PIPE, BLACK, opacities=drop(model.get_opacity))
+    assert hook.tally.regularized == 1
+
+
+def test_an_is_train_beside_an_iteration_is_no_dropout(rasterizer):
+    model = Model()
+
+    def render(iteration, is_train):
+        return rasterize(rasterizer, model, model.camera, BLACK)
+
+    with RasterizerHook(GaussianDropout(0.2), rasterizer=rasterizer) as hook:
+        hook.step(1)
+        render(iteration=3, is_train=True)
+    assert hook.tally.regularized == 1
+
+
+@pytest.mark.slow
+# Dynamo asks every tensor that crosses a cut for its gradient.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+def test_a_compiled_training_is_regularized(rasterizer, model_class):
+    model, render = model_class(), make_render(rasterizer)
+    dropout = GaussianDropout(0.5)
+
+    @torch.compile(backend="eager")
+    def loss(model):
+        return render(model.camera, model, PIPE, BLACK)["render"].sum() * 2
+
+    with RasterizerHook(dropout, rasterizer=rasterizer) as hook:
+        for iteration in (1, 2, 3):
+            model.update_learning_rate(iteration)
+            value = loss(model)
+    expected = (
+        2 * render(model.camera, model, PIPE, BLACK, opacities=model.get_opacity * dropout.keep[:, None])["render"]
+    )
+    assert value.item() == pytest.approx(expected.sum().item(), rel=1e-5)
+    assert hook.tally.regularized == 3
