@@ -1,6 +1,11 @@
-"""Fixtures shared by all tests."""
+"""Fixtures shared by all tests, and how a run of the tests is cut into tiers and spread over the processors."""
 
 import os
+
+# The tests are many small operations: a second thread only spins, and slows them down when the cores are busy. Torch
+# reads this when it is loaded, and the processes that tests start inherit it.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -10,8 +15,8 @@ import pytest
 import torch
 from stand_ins.card import CARD, pretended_card, register_card
 
-# The tests are many small operations: a second thread only spins, and slows them down when the cores are busy.
-torch.set_num_threads(1)
+QUICK = "not slow"  # the tier that pyproject.toml asks for
+WORKERS = 8  # at most: each imports torch and collects all tests before its first one
 
 
 @pytest.fixture(scope="session")
@@ -46,6 +51,15 @@ def generator() -> torch.Generator:
 
 
 @pytest.fixture
+def one_thread() -> Iterator[None]:
+    """For what must have the bits of another process, whatever the threads of this one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def full_disk() -> Callable[[int], AbstractContextManager[None]]:
     """A context in which every file of this process ends at so many bytes: what goes beyond fails half-way."""
     resource = pytest.importorskip("resource", reason="the limit of a file's size is POSIX")
@@ -60,6 +74,22 @@ def full_disk() -> Callable[[int], AbstractContextManager[None]]:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
     return limited
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks at its options
+def pytest_cmdline_main(config):
+    """Run what is named by its id whatever its tier, and whole folders on all processors, with pytest-xdist."""
+    option, named = config.option, all("::" in name for name in config.args)
+    if named and option.markexpr == QUICK:
+        option.markexpr = ""
+    if hasattr(config, "workerinput") or not hasattr(option, "numprocesses"):
+        return  # a worker, or no pytest-xdist
+    attended = option.usepdb or option.trace or option.capture == "no" or option.collectonly
+    files = all("::" in name or name.endswith(".py") for name in config.args)
+    if option.numprocesses is None and option.dist == "no" and not (option.tx or attended or files):
+        option.numprocesses, option.maxprocesses = "auto", option.maxprocesses or WORKERS
+    if option.numprocesses and option.dist == "no":
+        option.dist = "worksteal"  # neighbours stay together, and with them what a file's fixtures have made
 
 
 def pytest_configure(config):
