@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from devices import DEVICES
 from stand_ins.card import CARD, pretended_card, register_card
 
 QUICK = "not slow"  # the tier that pyproject.toml asks for
@@ -28,7 +29,7 @@ def data_root() -> Path:
     return root
 
 
-@pytest.fixture(params=["cpu", CARD, pytest.param("cuda", marks=pytest.mark.gpu)])
+@pytest.fixture(params=DEVICES)
 def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
     """Every device that this machine has, and one that it only pretends to have."""
     if request.param == "cuda" and not torch.cuda.is_available():

@@ -68,6 +68,7 @@ def test_a_shortened_schedule_keeps_its_proportions():
     assert shortened(TrainConfig(iterations=500), 500) == TrainConfig(iterations=500)
 
 
+@pytest.mark.slow
 def test_the_study_trains_what_it_says(studied):
     out, records, said = studied
     assert [(record["variant"], record["config"]["seed"]) for record in records] == [
@@ -81,6 +82,7 @@ def test_the_study_trains_what_it_says(studied):
     assert (out / "plan_study.md").read_text() == said[-1] == plan_table(records)
 
 
+@pytest.mark.slow
 def test_a_second_call_trains_nothing(studied, options, short, monkeypatch):
     out, records, _ = studied
     monkeypatch.setattr(plan_module, "Processes", Here)

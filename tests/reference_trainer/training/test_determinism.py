@@ -72,6 +72,7 @@ def trained_on_a_card(scene: Scene, config: TrainConfig, order: int, *, repeatab
         return {name: x.detach().cpu() for name, x in trainer.gaussians.named()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{}, {"analytic": True, "iterations": 8}], ids=["sampled", "analytic"])
 def test_on_a_card_the_order_of_additions_does_not_matter(tiny_scene, busy, change):
     """Nor does anything that happens in training lack an algorithm that repeats itself: the card refuses that."""
