@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -59,7 +60,8 @@ def kernel(function: Callable[..., None], pixels: Tensor, *arguments: Tensor | l
     kind = (function, *(_kind(x) for x in arguments))
     if kind not in _known:
         # Compiled for any number of tiles, with many in mind: for few it would not be run in parallel.
-        run(pixels, *(_example(x) for x in arguments))
+        with _cache_of_this_processor():
+            run(pixels, *(_example(x) for x in arguments))
         _known.add(kind)
     run(pixels, *arguments)
 
@@ -78,6 +80,21 @@ def _example(argument: Tensor | list[Tensor]) -> Tensor | list[Tensor]:
     example = argument.new_zeros(_MANY, *argument.shape[1:])
     torch._dynamo.mark_dynamic(example, 0)
     return example
+
+
+def _cache_of_this_processor() -> AbstractContextManager[None]:
+    """Let torch find on the disk only what was compiled for the instructions that it uses now.
+
+    Its cache forgets them: code in steps of AVX-512, found by a process with ATEN_CPU_CAPABILITY=avx2 or on another
+    machine that shares the folder, would leave out every second vector, without an error (torch 2.13).
+    """
+    try:
+        from torch.compiler import config
+    except ImportError:  # before torch 2.6
+        return nullcontext()
+    tag = f"{config.cache_key_tag} {torch.backends.cpu.get_cpu_capability()}"
+    patch: AbstractContextManager[None] = config.patch(cache_key_tag=tag)
+    return patch
 
 
 _MANY = 1021
