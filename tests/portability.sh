@@ -56,7 +56,7 @@ git clone --quiet . "$clone"
 python -m venv --without-pip "$out/a path with spaces/venv"
 python=$out/a\ path\ with\ spaces/venv/bin/python
 site=$("$python" -c 'import site; print(site.getsitepackages()[0])')
-python -c 'import site; print(*site.getsitepackages(), sep="\n")' >"$site/base.pth"
+python -c 'import sys; print(*(x for x in sys.path if x.endswith("-packages")), sep="\n")' >"$site/base.pth"
 python -m pip --python "$python" install --quiet --no-deps -e "$clone"
 chmod -R a+rX "$out"
 mkdir -p "$out/temporary" && chmod 1777 "$out/temporary"
