@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests, and how a run of the tests is cut into tiers and spread over the processors."""
+"""Fixtures shared by all tests."""
 
 import os
 
@@ -15,9 +15,7 @@ import pytest
 import torch
 from devices import DEVICES
 from stand_ins.card import CARD, pretended_card, register_card
-
-QUICK = "not slow"  # the tier that pyproject.toml asks for
-WORKERS = 8  # at most: each imports torch and collects all tests before its first one
+from tiers import pytest_cmdline_main as pytest_cmdline_main
 
 
 @pytest.fixture(scope="session")
@@ -75,22 +73,6 @@ def full_disk() -> Callable[[int], AbstractContextManager[None]]:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
     return limited
-
-
-@pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks at its options
-def pytest_cmdline_main(config):
-    """Run what is named by its id whatever its tier, and whole folders on all processors, with pytest-xdist."""
-    option, named = config.option, all("::" in name for name in config.args)
-    if named and option.markexpr == QUICK:
-        option.markexpr = ""
-    if hasattr(config, "workerinput") or not hasattr(option, "numprocesses"):
-        return  # a worker, or no pytest-xdist
-    attended = option.usepdb or option.trace or option.capture == "no" or option.collectonly
-    files = all("::" in name or name.endswith(".py") for name in config.args)
-    if option.numprocesses is None and option.dist == "no" and not (option.tx or attended or files):
-        option.numprocesses, option.maxprocesses = "auto", option.maxprocesses or WORKERS
-    if option.numprocesses and option.dist == "no":
-        option.dist = "worksteal"  # neighbours stay together, and with them what a file's fixtures have made
 
 
 def pytest_configure(config):

@@ -19,7 +19,7 @@ failed=()
 check() { # name, then the command before pytest
     local name=$1 && shift
     ((${#wanted[@]})) && [[ " ${wanted[*]} " != *" $name "* ]] && return
-    if "$@" "${python:-python}" -m pytest -q -p no:cacheprovider "${arguments[@]}" >"$out/$name.txt" 2>&1; then
+    if "$@" "${python:-python}" -m pytest -q "${arguments[@]}" >"$out/$name.txt" 2>&1; then
         echo "$name: $(tail -n 1 "$out/$name.txt")"
     else
         failed+=("$name")
