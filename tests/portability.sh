@@ -6,7 +6,8 @@
 #   tests/portability.sh avx2 threads-4      # these
 #   tests/portability.sh -- -m slow          # all, with other arguments for pytest
 #
-# The ordinary user's condition needs root and a Python that others may read. Real scenes are left out by "no data".
+# The ordinary user tests a clone, of what is committed; as root, with a Python that others may read. OUT names the folder
+# of the outputs.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 out=${OUT:-$(mktemp -d)}
@@ -16,9 +17,11 @@ shift || true
 arguments=("$@")
 failed=()
 
+asked() { ((${#wanted[@]} == 0)) || [[ " ${wanted[*]} " == *" $1 "* ]]; }
+
 check() { # name, then the command before pytest
     local name=$1 && shift
-    ((${#wanted[@]})) && [[ " ${wanted[*]} " != *" $name "* ]] && return
+    asked "$name" || return
     if "$@" "${python:-python}" -m pytest -q "${arguments[@]}" >"$out/$name.txt" 2>&1; then
         echo "$name: $(tail -n 1 "$out/$name.txt")"
     else
@@ -40,7 +43,7 @@ check no-data env CA_REG_DATA=/nonexistent
 
 # A compiler that fails, and a PATH without one.
 check broken-compiler env CC=/bin/false CXX=/bin/false
-mkdir -p "$out/bin"
+rm -rf "$out/bin" && mkdir -p "$out/bin"
 IFS=: read -ra folders <<<"$PATH"
 for folder in "${folders[@]}"; do
     find -L "$folder" -maxdepth 1 -type f -executable 2>/dev/null
@@ -50,8 +53,12 @@ done
 chmod -R a+rx "$out/bin"
 check no-compiler env PATH="$out/bin"
 
+finish() { ((${#failed[@]})) && echo "failed: ${failed[*]}" && exit 1 || exit 0; }
+
+asked ordinary-user || finish
 # A clone that its user cannot write to, below a path with spaces, without a home.
 user=${CHECK_USER:-nobody} clone="$out/a path with spaces/ca reg"
+rm -rf "$out/a path with spaces"
 git clone --quiet . "$clone"
 python -m venv --without-pip "$out/a path with spaces/venv"
 python=$out/a\ path\ with\ spaces/venv/bin/python
@@ -69,4 +76,4 @@ else
         env HOME=/nonexistent TMPDIR="$out/temporary"
 fi
 
-if ((${#failed[@]})); then echo "failed: ${failed[*]}" && exit 1; fi
+finish
