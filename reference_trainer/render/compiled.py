@@ -93,7 +93,7 @@ def _cache_of_this_processor() -> AbstractContextManager[None]:
     except ImportError:  # before torch 2.6
         return nullcontext()
     tag = f"{config.cache_key_tag} {torch.backends.cpu.get_cpu_capability()}"
-    patch: AbstractContextManager[None] = config.patch(cache_key_tag=tag)
+    patch: AbstractContextManager[None] = config.patch(cache_key_tag=tag)  # type: ignore[attr-defined]
     return patch
 
 
