@@ -84,7 +84,7 @@ def test_on_a_card_the_order_of_additions_does_not_matter(tiny_scene, busy, chan
 def test_on_a_card_it_matters_without(tiny_scene, busy):
     config = dataclasses.replace(busy, iterations=2)
     one, other = (trained_on_a_card(tiny_scene, config, order, repeatable=False) for order in (0, 1))
-    assert not torch.equal(one["means"], other["means"])
+    assert not all(torch.equal(x, other[name]) for name, x in one.items())  # which ones differ depends on the processor
 
 
 @pytest.mark.gpu
