@@ -1,6 +1,11 @@
 """Fixtures shared by all tests."""
 
 import os
+
+# The tests are many small operations: a second thread only spins, and slows them down when the cores are busy. Torch
+# reads this when it is loaded, and the processes that tests start inherit it.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -8,10 +13,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from devices import DEVICES
 from stand_ins.card import CARD, pretended_card, register_card
-
-# The tests are many small operations: a second thread only spins, and slows them down when the cores are busy.
-torch.set_num_threads(1)
+from tiers import pytest_cmdline_main as pytest_cmdline_main
 
 
 @pytest.fixture(scope="session")
@@ -23,7 +27,7 @@ def data_root() -> Path:
     return root
 
 
-@pytest.fixture(params=["cpu", CARD, pytest.param("cuda", marks=pytest.mark.gpu)])
+@pytest.fixture(params=DEVICES)
 def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
     """Every device that this machine has, and one that it only pretends to have."""
     if request.param == "cuda" and not torch.cuda.is_available():
@@ -43,6 +47,15 @@ def card() -> Iterator[torch.device]:
 def generator() -> torch.Generator:
     """A generator with a fixed seed."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """For what must have the bits of another process, whatever the threads of this one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from waiting import PATIENCE
+
 import ca_reg
 
 WORKER = """
@@ -30,6 +32,6 @@ def on_ranks(path, name, folder, ranks=2):
     for rank in range(ranks):
         command = [sys.executable, "-c", WORKER, str(path), name, str(folder / name), str(rank), str(ranks)]
         processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, cwd=root, env=environment))
-    outputs = [process.communicate(timeout=60)[0] for process in processes]
+    outputs = [process.communicate(timeout=PATIENCE)[0] for process in processes]
     assert all(process.returncode == 0 for process in processes)
     return [json.loads(output.splitlines()[-1]) for output in outputs]

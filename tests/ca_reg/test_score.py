@@ -190,6 +190,7 @@ def test_float32_opacities_get_the_masks_of_float64_ones():
         assert torch.equal(a > 0, b > 0)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_samples():
     size, live = (3, 31, 37), []
 

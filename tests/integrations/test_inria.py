@@ -53,7 +53,7 @@ def test_masking_with_zeroed_radii_is_removing_the_gaussians(form, device):
         keep = dropout.keep.nonzero().squeeze(1)
         subset = render(model.camera, model, PIPE, black, keep=keep)
         expected = torch.autograd.grad(loss_of(subset["render"]), model.parameters())
-        assert torch.equal(package["render"], subset["render"])
+        torch.testing.assert_close(package["render"], subset["render"], rtol=1e-6, atol=1e-6)
         for ours_, theirs in zip(gradients, expected, strict=True):
             torch.testing.assert_close(ours_, theirs, rtol=1e-6, atol=0)
         full_radii = torch.zeros(n, dtype=torch.int32, device=device)
@@ -75,7 +75,7 @@ def test_masking_with_zeroed_radii_is_removing_the_gaussians(form, device):
     assert torch.equal(hooked.radii, removed.radii)
     torch.testing.assert_close(hooked.mean(), removed.mean(), rtol=1e-6, atol=0)
     torch.testing.assert_close(hooked.mean(), ours.mean_gradient, rtol=1e-5, atol=0)
-    threshold = removed.mean().median()
+    threshold = removed.mean().sort().values[n // 2 - 1 : n // 2 + 1].mean()  # between two of them
     assert torch.equal(hooked.mean() >= threshold, removed.mean() >= threshold)
     # Without the zeroed radii the means shrink and fewer Gaussians are densified: the comparison can fail.
     assert (naive.mean() >= threshold).sum() < (hooked.mean() >= threshold).sum()

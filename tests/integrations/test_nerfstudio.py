@@ -131,13 +131,13 @@ def test_other_models_of_the_module_are_left_alone_even_in_other_threads():
 
     def wait(opacity):
         inside.set()
-        assert done.wait(timeout=30)
+        assert done.wait(timeout=180)
         return draw(opacity)
 
     noise.forward = wait
     thread = threading.Thread(target=model.get_outputs, args=(CAMERA,))
     thread.start()
-    assert inside.wait(timeout=30)
+    assert inside.wait(timeout=180)
     rendered = plain.get_outputs(CAMERA)["rgb"]  # while the other thread is in the middle of a training render
     done.set()
     thread.join()
@@ -255,7 +255,7 @@ def test_loading_the_entry_point_never_raises(only_stub, kind):
 def test_a_fresh_process_without_nerfstudio_imports_the_module():
     code = f"import importlib, sys; sys.modules['nerfstudio'] = None; sys.modules['gsplat'] = None\n\
 module, name = '{ENTRY_POINT}'.split(':')\nprint(getattr(importlib.import_module(module), name))"
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("splatfacto-ca (which needs nerfstudio")
 

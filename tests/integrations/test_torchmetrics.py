@@ -2,6 +2,7 @@
 
 import difflib
 import doctest
+import importlib.util
 import math
 import pickle
 
@@ -11,14 +12,10 @@ from ranks import on_ranks
 
 from ca_reg import CAScore
 
-torchmetrics = pytest.importorskip("torchmetrics", reason="needs torchmetrics (the extra torchmetrics)")
-
-from torchmetrics import MetricCollection  # noqa: E402
-from torchmetrics.aggregation import SumMetric  # noqa: E402
-from torchmetrics.image import PeakSignalNoiseRatio  # noqa: E402
-
-from ca_reg.integrations import torchmetrics as adapter  # noqa: E402
-from ca_reg.integrations.torchmetrics import CAScoreMetric  # noqa: E402
+# Torchmetrics takes two seconds to import, so the tests do it, and not the collection of all tests.
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("torchmetrics") is None, reason="needs torchmetrics (the extra torchmetrics)"
+)
 
 OPACITY = torch.linspace(0.1, 0.9, 30)
 COLORS = torch.rand(3, 30, generator=torch.Generator().manual_seed(0))
@@ -44,6 +41,12 @@ ADDED = {
     "PeakSignalNoiseRatio(1.0),\n": '        "ca": CAScoreMetric(render_fn),\n',
     "target=photograph,\n": "            opacity=opacities, view=camera,\n",
 }
+
+
+def CAScoreMetric(score):
+    from ca_reg.integrations.torchmetrics import CAScoreMetric
+
+    return CAScoreMetric(score)
 
 
 def render_fn(opacity, view):
@@ -139,6 +142,8 @@ def test_one_metric_of_a_collection_never_takes_the_state_of_another():
     def faint(opacity, view):
         return render_fn(opacity * 1e-5 * view, 0)
 
+    from torchmetrics import MetricCollection
+
     for first_view in (1.0, 0.0):
         metrics = MetricCollection(
             {"five": CAScoreMetric(faint), "fewer": CAScoreMetric(CAScore(faint, drop_rate=0.2))}
@@ -171,6 +176,9 @@ def test_a_users_evaluation_takes_three_more_lines():
 
 
 def test_collections_copy_and_prefix_it():
+    from torchmetrics import MetricCollection
+    from torchmetrics.image import PeakSignalNoiseRatio
+
     metrics = MetricCollection({"ca": CAScoreMetric(render_fn), "psnr": PeakSignalNoiseRatio(1.0)})
     test = metrics.clone(prefix="test/")
     test.update(opacity=OPACITY, view=0, preds=torch.zeros(3, 4, 4), target=torch.ones(3, 4, 4))
@@ -241,6 +249,8 @@ def test_counts_on_the_device_what_was_rendered_there(device):
 
 
 def test_says_what_it_is():
+    from torchmetrics.aggregation import SumMetric
+
     metric = CAScoreMetric(render_fn)
     assert (metric.higher_is_better, metric.is_differentiable, metric.full_state_update) == (False, False, False)
     composed = 2 * metric + SumMetric()
@@ -261,4 +271,6 @@ def test_plots_one_value_or_many():
 
 
 def test_the_example_runs():
+    from ca_reg.integrations import torchmetrics as adapter
+
     assert doctest.testmod(adapter) == (0, 7)

@@ -164,6 +164,7 @@ def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
     assert (tmp_path / "flight" / "flight.gif").exists()
 
 
+@pytest.mark.slow
 def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path):
     main(["train", "--out", str(tmp_path / "run"), "--noise", "0.8", *SMALL])
     main(["evaluate", str(tmp_path / "run"), "--scale-noise", "--samples", "2"])
@@ -378,6 +379,7 @@ def test_the_real_arguments_are_the_default(monkeypatch, capsys):
     assert "nothing to evaluate" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_seen_enough_is_no_error():
     code = "from reference_trainer.cli import main; main(['study', 'growth', '--help'])"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:

@@ -13,7 +13,10 @@ def scene() -> Scene:
     return synthetic_scene(width=32, height=24, points=150)
 
 
-@pytest.mark.parametrize("name", CASES)
+SLOW = "densify at every step"
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == SLOW)) for name in CASES])
 def test_it_trains_or_stops_with_a_reason_and_a_good_checkpoint(scene, tmp_path, name):
     config = TrainConfig(iterations=24, sh_every=6, densify_from=3, densify_every=4, densify_gradient=1e-4,
                          opacity_reset_from=10, opacity_reset_every=6)  # fmt: skip

@@ -2,7 +2,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import kendalltau, spearmanr
 
 from reference_trainer.evaluation.rank_correlation import kendall, spearman
 
@@ -10,6 +9,8 @@ from reference_trainer.evaluation.rank_correlation import kendall, spearman
 @pytest.mark.parametrize("levels", [2, 4, 1000])  # nearly everything tied, many ties, hardly any
 @pytest.mark.parametrize("n", [2, 3, 7, 40])
 def test_they_are_those_of_scipy(n, levels):
+    from scipy.stats import kendalltau, spearmanr  # a second to import
+
     rng = np.random.default_rng(n * levels)
     compared = 0
     for _ in range(30):

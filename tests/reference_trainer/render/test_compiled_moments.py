@@ -105,6 +105,16 @@ def test_compiled_agrees_with_eager_within_rounding(monkeypatch):
         assert (x - y).norm() < 1e-4 * y.norm()
 
 
+def test_what_was_compiled_for_other_instructions_is_not_taken_from_the_disk(monkeypatch):
+    config = pytest.importorskip("torch.compiler.config", reason="torch has had it since 2.6")
+    before, tags = config.cache_key_tag, []
+    monkeypatch.setattr(compiled, "_compile", lambda function: lambda *arguments: tags.append(config.cache_key_tag))
+    monkeypatch.setattr(compiled, "_known", set())
+    compiled.kernel(print, torch.zeros(1), torch.zeros(2, 1))
+    assert torch.backends.cpu.get_cpu_capability() in tags[0]  # the first call compiles
+    assert config.cache_key_tag == before
+
+
 def test_without_a_compiler_it_says_so_and_stays_eager(monkeypatch):
     def broken(*args, **kwargs):
         raise RuntimeError("no g++ here\n\nand a long story")

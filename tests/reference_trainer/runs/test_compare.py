@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import os
 import statistics
 from pathlib import Path
 
@@ -229,12 +230,14 @@ def files_of(folder: Path) -> dict[Path, int]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["processes", "ray"])
+@pytest.mark.usefixtures("one_thread")
 def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_path, options, monkeypatch):
     """The worker of seed 1 is killed at its first checkpoint; a second call starts no worker and writes no run."""
     if name == "ray":
         pytest.importorskip("ray")
     tests = Path(sweep_tasks.__file__).parent
     monkeypatch.setenv("PYTHONPATH", f"{tests.parent}:{tests}")  # Ray passes it to its workers
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)  # one thread for each of two workers: the bits depend on it
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr("reference_trainer.runs.grid.train_run", sweep_tasks.train_and_be_killed_once)
     config = TrainConfig(iterations=60, dropout=0.2)

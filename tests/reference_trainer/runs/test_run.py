@@ -91,6 +91,7 @@ def test_ctrl_c_saves_where_it_is(finished, options, short, ctrl_c, tmp_path):
     assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
 
 
+@pytest.mark.slow
 def test_sigterm_saves_and_then_ends_the_process_as_its_sender_expects(finished, options, short, monkeypatch, tmp_path):
     original, received = Trainer.train_step, []
 
@@ -114,6 +115,7 @@ def test_sigterm_saves_and_then_ends_the_process_as_its_sender_expects(finished,
     assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_full_disk_keeps_the_last_checkpoint(finished, options, short, monkeypatch, tmp_path, full_disk):
     original = Trainer.save
 
@@ -131,6 +133,7 @@ def test_a_full_disk_keeps_the_last_checkpoint(finished, options, short, monkeyp
     assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
 
 
+@pytest.mark.slow
 def test_leftovers_of_a_killed_run_are_removed(options, short, tmp_path):
     leftover = tmp_path / "views" / "train" / ".train_0.png.1234.part"
     leftover.parent.mkdir(parents=True)
@@ -168,12 +171,12 @@ def test_a_damaged_plan_is_named(options, short, tmp_path):
 @pytest.mark.parametrize(
     ("owner", "name", "call"),
     [
-        (Trainer, "train_step", 1),
+        pytest.param(Trainer, "train_step", 1, marks=pytest.mark.slow),
         (Trainer, "train_step", 6),
-        (Trainer, "train_step", 8),
-        (run_module, "psnr", 2),  # in the middle of a measurement
-        (run_module, "save_ply", 1),
-        (run_module, "evaluate", 1),
+        pytest.param(Trainer, "train_step", 8, marks=pytest.mark.slow),
+        pytest.param(run_module, "psnr", 2, marks=pytest.mark.slow),  # in the middle of a measurement
+        pytest.param(run_module, "save_ply", 1, marks=pytest.mark.slow),
+        pytest.param(run_module, "evaluate", 1, marks=pytest.mark.slow),
     ],
 )
 def test_an_interrupted_run_ends_like_an_uninterrupted_one(finished, interrupted, owner, name, call):
@@ -310,6 +313,7 @@ def test_auto_trains_by_the_plan_and_keeps_it(options, short, tmp_path):
         run_experiment(options, short, tmp_path, **EVERY, auto=True, given=["sh_degree"])
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_continues_with_its_own_plan(options, short, monkeypatch, tmp_path):
     """Even if the rules have changed since."""
     with monkeypatch.context() as patch:
@@ -326,6 +330,7 @@ def test_a_run_that_began_without_a_plan_goes_on_without(finished, options, shor
     assert run_experiment(options, short, out, **EVERY, auto=True) == results
 
 
+@pytest.mark.slow
 def test_what_is_given_is_trained(options, short, tmp_path):
     assert run_experiment(options, short, tmp_path, **EVERY, auto=True, given=["sh_degree"])["config"]["sh_degree"] == 3
 

@@ -104,6 +104,7 @@ def run(tmp_path_factory, options, short):
     return folder
 
 
+@pytest.mark.slow
 def test_runs_and_ply_files_are_sources(run, ball, tmp_path):
     results = study_error_runtime([run, ball], tmp_path / "out", max_samples=16, seeds=1, say=quiet)
     assert list(results) == ["scene/strategy/seed_0", "ball"]

@@ -327,6 +327,7 @@ def run(options, trainer, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_study_measures_plain_dropout_at_the_training_views_of_a_run(trainer, run, tmp_path, monkeypatch):
     monkeypatch.setattr(study_module, "ROUNDS", 1)
     monkeypatch.setattr(study_module, "gradient_noise_figure", lambda results, path: None)

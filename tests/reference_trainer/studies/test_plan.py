@@ -4,13 +4,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import get_args
 
 import pytest
 import sweep_tasks
 from stand_ins.engine import Here
+from waiting import PATIENCE, until
 
 from reference_trainer.cli import studies as commands
 from reference_trainer.runs.engines.engine import Task
@@ -68,6 +68,7 @@ def test_a_shortened_schedule_keeps_its_proportions():
     assert shortened(TrainConfig(iterations=500), 500) == TrainConfig(iterations=500)
 
 
+@pytest.mark.slow
 def test_the_study_trains_what_it_says(studied):
     out, records, said = studied
     assert [(record["variant"], record["config"]["seed"]) for record in records] == [
@@ -81,6 +82,7 @@ def test_the_study_trains_what_it_says(studied):
     assert (out / "plan_study.md").read_text() == said[-1] == plan_table(records)
 
 
+@pytest.mark.slow
 def test_a_second_call_trains_nothing(studied, options, short, monkeypatch):
     out, records, _ = studied
     monkeypatch.setattr(plan_module, "Processes", Here)
@@ -156,15 +158,7 @@ def test_a_training_is_interrupted_however_the_study_ends(tmp_path, number):
     until((tmp_path / "started").exists)
     study.send_signal(number)
     until((tmp_path / "interrupted").exists)
-    study.wait(timeout=30)
-
-
-def until(condition):
-    """Wait for a condition."""
-    end = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
+    study.wait(timeout=PATIENCE)
 
 
 @pytest.mark.slow

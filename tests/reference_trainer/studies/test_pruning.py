@@ -116,6 +116,7 @@ def runs(tmp_path_factory, options, tiny_scene, busy):
     return out, scene
 
 
+@pytest.mark.slow
 def test_a_study_is_resumed(runs, tmp_path, monkeypatch):
     (folder, evaluation), scene = next(iter(runs[0].items())), runs[1]
     score, calls = pruning_module._score, []

@@ -72,6 +72,7 @@ def trained_on_a_card(scene: Scene, config: TrainConfig, order: int, *, repeatab
         return {name: x.detach().cpu() for name, x in trainer.gaussians.named()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{}, {"analytic": True, "iterations": 8}], ids=["sampled", "analytic"])
 def test_on_a_card_the_order_of_additions_does_not_matter(tiny_scene, busy, change):
     """Nor does anything that happens in training lack an algorithm that repeats itself: the card refuses that."""
@@ -83,7 +84,7 @@ def test_on_a_card_the_order_of_additions_does_not_matter(tiny_scene, busy, chan
 def test_on_a_card_it_matters_without(tiny_scene, busy):
     config = dataclasses.replace(busy, iterations=6)
     one, other = (trained_on_a_card(tiny_scene, config, order, repeatable=False) for order in (0, 1))
-    assert not torch.equal(one["means"], other["means"])
+    assert not all(torch.equal(x, other[name]) for name, x in one.items())  # which ones differ depends on the processor
 
 
 @pytest.mark.gpu

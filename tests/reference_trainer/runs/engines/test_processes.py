@@ -5,25 +5,17 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
 import sweep_tasks
+from waiting import PATIENCE, until
 
 from reference_trainer.runs.engines.engine import Failure, Task, Value
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all
 
 TESTS = Path(sweep_tasks.__file__).parent
-
-
-def until(condition, seconds=30):
-    """Wait for a condition."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
 
 
 def gone(pid):
@@ -92,7 +84,7 @@ def test_a_worker_is_interrupted_once_however_its_parent_ends(tmp_path, number):
     else:
         os.kill(sweep.pid, number)
     until((tmp_path / "interrupted").exists)
-    sweep.communicate(timeout=30)
+    sweep.communicate(timeout=PATIENCE)
     until(lambda: gone(worker))
 
 

@@ -4,12 +4,12 @@ import os
 import signal
 import sys
 import threading
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import sweep_tasks
+from waiting import until
 
 from reference_trainer.runs.engines.engine import Failure, Task, Value
 from reference_trainer.runs.engines.ray_cluster import RayCluster
@@ -124,8 +124,7 @@ def test_a_sweep_on_ray_with_a_worker_killed(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(TESTS.parent), str(TESTS)]))  # Ray passes it to its workers
 
     def kill():
-        while not (tmp_path / "pid").exists():
-            time.sleep(0.01)
+        until((tmp_path / "pid").exists)
         os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
 
     killer = threading.Thread(target=kill, daemon=True)

@@ -4,6 +4,7 @@ import json
 import math
 
 import pytest
+from devices import slow_on_card
 
 from reference_trainer.studies.speed import growth as module
 from reference_trainer.studies.speed.growth import extrapolated, study, study_growth
@@ -52,6 +53,7 @@ def canned(monkeypatch, no_process):
     return measured
 
 
+@slow_on_card
 def test_a_tiny_study(device, tmp_path, no_process):
     said = []
     report = study(TINY, tmp_path, repeats=2, device=str(device), say=said.append)

@@ -2,12 +2,14 @@
 
 import pytest
 import torch
+from devices import slow_on_card
 from oracles import brute_force
 
 from reference_trainer.studies.speed.limits import Limits, bounds, covered_pairs, measure_limits
 from reference_trainer.studies.speed.workloads import WorkloadSpec
 
 
+@slow_on_card
 def test_limits_are_rates_in_the_right_units(device):
     limits = measure_limits(device, repeats=1)
     for rate in (limits.exp, limits.exp2, limits.copy):

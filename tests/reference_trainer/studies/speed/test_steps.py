@@ -1,6 +1,7 @@
 """What surrounds a rendering is timed on the right thing."""
 
 import torch
+from devices import slow_on_card
 
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.speed import steps
@@ -9,6 +10,7 @@ from reference_trainer.studies.speed.steps import masked_renders, training_step
 from reference_trainer.studies.speed.workloads import WorkloadSpec
 
 
+@slow_on_card
 def test_a_step_and_its_parts_are_timed_with_all_bands(device, monkeypatch):
     degrees = []
     render = steps.render_gaussians

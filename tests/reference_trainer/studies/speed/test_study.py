@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from devices import slow_on_card
 
 from reference_trainer.evaluation.report import write_json
 from reference_trainer.scenes.options import SceneOptions
@@ -21,6 +22,7 @@ def quiet(text):
     pass
 
 
+@slow_on_card
 def test_a_tiny_study(device, tmp_path, monkeypatch):
     monkeypatch.setattr(measure, "peak_memory", lambda spec, device: None)  # a process of its own: tested elsewhere
     scene = SceneOptions("synthetic", downscale=8)
