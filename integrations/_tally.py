@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 from typing import Any
 
 __all__ = ["Skip", "Tally"]
 
 
-class Skip(str, Enum):
+class Skip(StrEnum):
     """Why a render was left alone."""
 
     FURTHER_VIEW = "further render in the same iteration (scope main)"

@@ -75,7 +75,9 @@ def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:
     check_opacity(opacity)
     check_per_gaussian(noise, opacity, "noise")
     # In the wider dtype of the two, and rounded once: 1 + noise has 8 bits in bfloat16.
-    return (opacity * (1.0 + noise.view_as(opacity))).clamp(0.0, 1.0).to(opacity.dtype)
+    noisy = opacity * (1.0 + noise.view_as(opacity))
+    # Not clamp, whose gradient at the bounds themselves is 1 in torch 2.13 and 0 in torch 2.15.
+    return noisy.masked_fill(noisy < 0.0, 0.0).masked_fill(noisy > 1.0, 1.0).to(opacity.dtype)
 
 
 def opacity_noise(

@@ -136,7 +136,8 @@ def machine() -> dict[str, str | int]:
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
-        **{name: _version(name) for name in ("torch", "kornia", "ca_reg")},
+        "torch": str(torch.__version__),  # with its build, such as +cpu, which an index's metadata may leave out
+        **{name: _version(name) for name in ("kornia", "ca_reg")},
         "cpu": _cpu_name(),
         "cores": os.cpu_count() or 0,
         "threads": torch.get_num_threads(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -56,7 +56,7 @@ def study_stability(out: Path, *, cases: Sequence[Case] | None = None, say: Say 
             say(case.family)
         records.append(verdict_record(judge(case)))
     report = {
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine(),
         "seconds": perf_counter() - start,
         "points": sum(len(record["points"]) for record in records),
