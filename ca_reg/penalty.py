@@ -153,7 +153,9 @@ class CAPenalty(Regularizer):
             if not isinstance(multiplier, Multiplier):
                 raise TypeError(f"the multiplier callable must return a Multiplier, got {type(multiplier).__name__}.")
         moments = read_moments(self.moments_fn(opacity, view, multiplier, background), layout=self.layout)
-        return PenalizedRender(moments.mean, moments.variance, self._rate_to_apply() * moments.variance.mean())
+        # In a graph the weight is a float64 scalar, which another scalar does not outweigh.
+        penalty = (self._rate_to_apply() * moments.variance.mean()).to(moments.variance.dtype)
+        return PenalizedRender(moments.mean, moments.variance, penalty)
 
     def extra_repr(self) -> str:
         """Return the arguments, for ``print``."""

@@ -253,17 +253,18 @@ class CAScore:
                 raise TypeError("a score needs alpha_mean, the expected accumulated alpha, for its visible region.")
             return read, read.alpha_mean
 
+        broken, background = [], None
         if settings.method == "exact_neutral":
             # Over black the mean is sum w c, and the expected alpha sum w: no background has to be taken out again.
             over_black, total = moments(opacity.new_zeros(3))
+            broken.append(_is_broken(over_black.mean, total))
             neutral = over_black.mean / torch.where(total > 0, total, 1.0)
+            neutral = neutral.nan_to_num(0.0, 0.0, 0.0)
             background = neutral if self.layout == "CHW" else neutral.permute(1, 2, 0)
-        else:
-            background = None
         image, alpha = moments(background)
+        broken += [_is_broken(colors, alpha) for colors in (image.mean, image.variance)]
         variance = image.variance.to(torch.float64).mean(0)
         visible = alpha.to(variance.device) > settings.threshold
-        broken = _is_broken(image.mean, alpha) | _is_broken(image.variance, alpha)
         value, reason = _mean(variance, visible, broken)
         std_error = 0.0 if reason is Reason.OK else math.nan
         result = self._result(value, std_error, variance, visible, reason, None)
@@ -275,11 +276,11 @@ class CAScore:
         assert settings.samples is not None
         assert settings.ddof is not None
         groups = [RenderMoments() for _ in range(min(settings.samples, GROUPS))]
-        broken = None
+        broken = []
         for k, masked in enumerate(self._masked(opacity, index, settings.samples)):
             image, alpha = self._render(render_fn, masked, view)
             groups[k % len(groups)].add(image, alpha > settings.threshold)
-            broken = _is_broken(image, alpha) if broken is None else broken | _is_broken(image, alpha)
+            broken.append(_is_broken(image, alpha))
         total = merge(groups)
         divisor = total.count - settings.ddof
         variance = total.scatter / divisor
@@ -300,7 +301,7 @@ class CAScore:
         assert settings.max_samples is not None
         expected, alpha = self._render(render_fn, opacity * (1.0 - settings.drop_rate), view)
         visible = alpha > settings.threshold
-        broken = _is_broken(expected, alpha)
+        broken = [_is_broken(expected, alpha)]
         moments, deviations = RenderMoments(), Deviations(expected, visible)
         del expected, alpha  # they may be a buffer of the renderer, which the next render fills
         result = None
@@ -308,7 +309,7 @@ class CAScore:
             image, alpha = self._render(render_fn, masked, view)
             moments.add(image, visible)
             deviations.add(image)
-            broken |= _is_broken(image, alpha)
+            broken.append(_is_broken(image, alpha))
             if k == settings.max_samples or (k >= LEAST and k % ROUND == 0):
                 variance = moments.scatter / (k - 1)
                 value, reason = _mean(variance, visible, broken)
@@ -385,9 +386,9 @@ def _is_broken(colors: Tensor, alpha: Tensor) -> Tensor:
     return (~covered.isfinite() | (odd & (covered != 0))).any() | odd.all()
 
 
-def _mean(variance: Tensor, visible: Tensor, broken: Tensor | None) -> tuple[float, Reason]:
-    """Average over the visible pixels, or say why not."""
-    if broken is not None and bool(broken):
+def _mean(variance: Tensor, visible: Tensor, broken: list[Tensor]) -> tuple[float, Reason]:
+    """Average over the visible pixels, or say why not; ``broken`` is what was found in each image."""
+    if bool(torch.stack(broken).any()):
         return math.nan, Reason.NOT_FINITE
     if not bool(visible.any()):
         return math.nan, Reason.EMPTY
