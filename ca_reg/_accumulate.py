@@ -73,7 +73,7 @@ class Deviations:
         that estimate is ``Var(mean(e e)) / K + 2 E mean(e e')^2 / (K (K - 1))`` for two independent deviations e and e'
         (Hoeffding 1948, sec. 5). Neighbours in the row of renders stand for the pairs. The second term is all there is
         where half of some Gaussians are dropped that do not overlap: every mask is then equally far from the mean. An
-        image that is not quite the expected one makes both terms larger.
+        image that is not quite the expected one makes the error larger, as a rule.
         """
         count = len(self._squares)
         first = float(torch.stack(self._squares).var()) / count

@@ -17,8 +17,8 @@ ROUND = 8
 """Renders that adaptive sampling adds before it looks at the error again."""
 
 LEAST = 16
-"""Renders after which it looks for the first time. Their error is known to 18 %; with 8 it is 27 %, and stopping where
-an error so uncertain happens to look small leaves 12 % of the scores beyond two of them, not 5 %."""
+"""Renders after which it looks for the first time: the error is then known to 18 %. Stopping where an error happens to
+look small makes the stated errors too small, and the more so the less it is known: with 8 renders to 27 %."""
 
 _APPLIES = {
     "sampling": ("samples", "ddof"),

@@ -23,6 +23,10 @@ class GaussianDropout(Regularizer):
 
     Dropped Gaussians must leave no trace in density control: pass the radii through :meth:`mask_radii`.
 
+    Inside ``torch.compile`` one graph serves all steps, with ``fullgraph=True`` as well: the values of the opacities
+    are then not looked at, and a schedule draws also where its rate is 0. Inside ``torch.utils.checkpoint`` draw
+    without ``generator``, or outside and give ``keep``. :class:`OpacityNoise` does the same.
+
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call checks this.
 
     Args:
