@@ -81,9 +81,9 @@ def built_in_scene(dropout: float) -> Case:
     return Case(model.render, model.moments, trainer.gaussians.opacities.detach(), scene.test[-1], {"p": dropout})
 
 
-def few_gaussians(drop_rate: float) -> Case:
-    """Return 12 large Gaussians: the fewer are dropped, the longer the tails of a single render's share."""
-    scene, renders = random_scene(12, 8, 6, 5, size=0.4), {}
+def gaussians_at_random(drop_rate: float, n: int = 12, size: float = 0.4) -> Case:
+    """Return Gaussians at random places: the fewer they are, the longer the tails of what one render contributes."""
+    scene, renders = random_scene(n, 8, 6, 5, size=size), {}
     background = torch.ones(3, dtype=torch.float64)
 
     def render_fn(opacity: Tensor, view: None) -> tuple[Tensor, Tensor]:
@@ -103,8 +103,8 @@ def few_gaussians(drop_rate: float) -> Case:
 MODELS: dict[str, Callable[[], Case]] = {
     "built-in scene, baseline": lambda: built_in_scene(0.0),
     "built-in scene, dropout 0.2": lambda: built_in_scene(0.2),
-    "12 Gaussians, drop rate 0.5": lambda: few_gaussians(0.5),
-    "12 Gaussians, drop rate 0.3": lambda: few_gaussians(0.3),
+    "12 Gaussians, drop rate 0.5": lambda: gaussians_at_random(0.5),
+    "12 Gaussians, drop rate 0.3": lambda: gaussians_at_random(0.3),
 }
 
 
