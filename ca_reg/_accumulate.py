@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["MeanAlpha", "RenderMoments", "VarianceMap", "jackknife_error", "merge"]
+__all__ = ["Deviations", "RenderMoments", "VarianceMap", "jackknife_error", "merge"]
 
 
 class RenderMoments:
@@ -42,25 +42,43 @@ class RenderMoments:
         self.visible &= visible
 
 
-class MeanAlpha:
-    """Mean of the accumulated alpha over the renders seen so far, in float64."""
+class Deviations:
+    """Deviations of renders from the expected image over a fixed region: the error of their variance, in float64."""
 
-    def __init__(self) -> None:
-        self.count = 0
-        self.total = torch.empty(0)  # (H, W)
+    def __init__(self, expected: Tensor, visible: Tensor) -> None:
+        """Take the expected image (3, H, W) and the visible pixels (H, W); nothing of the former is kept."""
+        self._expected = expected[:, visible].to(torch.float64)
+        self._visible = visible
+        self._last: Tensor | None = None
+        self._squares: list[Tensor] = []
+        self._products: list[Tensor] = []
 
-    def add(self, alpha: Tensor) -> None:
-        """Take in the alpha (H, W) of one render."""
-        if self.count > 0 and alpha.shape != self.total.shape:
+    def add(self, image: Tensor) -> None:
+        """Take in one render (3, H, W)."""
+        if image.shape[1:] != self._visible.shape:
             raise ValueError(
-                f"the renders of one view must have one size, got {tuple(self.total.shape)} and {tuple(alpha.shape)}."
+                f"the renders of one view must have one size, got {tuple(self._visible.shape)} and then "
+                f"{tuple(image.shape[1:])}."
             )
-        self.total = alpha.to(torch.float64) if self.count == 0 else self.total + alpha
-        self.count += 1
+        deviation = image[:, self._visible] - self._expected
+        self._squares.append(deviation.square().mean())
+        if self._last is not None:
+            self._products.append((deviation * self._last).mean())
+        self._last = deviation
 
-    def above(self, threshold: float) -> Tensor:
-        """Return the pixels (H, W) at which the mean exceeds the threshold."""
-        return self.total / self.count > threshold
+    def std_error(self) -> float:
+        """Return the standard error over masks of the unbiased variance, averaged over the visible pixels.
+
+        With e_1 .. e_K the deviations as vectors over pixels and channels, and means taken over these, the variance of
+        that estimate is ``Var(mean(e e)) / K + 2 E mean(e e')^2 / (K (K - 1))`` for two independent deviations e and e'
+        (Hoeffding 1948, sec. 5). Neighbours in the row of renders stand for the pairs. The second term is all there is
+        where half of some Gaussians are dropped that do not overlap: every mask is then equally far from the mean. An
+        image that is not quite the expected one makes the error larger, as a rule.
+        """
+        count = len(self._squares)
+        first = float(torch.stack(self._squares).var()) / count
+        second = 2.0 * float(torch.stack(self._products).square().mean()) / (count * (count - 1))
+        return math.sqrt(first + second)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["check_count", "check_finite", "check_opacity", "check_opacity_range", "check_per_gaussian", "check_rate"]
+__all__ = [
+    "Rate",
+    "check_count",
+    "check_draw",
+    "check_finite",
+    "check_opacity",
+    "check_opacity_range",
+    "check_per_gaussian",
+    "check_rate",
+    "is_zero",
+]
+
+Rate = float | Tensor
+"""A number; inside ``torch.compile`` also a scalar tensor, so that a rate that changes needs no other graph."""
 
 
 def check_opacity(opacity: Any) -> None:
@@ -55,6 +68,8 @@ def check_per_gaussian(x: Any, opacity: Tensor, name: str) -> None:
 
 def check_rate(p: Any, name: str = "p") -> None:
     """Raise unless ``p`` is a real number in [0, 1)."""
+    if _is_in_a_graph(p):
+        return
     check_finite(p, name)
     if not 0.0 <= p < 1.0:
         raise ValueError(f"{name} must be in [0, 1), got {p}; it is the fraction of Gaussians that is dropped.")
@@ -62,6 +77,8 @@ def check_rate(p: Any, name: str = "p") -> None:
 
 def check_finite(x: Any, name: str, *, minimum: float = -math.inf) -> None:
     """Raise unless ``x`` is a finite real number of at least ``minimum``."""
+    if _is_in_a_graph(x):
+        return
     if not isinstance(x, Real):
         raise TypeError(f"{name} must be a real number, got {type(x).__name__}.")
     if not math.isfinite(x) or x < minimum:
@@ -75,3 +92,23 @@ def check_count(x: Any, name: str, *, minimum: int) -> None:
         raise TypeError(f"{name} must be an integer, got {type(x).__name__}.")
     if x < minimum:
         raise ValueError(f"{name} must be at least {minimum}, got {x}.")
+
+
+def check_draw(generator: torch.Generator | None) -> None:
+    """Raise if random numbers are drawn from ``generator`` while gradients are computed: they would be other ones."""
+    if generator is not None and torch._C._current_graph_task_id() != -1:
+        raise RuntimeError(
+            "a draw with generator= was repeated during backward(): torch.utils.checkpoint restores the global random "
+            "state and no other, so the gradient would be that of another draw. Draw outside the checkpointed function "
+            "and give it keep= or noise=, or leave out generator."
+        )
+
+
+def is_zero(rate: Rate) -> bool:
+    """Whether there is nothing to do; never, as far as a graph can know."""
+    return not isinstance(rate, Tensor) and rate == 0
+
+
+def _is_in_a_graph(x: Any) -> bool:
+    """Whether ``x`` is a scalar of a graph, whose value was checked where the step was set."""
+    return isinstance(x, Tensor) and torch.compiler.is_compiling()

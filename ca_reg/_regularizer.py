@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from ca_reg._check import check_count, check_opacity, check_opacity_range
 from ca_reg.schedules import Constant, Schedule
@@ -14,31 +15,68 @@ __all__ = ["Regularizer"]
 
 
 class Regularizer(nn.Module):
-    """A module without parameters whose rate may depend on the step, and that looks at the first opacities."""
+    """A module without parameters whose rate may depend on the step, and that looks at the first opacities.
+
+    ``state_dict`` holds nothing if the rate is constant, and ``step``, a float64 scalar that may be averaged like a
+    parameter, if it follows a schedule. A checkpoint without it leaves the step as it is, also with ``strict``.
+    """
 
     def __init__(self, schedule: Schedule) -> None:
         super().__init__()
         self._schedule = schedule
         self._opacity_seen = False
+        self._rate: Tensor | None = None
         self.step = 0
 
     def set_step(self, step: int) -> None:
-        """Tell the module the training step, at least 0. Only schedules need it."""
+        """Tell the module the training step, at least 0. Only schedules need it.
+
+        With ``torch.compile`` call this outside the compiled function: a graph then serves all steps.
+
+        Raises:
+            TypeError: if ``step`` is not an integer.
+            ValueError: if it is negative, or the schedule leaves its range there.
+        """
         check_count(step, "step", minimum=0)
         self.step = int(step)
+        if not isinstance(self._schedule, Constant):
+            # A graph reads the rate from a tensor; a number would be a constant of the graph, compiled anew at each
+            # step. A new tensor, because one that was made in inference mode cannot be overwritten outside.
+            self._rate = torch.tensor(self._present_rate(), dtype=torch.float64, device="cpu")
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return what ``state_dict`` saves: the step."""
-        return {"step": self.step}
+    def _present_rate(self) -> float:
+        """Return the rate at the present step, checked."""
+        raise NotImplementedError
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take the step from a ``state_dict``."""
-        self.set_step(state["step"])
+    def _rate_to_apply(self) -> float | Tensor:
+        """Return the rate at the present step: a number, or inside ``torch.compile`` a scalar tensor if it changes."""
+        if isinstance(self._schedule, Constant):
+            return self._schedule.value  # checked at construction; a graph that read the step would not outlive it
+        if self._rate is not None and torch.compiler.is_compiling():
+            return self._rate
+        return self._present_rate()
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if not isinstance(self._schedule, Constant):
+            destination[prefix + "step"] = torch.tensor(float(self.step), dtype=torch.float64)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        step = state_dict.pop(prefix + "step", None)
+        former = state_dict.pop(prefix + "_extra_state", None)  # of versions up to 0.1.0
+        if former is not None:
+            step = former["step"]
+        if step is not None:
+            self.set_step(round(float(step)))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _check(self, opacity: Any) -> None:
-        """Check shape and type always, and once that the values are opacities: on a GPU that look costs a wait."""
+        """Check shape and type always, and once that the values are opacities: on a GPU that look costs a wait.
+
+        A compiled graph does not look: what it does cannot depend on values.
+        """
         check_opacity(opacity)
-        if not self._opacity_seen:
+        if not torch.compiler.is_compiling() and not self._opacity_seen:
             # Compensated dropout may come before this module: it makes opacities above 1.
             check_opacity_range(opacity, upper=math.inf)
             self._opacity_seen = True

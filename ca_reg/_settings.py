@@ -7,11 +7,18 @@ from dataclasses import replace
 from ca_reg._check import check_count, check_finite, check_rate
 from ca_reg.result import CASettings, Method
 
-__all__ = ["GROUPS", "make_settings"]
+__all__ = ["GROUPS", "LEAST", "ROUND", "make_settings"]
 
 GROUPS = 8
 """Renders are pooled in at most this many groups, which bounds the memory; with fewer groups the standard error would
 be known less well (relative error about 1/sqrt(2 (groups - 1)), here 27 %)."""
+
+ROUND = 8
+"""Renders that adaptive sampling adds before it looks at the error again."""
+
+LEAST = 16
+"""Renders after which it looks for the first time: the error is then known to 18 %. Stopping where an error happens to
+look small makes the stated errors too small, and the more so the less it is known: with 8 renders to 27 %."""
 
 _APPLIES = {
     "sampling": ("samples", "ddof"),
@@ -51,8 +58,8 @@ def make_settings(
     settings = CASettings(
         method=method,
         samples=None,
-        drop_rate=drop_rate,
-        threshold=threshold,
+        drop_rate=float(drop_rate),
+        threshold=float(threshold),
         ddof=None,
         seed=None,
         relative_error=None,
@@ -70,7 +77,7 @@ def make_settings(
         check_finite(relative_error, "relative_error")
         if relative_error <= 0:
             raise ValueError(f"relative_error must be above 0, got {relative_error}; for an exact score, give exact.")
-        check_count(max_samples, "max_samples", minimum=GROUPS)
+        check_count(max_samples, "max_samples", minimum=LEAST)
         return replace(
             settings, ddof=1, seed=int(seed), relative_error=float(relative_error), max_samples=int(max_samples)
         )

@@ -114,7 +114,7 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor, view: Any) -
         return CAAttribution(_nothing(opacity), result)
     weights = result.visible.to(torch.float64) / result.visible.sum()
     with torch.no_grad():
-        shares = shares_fn(opacity.detach(), view, multiplier, background, weights)
+        shares = shares_fn(opacity.detach().clone(), view, multiplier, background, weights)
     if shares.shape != opacity.shape[:1]:
         raise ValueError(
             f"shares_fn must return one share per Gaussian, shape ({opacity.shape[0]},), got {tuple(shares.shape)}; "
@@ -155,7 +155,7 @@ def total_effects(score: CAScore, opacity: Tensor, view: Any) -> CATotalEffects:
     if result.reason is not Reason.OK:
         return CATotalEffects(_nothing(opacity), result)
     assert score.exact is not None
-    opacity = opacity.detach()
+    opacity = opacity.detach().clone()
     spread = opacity.new_full(opacity.shape[:1], float(multiplier.variance)).requires_grad_()
     gradient = None
     with torch.enable_grad():

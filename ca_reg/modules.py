@@ -25,6 +25,10 @@ class GaussianDropout(Regularizer):
 
     Dropped Gaussians must leave no trace in density control: pass the radii through :meth:`mask_radii`.
 
+    Inside ``torch.compile`` one graph serves all steps, with ``fullgraph=True`` as well: the values of the opacities
+    are then not looked at, and a schedule draws also where its rate is 0. Inside ``torch.utils.checkpoint`` draw
+    without ``generator``, or outside and give ``keep``. :class:`OpacityNoise` does the same.
+
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call checks this.
 
     Args:
@@ -34,7 +38,7 @@ class GaussianDropout(Regularizer):
     Attributes:
         keep: the last mask, True where the Gaussian stayed, (N,) bool; None if nothing was dropped.
         p: the rate at the present step.
-        step: the training step, set with :meth:`set_step` and saved in ``state_dict``.
+        step: the training step, set with :meth:`set_step`; a module with a schedule saves it in ``state_dict``.
 
     Raises:
         TypeError: if ``p`` is neither a number nor callable.
@@ -64,6 +68,9 @@ class GaussianDropout(Regularizer):
     @property
     def p(self) -> float:
         """The drop rate at the present step."""
+        return self._present_rate()
+
+    def _present_rate(self) -> float:
         rate = self._schedule(self.step)
         check_rate(rate, f"p at step {self.step}")
         return rate
@@ -86,7 +93,7 @@ class GaussianDropout(Regularizer):
             ValueError: if a shape is wrong, ``opacity`` looks like logits, or ``keep`` is given in evaluation.
         """
         self._check(opacity)
-        p = self.p
+        p = self._rate_to_apply()
         if not self.training:
             if keep is not None:
                 raise ValueError("keep was given in eval(), where nothing is dropped; call train() or leave it out.")
@@ -154,12 +161,13 @@ class OpacityNoise(Regularizer):
     Args:
         sigma: standard deviation of the relative noise, at least 0, or a schedule of it.
         clip: clip the noise to [-sigma, sigma], as the authors' released code does.
-        scale: return the mean opacities in evaluation.
+        scale: return the mean opacities in evaluation. That looks at their values, which ends a graph of
+            ``torch.compile``.
 
     Attributes:
         noise: the last draw, (N,) float32; None if there was none.
         sigma: the standard deviation at the present step.
-        step: the training step, set with :meth:`set_step` and saved in ``state_dict``.
+        step: the training step, set with :meth:`set_step`; a module with a schedule saves it in ``state_dict``.
 
     Raises:
         TypeError: if ``sigma`` is neither a number nor callable.
@@ -190,6 +198,9 @@ class OpacityNoise(Regularizer):
     @property
     def sigma(self) -> float:
         """The standard deviation at the present step."""
+        return self._present_rate()
+
+    def _present_rate(self) -> float:
         sigma = self._schedule(self.step)
         check_finite(sigma, f"sigma at step {self.step}", minimum=0.0)
         return sigma
@@ -222,7 +233,9 @@ class OpacityNoise(Regularizer):
             opacity = functional.apply_opacity_noise(opacity, noise)
             self.noise = noise
             return opacity
-        opacity, self.noise = functional.opacity_noise(opacity, self.sigma, clip=self.clip, generator=generator)
+        opacity, self.noise = functional.opacity_noise(
+            opacity, self._rate_to_apply(), clip=self.clip, generator=generator
+        )
         return opacity
 
     def extra_repr(self) -> str:

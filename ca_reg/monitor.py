@@ -168,7 +168,7 @@ class CAMonitor:
     def _mean_psnr(self, psnr: Callable[[Tensor, Any], float], opacity: Tensor, group: list[Any]) -> float | None:
         """Average PSNR over views, each with the opacities of the test; None if it is not finite."""
         scaled = scale_opacity(opacity, self.score.p)
-        mean = sum(float(psnr(scaled, view)) for view in group) / len(group)
+        mean = sum(float(psnr(scaled.clone(), view)) for view in group) / len(group)  # it may edit its opacities
         return mean if math.isfinite(mean) else None
 
     def _write(self, record: dict[str, float | int | str | None]) -> None:

@@ -74,7 +74,7 @@ class CAPenalty(Regularizer):
 
     Attributes:
         weight: the factor at the present step.
-        step: the training step, set with :meth:`set_step` and saved in ``state_dict``.
+        step: the training step, set with :meth:`set_step`; a penalty with a schedule saves it in ``state_dict``.
 
     Raises:
         TypeError: if an argument is of the wrong type.
@@ -126,6 +126,9 @@ class CAPenalty(Regularizer):
     @property
     def weight(self) -> float:
         """The factor of the penalty at the present step."""
+        return self._present_rate()
+
+    def _present_rate(self) -> float:
         weight = self._schedule(self.step)
         check_finite(weight, f"weight at step {self.step}", minimum=0.0)
         return weight
@@ -152,7 +155,9 @@ class CAPenalty(Regularizer):
             if not isinstance(multiplier, Multiplier):
                 raise TypeError(f"the multiplier callable must return a Multiplier, got {type(multiplier).__name__}.")
         moments = read_moments(self.moments_fn(opacity, view, multiplier, background), layout=self.layout)
-        return PenalizedRender(moments.mean, moments.variance, self.weight * moments.variance.mean())
+        # In a graph the weight is a float64 scalar, which another scalar does not outweigh.
+        penalty = (self._rate_to_apply() * moments.variance.mean()).to(moments.variance.dtype)
+        return PenalizedRender(moments.mean, moments.variance, penalty)
 
     def extra_repr(self) -> str:
         """Return the arguments, for ``print``."""

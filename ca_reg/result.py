@@ -36,8 +36,9 @@ class CASettings:
             ``"exact_neutral"``, the same over the expected colour of each pixel instead of the background.
         samples: number of renders K; None for adaptive scores too, where it is decided at each view.
         drop_rate: fraction of the Gaussians that is dropped in each.
-        threshold: a pixel is visible where the accumulated alpha exceeds this: in all K renders with ``"sampling"``, on
-            average over the renders with ``"adaptive"``, in expectation with the exact methods.
+        threshold: a pixel is visible where the accumulated alpha exceeds this: in all K renders with ``"sampling"``, in
+            the render with all opacities times ``1 - drop_rate`` with ``"adaptive"``, in expectation with the exact
+            methods.
         ddof: the variance divides by ``samples - ddof``. With 0 its expectation is (K - 1)/K of the true variance.
         seed: where the masks come from.
         relative_error: standard error, as a fraction of the score, at which adaptive sampling stops.
@@ -116,10 +117,8 @@ class _Score(CASettings):
             x = getattr(self, field.name)
             if isinstance(x, Reason):
                 out[field.name] = x.name
-            elif x is None or isinstance(x, str):
-                out[field.name] = x
-            elif isinstance(x, int | float):
-                out[field.name] = None if math.isnan(x) else x
+            elif not isinstance(x, Tensor):
+                out[field.name] = None if isinstance(x, float) and math.isnan(x) else x
         return out
 
 
@@ -130,8 +129,8 @@ class CAResult(_Score):
     Args:
         value: the score: variance of the renders, mean over RGB and over the visible pixels; nan unless ``reason`` is
             ``Reason.OK``.
-        std_error: standard error of ``value`` over the choice of masks; 0 if it is exact; nan below three samples or
-            without a value.
+        std_error: standard error of ``value`` over the choice of masks; 0 if it is exact; nan below three samples,
+            without a value, and for an adaptive score none of whose renders differed.
         variance: variance of every pixel, mean over RGB, shape (H, W), float64, visible or not.
         visible: pixels that count, shape (H, W), bool.
         reason: why the value is what it is.

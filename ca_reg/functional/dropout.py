@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ca_reg._check import check_count, check_opacity, check_per_gaussian, check_rate
+from ca_reg._check import Rate, check_count, check_draw, check_opacity, check_per_gaussian, check_rate, is_zero
 
 __all__ = ["apply_dropout", "draw_keep_mask", "gaussian_dropout"]
 
 
 def draw_keep_mask(
-    n: int, p: float, *, generator: torch.Generator | None = None, device: torch.device | str | None = None
+    n: int, p: Rate, *, generator: torch.Generator | None = None, device: torch.device | str | None = None
 ) -> Tensor:
     """Draw which Gaussians stay: each one independently with probability ``1 - p``.
 
@@ -22,7 +22,8 @@ def draw_keep_mask(
         n: number of Gaussians.
         p: drop rate in [0, 1).
         generator: source of the draw; the global state of the random numbers is then untouched. It decides where the
-            numbers are drawn, so one CPU generator gives the same mask for every device.
+            numbers are drawn, so one CPU generator gives the same mask for every device. Not inside a function that
+            ``torch.utils.checkpoint`` recomputes: draw outside it.
         device: where the mask is returned; by default where it was drawn.
 
     Returns:
@@ -31,6 +32,7 @@ def draw_keep_mask(
     Raises:
         TypeError: if ``n`` is not an integer or ``p`` not a number.
         ValueError: if ``n`` is negative or ``p`` outside [0, 1).
+        RuntimeError: if the draw with a generator is repeated during ``backward()``.
 
     Example:
         >>> keep = draw_keep_mask(1000, 0.2, generator=torch.Generator().manual_seed(0))
@@ -39,12 +41,13 @@ def draw_keep_mask(
     """
     check_count(n, "n", minimum=0)
     check_rate(p)
+    check_draw(generator)
     source = device if generator is None else generator.device
     keep = torch.rand(n, generator=generator, dtype=torch.float32, device=source) >= p
     return keep if device is None else keep.to(device)
 
 
-def apply_dropout(opacity: Tensor, keep: Tensor, *, p: float = 0.0, compensate: bool = False) -> Tensor:
+def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: bool = False) -> Tensor:
     """Set the opacities of dropped Gaussians to zero (paper, Eq. dropout_train).
 
     A dropped Gaussian gets an opacity and a gradient of exactly zero. The rasterizer may still report a radius for it:
@@ -85,7 +88,7 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: float = 0.0, compensate: 
 
 
 def gaussian_dropout(
-    opacity: Tensor, p: float, *, compensate: bool = False, generator: torch.Generator | None = None
+    opacity: Tensor, p: Rate, *, compensate: bool = False, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor | None]:
     """Draw a mask and apply it: :func:`draw_keep_mask`, then :func:`apply_dropout`.
 
@@ -110,7 +113,7 @@ def gaussian_dropout(
     """
     check_opacity(opacity)
     check_rate(p)
-    if p == 0:
+    if is_zero(p):
         return opacity, None
     keep = draw_keep_mask(opacity.shape[0], p, generator=generator, device=opacity.device)
     return apply_dropout(opacity, keep, p=p, compensate=compensate), keep

@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ca_reg._check import check_count, check_finite, check_opacity, check_per_gaussian
+from ca_reg._check import Rate, check_count, check_draw, check_finite, check_opacity, check_per_gaussian, is_zero
 
 __all__ = ["apply_opacity_noise", "draw_opacity_noise", "opacity_noise"]
 
 
 def draw_opacity_noise(
     n: int,
-    sigma: float,
+    sigma: Rate,
     *,
     clip: bool = False,
     generator: torch.Generator | None = None,
@@ -26,7 +26,8 @@ def draw_opacity_noise(
         clip: clip the draw to [-sigma, sigma], as the authors' released code does and the paper does not say. The
             variance is then 0.516 sigma^2.
         generator: source of the draw; the global state of the random numbers is then untouched. It decides where the
-            numbers are drawn, so one CPU generator gives the same noise for every device.
+            numbers are drawn, so one CPU generator gives the same noise for every device. Not inside a function that
+            ``torch.utils.checkpoint`` recomputes: draw outside it.
         device: where the noise is returned; by default where it was drawn.
 
     Returns:
@@ -35,6 +36,7 @@ def draw_opacity_noise(
     Raises:
         TypeError: if ``n`` is not an integer or ``sigma`` not a number.
         ValueError: if ``n`` or ``sigma`` is negative, or ``sigma`` not finite.
+        RuntimeError: if the draw with a generator is repeated during ``backward()``.
 
     Example:
         >>> noise = draw_opacity_noise(1000, 0.8, clip=True)
@@ -43,6 +45,7 @@ def draw_opacity_noise(
     """
     check_count(n, "n", minimum=0)
     check_finite(sigma, "sigma", minimum=0.0)
+    check_draw(generator)
     source = device if generator is None else generator.device
     noise = torch.randn(n, generator=generator, dtype=torch.float32, device=source)
     if clip:
@@ -81,7 +84,7 @@ def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:
 
 
 def opacity_noise(
-    opacity: Tensor, sigma: float, *, clip: bool = False, generator: torch.Generator | None = None
+    opacity: Tensor, sigma: Rate, *, clip: bool = False, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor | None]:
     """Draw noise and apply it: :func:`draw_opacity_noise`, then :func:`apply_opacity_noise`.
 
@@ -106,7 +109,7 @@ def opacity_noise(
     """
     check_opacity(opacity)
     check_finite(sigma, "sigma", minimum=0.0)
-    if sigma == 0:
+    if is_zero(sigma):
         return opacity, None
     noise = draw_opacity_noise(opacity.shape[0], sigma, clip=clip, generator=generator, device=opacity.device)
     return apply_opacity_noise(opacity, noise), noise

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ca_reg._check import check_finite, check_opacity, check_rate
+from ca_reg._check import Rate, check_finite, check_opacity, check_rate, is_zero
 from ca_reg.functional.multipliers import Multiplier
 
 __all__ = ["expected_opacity", "scale_opacity"]
 
 
-def scale_opacity(opacity: Tensor, p: float) -> Tensor:
+def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
     """Scale opacities by ``1 - p``, the mean of dropout at rate ``p`` (paper, strategy C).
 
     A pixel is linear in the factor of each of its splats, so the image of the scaled opacities *is* the mean image over
@@ -35,7 +35,7 @@ def scale_opacity(opacity: Tensor, p: float) -> Tensor:
     """
     check_opacity(opacity)
     check_rate(p)
-    return opacity if p == 0 else opacity * (1.0 - p)
+    return opacity if is_zero(p) else opacity * (1.0 - p)
 
 
 def expected_opacity(opacity: Tensor, sigma: float, *, clip: bool = False) -> Tensor:

@@ -1,12 +1,13 @@
 """Streaming moments and the jackknife, against numpy on all the renders at once in float64."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from ca_reg._accumulate import RenderMoments, jackknife_error, merge
+from ca_reg._accumulate import Deviations, RenderMoments, jackknife_error, merge
 
 
 def pooled(renders, visible, groups):
@@ -57,6 +58,24 @@ def test_jackknife_agrees_with_leaving_the_renders_out(count, groups):
     center = (pseudo / ratios).sum()
     expected = math.sqrt(np.mean((pseudo - center) ** 2 / (ratios - 1)))
     assert jackknife_error(moments, total) == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize(("n", "count"), [(3, 3), (2, 4), (1, 5)])
+def test_the_squared_error_of_an_adaptive_score_is_its_variance_on_average(n, count):
+    """Over all tuples of masks at rate 1/2, exactly. With one Gaussian every mask is equally far from the mean."""
+    generator = torch.Generator().manual_seed(n)
+    parts = torch.rand(n, 3, 4, 5, generator=generator, dtype=torch.float64)
+    renders = torch.stack([torch.einsum("n,nchw->chw", torch.tensor(mask).double(), parts)
+                           for mask in itertools.product([0.0, 1.0], repeat=n)])  # fmt: skip
+    visible = torch.rand(4, 5, generator=generator) > 0.4
+    values, squares = [], []
+    for which in itertools.product(range(2**n), repeat=count):
+        deviations = Deviations(renders.mean(0), visible)
+        for k in which:
+            deviations.add(renders[k])
+        values.append(renders[list(which)].var(dim=0, unbiased=True).mean(0)[visible].mean().item())
+        squares.append(deviations.std_error() ** 2)
+    assert np.mean(squares) == pytest.approx(np.var(values), rel=1e-10)
 
 
 def test_two_renders_have_no_error_estimate():

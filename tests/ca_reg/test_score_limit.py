@@ -221,7 +221,7 @@ def test_methods_are_not_averaged_with_one_another():
 
 
 def test_adaptive_views_are_averaged_though_they_took_different_numbers_of_renders():
-    score = CAScore(MANY.render, relative_error=0.15, threshold=THRESHOLD)
+    score = CAScore(MANY.render, relative_error=0.08, threshold=THRESHOLD)
     results = [score.update(MANY.opacity, None) for _ in range(6)]
     assert len({result.samples for result in results}) > 1
     assert summarize(results) == score.compute()
@@ -258,36 +258,47 @@ def test_more_renders_continue_the_masks_of_fewer():
     runs = [Recorder(MANY) for _ in range(3)]
     CAScore(runs[0])(MANY.opacity, None, index=4)
     CAScore(runs[1], samples=40)(MANY.opacity, None, index=4)
-    CAScore(runs[2], relative_error=1e-9, max_samples=40)(MANY.opacity, None, index=4)
+    CAScore(runs[2], relative_error=1e-9, max_samples=40, threshold=THRESHOLD)(MANY.opacity, None, index=4)
     masks = [torch.stack(run.opacities) for run in runs]
-    assert torch.equal(masks[0], masks[2][:5])
-    assert torch.equal(masks[1], masks[2])
+    assert torch.equal(masks[0], masks[2][1:6])
+    assert torch.equal(masks[2][0], 0.5 * MANY.opacity)  # the expected render comes first
+    assert torch.equal(masks[1], masks[2][1:])
 
 
-@pytest.mark.parametrize("target", [0.3, 0.15, 0.08])
+@pytest.mark.parametrize("target", [0.3, 0.08, 0.05])
 def test_adaptive_stops_at_the_first_round_with_the_error_asked_for(target):
     recorder = Recorder(MANY)
     result = CAScore(recorder, relative_error=target, threshold=THRESHOLD)(MANY.opacity, None)
-    assert result.samples == len(recorder.images)
+    assert result.samples == len(recorder.images) - 1  # the first is the expected render
     assert result.samples % 8 == 0
+    assert (result.samples == 16) == (target == 0.3)
     assert result.std_error <= target * result.value
-    for fewer in range(8, result.samples, 8):
+    for fewer in range(16, result.samples, 8):
         before = CAScore(MANY.render, relative_error=1e-9, max_samples=fewer, threshold=THRESHOLD)
         earlier = before(MANY.opacity, None)
         assert earlier.samples == fewer
         assert earlier.std_error > target * earlier.value
 
 
-def test_adaptive_value_in_plain_numpy():
+def test_adaptive_value_and_error_in_plain_numpy():
     recorder = Recorder(MANY)
     result = CAScore(recorder, relative_error=0.2, threshold=THRESHOLD)(MANY.opacity, None)
-    region = np.stack(recorder.alphas).mean(axis=0) > THRESHOLD
-    variance = np.stack(recorder.images).var(axis=0, ddof=1).mean(axis=0)
+    torch.testing.assert_close(recorder.opacities[0], 0.5 * MANY.opacity)
+    region = recorder.alphas[0] > THRESHOLD  # of the expected render: no draw decides which pixels count
+    images = np.stack(recorder.images[1:])
+    variance = images.var(axis=0, ddof=1).mean(axis=0)
     assert 0 < region.sum() < region.size
     np.testing.assert_array_equal(result.visible.numpy(), region)
     np.testing.assert_allclose(result.variance.numpy(), variance, rtol=1e-10)
     assert result.value == pytest.approx(variance[region].mean(), rel=1e-12)
     assert result.expected_fraction == 1.0
+
+    count = len(images)
+    deviations = (images - recorder.images[0])[:, :, region].reshape(count, -1)
+    squares = (deviations**2).mean(1)
+    pairs = (deviations[1:] * deviations[:-1]).mean(1)
+    expected = math.sqrt(squares.var(ddof=1) / count + 2 * (pairs**2).mean() / (count * (count - 1)))
+    assert result.std_error == pytest.approx(expected, rel=1e-10)
 
 
 def test_adaptive_gives_up_at_the_largest_number_and_says_how_far_it_came():
@@ -299,9 +310,9 @@ def test_adaptive_gives_up_at_the_largest_number_and_says_how_far_it_came():
 
 def test_adaptive_stops_at_once_where_there_is_nothing_to_refine():
     empty = CAScore(MANY.render, relative_error=0.1, threshold=1.0)(MANY.opacity, None)
-    assert (empty.samples, empty.reason) == (8, Reason.EMPTY)
+    assert (empty.samples, empty.reason) == (16, Reason.EMPTY)
     still = CAScore(MANY.render, relative_error=0.1, threshold=THRESHOLD, drop_rate=0.0)(MANY.opacity, None)
-    assert (still.samples, still.value) == (8, 0.0)
+    assert (still.samples, still.value, still.std_error) == (16, 0.0, 0.0)
 
 
 def test_adaptive_approaches_the_exact_score_which_the_fixed_region_does_not():
@@ -372,7 +383,7 @@ def test_the_paper_s_protocol_finds_four_fifths():
         ({"render_fn": MANY.render, "relative_error": 0.1, "samples": 9}, ValueError, "samples does not apply"),
         ({"render_fn": MANY.render, "relative_error": 0.1, "ddof": 0}, ValueError, "ddof does not apply.* ddof is 1"),
         ({"render_fn": MANY.render, "relative_error": 0.0}, ValueError, "relative_error must be above 0"),
-        ({"render_fn": MANY.render, "relative_error": 0.1, "max_samples": 7}, ValueError, "must be at least 8"),
+        ({"render_fn": MANY.render, "relative_error": 0.1, "max_samples": 15}, ValueError, "must be at least 16"),
         ({"render_fn": MANY.render, "max_samples": 70}, ValueError, "give relative_error as well"),
     ],
 )  # fmt: skip

@@ -1,0 +1,183 @@
+"""The modules inside what other people do with modules: state dicts, averages, torch.compile, recomputation."""
+
+import copy
+import io
+
+import pytest
+import torch
+from torch import nn
+from torch.utils.checkpoint import checkpoint
+
+from ca_reg import CAPenalty, GaussianDropout, LinearRamp, OpacityNoise
+from ca_reg.functional import Multiplier
+
+OPACITY = torch.linspace(0.05, 0.95, 40)
+RAMP = LinearRamp(0.0, 0.5, 0, 100)
+
+
+def penalty(weight):
+    def moments(opacity, view, multiplier, background):
+        both = {"mean": multiplier.mean * opacity[0], "variance": multiplier.variance * opacity[0] ** 2}  # of one splat
+        return {name: x.expand(3, 4, 5) for name, x in both.items()}
+
+    return CAPenalty(moments, Multiplier.dropout(0.3), weight=weight)
+
+
+KINDS = {"dropout": GaussianDropout, "noise": OpacityNoise, "penalty": penalty}
+each_kind = pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
+
+
+def model(*regularizers):
+    return nn.Sequential(nn.Linear(3, 2), *regularizers)
+
+
+# --- state dicts ---
+
+
+@each_kind
+@pytest.mark.parametrize("rate", [0.2, RAMP], ids=["constant", "schedule"])
+def test_a_strict_checkpoint_from_before_the_module_was_added_loads(make, rate):
+    former, present = model(), model(make(rate))
+    present[1].set_step(30)
+    present.load_state_dict(former.state_dict(), strict=True)
+    assert torch.equal(present[0].weight, former[0].weight)
+    assert present[1].step == 30
+
+
+@each_kind
+def test_a_constant_rate_leaves_no_trace_in_the_state(make):
+    assert make(0.2).state_dict() == {}
+
+
+@each_kind
+def test_the_step_of_a_schedule_survives_a_checkpoint_on_disk(make):
+    saved, loaded = make(RAMP), make(RAMP)
+    saved.set_step(70)
+    file = io.BytesIO()
+    torch.save(saved.state_dict(), file)
+    file.seek(0)
+    loaded.load_state_dict(torch.load(file, weights_only=True), strict=True)
+    assert loaded.step == 70
+    assert repr(loaded) == repr(saved)
+
+
+@each_kind
+@pytest.mark.parametrize("rate", [0.2, RAMP], ids=["constant", "schedule"])
+def test_checkpoints_of_version_0_1_0_load(make, rate):
+    """They held the step of every module as extra state."""
+    module = nn.ModuleDict({"inner": make(rate)})
+    module.load_state_dict({"inner._extra_state": {"step": 70}}, strict=True)
+    assert module["inner"].step == 70
+
+
+@each_kind
+@pytest.mark.parametrize("rate", [0.2, RAMP], ids=["constant", "schedule"])
+def test_a_moving_average_over_the_values_of_a_state(make, rate):
+    present = model(make(rate))
+    average = copy.deepcopy(present)
+    state = average.state_dict()
+    for step in (10, 20):
+        present[1].set_step(step)
+        for name, value in present.state_dict().items():
+            state[name].mul_(0.5).add_(value, alpha=0.5)
+    average.load_state_dict(state, strict=True)
+    assert average[1].step == (0 if rate == 0.2 else 12)  # (0 / 2 + 10 / 2) / 2 + 20 / 2, to the nearest even
+
+
+def test_an_unknown_entry_is_still_refused():
+    with pytest.raises(RuntimeError, match="Unexpected key"):
+        GaussianDropout(RAMP).load_state_dict({"rate": torch.tensor(0.1)})
+
+
+# --- torch.compile; the graphs are traced and run as they are, which takes no compiler ---
+
+
+class Counting:
+    """A backend that counts the graphs."""
+
+    def __init__(self):
+        self.graphs = 0
+
+    def __call__(self, graph, inputs):
+        self.graphs += 1
+        return graph.forward
+
+
+CALLS = {
+    "dropout": (GaussianDropout, {}, True),
+    "compensated dropout": (GaussianDropout, {"compensate": True}, True),
+    "noise": (OpacityNoise, {"clip": True}, True),
+    "dropout in evaluation": (GaussianDropout, {}, False),
+    "noise in evaluation": (OpacityNoise, {}, False),
+}
+
+
+@pytest.mark.slow  # loads torch's tracer
+@pytest.mark.parametrize("rate", [0.2, RAMP], ids=["constant", "schedule"])
+@pytest.mark.parametrize(("make", "arguments", "training"), CALLS.values(), ids=CALLS)
+def test_one_graph_serves_all_steps_and_does_what_the_module_does(make, arguments, training, rate):
+    torch._dynamo.reset()
+    module, backend = make(rate, **arguments).train(training), Counting()
+    module.set_step(0)
+    compiled = torch.compile(module, backend=backend, fullgraph=True)
+    for step in range(1, 21):
+        module.set_step(step)
+        torch.manual_seed(step)
+        found = compiled(OPACITY)
+        torch.manual_seed(step)
+        torch.testing.assert_close(found, module(OPACITY), rtol=1e-6, atol=0.0)
+    assert backend.graphs <= 1  # none, where there is nothing to do
+
+
+@pytest.mark.slow  # loads torch's tracer
+def test_one_graph_serves_all_weights_of_a_penalty():
+    torch._dynamo.reset()
+    module, backend = penalty(RAMP), Counting()
+    module.set_step(0)
+    compiled = torch.compile(module, backend=backend, fullgraph=True)
+    for step in range(1, 21):
+        module.set_step(step)
+        torch.testing.assert_close(compiled(OPACITY, None).penalty, module(OPACITY, None).penalty)
+    assert backend.graphs == 1
+
+
+@pytest.mark.slow  # compiles
+def test_a_compiled_schedule_drops_at_its_rate():
+    """Through the whole compiler, whose random numbers are its own; two rates from one graph."""
+    torch._dynamo.reset()
+    module = GaussianDropout(LinearRamp(0.2, 0.6, 0, 100))
+    module.set_step(0)
+    compiled = torch.compile(module, fullgraph=True)
+    opacity = torch.full((40_000,), 0.5)
+    for step, rate in ((0, 0.2), (50, 0.4), (100, 0.6)):
+        module.set_step(step)
+        try:
+            dropped = (compiled(opacity) == 0).double().mean().item()
+        except Exception as error:  # whatever this machine's compiler, or its absence, raises
+            if "compiler" in str(error).lower():
+                pytest.skip(f"no compiler works here: {error}")
+            raise
+        # 5 standard deviations of a mean of 40,000 Bernoulli numbers: false alarm 6e-7 each.
+        assert abs(dropped - rate) < 5 * 0.5 / 200
+
+
+# --- recomputation ---
+
+
+@pytest.mark.parametrize("reentrant", [False, True])
+@pytest.mark.parametrize("module", [GaussianDropout(0.5), OpacityNoise(0.3)], ids=["dropout", "noise"])
+def test_recomputation_repeats_the_draw_or_refuses(module, reentrant):
+    def gradient(**arguments):
+        x = OPACITY.clone().requires_grad_()
+        torch.manual_seed(3)
+        checkpoint(lambda o: module(o, **arguments).square().sum(), x, use_reentrant=reentrant).backward()
+        return x.grad
+
+    x = OPACITY.clone().requires_grad_()
+    torch.manual_seed(3)
+    module(x).square().sum().backward()
+    draw = {"keep": module.keep} if isinstance(module, GaussianDropout) else {"noise": module.noise}
+    assert torch.equal(gradient(), x.grad)
+    assert torch.equal(gradient(**draw), x.grad)
+    with pytest.raises(RuntimeError, match=r"generator=.*torch\.utils\.checkpoint.*keep="):
+        gradient(generator=torch.Generator().manual_seed(3))

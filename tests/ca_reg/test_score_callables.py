@@ -1,0 +1,265 @@
+"""Renderers that are less tidy than a function: they reuse buffers, edit what they are given, and return NaN."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from ca_reg import CAMonitor, CAScore, Reason, attribute, total_effects
+from ca_reg.functional import Multiplier, alpha_moments, contributions, pixel_moments
+
+N, HEIGHT, WIDTH = 7, 3, 4
+G = torch.Generator().manual_seed(0)
+FOOTPRINT = torch.rand(HEIGHT * WIDTH, N, generator=G, dtype=torch.float64)
+COLORS = torch.rand(N, 3, generator=G, dtype=torch.float64)
+OPACITY = 0.2 + 0.7 * torch.rand(N, generator=G, dtype=torch.float64)
+SETTINGS = {"threshold": 0.3}
+METHODS = {"sampling": {}, "adaptive": {"relative_error": 0.2}}
+each_method = pytest.mark.parametrize("arguments", METHODS.values(), ids=METHODS)
+
+
+def images(x):
+    """(P, C) as (C, H, W)."""
+    return x.T.reshape(-1, HEIGHT, WIDTH)
+
+
+def blend(opacity, values):
+    alphas = FOOTPRINT * opacity.flatten()
+    weights = alphas * torch.cumprod(torch.nn.functional.pad(1 - alphas[:, :-1], (1, 0), value=1.0), 1)
+    return images(weights @ values)
+
+
+def render(opacity, view):
+    return blend(opacity, COLORS), blend(opacity, torch.ones_like(COLORS))[0]
+
+
+def moments(opacity, view, multiplier, background):
+    behind = COLORS.new_zeros(3) if background is None else background
+    behind = behind if behind.ndim == 1 else behind.flatten(1).T
+    found = pixel_moments(FOOTPRINT * opacity, COLORS.expand(HEIGHT * WIDTH, N, 3), multiplier, background=behind)
+    alpha = alpha_moments(FOOTPRINT * opacity, multiplier).mean
+    return {"mean": images(found.mean), "variance": images(found.variance), "alpha_mean": alpha.view(HEIGHT, WIDTH)}
+
+
+def shares(opacity, view, multiplier, background, weights):
+    parts = contributions(FOOTPRINT * opacity, COLORS.expand(HEIGHT * WIDTH, N, 3), multiplier)
+    return (parts.mean(-1) * weights.reshape(-1, 1)).sum(0)
+
+
+def same(found, expected):
+    assert expected.reason is Reason.OK
+    assert torch.equal(found.variance, expected.variance)
+    assert torch.equal(found.visible, expected.visible)
+    assert (found.value, found.std_error) == (expected.value, expected.std_error)
+
+
+# --- one output buffer for all calls ---
+
+
+def into(*buffers):
+    """Write results where the former ones stood, and return the buffers."""
+
+    def write(*results):
+        for buffer, result in zip(buffers, results, strict=True):
+            buffer.copy_(result)
+        return buffers if len(buffers) > 1 else buffers[0]
+
+    return write
+
+
+@each_method
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_reused_output_buffer_changes_nothing(arguments, dtype):
+    write = into(torch.empty(3, HEIGHT, WIDTH, dtype=dtype), torch.empty(HEIGHT, WIDTH, dtype=dtype))
+
+    def fresh(opacity, view):
+        return tuple(x.to(dtype) for x in render(opacity, view))
+
+    expected = CAScore(fresh, **SETTINGS, **arguments)(OPACITY, None)
+    same(CAScore(lambda o, v: write(*render(o, v)), **SETTINGS, **arguments)(OPACITY, None), expected)
+
+
+@each_method
+@pytest.mark.parametrize("numpy", [False, True])
+def test_an_alpha_pass_may_fill_the_buffer_of_the_image(arguments, numpy):
+    write = into(torch.empty(3, HEIGHT, WIDTH, dtype=torch.float64))
+
+    def drawn(values):
+        return lambda opacity, view: (lambda x: x.numpy() if numpy else x)(write(blend(opacity, values)))
+
+    score = CAScore(drawn(COLORS), alpha_fn=drawn(torch.ones_like(COLORS)), **SETTINGS, **arguments)
+    same(score(OPACITY, None), CAScore(render, **SETTINGS, **arguments)(OPACITY, None))
+
+
+@pytest.mark.parametrize("neutral", [False, True])
+def test_moments_may_fill_the_same_buffers(neutral):
+    write = into(*(torch.empty_like(x) for x in moments(OPACITY, None, Multiplier.dropout(0.5), None).values()))
+
+    def reusing(*arguments):
+        return dict(zip(("mean", "variance", "alpha_mean"), write(*moments(*arguments).values()), strict=True))
+
+    expected = CAScore(exact=moments, neutral=neutral, **SETTINGS)(OPACITY, None)
+    same(CAScore(exact=reusing, neutral=neutral, **SETTINGS)(OPACITY, None), expected)
+
+
+# --- callables that edit their opacities in place ---
+
+
+def spoiling(fn):
+    def edits(opacity, *rest):
+        result = fn(opacity, *rest)
+        opacity.zero_()
+        return result
+
+    return edits
+
+
+def white(opacity, view):
+    return blend(opacity, torch.ones_like(COLORS))
+
+
+@pytest.mark.parametrize("drop_rate", [0.0, 0.5])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda f, **a: CAScore(f(render), **a),
+        lambda f, **a: CAScore(f(render), alpha_fn=f(white), **a),
+        lambda f, **a: CAScore(f(render), relative_error=0.2, **a),
+        lambda f, **a: CAScore(f(render), alpha_fn=f(white), relative_error=0.2, **a),
+        lambda f, **a: CAScore(exact=f(moments), **a),
+        lambda f, **a: CAScore(exact=f(moments), neutral=True, **a),
+    ],
+    ids=["sampling", "sampling, alpha_fn", "adaptive", "adaptive, alpha_fn", "exact", "neutral"],
+)
+def test_a_callable_that_edits_its_opacities_reaches_nobody_else_s(make, drop_rate):
+    opacity = OPACITY.clone()
+    found = make(spoiling, drop_rate=drop_rate, **SETTINGS)(opacity, None)
+    assert torch.equal(opacity, OPACITY)
+    same(found, make(lambda f: f, drop_rate=drop_rate, **SETTINGS)(OPACITY, None))
+
+
+def test_attribution_and_monitor_keep_the_opacities_too(tmp_path):
+    opacity = OPACITY.clone()
+    score = CAScore(exact=moments, **SETTINGS)
+    assert torch.equal(attribute(score, spoiling(shares), opacity, None)[0], attribute(score, shares, OPACITY, None)[0])
+    score = CAScore(exact=spoiling(moments), **SETTINGS)
+    total_effects(score, opacity, None)
+    with CAMonitor(
+        score, tmp_path, views={"all": [0, 1]}, every=1, psnr=spoiling(lambda o, v: o.sum().item())
+    ) as monitor:
+        assert monitor(1, opacity)["psnr/all"] == pytest.approx(OPACITY.sum().item())
+    assert torch.equal(opacity, OPACITY)
+
+
+# --- NaN ---
+
+
+def with_nan(where, colors, alpha):
+    def fn(opacity, view):
+        image, plane = (x.clone() for x in render(opacity, view))
+        if colors:
+            image[:, where] = math.nan
+        if alpha:
+            plane[where] = math.nan
+        return image, plane
+
+    return fn
+
+
+ALL, HALF, ONE = torch.ones(3, 4, dtype=torch.bool), torch.arange(12).view(3, 4) < 6, torch.arange(12).view(3, 4) == 5
+
+
+@each_method
+@pytest.mark.parametrize("where", [ALL, HALF, ONE], ids=["all", "half", "one pixel"])
+@pytest.mark.parametrize(("colors", "alpha"), [(True, True), (True, False), (False, True)])
+def test_nan_in_a_render_is_not_finite(arguments, where, colors, alpha):
+    result = CAScore(with_nan(where, colors, alpha), threshold=0.0, **arguments)(OPACITY, None)
+    assert result.reason is Reason.NOT_FINITE
+    assert math.isnan(result.value)
+    assert math.isnan(result.std_error)
+
+
+@each_method
+def test_nan_in_a_single_render_is_not_finite(arguments):
+    calls = []
+
+    def fn(opacity, view):
+        calls.append(None)
+        return with_nan(ONE, False, len(calls) == 3)(opacity, view)
+
+    assert CAScore(fn, **SETTINGS, **arguments)(OPACITY, None).reason is Reason.NOT_FINITE
+
+
+@each_method
+def test_nan_where_nothing_is_covered_does_not_count(arguments):
+    """Renderers that divide colours by alpha return 0 / 0 there."""
+
+    def fn(opacity, view):
+        image, alpha = render(opacity, view)
+        image[:, ONE], alpha[ONE] = math.nan, 0.0
+        return image, alpha
+
+    assert CAScore(fn, threshold=0.2, **arguments)(OPACITY, None).reason is Reason.OK
+    nothing = CAScore(lambda o, v: (torch.full((3, 4, 4), math.nan), torch.zeros(4, 4)), **arguments)
+    assert nothing(OPACITY, None).reason is Reason.NOT_FINITE  # not one colour is finite
+
+
+@pytest.mark.parametrize("name", ["mean", "variance", "alpha_mean"])
+@pytest.mark.parametrize("where", [ALL, HALF, ONE], ids=["all", "half", "one pixel"])
+@pytest.mark.parametrize("neutral", [False, True])
+def test_nan_in_exact_moments_is_not_finite(name, where, neutral):
+    def fn(*arguments):
+        found = moments(*arguments)
+        found[name][..., where] = math.nan
+        return found
+
+    result = CAScore(exact=fn, neutral=neutral, threshold=0.0)(OPACITY, None)
+    assert (result.reason, math.isnan(result.value)) == (Reason.NOT_FINITE, True)
+
+
+# --- what an empty region and rare drops are to adaptive scores ---
+
+
+def test_an_empty_region_is_empty_whatever_the_masks():
+    """Expected alpha 0.72 everywhere, which a good part of the renders exceeds: they must not make a region."""
+
+    def fn(opacity, view):
+        light = torch.cumprod(1 - opacity, 0)
+        weights = opacity * torch.cat([torch.ones(1), light[:-1]])
+        return (weights * torch.linspace(0, 1, 8)).sum().expand(3, 2, 2), (1 - light[-1]).expand(2, 2)
+
+    opacity = torch.full((8,), 2 * (1 - 0.28 ** (1 / 8)))
+    for seed in range(10):
+        result = CAScore(fn, relative_error=0.1, threshold=0.8, seed=seed)(opacity, None)
+        assert (result.reason, result.visible.any().item()) == (Reason.EMPTY, False)
+    assert CAScore(fn, relative_error=0.1, threshold=0.7)(opacity, None).reason is Reason.OK
+
+
+def test_renders_that_do_not_differ_are_not_taken_for_certainty():
+    """Where hardly anything is dropped, the first renders are often all the same."""
+
+    def fn(opacity, view):
+        return (opacity * torch.linspace(0, 1, 20)).mean().expand(3, 2, 2), torch.ones(2, 2)
+
+    results = [CAScore(fn, drop_rate=0.002, relative_error=0.9, seed=seed)(torch.ones(20), None) for seed in range(6)]
+    # P(16 renders without a drop) = 0.998^320 = 0.53 for each seed: in 6 seeds there is one but for a chance of 1 %.
+    assert max(result.samples for result in results) > 16
+    assert all(result.value > 0 and result.std_error > 0 for result in results)
+    never = CAScore(fn, drop_rate=1e-9, relative_error=0.5)(torch.ones(20), None)
+    assert (never.value, never.samples, never.as_dict()["std_error"]) == (0.0, 256, None)
+
+
+# --- numbers of numpy ---
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float16, np.float64])
+@each_method
+def test_numbers_of_numpy_are_kept(arguments, kind):
+    score = CAScore(render, drop_rate=kind(0.25), threshold=kind(0.5), **arguments)
+    for found in (score.update(OPACITY, None), score.compute()):
+        data = json.loads(json.dumps(found.as_dict()))
+        assert (data["drop_rate"], data["threshold"]) == (0.25, 0.5)
+    from_p = CAScore(render, p=kind(0.5), **arguments)
+    assert json.loads(json.dumps(from_p(OPACITY, None).as_dict()))["drop_rate"] == 0.75
