@@ -127,7 +127,7 @@ def _check_lambda(lambda_dssim: float) -> None:
 
 
 class _SSIMMap(torch.autograd.Function):
-    """SSIM = a1 a2 / (b1 b2) with the hand-derived gradient in the image."""
+    """SSIM with the hand-derived gradient in the image."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, variance: Tensor | None) -> Tensor:
@@ -135,35 +135,44 @@ class _SSIMMap(torch.autograd.Function):
         squares = torch.addcmul(image * image, target, target)
         if variance is not None:
             squares.add_(variance)
-        maps = torch.stack([image, target, image * target, squares])
-        mean_x, mean_y, mean_xy, mean_squares = _blur(maps)
-        product, squares = mean_x * mean_y, torch.addcmul(mean_x * mean_x, mean_y, mean_y)
-        a1, a2 = 2 * product + _C1, (mean_xy - product).mul_(2).add_(_C2)
-        b1, b2 = squares + _C1, (mean_squares - squares).add_(_C2)
-        similarity: Tensor = a1 * a2 / (b1 * b2)
-        ctx.save_for_backward(image, target, mean_x, mean_y, a1, a2, b1, b2, similarity)
+        similarity, slopes = _similarity(_blur(torch.stack([image, target, image * target, squares])))
+        ctx.save_for_backward(image, target, slopes)
         return similarity
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, Tensor | None]:
-        image, target, mean_x, mean_y, a1, a2, b1, b2, similarity = ctx.saved_tensors
-        weight = gradient / (b1 * b2)
-        weighted = weight * similarity
-        # The chain rule through the blurred x, x^2 + y^2 and x y, with the common factor 2 taken out until the end.
-        to_mean = (weight * mean_y).mul_(a2 - a1).addcmul_(weighted * mean_x, b1 - b2)
-        to_squares = (weighted * b1).neg_()
-        to_product = weight * a1
+        image, target, slopes = ctx.saved_tensors
         # The window is symmetric and the padding is zero, so the blur is its own transpose.
-        mean, squares, product = _blur(torch.stack([to_mean, to_squares, to_product]))
-        to_image = mean.addcmul_(image, squares).addcmul_(target, product).mul_(2)
+        mean, squares, product = _blur(slopes * gradient)
+        to_image = mean.addcmul_(image, squares, value=2).addcmul_(target, product)
         return to_image, None, squares if ctx.needs_input_grad[2] else None
+
+
+def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
+    """Return SSIM = a1 a2 / (b1 b2), and its derivatives in the blurred x, x^2 + y^2 and x y.
+
+    Args:
+        blurred: x, y, x y and x^2 + y^2, shape (4, C, H, W).
+    """
+    if engine_for(blurred).name == "loops":
+        from reference_trainer.render.loops.ssim import similarity
+
+        return similarity(blurred, _C1, _C2)
+    mean_x, mean_y, mean_xy, mean_squares = blurred
+    product, squares = mean_x * mean_y, torch.addcmul(mean_x * mean_x, mean_y, mean_y)
+    a1, a2 = 2 * product + _C1, (mean_xy - product).mul_(2).add_(_C2)
+    b1, b2 = squares + _C1, (mean_squares - squares).add_(_C2)
+    weight = 1 / (b1 * b2)
+    result = a1 * a2 * weight
+    to_mean = 2 * weight * (mean_y * (a2 - a1) + result * mean_x * (b1 - b2))
+    return result, torch.stack([to_mean, -weight * result * b1, 2 * weight * a1])
 
 
 def _blur(maps: Tensor) -> Tensor:
     """Blur maps (..., H, W) with the zero-padded window."""
     if engine_for(maps).name == "loops":
-        from reference_trainer.render.loops.blur import blur
+        from reference_trainer.render.loops.ssim import blur
 
         return blur(maps, _WEIGHTS)
     # Sums of shifted slices: on a CPU faster than a depthwise convolution, whose speed depends on the memory layout.

@@ -48,6 +48,22 @@ def test_gradient_of_the_map(size):
     assert torch.autograd.gradcheck(lambda x: ssim_map(x, target), (image.requires_grad_(),))
 
 
+@pytest.mark.parametrize("size", [(1, 1), (3, 4), (13, 70), (40, 61)])
+@pytest.mark.parametrize("spread", [0.0, 0.1])
+def test_float32_agrees_with_float64(size, spread):
+    """With numba, float32 on the processor is computed by loops; float64 never is."""
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        image, target = pair(*size, dtype=dtype)
+        image, variance = image.requires_grad_(), (spread * image.detach() ** 2).requires_grad_()
+        weights = pair(*size, dtype=dtype, seed=1)[0]
+        similarity = ssim_map(image, target, variance)
+        results.append([similarity.detach(), *torch.autograd.grad((similarity * weights).sum(), (image, variance))])
+    for short, long in zip(*results, strict=True):
+        # Rounding: the squares of colours near 1, against the constant 9e-4 that they are compared with.
+        assert (short - long).norm() <= 1e-4 * long.norm()
+
+
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_gradient_of_the_loss(weight):
     image, target = pair(8, 9)

@@ -1,4 +1,4 @@
-"""The window of SSIM as a loop: rows are added with weights, first across the picture, then down."""
+"""What SSIM takes most of its time for, as loops: the window, and the formula with its derivatives."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from reference_trainer.render.loops.compiling import kernel
 from reference_trainer.render.loops.threads import in_threads
 
-__all__ = ["blur"]
+__all__ = ["blur", "similarity"]
 
 Array = Any
 f4 = np.float32
@@ -54,3 +54,39 @@ def blur(maps: Tensor, weights: list[float]) -> Tensor:
     blurred = torch.empty_like(images)
     in_threads(_blur, images.shape[0], images.numpy(), np.array(weights, f4), blurred.numpy(), least=1)
     return blurred.view(maps.shape)
+
+
+@kernel
+def _similarity(first: int, last: int, blurred: Array, c1: float, c2: float, result: Array, slopes: Array) -> None:
+    """Evaluate the formula at pixels."""
+    one, two, c1, c2 = f4(1), f4(2), f4(c1), f4(c2)
+    for i in range(first, last):
+        x, y, xy, squared = blurred[0, i], blurred[1, i], blurred[2, i], blurred[3, i]
+        product, squares = x * y, x * x + y * y
+        a1, a2 = two * product + c1, two * (xy - product) + c2
+        b1, b2 = squares + c1, squared - squares + c2
+        weight = one / (b1 * b2)
+        value = a1 * a2 * weight
+        result[i] = value
+        slopes[0, i] = two * weight * (y * (a2 - a1) + value * x * (b1 - b2))
+        slopes[1, i] = -weight * value * b1
+        slopes[2, i] = two * weight * a1
+
+
+def similarity(blurred: Tensor, c1: float, c2: float) -> tuple[Tensor, Tensor]:
+    """Return SSIM, and its derivatives in the blurred x, x^2 + y^2 and x y.
+
+    Args:
+        blurred: x, y, x y and x^2 + y^2, float32 on the processor, shape (4, C, H, W).
+        c1: the constant beside the means.
+        c2: the constant beside the variances.
+
+    Returns:
+        Similarities (C, H, W) and derivatives (3, C, H, W).
+    """
+    result, slopes = torch.empty_like(blurred[0]), torch.empty_like(blurred[:3])
+    pixels = result.numel()
+    arrays = (slopes.view(3, pixels), result.view(pixels), blurred.contiguous().view(4, pixels))
+    of_slopes, of_result, of_blurred = (x.numpy() for x in arrays)
+    in_threads(_similarity, pixels, of_blurred, c1, c2, of_result, of_slopes, least=4096)
+    return result, slopes
