@@ -12,6 +12,7 @@ from typing import Any
 
 import tyro
 
+from reference_trainer.cli.drawing import Warmup
 from reference_trainer.cli.ply import Bake
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
@@ -52,6 +53,7 @@ def _parse(arguments: Sequence[str]) -> Callable[[], None]:
             "render": Render(run=Path("runs/train")),
             "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
             "study": Study(tyro.MISSING),
+            "warmup": Warmup(),
         },
     )
     command: Callable[[], None] = tyro.cli(

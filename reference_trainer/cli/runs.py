@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from reference_trainer.cli.drawing import Draw, Drawing, DrawingOfSweep, DrawOfSweep
 from reference_trainer.runs.engines.choice import EngineName
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.training.config import PRESETS, TrainConfig
@@ -22,7 +23,6 @@ Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
 Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="")]
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
 Given = Annotated[frozenset[str], tyro.conf.Suppress]  # filled in from the command line itself, see given_fields
-EngineChoice = Literal["auto", "torch", "loops"]
 Strategy = Literal["baseline", "dropout", "noise", "both", "analytic-dropout", "analytic-noise"]
 
 
@@ -52,11 +52,13 @@ class Demo:
     """Number of seeds."""
     jobs: int = 2
     """Runs at a time."""
+    drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.runs.demo import demo
 
+        self.drawing.begin("cpu", trains=True)
         done = demo(self.out, iterations=self.iterations, seeds=range(self.seeds), jobs=self.jobs, say=print)
         if done.failures:
             sys.exit(1)
@@ -81,8 +83,7 @@ class Train:
     given: Given = frozenset()
     device: str = "cpu"
     """"cpu" or "cuda"."""
-    engine: EngineChoice = "auto"
-    """What draws: "loops" (compiled, float32 on a CPU), "torch" (anything), or whichever fits."""
+    drawing: Draw = field(default_factory=Drawing)
     monitor_every: int = 500
     """Steps between measurements of CA and PSNR for TensorBoard; 0 for none."""
     lpips: str | None = None
@@ -92,7 +93,6 @@ class Train:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.render import use_engine
         from reference_trainer.runs.run import run_experiment, summary
         from reference_trainer.training.determinism import deterministic
 
@@ -101,7 +101,8 @@ class Train:
                 "--deterministic needs --renderer torch: gsplat's kernels add gradients in whatever order they come, "
                 "which PyTorch cannot change."
             )
-        use_engine(self.engine)
+        if self.config.renderer == "torch":
+            self.drawing.begin(self.device, trains=True)
         with deterministic(self.device) if self.deterministic else nullcontext():
             results = run_experiment(
                 self.scene,
@@ -183,6 +184,7 @@ class Evaluate:
     """"cpu" or "cuda"."""
     out: Path | None = None
     """Folder for the results; by default <run>/evaluation, <run>/evaluation_scale_noise or <ply>_evaluation."""
+    drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
         """Run the command."""
@@ -192,13 +194,14 @@ class Evaluate:
 
         if self.run is not None and self.ply is not None:
             raise ValueError(f"give the folder of a run or --ply FILE, not both: got {self.run} and {self.ply}.")
+        if self.ply is None and self.run is None:
+            raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE (and --path SCENE).")
+        self.drawing.begin(self.device)
         if self.run is not None:
             model, scene, default = of_run(self.run, self.device, scale_noise=self.scale_noise)
             perceptual = lpips_option(self.lpips, device=self.device)
             measure(model, scene, self.out or default, samples=self.samples, seed=self.seed, perceptual=perceptual)
             return
-        if self.ply is None:
-            raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE (and --path SCENE).")
         if self.scale_noise:
             raise ValueError(
                 "--scale-noise needs the folder of a run: a PLY does not say which noise it was trained with."
@@ -232,11 +235,13 @@ class Render:
     """Folder for the pictures; by default <run>/render_<what>."""
     device: str = "cpu"
     """"cpu" or "cuda"."""
+    drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.runs.measure import render_run
 
+        self.drawing.begin(self.device)
         render_run(self.run, self.what, self.out, frames=self.frames, device=self.device, say=print)
 
 
@@ -284,6 +289,7 @@ class Compare:
     """Steps between checkpoints: what a dead worker costs at most."""
     lpips: str | None = None
     """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
+    drawing: DrawOfSweep = field(default_factory=DrawingOfSweep)
 
     def __call__(self) -> None:
         """Run the command."""
@@ -309,6 +315,8 @@ class Compare:
             lpips=self.lpips,
             say=print,
         )
+        if self.config.renderer == "torch":
+            self.drawing.begin(self.device, trains=True)
         comparisons = compare(scene_folders(self.path, self.scene, self.out), chosen, range(self.seeds), running)
         report(comparisons, say=print)
         if any(comparison.failures for comparison in comparisons.values()):

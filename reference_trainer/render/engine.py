@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import os
+from importlib.metadata import version
 from typing import Protocol
 
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.render.splats import Splats
 
-__all__ = ["ENGINES", "Engine", "describe_engine", "engine_for", "use_engine"]
+__all__ = ["ENGINES", "Engine", "chosen_engine", "describe_engine", "engine_for", "use_engine"]
 
 ENGINES = ("auto", "torch", "loops")
 _VARIABLE = "CA_REG_ENGINE"
@@ -92,6 +93,24 @@ def use_engine(name: str) -> None:
     os.environ[_VARIABLE] = name
 
 
+def chosen_engine() -> str:
+    """Return what `use_engine`, or the environment, has chosen; for workers on other machines.
+
+    Raises:
+        ValueError: if the environment names an engine that does not exist.
+    """
+    chosen = os.environ.get(_VARIABLE, "auto")
+    if chosen not in ENGINES:
+        raise ValueError(f"{_VARIABLE} names the engine {chosen!r}; choose one of {', '.join(ENGINES)}.")
+    return chosen
+
+
+def _name(device: torch.device, dtype: torch.dtype) -> str:
+    if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32 or not _has_numba():
+        return "torch"
+    return "loops"
+
+
 def engine_for(like: Tensor) -> Engine:
     """Return the engine that draws tensors of a dtype and device.
 
@@ -103,22 +122,15 @@ def engine_for(like: Tensor) -> Engine:
     Raises:
         ValueError: if the environment names an engine that does not exist.
     """
-    chosen = os.environ.get(_VARIABLE, "auto")
-    if chosen not in ENGINES:
-        raise ValueError(f"{_VARIABLE} names the engine {chosen!r}; choose one of {', '.join(ENGINES)}.")
-    if chosen == "torch" or like.device.type != "cpu" or like.dtype != torch.float32 or not _has_numba():
-        return _torch_engine()
-    return _loop_engine()
+    return _torch_engine() if _name(like.device, like.dtype) == "torch" else _loop_engine()
 
 
 def describe_engine(device: torch.device | str) -> str:
-    """Return which engine draws a model on a device, in words for people."""
-    engine = engine_for(torch.empty(0, device=device))
-    if engine.name == "torch":
+    """Return which engine draws a model (float32) on a device, in words for people; costs nothing."""
+    if _name(torch.device(device), torch.float32) == "torch":
         return "torch"
-    from importlib.metadata import version
-
-    return f"loops (numba {version('numba')}, {torch.get_num_threads()} threads)"
+    count = torch.get_num_threads()
+    return f"loops (numba {version('numba')}, {count} thread{'s' if count > 1 else ''})"
 
 
 @functools.cache
