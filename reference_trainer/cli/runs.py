@@ -194,18 +194,19 @@ class Evaluate:
 
         if self.run is not None and self.ply is not None:
             raise ValueError(f"give the folder of a run or --ply FILE, not both: got {self.run} and {self.ply}.")
-        if self.ply is None and self.run is None:
-            raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE (and --path SCENE).")
-        self.drawing.begin(self.device)
         if self.run is not None:
+            self.drawing.begin(self.device)
             model, scene, default = of_run(self.run, self.device, scale_noise=self.scale_noise)
             perceptual = lpips_option(self.lpips, device=self.device)
             measure(model, scene, self.out or default, samples=self.samples, seed=self.seed, perceptual=perceptual)
             return
+        if self.ply is None:
+            raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE (and --path SCENE).")
         if self.scale_noise:
             raise ValueError(
                 "--scale-noise needs the folder of a run: a PLY does not say which noise it was trained with."
             )
+        self.drawing.begin(self.device)
         shared: dict[str, Any] = {
             "dropout": self.dropout, "samples": self.samples, "seed": self.seed, "device": self.device
         }  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import os
+import warnings
 from importlib.metadata import version
 from typing import Protocol
 
@@ -88,7 +89,7 @@ def use_engine(name: str) -> None:
     """
     if name not in ENGINES:
         raise ValueError(f"there is no engine {name!r}; choose one of {', '.join(ENGINES)}.")
-    if name == "loops" and not _has_numba():
+    if name == "loops" and _loop_engine() is None:
         raise ImportError("the compiled loops need numba: pip install 'ca_reg[trainer]', or use the engine torch.")
     os.environ[_VARIABLE] = name
 
@@ -105,12 +106,6 @@ def chosen_engine() -> str:
     return chosen
 
 
-def _name(device: torch.device, dtype: torch.dtype) -> str:
-    if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32 or not _has_numba():
-        return "torch"
-    return "loops"
-
-
 def engine_for(like: Tensor) -> Engine:
     """Return the engine that draws tensors of a dtype and device.
 
@@ -122,20 +117,17 @@ def engine_for(like: Tensor) -> Engine:
     Raises:
         ValueError: if the environment names an engine that does not exist.
     """
-    return _torch_engine() if _name(like.device, like.dtype) == "torch" else _loop_engine()
+    if chosen_engine() == "torch" or like.device.type != "cpu" or like.dtype != torch.float32:
+        return _torch_engine()
+    return _loop_engine() or _torch_engine()
 
 
 def describe_engine(device: torch.device | str) -> str:
-    """Return which engine draws a model (float32) on a device, in words for people; costs nothing."""
-    if _name(torch.device(device), torch.float32) == "torch":
+    """Return which engine draws a model (float32) on a device, in words for people."""
+    if engine_for(torch.empty(0, device=device)).name == "torch":
         return "torch"
     count = torch.get_num_threads()
     return f"loops (numba {version('numba')}, {count} thread{'s' if count > 1 else ''})"
-
-
-@functools.cache
-def _has_numba() -> bool:
-    return importlib.util.find_spec("numba") is not None
 
 
 @functools.cache
@@ -146,7 +138,13 @@ def _torch_engine() -> Engine:
 
 
 @functools.cache
-def _loop_engine() -> Engine:
-    from reference_trainer.render.loops.engine import LoopEngine
-
+def _loop_engine() -> Engine | None:
+    """Return the loops, or None without a numba that works."""
+    if importlib.util.find_spec("numba") is None:
+        return None
+    try:
+        from reference_trainer.render.loops.engine import LoopEngine
+    except ImportError as error:  # such as of a NumPy that is too new for it
+        warnings.warn(f"numba is installed but cannot be imported ({error}): the engine torch draws.", stacklevel=2)
+        return None
     return LoopEngine()

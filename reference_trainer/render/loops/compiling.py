@@ -25,14 +25,14 @@ KERNELS: list[Any] = []
 
 
 def _digest() -> str:
-    """Return a hash of all that is compiled into kernels.
+    """Return a hash of all that is compiled into kernels of other files.
 
     numba looks at the file of a kernel alone, and would go on using machine code into which an older version of
     another file was inlined.
     """
     folder = Path(__file__).parent
-    sources = [folder.parent / "constants.py", *sorted(folder.glob("*.py"))]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+    sources = [path.read_bytes() for path in (folder.parent / "constants.py", *sorted(folder.glob("*.py")))]
+    return hashlib.sha256(b"".join([sources[0], *(text for text in sources if b"\n@inlined" in text)])).hexdigest()
 
 
 _DIGEST = _digest()
@@ -81,7 +81,7 @@ def _name(function: Callable[..., Any]) -> str:
     return f"{function.__module__.rpartition('.')[2]}.{function.__name__.lstrip('_')}"
 
 
-class _Kept(FunctionCache):  # type: ignore[misc]
+class _Kept(FunctionCache):
     """Machine code on the disk; what is wrong with the disk costs the time to compile, and not the run."""
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
@@ -107,7 +107,7 @@ class _Kept(FunctionCache):  # type: ignore[misc]
             logging.getLogger(__name__).info("%s is not kept: %s", _name(self._py_func), error)
 
 
-class _NotKept(NullCache):  # type: ignore[misc]
+class _NotKept(NullCache):
     """No machine code on the disk."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
