@@ -11,10 +11,10 @@ from types import SimpleNamespace
 import torch
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.eager.projection import project
 from reference_trainer.render import Splats, draw
-from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
 from reference_trainer.render.eager.binning import bin_gaussians
+from reference_trainer.render.eager.projection import project
+from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
 
 MIN_ALPHA = 1 / 255
 

@@ -53,10 +53,7 @@ class _Log:
         if self.said:
             return
         self.said = True
-        kept = (
-            "once on this machine" if where else "in every process: set NUMBA_CACHE_DIR to a folder that can be written"
-        )
-        logging.getLogger(__name__).warning("Compiling the renderer's loops, %s: about 15 s of one core.", kept)
+        logging.getLogger(__name__).warning(describe_compilation(where))
 
 
 _report: Callable[[str, str | None], None] = _Log()

@@ -1,9 +1,9 @@
 """Loops side by side: ranges of one loop are handed to threads, as many as PyTorch uses.
 
 Kernels run without the interpreter's lock, so plain threads are enough, and with them what compilers' own thread pools
-break holds: several threads may call at once, processes may fork at any time, and ``OMP_NUM_THREADS`` and
-`torch.set_num_threads` decide for both libraries. Every range writes to places of its own, and no sum crosses ranges:
-results do not depend on the number of threads.
+break holds: several threads may call at once, processes may fork at any time (the new one goes on with one thread), and
+``OMP_NUM_THREADS`` and `torch.set_num_threads` decide for both libraries. Every range writes to places of its own, and
+no sum crosses ranges: results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -23,7 +23,19 @@ _RANGES = 8  # for each thread: so many that none waits long for the others
 _LEAST = 64  # items worth a call
 
 _pools: dict[int, ThreadPoolExecutor] = {}
-os.register_at_fork(after_in_child=_pools.clear)  # a forked process has none of its parent's threads
+
+
+def _begin_forked_process() -> None:
+    """Forget the threads of the parent, which do not exist here: ours, and PyTorch's own.
+
+    PyTorch would wait for the latter for ever; a worker of its DataLoader begins likewise.
+    """
+    _pools.clear()
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_forked_process)
 
 
 def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any, least: int = _LEAST) -> list[Any]:

@@ -115,22 +115,21 @@ def test_it_says_so_once(caplog, monkeypatch, folder, loaded):
 
 
 SCRIPT = """
-import importlib.util, json, sys
+import json, sys
 import numpy as np
-from reference_trainer.render.loops import compiling  # noqa: E402
-spec = importlib.util.spec_from_file_location("doubling", sys.argv[1])
-module = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(module)
+from reference_trainer.render.loops import compiling
+sys.path.append(sys.argv[1])
+import doubling
 compiled, x = [], np.arange(5.0)
 with compiling.reported_to(lambda name, folder: compiled.append(name)):
-    compiling.kernel(module.double)(1, 4, x)
+    compiling.kernel(doubling.double)(1, 4, x)
 print(json.dumps([compiled, x.tolist()]))
 """
 
 
 def started(path, folder, **environment):
     return subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, str(path)],
+        [sys.executable, "-c", SCRIPT, str(path.parent)],
         env=subprocess_environment(NUMBA_CACHE_DIR=str(folder), **environment),
         stdout=subprocess.PIPE,
     )

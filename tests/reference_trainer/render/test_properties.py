@@ -45,9 +45,10 @@ def decided(splats):
     raw = splats.opacities[order] * torch.exp(-0.5 * ((l11 * dx + l21 * dy) ** 2 + (l22 * dy) ** 2))
     alpha = torch.where(raw >= MIN_ALPHA, raw.clamp(max=0.99), 0.0)
     light = (1 - alpha).cumprod(-1)
-    at_cut = ((raw / MIN_ALPHA - 1).abs() < 5e-3).any(-1)
+    at_cut = (raw / MIN_ALPHA - 1).abs() < 5e-3
     at_end = ((light / MIN_TRANSMITTANCE - 1).abs() < 0.02).any(-1)
-    return ~(at_cut | at_end).detach(), ((raw / MIN_ALPHA - 1).abs() < 5e-3).sum(-1)
+    # How far off a pixel may be where it does: a splat at the cut is worth 1/255, one at the end up to 0.99 x 0.01.
+    return ~(at_cut.any(-1) | at_end).detach(), at_cut.sum(-1).detach() / 255 + 0.01 * at_end.detach()
 
 
 def results(scene, engine, dtype, weights, mask, random):
@@ -86,8 +87,8 @@ def test_the_loops_are_the_torch_engine(random, scene):
     assert torch.isfinite(image).all()
     error = (image - exact).abs() / exact.abs().clamp(min=1.0)
     assert (error[:, mask] <= PIXEL).all()
-    _, near = decided(splats)
-    assert (error <= PIXEL + (near + 0.05) / 255 * 3.5).all()  # a splat at the cut, of a colour or a depth of up to 3.5
+    _, doubt = decided(splats)
+    assert (error <= PIXEL + 3.5 * doubt).all()  # colours of up to 1, depths of up to 3.5
     scale = max((float(x.norm()) for x in gradients if x is not None), default=0.0)
     for one, other in zip(mine, gradients, strict=True):
         assert (one is None) == (other is None)
