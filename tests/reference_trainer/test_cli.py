@@ -94,7 +94,7 @@ def test_the_engine_is_chosen_said_and_noted(engine, trained, capsys, tmp_path, 
     if engine == "loops":
         pytest.importorskip("numba")
     monkeypatch.setenv("CA_REG_ENGINE", "auto")  # which the option changes, for workers
-    main(["evaluate", str(trained), "--samples", "1", "--engine", engine, "--out", str(tmp_path)])
+    main(["evaluate", str(trained), "--samples", "2", "--engine", engine, "--out", str(tmp_path)])
     said = capsys.readouterr().out.splitlines()
     assert [line.startswith(f"Engine: {engine}") for line in said].count(True) == 1
     noted = json.loads((tmp_path / "evaluation.json").read_text())["machine"]["engine"]

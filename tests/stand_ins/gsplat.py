@@ -13,6 +13,7 @@ import torch
 from reference_trainer.camera import Camera
 from reference_trainer.render import Splats, draw
 from reference_trainer.render.eager.binning import bin_gaussians
+from reference_trainer.render.eager.engine import TorchEngine
 from reference_trainer.render.eager.projection import project
 from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
 
@@ -70,7 +71,7 @@ def _rasterize(given, *, culls):
             lists = bin_gaussians(projection, a.opacities[which], a.width, a.height)
             lists = lists.only(a.opacities[which] >= MIN_ALPHA)
         out = draw(
-            Splats(which, projection, a.opacities[which], colors, lists),
+            Splats(which, projection, a.opacities[which], colors, lists, TorchEngine()),
             background=None if a.backgrounds is None else a.backgrounds[number],
             depth="D" in a.render_mode,
         )

@@ -22,8 +22,7 @@ Array = Any
 f4 = np.float32
 _ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
 _DILATION, _NEAR, _MIN = f4(DILATION), f4(NEAR_PLANE), f4(MIN_ALPHA)
-# math.isfinite(x) is x - x == 0 to numba, which the compiler may take for true where sums may be reordered.
-_LARGEST = np.finfo(f4).max
+_INFINITY = f4(np.inf)  # nan and infinity are not below it; math.isfinite is optimized away
 _NO_DIRECTION = f4(1e-30)  # a quaternion well below this is taken for 0
 
 
@@ -34,7 +33,7 @@ def _visible(first: int, last: int, means: Array, opacities: Array, view: Array,
     for i in range(first, last):
         depth = view[2, 0] * means[i, 0] + view[2, 1] * means[i, 1] + view[2, 2] * means[i, 2] + view[2, 3]
         seen[i] = depth > _NEAR and opacities[i] >= _MIN
-        finite = finite and abs(depth + opacities[i]) <= _LARGEST
+        finite = finite and abs(depth + opacities[i]) < _INFINITY
     return finite
 
 
@@ -172,7 +171,7 @@ def _forward(
                     color += values[j] * sh[i, j, c]
                 colors[k, c] = color if not color < _ZERO else _ZERO
         total = centers[k, 0] + centers[k, 1] + xx + xy + yy + colors[k, 0] + colors[k, 1] + colors[k, 2]
-        finite = finite and abs(total) <= _LARGEST
+        finite = finite and abs(total) < _INFINITY
     return finite
 
 

@@ -74,10 +74,8 @@ def results(scene, engine, dtype, weights, mask, random):
     return splats, images.detach().double(), [x.grad for x in leaves], shares, mask
 
 
-@pytest.mark.parametrize("random", [False, True], ids=["drawn", "moments"])
-@settings(max_examples=40, deadline=None, derandomize=True)
-@given(scene=scenes())
-def test_the_loops_are_the_torch_engine(random, scene):
+def agree(random, scene):
+    """Assert that the loops are the torch engine: images, gradients and shares."""
     shape = (8, scene.camera.height, scene.camera.width)
     weights = torch.randn(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     splats, exact, gradients, shares, mask = results(scene, "torch", torch.float64, weights, None, random)
@@ -96,3 +94,18 @@ def test_the_loops_are_the_torch_engine(random, scene):
             assert torch.isfinite(one).all()
             assert (one.double() - other).norm() <= GRADIENT * other.norm() + 1e-6 * scale
     assert (parts - shares).norm() <= GRADIENT * shares.norm() + 1e-9
+
+
+@pytest.mark.parametrize("random", [False, True], ids=["drawn", "moments"])
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(scene=scenes())
+def test_the_loops_are_the_torch_engine(random, scene):
+    agree(random, scene)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("random", [False, True], ids=["drawn", "moments"])
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(scene=scenes())
+def test_the_loops_are_the_torch_engine_in_many_scenes(random, scene):
+    agree(random, scene)

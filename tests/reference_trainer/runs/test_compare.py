@@ -255,6 +255,6 @@ def test_a_worker_draws_with_the_engine_of_the_sweep(chosen, tmp_path, options, 
         return train(*arguments)
 
     monkeypatch.setattr(grid, "train_run", elsewhere)
-    monkeypatch.setattr(grid, "run_experiment", lambda *arguments, **options: {"engine": chosen_engine()})
+    monkeypatch.setattr(grid, "run_experiment", lambda *arguments, **options: made(20.0) | {"engine": chosen_engine()})
     (outcome,) = grid.run_grid([grid.Run("one", options, short, tmp_path)], Running(Here()))
-    assert outcome == {"engine": chosen}
+    assert outcome["engine"] == chosen
