@@ -117,14 +117,18 @@ def engine_for(like: Tensor) -> Engine:
     Raises:
         ValueError: if the environment names an engine that does not exist.
     """
-    if chosen_engine() == "torch" or like.device.type != "cpu" or like.dtype != torch.float32:
+    return _engine(like.device, like.dtype)
+
+
+def _engine(device: torch.device, dtype: torch.dtype) -> Engine:
+    if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
         return _torch_engine()
     return _loop_engine() or _torch_engine()
 
 
 def describe_engine(device: torch.device | str) -> str:
-    """Return which engine draws a model (float32) on a device, in words for people."""
-    if engine_for(torch.empty(0, device=device)).name == "torch":
+    """Return which engine draws a model (float32) on a device, which need not be there, in words for people."""
+    if _engine(torch.device(device), torch.float32).name == "torch":
         return "torch"
     count = torch.get_num_threads()
     return f"loops (numba {version('numba')}, {count} thread{'s' if count > 1 else ''})"
