@@ -13,6 +13,7 @@ from typing import Any
 
 import tyro
 
+from reference_trainer.cli.drawing import Warmup
 from reference_trainer.cli.ply import Bake
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
@@ -57,6 +58,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "render": Render(run=Path("runs/train")),
         "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
         "study": Study(tyro.MISSING),
+        "warmup": Warmup(),
     }
     # In the list of the commands the first paragraph of each; the command's own help has all of it.
     texts = {name: inspect.getdoc(type(command)) or "" for name, command in defaults.items()}

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from reference_trainer.cli.drawing import Draw, Drawing, DrawingOfSweep, DrawOfSweep
 from reference_trainer.runs.engines.choice import EngineName
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.training.config import PRESETS, TrainConfig
@@ -24,7 +25,6 @@ Folder = Annotated[str | None, tyro.conf.Positional]
 Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="")]
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
 Given = Annotated[frozenset[str], tyro.conf.Suppress]  # filled in from the command line itself, see given_fields
-EngineChoice = Literal["auto", "torch", "loops"]
 Strategy = Literal["baseline", "dropout", "noise", "both", "analytic-dropout", "analytic-noise"]
 
 
@@ -61,11 +61,13 @@ class Demo:
     """Number of seeds."""
     jobs: int = 2
     """Runs at a time."""
+    drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.runs.demo import demo
 
+        self.drawing.begin("cpu", trains=True)
         done = demo(self.out, iterations=self.iterations, seeds=range(self.seeds), jobs=self.jobs, say=print)
         if done.failures:
             sys.exit(1)
@@ -92,8 +94,7 @@ class Train:
     given: Given = frozenset()
     device: str = "cpu"
     """"cpu" or "cuda"."""
-    engine: EngineChoice = "auto"
-    """What draws: "loops" (compiled, float32 on a CPU), "torch" (anything), or whichever fits."""
+    drawing: Draw = field(default_factory=Drawing)
     monitor_every: int = 500
     """Steps between measurements of CA and PSNR for TensorBoard; 0 for none."""
     lpips: str | None = None
@@ -103,7 +104,6 @@ class Train:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.render import use_engine
         from reference_trainer.runs.run import run_experiment, summary
         from reference_trainer.training.determinism import deterministic
 
@@ -112,7 +112,8 @@ class Train:
                 "--deterministic needs --renderer torch: gsplat's kernels add gradients in whatever order they come, "
                 "which PyTorch cannot change."
             )
-        use_engine(self.engine)
+        if self.config.renderer == "torch":
+            self.drawing.begin(self.device, trains=True)
         with deterministic(self.device) if self.deterministic else nullcontext():
             results = run_experiment(
                 _chosen(self.scene, self.folder),
@@ -195,6 +196,7 @@ class Evaluate:
     """"cpu" or "cuda"."""
     out: Path | None = None
     """Folder for the results; by default <run>/evaluation, <run>/evaluation_scale_noise or <ply>_evaluation."""
+    drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
         """Run the command."""
@@ -208,6 +210,7 @@ class Evaluate:
             replace(self, run=None, ply=self.run)()
             return
         if self.run is not None:
+            self.drawing.begin(self.device)
             model, scene, default = of_run(self.run, self.device, scale_noise=self.scale_noise)
             perceptual = lpips_option(self.lpips, device=self.device)
             measure(model, scene, self.out or default, samples=self.samples, seed=self.seed, perceptual=perceptual)
@@ -218,6 +221,7 @@ class Evaluate:
             raise ValueError(
                 "--scale-noise needs the folder of a run: a PLY does not say which noise it was trained with."
             )
+        self.drawing.begin(self.device)
         shared: dict[str, Any] = {
             "dropout": self.dropout, "samples": self.samples, "seed": self.seed, "device": self.device
         }  # fmt: skip
@@ -247,11 +251,13 @@ class Render:
     """Folder for the pictures; by default <run>/render_<what>."""
     device: str = "cpu"
     """"cpu" or "cuda"."""
+    drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.runs.measure import render_run
 
+        self.drawing.begin(self.device)
         render_run(self.run, self.what, self.out, frames=self.frames, device=self.device, say=print)
 
 
@@ -299,6 +305,7 @@ class Compare:
     """Steps between checkpoints: what a dead worker costs at most."""
     lpips: str | None = None
     """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
+    drawing: DrawOfSweep = field(default_factory=DrawingOfSweep)
 
     @property
     def elsewhere(self) -> bool:
@@ -329,6 +336,8 @@ class Compare:
             lpips=self.lpips,
             say=print,
         )
+        if self.config.renderer == "torch":
+            self.drawing.begin(self.device, trains=True)
         comparisons = compare(scene_folders(self.path, self.scene, self.out), chosen, range(self.seeds), running)
         report(comparisons, say=print)
         if any(comparison.failures for comparison in comparisons.values()):

@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 
 from reference_trainer.files import write_text
+from reference_trainer.render import describe_engine
 
 __all__ = ["format_mean_std", "machine", "markdown_table", "mean_std", "write_json"]
 
@@ -127,11 +128,11 @@ def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str])
 
 
 def machine() -> dict[str, str | int]:
-    """Return what a measurement depends on: versions, processor, cores, threads and the GPU if there is one.
+    """Return what a measurement depends on: versions, processor, cores, threads, engine, and the GPU if there is one.
 
     Example:
         >>> sorted(machine())
-        ['ca_reg', 'cores', 'cpu', 'device', 'kornia', 'platform', 'python', 'threads', 'torch']
+        ['ca_reg', 'cores', 'cpu', 'device', 'engine', 'kornia', 'platform', 'python', 'threads', 'torch']
     """
     return {
         "python": platform.python_version(),
@@ -142,6 +143,7 @@ def machine() -> dict[str, str | int]:
         "cores": os.cpu_count() or 0,
         "threads": torch.get_num_threads(),
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
+        "engine": describe_engine("cpu"),  # what draws on the processor
     }
 
 

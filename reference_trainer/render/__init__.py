@@ -5,7 +5,7 @@ which the loops are tested against. `use_engine` chooses.
 """
 
 from reference_trainer.render.checks import NotFiniteError
-from reference_trainer.render.engine import ENGINES, Engine, describe_engine, use_engine
+from reference_trainer.render.engine import ENGINES, Engine, chosen_engine, describe_engine, use_engine
 from reference_trainer.render.moments import render_moments, variance_shares
 from reference_trainer.render.renderer import draw, masked, render, splat
 from reference_trainer.render.splats import MomentImages, Rendering, Splats
@@ -18,6 +18,7 @@ __all__ = [
     "NotFiniteError",
     "Rendering",
     "Splats",
+    "chosen_engine",
     "color_variance_map",
     "describe_engine",
     "draw",

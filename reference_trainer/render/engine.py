@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import importlib.util
 import os
+import warnings
+from importlib.metadata import version
 from typing import Protocol
 
 import torch
@@ -13,7 +15,7 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.render.splats import Splats
 
-__all__ = ["ENGINES", "Engine", "describe_engine", "engine_for", "use_engine"]
+__all__ = ["ENGINES", "Engine", "chosen_engine", "describe_engine", "engine_for", "use_engine"]
 
 ENGINES = ("auto", "torch", "loops")
 _VARIABLE = "CA_REG_ENGINE"
@@ -87,9 +89,21 @@ def use_engine(name: str) -> None:
     """
     if name not in ENGINES:
         raise ValueError(f"there is no engine {name!r}; choose one of {', '.join(ENGINES)}.")
-    if name == "loops" and not _has_numba():
+    if name == "loops" and _loop_engine() is None:
         raise ImportError("the compiled loops need numba: pip install 'ca_reg[trainer]', or use the engine torch.")
     os.environ[_VARIABLE] = name
+
+
+def chosen_engine() -> str:
+    """Return what `use_engine`, or the environment, has chosen; for workers on other machines.
+
+    Raises:
+        ValueError: if the environment names an engine that does not exist.
+    """
+    chosen = os.environ.get(_VARIABLE, "auto")
+    if chosen not in ENGINES:
+        raise ValueError(f"{_VARIABLE} names the engine {chosen!r}; choose one of {', '.join(ENGINES)}.")
+    return chosen
 
 
 def engine_for(like: Tensor) -> Engine:
@@ -103,27 +117,21 @@ def engine_for(like: Tensor) -> Engine:
     Raises:
         ValueError: if the environment names an engine that does not exist.
     """
-    chosen = os.environ.get(_VARIABLE, "auto")
-    if chosen not in ENGINES:
-        raise ValueError(f"{_VARIABLE} names the engine {chosen!r}; choose one of {', '.join(ENGINES)}.")
-    if chosen == "torch" or like.device.type != "cpu" or like.dtype != torch.float32 or not _has_numba():
+    return _engine(like.device, like.dtype)
+
+
+def _engine(device: torch.device, dtype: torch.dtype) -> Engine:
+    if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
         return _torch_engine()
-    return _loop_engine()
+    return _loop_engine() or _torch_engine()
 
 
 def describe_engine(device: torch.device | str) -> str:
-    """Return which engine draws a model on a device, in words for people."""
-    engine = engine_for(torch.empty(0, device=device))
-    if engine.name == "torch":
+    """Return which engine draws a model (float32) on a device, which need not be there, in words for people."""
+    if _engine(torch.device(device), torch.float32).name == "torch":
         return "torch"
-    from importlib.metadata import version
-
-    return f"loops (numba {version('numba')}, {torch.get_num_threads()} threads)"
-
-
-@functools.cache
-def _has_numba() -> bool:
-    return importlib.util.find_spec("numba") is not None
+    count = torch.get_num_threads()
+    return f"loops (numba {version('numba')}, {count} thread{'s' if count > 1 else ''})"
 
 
 @functools.cache
@@ -134,7 +142,13 @@ def _torch_engine() -> Engine:
 
 
 @functools.cache
-def _loop_engine() -> Engine:
-    from reference_trainer.render.loops.engine import LoopEngine
-
+def _loop_engine() -> Engine | None:
+    """Return the loops, or None without a numba that works."""
+    if importlib.util.find_spec("numba") is None:
+        return None
+    try:
+        from reference_trainer.render.loops.engine import LoopEngine
+    except ImportError as error:  # such as of a NumPy that is too new for it
+        warnings.warn(f"numba is installed but cannot be imported ({error}): the engine torch draws.", stacklevel=2)
+        return None
     return LoopEngine()

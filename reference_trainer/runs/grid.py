@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from reference_trainer.render import chosen_engine, use_engine
 from reference_trainer.runs.engines.engine import Engine, Failure, Task, Value, attempt
 from reference_trainer.runs.engines.run_all import run_all
 from reference_trainer.runs.folder import RESULTS
@@ -94,7 +95,7 @@ def run_grid(runs: Sequence[Run], running: Running) -> list[dict[str, Any] | Fai
         else:
             run.out.mkdir(parents=True, exist_ok=True)
             how = (running.device, running.monitor_every, running.checkpoint_every, _lpips(running.lpips))
-            tasks[number] = Task(run.label, train_run, (*_where(run), *how))
+            tasks[number] = Task(run.label, train_run, (*_where(run), *how, chosen_engine()))
     numbers = list(tasks)
     for index, outcome in run_all(running.engine, list(tasks.values()), retries=running.retries, say=running.say):
         note(numbers[index], outcome, "now")
@@ -112,8 +113,9 @@ def train_run(
     monitor_every: int,
     checkpoint_every: int,
     lpips: str | None,
+    engine: str,
 ) -> dict[str, Any]:
-    """Do or continue one run, in a worker; see `run_experiment`.
+    """Do or continue one run, in a worker; see `run_experiment`, and `use_engine` for what draws.
 
     Raises:
         FileNotFoundError: if the folder of the run is not there, because this machine does not share it.
@@ -123,6 +125,7 @@ def train_run(
             f"{out} is not on the machine of the worker: --out must be on a file system that all machines of the "
             f"cluster share under the same path, and so must the scenes."
         )
+    use_engine(engine)  # a machine of a cluster has an environment of its own
     return run_experiment(
         options,
         config,

@@ -46,14 +46,40 @@ def trained(tmp_path_factory):
 @pytest.mark.parametrize(
     ("command", "options"),
     [
-        ([], ["demo", "train", "evaluate", "bake", "render", "compare"]),
+        ([], ["demo", "train", "evaluate", "bake", "render", "compare", "warmup"]),
         (["demo"], ["--iterations", "--seeds", "--jobs", "--out"]),
-        (["train"], ["--out", "--path", "--views", "--preset", "--dropout", "--noise", "--opacity-decay", "--device"]),
+        (["warmup"], ["--engine", "{None,auto,torch,loops}"]),
+        (
+            ["train"],
+            [
+                "--engine",
+                "--out",
+                "--path",
+                "--views",
+                "--preset",
+                "--dropout",
+                "--noise",
+                "--opacity-decay",
+                "--device",
+            ],
+        ),
         (["evaluate"], ["--ply", "--path", "--scene", "--dropout", "--samples", "--lpips", "--scale-noise"]),
         (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
         (["bake"], ["PATH", "--dropout", "--out"]),
         (["render"], ["--what", "--frames", "{test,train,flight}"]),
-        (["compare"], ["--strategies", "--seeds", "--jobs", "--iterations", "--engine", "--address", "--path"]),
+        (
+            ["compare"],
+            [
+                "--strategies",
+                "--seeds",
+                "--jobs",
+                "--iterations",
+                "--engine",
+                "--drawing-engine",
+                "--address",
+                "--path",
+            ],
+        ),
     ],
 )
 def test_help(command, options, capsys):
@@ -140,6 +166,18 @@ def test_a_ply_is_known_by_its_name(monkeypatch):
     monkeypatch.setattr(score_module, "score_ply_on_orbit", lambda ply, *rest, **named: asked.append(str(ply)))
     main(["evaluate", "somewhere/a.PLY"])
     assert asked == ["somewhere/a.PLY"]
+
+
+@pytest.mark.parametrize("engine", ["torch", "loops"])
+def test_the_engine_is_chosen_said_and_noted(engine, trained, capsys, tmp_path, monkeypatch):
+    if engine == "loops":
+        pytest.importorskip("numba")
+    monkeypatch.setenv("CA_REG_ENGINE", "auto")  # which the option changes, for workers
+    main(["evaluate", str(trained), "--samples", "2", "--engine", engine, "--out", str(tmp_path)])
+    said = capsys.readouterr().out.splitlines()
+    assert [line.startswith(f"Engine: {engine}") for line in said].count(True) == 1
+    noted = json.loads((tmp_path / "evaluation.json").read_text())["machine"]["engine"]
+    assert f"Engine: {noted}" in said
 
 
 def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):

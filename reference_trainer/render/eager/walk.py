@@ -84,7 +84,8 @@ def _monomials(like: Tensor) -> Tensor:
 def geometry_rows(splats: Splats) -> Tensor:
     """Return x, y, l11, l21, l22 and the binary logarithm of the opacity of M splats, shape (6, M)."""
     means, factors = splats.projection.means, splats.projection.factors
-    return torch.cat([means.T, factors.T, torch.log2(splats.opacities)[None]])
+    opacities = splats.opacities.clamp_min(MIN_ALPHA)  # what a mask has dropped is in no list, and has a gradient of 0
+    return torch.cat([means.T, factors.T, torch.log2(opacities)[None]])
 
 
 def blocks(lists: TileLists, device: torch.device) -> Iterator[Block]:

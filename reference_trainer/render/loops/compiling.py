@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from numba.core.caching import FunctionCache, NullCache
 
-__all__ = ["inlined", "kernel"]
+__all__ = ["KERNELS", "describe_compilation", "inlined", "kernel", "reported_to"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -15,19 +20,114 @@ F = TypeVar("F", bound=Callable[..., Any])
 # the inputs see must be what is there.
 _FAST = {"nsz", "contract", "reassoc", "arcp", "afn"}
 
+KERNELS: list[Any] = []
+"""All that were made; those of modules that are not imported yet are missing."""
+
+
+def _digest() -> str:
+    """Return a hash of all that is compiled into kernels of other files.
+
+    numba looks at the file of a kernel alone, and would go on using machine code into which an older version of
+    another file was inlined.
+    """
+    folder = Path(__file__).parent
+    sources = [path.read_bytes() for path in (folder.parent / "constants.py", *sorted(folder.glob("*.py")))]
+    return hashlib.sha256(b"".join([sources[0], *(text for text in sources if b"\n@inlined" in text)])).hexdigest()
+
+
+_DIGEST = _digest()
+
+
+def describe_compilation(folder: str | None) -> str:
+    """Return what happens, for people, when something must be compiled that will be kept in a folder, or nowhere."""
+    when = "once on this machine" if folder else "in every process, as no folder can be written (set NUMBA_CACHE_DIR)"
+    return f"Compiling the renderer's loops, {when}: about 15 s of one core."
+
+
+class _Log:
+    """Says once in a process that it compiles."""
+
+    said = False
+
+    def __call__(self, name: str, where: str | None) -> None:
+        if self.said:
+            return
+        self.said = True
+        logging.getLogger(__name__).warning(describe_compilation(where))
+
+
+_report: Callable[[str, str | None], None] = _Log()
+
+
+@contextmanager
+def reported_to(report: Callable[[str, str | None], None]) -> Iterator[None]:
+    """Tell a function, instead of the log, of every kernel that is compiled because it is not on the disk.
+
+    Args:
+        report: receives the kernel's name, and the folder where it will be kept, None if there is none.
+    """
+    global _report
+    before, _report = _report, report
+    try:
+        yield
+    finally:
+        _report = before
+
+
+def _name(function: Callable[..., Any]) -> str:
+    return f"{function.__module__.rpartition('.')[2]}.{function.__name__.lstrip('_')}"
+
+
+class _Kept(FunctionCache):
+    """Machine code on the disk; what is wrong with the disk costs the time to compile, and not the run."""
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        return (*super()._index_key(sig, codegen), _DIGEST)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            found = super().load_overload(sig, target_context)
+        except Exception:  # a damaged file, which may unpickle to anything
+            found = None
+            self._try(self.flush)
+        if found is None:
+            _report(_name(self._py_func), self.cache_path)
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        self._try(super().save_overload, sig, data)
+
+    def _try(self, function: Callable[..., None], *arguments: Any) -> None:
+        try:
+            function(*arguments)
+        except OSError as error:  # such as a full disk
+            logging.getLogger(__name__).info("%s is not kept: %s", _name(self._py_func), error)
+
+
+class _NotKept(NullCache):
+    """No machine code on the disk."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def load_overload(self, sig: Any, target_context: Any) -> None:
+        _report(_name(self._function), None)
+
 
 def kernel(function: F) -> F:
     """Compile a loop over NumPy arrays; it runs without the interpreter's lock, so that threads run side by side.
 
     The machine code is kept beside the source, or in the user's cache if that cannot be written, or nowhere if none
-    can: then every process compiles anew.
+    can: then every process compiles anew. ``NUMBA_CACHE_DIR`` goes before both.
     """
-    options = {"nogil": True, "fastmath": _FAST, "error_model": "numpy"}
+    compiled: Any = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy")(function)
     try:
-        compiled: F = numba.njit(cache=True, **options)(function)
+        compiled._cache = _Kept(function)
     except RuntimeError:  # "no locator available": neither the package nor the home can be written
-        compiled = numba.njit(**options)(function)
-    return compiled
+        compiled._cache = _NotKept(function)
+    KERNELS.append(compiled)
+    result: F = compiled
+    return result
 
 
 def inlined(function: F) -> F:

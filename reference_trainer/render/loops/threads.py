@@ -1,17 +1,18 @@
 """Loops side by side: ranges of one loop are handed to threads, as many as PyTorch uses.
 
 Kernels run without the interpreter's lock, so plain threads are enough, and with them what compilers' own thread pools
-break holds: several threads may call at once, processes may fork at any time, and ``OMP_NUM_THREADS`` and
-`torch.set_num_threads` decide for both libraries. Every range writes to places of its own, and no sum crosses ranges:
-results do not depend on the number of threads.
+break holds: several threads may call at once, processes may fork at any time (the new one goes on with one thread), and
+``OMP_NUM_THREADS`` and `torch.set_num_threads` decide for both libraries. Every range writes to places of its own, and
+no sum crosses ranges: results do not depend on the number of threads.
 """
 
 from __future__ import annotations
 
+import collections
 import itertools
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
 import torch
@@ -22,11 +23,25 @@ _RANGES = 8  # for each thread: so many that none waits long for the others
 _LEAST = 64  # items worth a call
 
 _pools: dict[int, ThreadPoolExecutor] = {}
-os.register_at_fork(after_in_child=_pools.clear)  # a forked process has none of its parent's threads
+
+
+def _begin_forked_process() -> None:
+    """Forget the threads of the parent, which do not exist here: ours, and PyTorch's own.
+
+    PyTorch would wait for the latter for ever; a worker of its DataLoader begins likewise.
+    """
+    _pools.clear()
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_forked_process)
 
 
 def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any, least: int = _LEAST) -> list[Any]:
     """Call ``kernel(first, last, *arguments)`` for ranges that make up ``range(count)``; return what they return.
+
+    Nothing is written any more when this returns, or raises: be it what a kernel raised, or KeyboardInterrupt.
 
     Args:
         kernel: compiled with `reference_trainer.render.loops.compiling.kernel`.
@@ -43,12 +58,43 @@ def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any, least: i
     def work() -> list[Any]:
         return [kernel(first, min(first + size, count), *arguments) for first in firsts]
 
-    if threads not in _pools:
-        _pools[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="loops")
-    others = [_pools[threads].submit(work) for _ in range(threads - 1)]
+    others: list[Future[list[Any]]] = []
     try:
+        _start(work, threads - 1, others)
         results = work()
-    finally:  # after Ctrl-C, too, nothing is written any more when the caller goes on
-        firsts = iter(())
-        wait(others)
-    return list(itertools.chain(results, *(other.result() for other in others)))
+    finally:
+        started = _finish(firsts, others)
+    return list(itertools.chain(results, *(other.result() for other in started)))
+
+
+def _start(work: Callable[[], Any], count: int, futures: list[Future[Any]]) -> None:
+    """Have work done by other threads; by none while the interpreter shuts down."""
+    pool = _pools.get(count)
+    if pool is None:
+        pool = _pools.setdefault(count, ThreadPoolExecutor(count, thread_name_prefix="loops"))
+    for _ in range(count):
+        try:
+            futures.append(pool.submit(work))
+        except RuntimeError:
+            return
+
+
+def _finish(ranges: Iterator[int], futures: list[Future[Any]]) -> list[Future[Any]]:
+    """Wait for all that have begun, whatever Ctrl-C says meanwhile; return them. The others never begin.
+
+    Args:
+        ranges: that are left after an error or Ctrl-C; nobody takes them any more.
+        futures: the work of other threads.
+    """
+    interruption = None
+    while True:
+        try:
+            collections.deque(ranges, maxlen=0)
+            started = [future for future in futures if not future.cancel()]
+            wait(started)
+            break
+        except KeyboardInterrupt as error:
+            interruption = error
+    if interruption is not None:
+        raise interruption
+    return started

@@ -8,6 +8,7 @@ import torch
 from oracles import random_scene
 
 from reference_trainer.camera import Camera
+from reference_trainer.render import splat
 from reference_trainer.render.eager.projection import project, rotation_matrices
 
 
@@ -129,3 +130,30 @@ def test_gradients_of_gaussians_of_a_million_scene_sizes_do_not_overflow():
         results[dtype] = [factors.detach(), *(x.grad for x in leaves)]
     for ours, exact in zip(results[torch.float32], results[torch.float64], strict=True):
         assert (ours.double() - exact).norm() < 1e-5 * exact.norm()
+
+
+@pytest.mark.parametrize("kind", ["random", "needles", "huge", "quaternions"])
+def test_every_engine_projects_alike(kind, case):
+    """Within float32 of the float64 projection of the same rounded numbers, entry by entry."""
+    scene = random_scene(200, 40, 30, seed=9)
+    if kind == "needles":
+        scene = scene._replace(scales=torch.tensor([[3.0, 1e-5, 1e-4]]).double().expand(200, 3))
+    if kind == "huge":
+        scene = scene._replace(scales=1e7 * scene.scales)
+    if kind == "quaternions":
+        scene = scene._replace(
+            quaternions=scene.quaternions * 10.0 ** torch.arange(-20, 20).double().repeat(5)[:, None]
+        )
+    s = scene.to(case.dtype)
+    splats = splat(*s[:4], s.camera, colors=s.colors)
+    assert splats.engine.name == case.engine
+    tensors = [x.double()[splats.indices] for x in s[:3]]
+    exact = project(*tensors, s.camera.to(dtype=torch.float64))
+    rounding = {torch.float32: 1e-4, torch.float64: 1e-11}[case.dtype]
+    for mine, other in zip(splats.projection, exact, strict=True):
+        scale = other.abs() if other.ndim == 1 else other.norm(dim=1, keepdim=True)
+        assert (
+            (mine.double() - other).abs() <= rounding * scale.clamp_min(1.0 if mine.shape[-1:] == (2,) else 0.0)
+        ).all()
+    depths = scene.means @ scene.camera.world_to_camera[2, :3] + scene.camera.world_to_camera[2, 3]
+    assert torch.equal(splats.indices, torch.nonzero(depths > 0.2).squeeze(1))

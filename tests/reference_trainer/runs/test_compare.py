@@ -11,7 +11,9 @@ from stand_ins.engine import Here
 
 from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.pictures import save_png
+from reference_trainer.render import chosen_engine
 from reference_trainer.runs import demo as demo_module
+from reference_trainer.runs import grid
 from reference_trainer.runs.compare import compare, scene_folders, strategies
 from reference_trainer.runs.compare_report import REPORT, TABLE, Comparison, comparison_table, report
 from reference_trainer.runs.engines.choice import choose_engine
@@ -85,7 +87,8 @@ def test_the_options_hold_for_every_scene(tmp_path):
 def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
     """One run of eight fails; every scene has its own table and its own failures."""
 
-    def train(options, config, out, device, monitor_every, checkpoint_every, lpips):
+    def train(options, config, out, device, monitor_every, checkpoint_every, lpips, engine):
+        assert engine == chosen_engine()
         assert (device, monitor_every, checkpoint_every, lpips) == ("cpu", 7, 9, str(Path("weights.pth").resolve()))
         assert out.is_dir()
         assert out.is_absolute()
@@ -260,3 +263,19 @@ def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_
     assert nobody.tasks == []
     assert files_of(out / "dropout") == before
     assert all(line.endswith("finished before") for line in said[-2:])
+
+
+@pytest.mark.parametrize("chosen", ["torch", "auto"])
+def test_a_worker_draws_with_the_engine_of_the_sweep(chosen, tmp_path, options, short, monkeypatch):
+    """Also where it does not inherit the environment, as on another machine."""
+    monkeypatch.setenv("CA_REG_ENGINE", chosen)
+    train = grid.train_run
+
+    def elsewhere(*arguments):
+        monkeypatch.setenv("CA_REG_ENGINE", "loops")
+        return train(*arguments)
+
+    monkeypatch.setattr(grid, "train_run", elsewhere)
+    monkeypatch.setattr(grid, "run_experiment", lambda *arguments, **options: made(20.0) | {"engine": chosen_engine()})
+    (outcome,) = grid.run_grid([grid.Run("one", options, short, tmp_path)], Running(Here()))
+    assert outcome["engine"] == chosen

@@ -1,0 +1,68 @@
+"""The option that chooses what draws, and the command that prepares it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import tyro
+
+__all__ = ["Draw", "DrawOfSweep", "Drawing", "DrawingOfSweep", "Warmup"]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What draws; the same for all commands that render."""
+
+    engine: Literal["auto", "torch", "loops"] | None = None
+    """What draws: "loops" (compiled; float32 on a CPU), "torch" (anything), or "auto", whichever fits. By default
+    $CA_REG_ENGINE, or "auto"."""
+
+    def begin(self, device: str, *, trains: bool = False) -> None:
+        """Choose the engine of this process and its workers, and say which it is.
+
+        Args:
+            device: where is drawn.
+            trains: whether all loops will be needed: those that are not compiled yet are compiled now, with progress.
+        """
+        from reference_trainer.render import describe_engine, use_engine
+
+        if self.engine is not None:
+            use_engine(self.engine)
+        print(f"Engine: {describe_engine(device)}", flush=True)
+        if trains and device == "cpu":
+            from reference_trainer.runs.warmup import warm_up
+
+            warm_up(_say)
+
+
+@dataclass(frozen=True)
+class DrawingOfSweep(Drawing):
+    """The same under another name, where --engine says where the runs are done."""
+
+    engine: Annotated[Literal["auto", "torch", "loops"] | None, tyro.conf.arg(name="drawing-engine")] = None
+    """What draws: "loops" (compiled; float32 on a CPU), "torch" (anything), or "auto", whichever fits. By default
+    $CA_REG_ENGINE, or "auto"."""
+
+
+Draw = Annotated[Drawing, tyro.conf.arg(name="")]
+DrawOfSweep = Annotated[DrawingOfSweep, tyro.conf.arg(name="")]
+
+
+@dataclass(frozen=True)
+class Warmup:
+    """Compile all loops of the renderer now instead of at the first use; needed once per machine and version."""
+
+    drawing: Draw = field(default_factory=Drawing)
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.runs.warmup import warm_up
+
+        self.drawing.begin("cpu")
+        names = warm_up(_say)
+        print(f"Compiled: {', '.join(names)}." if names else "Nothing is left to compile.")
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)

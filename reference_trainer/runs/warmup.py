@@ -1,0 +1,68 @@
+"""Compile the renderer's loops in advance, with progress: once per machine instead of at the first step."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import torch
+
+from reference_trainer.render import describe_engine, render_moments, variance_shares
+
+__all__ = ["warm_up"]
+
+
+@functools.cache
+def warm_up(say: Callable[[str], None] = lambda text: None) -> tuple[str, ...]:
+    """Use every loop once, if loops draw on a CPU; those that are on the disk are read from there.
+
+    Done once in a process. One training step of each kind and one of every score is what makes sure that exactly those
+    variants of the loops are compiled that are needed.
+
+    Args:
+        say: receives what is being done, if it takes time.
+
+    Returns:
+        The names of the loops that had to be compiled.
+    """
+    if describe_engine("cpu") == "torch":
+        return ()
+    from tqdm import tqdm
+
+    from reference_trainer.render.loops.compiling import KERNELS, describe_compilation, reported_to
+
+    names: list[str] = []
+    with tqdm(delay=1e9, unit="loop", leave=False) as bar:
+
+        def note(name: str, folder: str | None) -> None:
+            if not names:
+                say(describe_compilation(folder))
+                bar.delay = 0.0
+            names.append(name)
+            bar.total = max(len(KERNELS), len(names))
+            bar.set_postfix_str(name)
+            bar.update()
+
+        with reported_to(note):
+            _use_everything()
+    return tuple(names)
+
+
+def _use_everything() -> None:
+    """Do one training step of each kind and one exact score on a scene of a few pixels."""
+    from ca_reg.functional import Multiplier
+    from reference_trainer.runs.run import model_of
+    from reference_trainer.scenes import synthetic_scene
+    from reference_trainer.training.config import TrainConfig
+    from reference_trainer.training.trainer import Trainer
+
+    scene = synthetic_scene(width=8, height=6, points=20)
+    for analytic in (False, True):
+        trainer = Trainer(scene, TrainConfig(iterations=1, dropout=0.2, analytic=analytic))
+        trainer.train_step()
+    model, view = model_of(trainer), trainer.views[0]
+    with torch.no_grad():
+        model.rendering(model.gaussians.opacities, view)
+        splats = model.splats(model.gaussians.opacities, view)
+        render_moments(splats, Multiplier.dropout(0.5))
+        variance_shares(splats, Multiplier.dropout(0.5), torch.ones(splats.lists.height, splats.lists.width))

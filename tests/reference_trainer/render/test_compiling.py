@@ -1,0 +1,154 @@
+"""The machine code of the loops on the disk: kept, found again, and never needed."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from engines import subprocess_environment
+
+numba = pytest.importorskip("numba")
+from reference_trainer.render.loops import compiling  # noqa: E402
+
+SOURCE = """
+def double(first, last, x):
+    for i in range(first, last):
+        x[i] = 2 * x[i]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Where kernels are kept, empty; kernels of the test are not among those of the package."""
+    monkeypatch.setattr(compiling, "KERNELS", [])
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def loaded(tmp_path):
+    """Return a function that makes the kernel anew, as in a new process, uses it, and returns what was compiled."""
+    path = tmp_path / "doubling.py"
+    path.write_text(SOURCE)
+
+    def load() -> list[tuple[str, bool]]:
+        spec = importlib.util.spec_from_file_location("doubling", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        compiled, x = [], np.arange(5.0)
+        with compiling.reported_to(lambda name, folder: compiled.append((name, folder is not None))):
+            compiling.kernel(module.double)(1, 4, x)
+        assert x.tolist() == [0, 2, 4, 6, 4]
+        return compiled
+
+    return load
+
+
+def test_it_is_compiled_once(folder, loaded):
+    assert loaded() == [("doubling.double", True)]
+    assert loaded() == []
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("damage", [b"", b"no pickle", None], ids=["empty", "garbage", "cut off"])
+def test_a_damaged_file_costs_the_time_to_compile(folder, loaded, suffix, damage):
+    loaded()
+    (path,) = folder.rglob(f"*.{suffix}")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2] if damage is None else damage)
+    assert loaded() == [("doubling.double", True)]
+    assert loaded() == []  # and is mended
+
+
+def test_what_is_inlined_from_other_files_counts(folder, loaded, monkeypatch):
+    loaded()
+    monkeypatch.setattr(compiling, "_DIGEST", "of other sources")
+    assert loaded() == [("doubling.double", True)]
+
+
+def test_the_digest_is_of_what_is_inlined(monkeypatch):
+    read, texts = compiling.Path.read_bytes, {}
+
+    def edited(path):
+        texts[path.name] = read(path)
+        return texts[path.name] + (b"#" if path.name == changed else b"")
+
+    monkeypatch.setattr(compiling.Path, "read_bytes", edited)
+    changed = ""
+    assert compiling._digest() == compiling._DIGEST
+    for changed in ("constants.py", "arithmetic.py", "harmonics.py", "drawing.py"):  # noqa: B007
+        assert compiling._digest() != compiling._DIGEST
+    changed = "threads.py"
+    assert compiling._digest() == compiling._DIGEST
+
+
+def test_a_full_disk_costs_the_time_to_compile(folder, loaded, full_disk):
+    loaded()
+    for path in folder.rglob("*.nb?"):
+        path.unlink()
+    with full_disk(100):
+        assert loaded() == [("doubling.double", True)]
+    assert loaded() == [("doubling.double", True)]
+    assert loaded() == []
+
+
+def test_a_machine_on_which_nothing_can_be_written(tmp_path, folder, loaded, monkeypatch):
+    file = tmp_path / "file"
+    file.touch()  # nobody makes a folder below a file, not even root
+    (tmp_path / "__pycache__").touch()
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(file / "cache"))
+    for variable in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(variable, str(file / "home"))
+    assert loaded() == loaded() == [("doubling.double", False)]
+
+
+def test_it_says_so_once(caplog, monkeypatch, folder, loaded):
+    log = compiling._Log()
+    log("a", "/cache")
+    log("b", "/cache")
+    assert [record.getMessage() for record in caplog.records] == [
+        "Compiling the renderer's loops, once on this machine: about 15 s of one core."
+    ]
+    compiling._Log()("a", None)
+    assert "in every process, as no folder can be written (set NUMBA_CACHE_DIR)" in caplog.text
+
+
+SCRIPT = """
+import json, sys
+import numpy as np
+from reference_trainer.render.loops import compiling
+sys.path.append(sys.argv[1])
+import doubling
+compiled, x = [], np.arange(5.0)
+with compiling.reported_to(lambda name, folder: compiled.append(name)):
+    compiling.kernel(doubling.double)(1, 4, x)
+print(json.dumps([compiled, x.tolist()]))
+"""
+
+
+def started(path, folder, **environment):
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(path.parent)],
+        env=subprocess_environment(NUMBA_CACHE_DIR=str(folder), **environment),
+        stdout=subprocess.PIPE,
+    )
+
+
+def answer(process):
+    compiled, x = json.loads(process.communicate(timeout=300)[0])
+    assert x == [0, 2, 4, 6, 4]
+    return compiled
+
+
+@pytest.mark.slow
+def test_several_processes_at_once_and_another_processor(tmp_path):
+    path, folder = tmp_path / "doubling.py", tmp_path / "cache"
+    path.write_text(SOURCE)
+    together = [started(path, folder) for _ in range(4)]
+    assert any([answer(process) for process in together])
+    assert answer(started(path, folder)) == []
+    generic = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    assert answer(started(path, folder, **generic)) == ["doubling.double"]
+    assert answer(started(path, folder, **generic)) == []
+    assert answer(started(path, folder)) == []

@@ -1,0 +1,233 @@
+"""The loops in other processes: forked, spawned, Ray's, without numba, and at the end of the interpreter."""
+
+import subprocess
+import sys
+
+import pytest
+from engines import subprocess_environment
+
+pytestmark = pytest.mark.slow  # each starts interpreters that import torch
+
+
+def run(script, timeout=300, **environment):
+    """Run a script in a process of its own; return what it prints."""
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", script],
+        env=subprocess_environment(**environment),
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+DRAW = """
+import multiprocessing, os, sys, threading, time
+import torch
+from reference_trainer.camera import Camera
+from reference_trainer.render import describe_engine, render, use_engine
+
+torch.set_num_threads(3)
+
+def picture(*_):
+    g = torch.Generator().manual_seed(0)
+    means = torch.rand(3000, 3, generator=g) + torch.tensor([-0.5, -0.5, 1.0])
+    tensors = [means, torch.randn(3000, 4, generator=g), 0.05 * torch.rand(3000, 3, generator=g),
+               torch.rand(3000, generator=g).requires_grad_()]
+    out = render(*tensors, Camera(torch.eye(4), 90.0, 90.0, 50.0, 40.0, 100, 80), colors=means)
+    assert out.splats.engine.name == "loops"
+    out.image.square().sum().backward()
+    return out.image.detach().numpy().tobytes() + tensors[3].grad.numpy().tobytes()
+"""
+
+
+def test_forks_after_the_first_use():
+    pytest.importorskip("numba")
+    assert run(
+        DRAW
+        + """
+expected = picture()
+for _ in range(3):
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if picture() == expected else 1)
+    for _ in range(600):
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            break
+        time.sleep(0.1)
+    else:
+        os.kill(child, 9)
+        sys.exit("the forked process hangs")
+    assert status == 0
+with multiprocessing.get_context("fork").Pool(2) as pool:
+    assert pool.map(picture, range(4)) == [expected] * 4
+assert picture() == expected
+print("done")
+"""
+    ) == "done\n"  # fmt: skip
+
+
+def test_spawned_processes(tmp_path):
+    pytest.importorskip("numba")
+    script = tmp_path / "spawning.py"
+    script.write_text(
+        DRAW
+        + """
+if __name__ == "__main__":
+    expected = picture()
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        assert pool.map(picture, range(2)) == [expected] * 2
+"""
+    )
+    subprocess.run([sys.executable, str(script)], env=subprocess_environment(), check=True, timeout=300)
+
+
+def test_ray_workers_draw_with_the_chosen_engine():
+    pytest.importorskip("numba")
+    pytest.importorskip("ray")
+    assert "done" in run(
+        DRAW
+        + """
+from reference_trainer.runs.engines.engine import Task, Value
+from reference_trainer.runs.engines.ray_cluster import RayCluster
+from reference_trainer.runs.engines.run_all import run_all
+expected = picture()
+answers = [answer for _, answer in run_all(RayCluster(2), [Task(str(i), picture, ()) for i in range(4)])]
+assert answers == [Value(expected)] * 4, answers
+print("done")
+"""
+    )
+
+
+def test_a_thread_that_outlives_the_main_one_still_draws():
+    pytest.importorskip("numba")
+    assert "drawn" in run(
+        DRAW
+        + """
+expected = picture()
+def later():
+    threading.main_thread().join()
+    time.sleep(0.5)
+    assert picture() == expected
+    print("drawn", flush=True)
+threading.Thread(target=later).start()
+"""
+    )
+
+
+@pytest.mark.parametrize("count", ["1", "2"])
+def test_omp_num_threads_decides_for_the_loops(count):
+    pytest.importorskip("numba")
+    out = run(
+        """
+import threading, time, torch
+from reference_trainer.render import describe_engine
+from reference_trainer.render.loops.threads import in_threads
+used = in_threads(lambda *_: time.sleep(0.05) or threading.get_ident(), 20, least=1)
+print(torch.get_num_threads(), len(set(used)), describe_engine("cpu"))
+""",
+        OMP_NUM_THREADS=count,
+    )
+    of_torch, used, described = out.split(maxsplit=2)
+    assert used == of_torch
+    assert f", {of_torch} thread" in described
+    assert int(of_torch) <= int(count)
+
+
+def test_what_does_not_draw_does_not_import_numba():
+    out = run(
+        """
+import sys
+import ca_reg, reference_trainer.render
+from reference_trainer.cli import main
+for command in ([], ["train"], ["compare"]):
+    try:
+        main([*command, "--help"])
+    except SystemExit as exit_:
+        assert exit_.code == 0
+print("loaded:", [name for name in ("numba", "llvmlite") if name in sys.modules])
+"""
+    )
+    assert out.endswith("loaded: []\n")
+
+
+HIDE = """
+import importlib.machinery, sys
+import torch
+
+class Hiding(importlib.machinery.PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name.partition(".")[0] in ("numba", "llvmlite") else super().find_spec(name, path, target)
+
+sys.meta_path[sys.meta_path.index(importlib.machinery.PathFinder)] = Hiding
+"""
+
+
+def test_without_numba_everything_is_there(tmp_path):
+    out = run(
+        HIDE
+        + f"""
+from reference_trainer.cli import main
+out = {str(tmp_path / "run")!r}
+main(["train", "--downscale", "16", "--iterations", "3", "--monitor-every", "0", "--dropout", "0.2", "--out", out])
+main(["evaluate", out])
+main(["train", "--downscale", "16", "--iterations", "2", "--monitor-every", "0", "--dropout", "0.2", "--analytic",
+      "--out", out + "2"])
+main(["warmup"])
+assert "numba" not in sys.modules
+try:
+    main(["render", out, "--engine", "loops"])
+except SystemExit as exit_:
+    print("code", exit_.code)
+"""
+    )
+    assert "Engine: torch" in out
+    assert "ca_exact" in out
+    assert "Nothing is left to compile." in out
+    assert out.endswith("code 2\n")
+
+
+def test_a_numba_that_cannot_be_imported_is_as_good_as_none(tmp_path):
+    """Such as one that is too old for the installed NumPy, which raises ImportError."""
+    (tmp_path / "numba").mkdir()
+    (tmp_path / "numba" / "__init__.py").write_text("raise ImportError('Numba needs NumPy 1.0 or less')")
+    root = subprocess_environment()["PYTHONPATH"]
+    out = run(
+        """
+import warnings
+from reference_trainer.render import describe_engine, use_engine
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    print(describe_engine("cpu"), describe_engine("cpu"), [str(x.message) for x in caught])
+try:
+    use_engine("loops")
+except ImportError as error:
+    print(error)
+""",
+        PYTHONPATH=f"{tmp_path}:{root}",
+    )
+    assert out.startswith("torch torch ['numba is installed but cannot be imported (Numba needs NumPy 1.0 or less): ")
+    assert out.count("numba is installed") == 1
+    assert "the compiled loops need numba" in out
+
+
+def test_warmup_leaves_nothing_to_compile(tmp_path):
+    """With every loop that a training, a score or shares use; about 15 s of one core."""
+    pytest.importorskip("numba")
+    script = """
+from reference_trainer.cli import main
+main(["warmup"])
+from reference_trainer.render.loops.compiling import KERNELS
+assert len(KERNELS) > 10
+print("unused:", [kernel.__name__ for kernel in KERNELS if not kernel.signatures])
+"""
+    first = run(script, timeout=900, NUMBA_CACHE_DIR=str(tmp_path))
+    assert "Compiling the renderer's loops, once on this machine" in first
+    assert "Compiled: " in first
+    assert first.endswith("unused: []\n")
+    second = run(script, NUMBA_CACHE_DIR=str(tmp_path))
+    assert "Compiling" not in second
+    assert "Nothing is left to compile." in second
