@@ -9,7 +9,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render import render
-from reference_trainer.studies.speed.baseline import render_simply
+from reference_trainer.studies.stability.baseline import render_simply
 from reference_trainer.studies.speed.workloads import Workload
 
 __all__ = ["BASELINE", "SUBJECT", "Draw", "gradients", "image"]
