@@ -230,7 +230,7 @@ def error_runtime(
     }
     tell(f"render, {', '.join(list(calls)[1:])}")
     maps = {name: call() for name, call in calls.items()}
-    seconds = in_turns(calls, ROUNDS, device)
+    seconds = in_turns(calls, ROUNDS, functools.partial(now, device))
     runs = []
     for seed in range(seeds):
         tell(f"{MONTE_CARLO}, {max_samples} renders, seed {seed}")

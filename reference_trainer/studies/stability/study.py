@@ -77,7 +77,9 @@ def study_stability(out: Path, *, cases: Sequence[Case] | None = None, say: Say 
     say(text)
     say(f"numbers, tables and picture: {out / REPORT}, {out / TABLE}, {out / FIGURE}")
     if defects := [x for x in records if x["ending"] == "defect"]:
-        names = "\n".join(f"  {x['family']}: {x['name']}" + (f" ({x['engine']})" if x["engine"] else "") for x in defects)
+        names = "\n".join(
+            f"  {x['family']}: {x['name']}" + (f" ({x['engine']})" if x["engine"] else "") for x in defects
+        )
         raise RuntimeError(f"{len(defects)} cases do not end as they should:\n{names}")
     return report
 

@@ -102,8 +102,9 @@ def test_numbers_tables_and_picture(tmp_path):
 
 def test_a_defect_fails_after_everything_is_written(tmp_path):
     nan = Probe(lambda: {"image": torch.tensor([math.nan])}, lambda: {"image": torch.ones(1).double()})
+    cases = [*MADE_UP, single("third", "gives nan", lambda: nan, draws=False)]
     with pytest.raises(RuntimeError, match="1 cases do not end as they should:\n  third: gives nan"):
-        study_stability(tmp_path, cases=[*MADE_UP, single("third", "gives nan", lambda: nan, draws=False)], say=lambda text: None)
+        study_stability(tmp_path, cases=cases, say=lambda text: None)
     last = json.loads((tmp_path / "stability.json").read_text())["cases"][-1]
     assert (last["ending"], last["points"][0]["errors"]) == ("defect", {"image": None})
     assert (tmp_path / "stability.md").exists()
