@@ -29,13 +29,6 @@ def parts_of_a_step(trainer: Trainer, *, repeats: int = 7) -> dict[str, float]:
 
     Returns:
         Seconds, of processors on a CPU: of the "step" (render, loss, gradients), and by how much each change differs.
-
-    Example:
-        >>> from reference_trainer.scenes import synthetic_scene
-        >>> from reference_trainer.training.config import TrainConfig
-        >>> trainer = Trainer(synthetic_scene(width=32, height=24, points=100), TrainConfig(iterations=1))
-        >>> list(parts_of_a_step(trainer, repeats=1))[:3]
-        ['step', 'all bands left out', 'background left out']
     """
     gaussians, view, background = trainer.gaussians, trainer.views[0], trainer.background
     leaves = [x for _, x in gaussians.named() if x.numel()]

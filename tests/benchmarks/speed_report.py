@@ -97,7 +97,7 @@ def _drawn(w: Mapping[str, Any]) -> list[str]:
 
 
 def _ms(seconds: Mapping[str, Any], name: str) -> float:
-    return 1e3 * statistics.median(seconds[name])
+    return 1e3 * float(statistics.median(seconds[name]))
 
 
 def _times(name: str, w: Mapping[str, Any], drawer: str) -> dict[str, object]:

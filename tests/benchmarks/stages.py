@@ -67,7 +67,8 @@ def staged(workload: Workload, engine: str, clock: Clock) -> Staged:
     room = importlib.import_module(f"reference_trainer.render.{'eager' if engine == 'torch' else engine}.engine")
     with drawn_by(engine), mock.patch.object(room, "bin_gaussians", timed(room.bin_gaussians)):
         times = [clock()]
-        splats = splat(**leaves, camera=workload.camera, colors=colors)
+        p = leaves
+        splats = splat(p["means"], p["quaternions"], p["scales"], p["opacities"], workload.camera, colors=colors)
         end = clock()
         times += [end - binning, end]
     ends = (splats.projection.means, splats.projection.factors, splats.opacities, splats.colors)

@@ -32,6 +32,7 @@ def canned(monkeypatch):
         return {"per_pixel": 2.0, "medians": {"torch": seconds}, "memory": {"torch": peaks(spec, "torch", device)}}
 
     monkeypatch.setattr(module, "_measure", measure)
+    monkeypatch.setattr(module, "growth_figure", lambda report, path: None)
     return measured
 
 

@@ -29,15 +29,20 @@ def test_every_case_ends_as_it_should(case):
         assert record["ending"] != "defect", (record["engine"], record["onset"], record["failure"])
 
 
-def test_what_draws_is_judged_with_every_engine():
-    drawn = []
+def test_what_draws_is_judged_with_every_engine_against_one_reference():
+    drawn, references = [], []
 
-    def probe(magnitude):
-        splats = splats_of(base_scene(3).to(torch.float32))
-        drawn.append(splats.engine.name)
-        return grows(magnitude)
+    def measured():
+        drawn.append(splats_of(base_scene(3).to(torch.float32)).engine.name)
+        return {"image": torch.ones(2)}
 
-    assert [x["engine"] for x in judged(Case("f", "n", probe), ("loops", "torch"))] == drawn == ["loops", "torch"]
+    def reference():
+        references.append(1)
+        return {"image": torch.ones(2).double()}
+
+    case = Case("f", "n", lambda magnitude: Probe(measured, reference))
+    assert [x["engine"] for x in judged(case, ("loops", "torch"))] == drawn == ["loops", "torch"]
+    assert len(references) == 1
     assert [x["engine"] for x in judged(Case("f", "n", grows, draws=False), ("loops", "torch"))] == [None]
 
 
