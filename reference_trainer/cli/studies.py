@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.training.config import TrainConfig
-
 __all__ = [
     "Attribution",
     "ErrorRuntime",
     "GradientNoise",
-    "Growth",
-    "Plan",
     "Pruning",
     "Ranking",
-    "Speed",
     "Stability",
     "Study",
-]
-
-Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
-Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
-Alternative = Literal[
-    "SH degree 0", "SH degree 1", "initial size 1/2", "initial size 1/4", "no densification", "no opacity reset"
 ]
 
 
@@ -43,8 +31,6 @@ class ErrorRuntime:
     """Largest number of renders."""
     seeds: int = 3
     """Independent sequences of masks."""
-    compile: bool = False
-    """Measure the moments compiled, too."""
     device: str = "cpu"
     """"cpu" or "cuda"."""
 
@@ -57,7 +43,6 @@ class ErrorRuntime:
             self.out,
             max_samples=self.max_samples,
             seeds=self.seeds,
-            compiled=self.compile,
             device=self.device,
             say=print,
         )
@@ -152,101 +137,8 @@ class GradientNoise:
 
 
 @dataclass(frozen=True)
-class Speed:
-    """Time, memory and error of the renderer on the standard workloads, as ratios to the machine and to a baseline."""
-
-    out: Path = Path("runs/speed")
-    """Folder for the JSON and the tables."""
-    workloads: tuple[Literal["small", "medium", "large"], ...] = ("small", "medium")
-    """"large" takes minutes, nearly all of them in the baseline."""
-    scene: Scene = field(default_factory=SceneOptions)
-    repeats: int = 7
-    """Rounds of which the medians are taken."""
-    against: Path | None = None
-    """An older speed.json; slower or less exact than that is an error."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
-
-    def __call__(self) -> None:
-        """Run the study."""
-        from reference_trainer.studies.speed.study import study_speed
-
-        study_speed(
-            self.out,
-            workloads=self.workloads,
-            scene=self.scene,
-            repeats=self.repeats,
-            device=self.device,
-            against=self.against,
-            say=print,
-        )
-
-
-@dataclass(frozen=True)
-class Growth:
-    """Time and memory of the renderer against Gaussians, pixels, and Gaussians per pixel: exponents and a formula."""
-
-    out: Path = Path("runs/growth")
-    """Folder for the JSON, the tables and the figure; what is in it is not measured again."""
-    largest: int = 1_000_000
-    """Largest number of Gaussians."""
-    repeats: int = 3
-    """Rounds of which the medians are taken."""
-    time_limit: float = 300.0
-    """Seconds that one point may take; larger ones are left out, with the reason."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
-
-    def __call__(self) -> None:
-        """Run the study."""
-        from reference_trainer.studies.speed.growth import study_growth
-
-        study_growth(
-            self.out,
-            largest=self.largest,
-            repeats=self.repeats,
-            time_limit=self.time_limit,
-            device=self.device,
-            say=print,
-        )
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What every item of the plan is worth: short trainings with it on and off; time, memory, quality."""
-
-    scene: Scene = field(default_factory=SceneOptions)
-    config: Config = field(default_factory=TrainConfig)
-    out: Path = Path("runs/plan")
-    """Folder for the JSON and the table; what is in it is not trained again."""
-    steps: int = 1_000
-    """Steps of each training; the schedule of --iterations is shortened alike."""
-    seeds: int = 3
-    """Number of seeds."""
-    alternatives: tuple[Alternative, ...] = ()
-    """Changes to try besides those of the plan."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
-
-    def __call__(self) -> None:
-        """Run the study."""
-        from reference_trainer.studies.plan import study_plan
-
-        study_plan(
-            self.scene,
-            self.out,
-            config=self.config,
-            iterations=self.steps,
-            seeds=self.seeds,
-            alternatives=self.alternatives,
-            device=self.device,
-            say=print,
-        )
-
-
-@dataclass(frozen=True)
 class Stability:
-    """Extreme cases against float64 and exact arithmetic: which are right, refused, or limits, and from where on."""
+    """Extreme cases of both engines against float64 and exact arithmetic: right, refused, or limits, from where on."""
 
     out: Path = Path("runs/stability")
     """Folder for the JSON, the tables and the picture."""
@@ -262,7 +154,7 @@ class Stability:
 class Study:
     """Measure something about the method itself; see the subcommands."""
 
-    what: ErrorRuntime | Ranking | Attribution | Pruning | GradientNoise | Speed | Growth | Plan | Stability
+    what: ErrorRuntime | Ranking | Attribution | Pruning | GradientNoise | Stability
 
     def __call__(self) -> None:
         """Run the study that was chosen."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -15,18 +16,18 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.model import Model
-from reference_trainer.render.compiled import use_compiled
-from reference_trainer.render.statistics import first_order_map
+from reference_trainer.render import first_order_map
 from reference_trainer.scenes.scene import View
+from reference_trainer.studies.engines import drawn_by, engines_on
 from reference_trainer.studies.timing import in_turns, now
 
 __all__ = [
-    "COMPILED",
     "DOUBLE",
     "ERRORS",
     "FIRST_ORDER",
+    "LOOPS",
     "MONTE_CARLO",
-    "SINGLE",
+    "TORCH",
     "Error",
     "ErrorRuntime",
     "Measurement",
@@ -35,8 +36,8 @@ __all__ = [
 
 MONTE_CARLO = "Monte Carlo"
 FIRST_ORDER = "first order"
-SINGLE = "exact float32"
-COMPILED = "exact float32, compiled"
+LOOPS = "exact, loops"
+TORCH = "exact, torch"
 DOUBLE = "exact float64"
 
 Error = Literal["score", "map"]
@@ -113,14 +114,14 @@ class ErrorRuntime:
         return float(np.polyfit(np.log(ks), np.log(errors), 1)[0])
 
     def samples_to_match(self, error: Error) -> float | None:
-        """Return the K at which Monte Carlo would have the error of the exact float32 estimate.
+        """Return the K at which Monte Carlo would have the error of the first exact float32 estimate.
 
         Extrapolated from the measured errors by the law K^(-1/2) and not by the fitted slope, whose uncertainty would
         be multiplied by many decades. The renders' own rounding and early stop may keep the average from getting
         there. None if the exact estimate has no error at all.
         """
         ks, errors = self._convergence(error)
-        target = self.of(SINGLE).rms(error)
+        target = self.single.rms(error)
         return float(np.exp(np.mean(np.log(ks * errors**2)))) / target**2 if target > 0 else None
 
     def _convergence(self, error: Error) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -128,6 +129,11 @@ class ErrorRuntime:
         points = [(m.samples, m.rms(error)) for m in self.measurements if m.samples and m.samples >= FIT_FROM]
         ks, errors = np.array(points, dtype=np.float64).T
         return ks, errors
+
+    @property
+    def single(self) -> Measurement:
+        """The exact float32 estimate of the loops, or of torch where there are none."""
+        return next(m for m in self.measurements if m.estimator in (LOOPS, TORCH))
 
     def of(self, estimator: str) -> Measurement:
         """Return the first measurement of an estimator."""
@@ -155,26 +161,24 @@ def error_runtime(
     *,
     max_samples: int = 1024,
     seeds: int = 3,
-    compiled: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> ErrorRuntime:
     """Measure error and wall-clock time of all estimators of the co-adaptation of one view at a drop rate of 1/2.
 
     - Monte Carlo with K = 2, 4, 8, ... renders: the unbiased variance (ddof = 1), accumulated in float64 in one running
       pass per seed. Its time includes drawing the masks.
-    - The paper's first-order form, and the exact moments in float32 and in float64.
+    - The paper's first-order form, and the exact moments in float32, drawn by every engine, and in float64.
 
     All share one region, the pixels whose expected alpha exceeds 0.8 in the exact float64 result, and every time starts
     at the parameters of the model: projection and tile lists are included. Each call is made once before it is timed;
     on a GPU the clock waits for the work to be done. What takes one call is timed in turns with the plain render, so
-    that a change of the machine's load meets all of them.
+    that a change of the machine's load meets all of them. Plain renders are drawn by the engine that is chosen.
 
     Args:
         model: what to measure, float32; its dropout rate does not matter.
         view: what to render; only its name and camera matter.
         max_samples: largest K, a power of two, at least 16.
         seeds: number of Monte Carlo runs, at least 1; their masks come from the seeds 0, 1, 2, ...
-        compiled: whether to measure the compiled moments too, if the machine has a working compiler.
         progress: receives a line before each part.
 
     Returns:
@@ -213,27 +217,20 @@ def error_runtime(
         rms = (estimate - reference).square().mean().sqrt().item()
         return found, abs(found - score) / score, rms / score
 
-    def moments() -> Tensor:
-        return model.moments(opacities, view, multiplier).variance
+    def moments(engine: str) -> Tensor:
+        with drawn_by(engine):
+            return model.moments(opacities, view, multiplier).variance
 
-    def compiled_moments() -> Tensor:
-        use_compiled()
-        try:
-            return moments()
-        finally:
-            use_compiled(False)
-
+    exact_calls = {f"exact, {engine}": functools.partial(moments, engine) for engine in engines_on(device)}
     calls: dict[str, Callable[[], Tensor]] = {
         "render": lambda: model.render(opacities, view)[0],
         FIRST_ORDER: lambda: first_order_map(model.splats(opacities, view), multiplier),
-        SINGLE: moments,
+        **exact_calls,
         DOUBLE: lambda: double.moments(precise, view, multiplier).variance,
     }
-    if compiled and use_compiled():
-        calls[COMPILED] = compiled_moments
     tell(f"render, {', '.join(list(calls)[1:])}")
     maps = {name: call() for name, call in calls.items()}
-    seconds = in_turns(calls, ROUNDS, device)
+    seconds = in_turns(calls, ROUNDS, functools.partial(now, device))
     runs = []
     for seed in range(seeds):
         tell(f"{MONTE_CARLO}, {max_samples} renders, seed {seed}")

@@ -15,16 +15,18 @@ from reference_trainer.evaluation.report import format_mean_std, machine, markdo
 from reference_trainer.files import replacing, write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.model.ply import load_ply
+from reference_trainer.render import describe_engine
 from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.orbit import orbit_views
 from reference_trainer.scenes.scene import View
+from reference_trainer.studies.engines import engines_on
 from reference_trainer.studies.error_runtime import (
-    COMPILED,
     DOUBLE,
     ERRORS,
     FIRST_ORDER,
+    LOOPS,
     MONTE_CARLO,
-    SINGLE,
+    TORCH,
     Error,
     ErrorRuntime,
     error_runtime,
@@ -46,7 +48,6 @@ def study_error_runtime(
     *,
     max_samples: int = 1024,
     seeds: int = 3,
-    compiled: bool = False,
     device: str = "cpu",
     say: Say = print,
 ) -> dict[str, ErrorRuntime]:
@@ -60,7 +61,6 @@ def study_error_runtime(
         out: folder for the results.
         max_samples: largest K.
         seeds: number of Monte Carlo runs.
-        compiled: whether to measure the compiled moments too.
         device: where to render.
         say: receives the progress and the tables.
 
@@ -79,7 +79,7 @@ def study_error_runtime(
         if name in models:
             raise ValueError(f"two sources are called {name}: rename one, or study them in different folders.")
         models[name] = _of_ply(source, device) if is_ply else _of_run(source, device)
-    return study(models, out, max_samples=max_samples, seeds=seeds, compiled=compiled, say=say)
+    return study(models, out, max_samples=max_samples, seeds=seeds, say=say)
 
 
 def study(
@@ -88,7 +88,6 @@ def study(
     *,
     max_samples: int = 1024,
     seeds: int = 3,
-    compiled: bool = False,
     say: Say = print,
 ) -> dict[str, ErrorRuntime]:
     """Measure every model, and write ``error_runtime.json``, ``.md`` and ``.png``.
@@ -101,7 +100,6 @@ def study(
         out: folder for the results.
         max_samples: largest K.
         seeds: number of Monte Carlo runs.
-        compiled: whether to measure the compiled moments too.
         say: receives the progress and the tables.
 
     Returns:
@@ -120,13 +118,11 @@ def study(
     scenes: dict[str, Any] = read_json(file) if file.exists() else {}
     results: dict[str, ErrorRuntime] = {}
     for name, (model, view) in models.items():
-        settings = _settings(model, view, max_samples, seeds) | ({"compiled": True} if compiled else {})
+        settings = _settings(model, view, max_samples, seeds)
         if scenes.get(name, {}).get("settings") == settings:
             say(f"{name}: measured before, kept")
         else:
-            result = error_runtime(
-                model, view, max_samples=max_samples, seeds=seeds, compiled=compiled, progress=progress(name)
-            )
+            result = error_runtime(model, view, max_samples=max_samples, seeds=seeds, progress=progress(name))
             scenes[name] = {"settings": settings, **result.as_dict(), "machine": machine()}
             write_json(file, scenes)
         results[name] = ErrorRuntime.from_dict(scenes[name])
@@ -197,7 +193,7 @@ def error_runtime_figure(results: Mapping[str, ErrorRuntime], path: Path) -> Non
 
 def _panel(axes: Any, result: ErrorRuntime) -> None:
     """Draw one scene: filled markers for the score, hollow ones for the map."""
-    styles = {MONTE_CARLO: ("o", "C0"), FIRST_ORDER: ("s", "C1"), SINGLE: ("D", "C2"), COMPILED: ("^", "C3")}
+    styles = {MONTE_CARLO: ("o", "C0"), FIRST_ORDER: ("s", "C1"), LOOPS: ("D", "C2"), TORCH: ("^", "C3")}
     for error in ERRORS:
         for estimator, (marker, color) in styles.items():
             measured = [m for m in result.measurements if m.estimator == estimator and m.rms(error) > 0]
@@ -237,12 +233,13 @@ def _panel(axes: Any, result: ErrorRuntime) -> None:
 def _conclusion(result: ErrorRuntime, error: Error) -> str:
     """Say how the Monte Carlo error falls, and when it would be that of the exact estimate."""
     needed = result.samples_to_match(error)
+    single = result.single.estimator
     text = f"{error}: the error of {MONTE_CARLO} falls as K^{result.slope(error):.2f}"
     if needed is None:
-        return f"{text}; {SINGLE} has none."
+        return f"{text}; {single} has none."
     last = [m for m in result.measurements if m.samples is not None][-1]
     hours = needed / (last.samples or 1) * statistics.median(last.seconds) / 3600
-    return f"{text}; continued as K^-0.5 it equals that of {SINGLE} at K = {needed:.1e}, after {hours:.1e} hours."
+    return f"{text}; continued as K^-0.5 it equals that of {single} at K = {needed:.1e}, after {hours:.1e} hours."
 
 
 def _settings(model: Model, view: View, max_samples: int, seeds: int) -> dict[str, object]:
@@ -257,6 +254,8 @@ def _settings(model: Model, view: View, max_samples: int, seeds: int) -> dict[st
         "sh_degree": model.sh_degree,
         "fingerprint": digest.hexdigest(),
         "device": str(model.background.device),
+        "engine": describe_engine(model.background.device),
+        "exact": list(engines_on(model.background.device)),
         "threads": torch.get_num_threads(),
     }
 

@@ -1,28 +1,31 @@
-"""The clock of the studies."""
+"""The clocks of the studies."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from time import perf_counter
+from functools import partial
+from time import perf_counter, process_time
 
 import torch
 
-__all__ = ["in_turns", "now"]
+__all__ = ["Clock", "in_turns", "now", "processor_clock"]
+
+Clock = Callable[[], float]
 
 
-def in_turns(calls: Mapping[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, list[float]]:
+def in_turns(calls: Mapping[str, Callable[[], object]], repeats: int, clock: Clock) -> dict[str, list[float]]:
     """Time several calls in turns, so that a change of the machine's load meets all of them.
 
     Args:
         calls: by name.
         repeats: number of timed rounds; one round before them is not timed.
-        device: whose work to wait for.
+        clock: seconds; `now` of a device, or `processor_clock`.
 
     Returns:
         Seconds of every round, by name.
 
     Example:
-        >>> len(in_turns({"nothing": lambda: None}, 3, torch.device("cpu"))["nothing"])
+        >>> len(in_turns({"nothing": lambda: None}, 3, perf_counter)["nothing"])
         3
     """
     seconds: dict[str, list[float]] = {name: [] for name in calls}
@@ -30,9 +33,9 @@ def in_turns(calls: Mapping[str, Callable[[], object]], repeats: int, device: to
         call()
     for _ in range(repeats):
         for name, call in calls.items():
-            start = now(device)
+            start = clock()
             call()
-            seconds[name].append(now(device) - start)
+            seconds[name].append(clock() - start)
     return seconds
 
 
@@ -41,3 +44,8 @@ def now(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return perf_counter()
+
+
+def processor_clock(device: torch.device) -> Clock:
+    """Return a clock that other programs disturb less: the time of this process's processors; `now` on a GPU."""
+    return process_time if device.type == "cpu" else partial(now, device)

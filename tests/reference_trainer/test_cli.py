@@ -419,7 +419,7 @@ def test_the_real_arguments_are_the_default(monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_a_reader_that_has_seen_enough_is_no_error():
-    code = "from reference_trainer.cli import main; main(['study', 'growth', '--help'])"
+    code = "from reference_trainer.cli import main; main(['study', 'pruning', '--help'])"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
         assert b"ca-reg:" not in process.stderr.read()

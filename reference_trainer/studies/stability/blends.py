@@ -35,11 +35,11 @@ def blend_cases() -> list[Case]:
         *(single(_OPACITY, f"opacities {name}", partial(_opacities, x)) for name, x in _OPACITIES.items()),
         Case(
             _OPACITY, "opacity logits", _logits, _LOGITS, until=10.0,
-            note="the gradient, o (1 - o), loses its digits and is 0 from 17 on: 1 is the next float32",
+            note="the gradient, o (1 - o), loses its digits and is 0 from 17 on: 1 is the next float32", draws=False,
         ),
         Case(
             _OPACITY, "opacity logits, negative", lambda x: _logits(-x), _LOGITS, until=50.0,
-            note="below 1e-38 there is no float32",
+            note="below 1e-38 there is no float32", draws=False,
         ),
         *(Case(_BLEND, f"Gaussians on one pixel, opacity {o}", partial(_stacked, o), decades(0, 4)) for o in _STACKS),
         Case(
@@ -56,8 +56,8 @@ def blend_cases() -> list[Case]:
         *(single(_RANDOM, f"drop rate {name}", partial(_rate, x)) for name, x in _RATES.items()),
         Case(_RANDOM, "sigma of the opacity noise", _noise, _SIGMAS),
         single(_RANDOM, "opacity noise of sigma 0", partial(_noise, 0.0)),
-        Case(_RANDOM, "renders K of a score", _renders, (2.0, 100.0, 10_000.0)),
-        single(_RANDOM, "K = 1", partial(_renders, 1.0), refused="the variance of one render"),
+        Case(_RANDOM, "renders K of a score", _renders, (2.0, 100.0, 10_000.0), draws=False),
+        single(_RANDOM, "K = 1", partial(_renders, 1.0), refused="the variance of one render", draws=False),
         single(_RANDOM, "no visible pixel: no score, but a reason", _faint),
         single(_COLOR, "black background", partial(_colored, 0.0, 0.0)),
         *(
@@ -66,7 +66,7 @@ def blend_cases() -> list[Case]:
         ),
         single(_DTYPE, "float16 inputs", lambda: of_scene(base_scene(), dtype=torch.float16)),
         single(_DTYPE, "bfloat16 inputs", lambda: of_scene(base_scene(), dtype=torch.bfloat16)),
-        single(_DTYPE, "moments of lists in float16", _short_lists, refused="its checks"),
+        single(_DTYPE, "moments of lists in float16", _short_lists, refused="its checks", draws=False),
         single(_DTYPE, "torch.autocast to bfloat16", _autocast),
     ]  # fmt: skip
 

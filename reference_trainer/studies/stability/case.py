@@ -35,6 +35,7 @@ class Case:
         beyond: what is allowed after it: an error that names the mistake; a documented limit, finite but less exact; or
             an infinity where the dtype has no larger number.
         note: the documented limit, or what refuses.
+        draws: whether float32 is drawn, by an engine of the renderer; what is not is judged once for all engines.
     """
 
     family: str
@@ -44,11 +45,13 @@ class Case:
     until: float = math.inf
     beyond: Literal["refused", "limit", "overflow"] = "limit"
     note: str = ""
+    draws: bool = True
 
 
-def single(family: str, name: str, probe: Callable[[], Probe], *, refused: str = "") -> Case:
+def single(family: str, name: str, probe: Callable[[], Probe], *, refused: str = "", draws: bool = True) -> Case:
     """Return a case without a scale, which must be right, or refused if it is said by what."""
-    return Case(family, name, lambda _: probe(), until=0.0 if refused else math.inf, beyond="refused", note=refused)
+    until = 0.0 if refused else math.inf
+    return Case(family, name, lambda _: probe(), until=until, beyond="refused", note=refused, draws=draws)
 
 
 def decades(first: int, last: int, step: int = 1) -> tuple[float, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from reference_trainer.files import replacing
 from reference_trainer.studies.stability.quantities import SCENE_QUANTITIES
-from reference_trainer.studies.stability.report import worst_errors
+from reference_trainer.studies.stability.report import of_engine, worst_errors
 
 __all__ = ["stability_figure"]
 
@@ -25,7 +25,7 @@ _FLOOR, _CEILING = 1e-9, 1.0
 
 
 def stability_figure(report: Mapping[str, Any], path: Path) -> None:
-    """Draw the errors as a heat map, and as lines for the cases that have an onset.
+    """Draw the errors as a heat map for each engine, and as lines for the cases that have an onset.
 
     Args:
         report: what `study_stability` returns.
@@ -36,10 +36,13 @@ def stability_figure(report: Mapping[str, Any], path: Path) -> None:
 
     cases = [case for case in report["cases"] if worst_errors(case)]
     sweeps = [case for case in cases if case["magnitudes"] and case["onset"] is not None]
-    figure: Any = Figure(figsize=(15, max(4.0, 0.2 * len(cases) + 2)), layout="constrained")
+    engines = report["engines"]
+    rows = max(len(of_engine(cases, engine)) for engine in engines)
+    figure: Any = Figure(figsize=(6.5 * len(engines) + 7, max(4.0, 0.2 * rows + 2)), layout="constrained")
     FigureCanvasAgg(figure)
-    left, right = figure.subfigures(1, 2, width_ratios=(1.0, 0.9))
-    _heat(left, cases)
+    *left, right = figure.subfigures(1, len(engines) + 1)
+    for part, engine in zip(left, engines, strict=True):
+        _heat(part, engine, of_engine(cases, engine))
     if sweeps:
         panels = right.subplots(math.ceil(len(sweeps) / 2), 2, squeeze=False).flat
         for panel, case in zip(panels, sweeps, strict=False):
@@ -50,7 +53,7 @@ def stability_figure(report: Mapping[str, Any], path: Path) -> None:
         figure.savefig(place, dpi=110, format="png")
 
 
-def _heat(figure: Any, cases: Sequence[Mapping[str, Any]]) -> None:
+def _heat(figure: Any, engine: str, cases: Sequence[Mapping[str, Any]]) -> None:
     """Draw the largest error of every quantity over the magnitudes at which all are right."""
     table = np.full((len(cases), len(SCENE_QUANTITIES)), math.nan)
     for i, case in enumerate(cases):
@@ -64,7 +67,7 @@ def _heat(figure: Any, cases: Sequence[Mapping[str, Any]]) -> None:
     for i in range(1, len(cases)):
         if cases[i]["family"] != cases[i - 1]["family"]:
             axes.axhline(i - 0.5, color="white", linewidth=2)
-    axes.set_title("largest error where all is right (grey: not part of the case)", fontsize=9)
+    axes.set_title(f"{engine}: largest error where all is right (grey: not part of the case)", fontsize=9)
     bar = figure.colorbar(picture, ax=axes, shrink=0.4, aspect=30)
     bar.set_label("log10 of the relative error", fontsize=7)
 
@@ -98,6 +101,6 @@ def _lines(panel: Any, case: Mapping[str, Any]) -> None:
     panel.set_yscale("log")
     panel.set_ylim(_FLOOR / 2, _CEILING * 3)
     panel.tick_params(labelsize=6)
-    panel.set_title(f"{case['name']} ({case['ending']})", fontsize=7)
+    panel.set_title(f"{case['name']}, {case['engine'] or 'any engine'} ({case['ending']})", fontsize=7)
     panel.grid(alpha=0.3)
     panel.legend(fontsize=5, loc="lower right")

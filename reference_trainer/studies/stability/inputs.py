@@ -50,7 +50,8 @@ def _renderer() -> Iterator[Case]:
         yield single(_RENDERER, f"{label} in the harmonics", partial(_bad_harmonics, bad), refused="sh")
         moments = partial(_bad_background, bad)
         yield single(_RENDERER, f"{label} in a background of the moments", moments, refused="background")
-        yield single(_RENDERER, f"{label} in points of a new model", partial(_bad_points, bad), refused="positions")
+        points = partial(_bad_points, bad)
+        yield single(_RENDERER, f"{label} in points of a new model", points, refused="positions", draws=False)
 
 
 def _functions() -> Iterator[Case]:
@@ -83,7 +84,8 @@ def _functions() -> Iterator[Case]:
     }
     for name, call in calls.items():
         for label, bad in _BAD.items():
-            yield single(_FUNCTIONS, f"{label}: {name}", partial(_called, call, bad), refused="its checks")
+            probe = partial(_called, call, bad)
+            yield single(_FUNCTIONS, f"{label}: {name}", probe, refused="its checks", draws=False)
 
 
 def _passed() -> Iterator[Case]:
@@ -98,7 +100,7 @@ def _passed() -> Iterator[Case]:
         "expected_absolute_error": (lambda x: F.expected_absolute_error(x, image.to(x) / 9, image.to(x)), image),
     }
     for name, (call, x) in calls.items():
-        yield single(_PASSED, f"nan: {name}", partial(_stays, call, x))
+        yield single(_PASSED, f"nan: {name}", partial(_stays, call, x), draws=False)
 
 
 def _with(x: Tensor, bad: float) -> Tensor:

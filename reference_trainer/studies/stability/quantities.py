@@ -12,7 +12,7 @@ from ca_reg.functional import Multiplier, apply_dropout, apply_opacity_noise, dr
 from reference_trainer.camera import Camera
 from reference_trainer.render import Splats, draw, splat
 from reference_trainer.render.moments import render_moments
-from reference_trainer.studies.speed.baseline import render_simply
+from reference_trainer.studies.stability.baseline import render_simply
 from reference_trainer.studies.stability.scenes import PARAMETERS, StressScene
 
 __all__ = [

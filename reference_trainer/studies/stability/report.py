@@ -11,7 +11,7 @@ from reference_trainer.evaluation.report import markdown_table
 from reference_trainer.studies.stability.judge import GRADIENT_TOLERANCE, VALUE_TOLERANCE, Verdict
 from reference_trainer.studies.stability.quantities import SCENE_QUANTITIES
 
-__all__ = ["stability_tables", "verdict_record", "worst_errors"]
+__all__ = ["of_engine", "stability_tables", "verdict_record", "worst_errors"]
 
 
 def verdict_record(verdict: Verdict) -> dict[str, Any]:
@@ -51,14 +51,14 @@ def stability_tables(report: Mapping[str, Any]) -> str:
     """
     cases: Sequence[Mapping[str, Any]] = report["cases"]
     machine = report["machine"]
-    counts = Counter(case["ending"] for case in cases)
+    rows = [_count_row(engine, of_engine(cases, engine)) for engine in report["engines"]]
     lines = [
-        f"{report['date']}, {machine['cpu']}, torch {machine['torch']}: {len(cases)} cases at {report['points']} "
-        f"magnitudes in {report['seconds']:.0f} s. "
-        + ", ".join(f"{name}: {counts[name]}" for name in ("ok", "refused", "limit", "defect"))
-        + f". Right is an error of at most {VALUE_TOLERANCE:g}, of gradients (d) {GRADIENT_TOLERANCE:g}: the norm of "
-        "the difference over that of the reference.",
+        f"{report['date']}, {machine['cpu']}, torch {machine['torch']}: {report['points']} magnitudes in "
+        f"{report['seconds']:.0f} s. Right is an error of at most {VALUE_TOLERANCE:g}, of gradients (d) "
+        f"{GRADIENT_TOLERANCE:g}: the norm of the difference over that of the reference. What draws nothing in float32 "
+        "is judged once and counted for every engine.",
         "",
+        markdown_table(rows, list(rows[0])),
         "### Largest error over the magnitudes at which everything is right",
     ]
     for family in dict.fromkeys(case["family"] for case in cases):
@@ -66,17 +66,30 @@ def stability_tables(report: Mapping[str, Any]) -> str:
         if measured:
             used = [name for name in SCENE_QUANTITIES if any(name in worst_errors(case) for case in measured)]
             rows = [_error_row(case) for case in measured]
-            lines += ["", f"**{family}**", "", markdown_table(rows, ["case", "up to", *used]).rstrip()]
+            lines += ["", f"**{family}**", "", markdown_table(rows, ["case", "engine", "up to", *used]).rstrip()]
     rows = [_ending_row(case) for case in cases if case["ending"] != "ok"]
-    columns = ["case", "ends as", "from", "how", "what it says"]
+    columns = ["case", "engine", "ends as", "from", "how", "what it says"]
     lines += ["", "### Where and how the others end", "", markdown_table(rows, columns).rstrip()]
     return "\n".join(lines) + "\n"
+
+
+def of_engine(cases: Sequence[Mapping[str, Any]], engine: str) -> list[Mapping[str, Any]]:
+    """Return the records of an engine, and those that are of no engine."""
+    return [case for case in cases if case["engine"] in (engine, None)]
+
+
+def _count_row(engine: str, cases: Sequence[Mapping[str, Any]]) -> dict[str, object]:
+    """Return how many cases end in which way."""
+    counts = Counter(case["ending"] for case in cases)
+    endings = {name: counts[name] for name in ("ok", "refused", "limit", "defect")}
+    return {"engine": engine, "cases": len(cases), **endings}
 
 
 def _error_row(case: Mapping[str, Any]) -> dict[str, object]:
     """Return the row of a case, its errors with one digit."""
     right = [point["magnitude"] for point in case["points"] if point["status"] == "ok"]
-    row: dict[str, object] = {"case": case["name"], "up to": f"{max(right):.2g}" if case["magnitudes"] else "one"}
+    up_to = f"{max(right):.2g}" if case["magnitudes"] else "one"
+    row: dict[str, object] = {"case": case["name"], "engine": case["engine"] or "", "up to": up_to}
     return row | {name: f"{error:.0e}" if error else "0" for name, error in worst_errors(case).items()}
 
 
@@ -86,6 +99,7 @@ def _ending_row(case: Mapping[str, Any]) -> dict[str, object]:
     wrong = ", ".join(case["failure"]["quantities"])
     return {
         "case": f"{case['family']}: {case['name']}",
+        "engine": case["engine"] or "",
         "ends as": case["ending"],
         "from": f"{case['onset']:.2g}" if case["magnitudes"] else "always",
         "how": first["status"] + (f": {wrong}" if wrong else ""),

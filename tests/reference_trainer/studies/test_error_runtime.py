@@ -4,22 +4,23 @@ import dataclasses
 import itertools
 import json
 import math
+from collections import Counter
 
 import pytest
 import torch
 from oracles import brute_force, random_scene
 
 from ca_reg.functional import apply_dropout, draw_keep_mask
+from reference_trainer.evaluation import model as model_module
 from reference_trainer.evaluation.model import Model
 from reference_trainer.model.gaussians import SH_C0, Gaussians
-from reference_trainer.render import compiled, compiled_moments
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.error_runtime import (
-    COMPILED,
     DOUBLE,
     FIRST_ORDER,
+    LOOPS,
     MONTE_CARLO,
-    SINGLE,
+    TORCH,
     ErrorRuntime,
     Measurement,
     error_runtime,
@@ -105,9 +106,10 @@ def test_first_order_and_float32_have_their_true_errors(result, truth):
     assert first.scores == pytest.approx([estimate], rel=1e-5)
     assert first.score_errors == pytest.approx([abs(estimate / score(truth["variance"], truth) - 1)], rel=1e-5)
     assert first.map_errors == pytest.approx([relative_rms(truth["first order"], truth)], rel=1e-5)
-    single = result.of(SINGLE)
-    assert 0 < single.map_errors[0] < 1e-5
-    assert single.score_errors[0] < 1e-5
+    assert result.single is result.of(LOOPS)
+    for single in (result.of(LOOPS), result.of(TORCH)):
+        assert 0 < single.map_errors[0] < 1e-5
+        assert single.score_errors[0] < 1e-5
 
 
 def test_monte_carlo_is_the_unbiased_variance_of_renders_with_the_masks_of_the_seed(scene, result, truth):
@@ -141,8 +143,8 @@ def test_times_are_those_of_the_measured_calls(result):
         times = [m.seconds[seed] for m in sampled]
         assert times == sorted(times)
         assert times[0] > 0
-    assert len({len(result.of(name).seconds) for name in (FIRST_ORDER, SINGLE, DOUBLE)}) == 1
-    assert len(result.render_seconds) == len(result.of(SINGLE).seconds) > 2
+    assert len({len(result.of(name).seconds) for name in (FIRST_ORDER, LOOPS, TORCH, DOUBLE)}) == 1
+    assert len(result.render_seconds) == len(result.of(TORCH).seconds) > 2
     assert min(result.render_seconds) > 0
 
 
@@ -153,7 +155,7 @@ def test_slope_and_extrapolation_of_a_known_power_law():
         error = 99.0 if k < 8 else 3 / math.sqrt(k)
         return Measurement(MONTE_CARLO, k, [1.0, 1.0], [1.0, 1.0], [error, error], [0.0, error * math.sqrt(2)])
 
-    exact = Measurement(SINGLE, None, [1.0], [1.0], [1e-3], [0.0])
+    exact = Measurement(LOOPS, None, [1.0], [1.0], [1e-3], [0.0])
     law = ErrorRuntime("v", 2, 2, 1, 1.0, 0.5, 1.0, [1.0], [*(measured(2**i) for i in range(1, 8)), exact])
     assert law.slope("score") == pytest.approx(-0.5)
     assert law.slope("map") == pytest.approx(-0.5)  # of the root mean square over the seeds
@@ -183,17 +185,23 @@ def test_views_without_a_score_are_refused(scene):
         error_runtime(Model(black, torch.zeros(3)), view)
 
 
-def test_compiled_moments_are_measured_beside_the_eager_ones(scene, monkeypatch):
-    calls = []
+def test_every_engine_draws_its_own_moments(scene, monkeypatch):
+    drawn = Counter()
+    render_moments = model_module.render_moments
 
-    def kernel(function, *arguments):
-        calls.append(function)
-        function(*arguments)
+    def spy(splats, *rest, **keywords):
+        drawn[splats.engine.name, splats.colors.dtype] += 1
+        return render_moments(splats, *rest, **keywords)
 
-    monkeypatch.setattr(compiled_moments, "kernel", kernel)
-    monkeypatch.setattr(compiled, "_obstacle", lambda: "")
-    measured = error_runtime(*scene, max_samples=16, seeds=1, compiled=True)
-    assert calls
-    assert not compiled.is_compiled(torch.device("cpu"))
-    assert measured.of(COMPILED).rms("map") < 1e-5
-    assert [m.estimator for m in measured.measurements[-2:]] == [DOUBLE, COMPILED]
+    monkeypatch.setattr(model_module, "render_moments", spy)
+    measured = error_runtime(*scene, max_samples=16, seeds=1)
+    rounds = len(measured.render_seconds) + 2  # the maps, and a round that is not timed
+    assert drawn[LOOPS.removeprefix("exact, "), torch.float32] == rounds
+    assert drawn[TORCH.removeprefix("exact, "), torch.float32] == rounds
+
+
+def test_where_there_are_no_loops_torch_alone_is_measured(scene, monkeypatch):
+    monkeypatch.setattr("reference_trainer.studies.engines.importlib.util.find_spec", lambda name: None)
+    measured = error_runtime(*scene, max_samples=16, seeds=1)
+    assert [m.estimator for m in measured.measurements[-3:]] == [FIRST_ORDER, TORCH, DOUBLE]
+    assert measured.single is measured.of(TORCH)

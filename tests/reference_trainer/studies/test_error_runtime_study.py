@@ -15,7 +15,7 @@ from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies import error_runtime_study
-from reference_trainer.studies.error_runtime import SINGLE, ErrorRuntime, Measurement
+from reference_trainer.studies.error_runtime import LOOPS, ErrorRuntime, Measurement
 from reference_trainer.studies.error_runtime_study import (
     error_runtime_figure,
     error_runtime_table,
@@ -57,7 +57,7 @@ def calls(monkeypatch):
     """Studies whose measurements take no time, and the settings of each."""
     asked = []
 
-    def measure(model, view, *, max_samples, seeds, compiled, progress):
+    def measure(model, view, *, max_samples, seeds, progress):
         asked.append((view.name, max_samples))
         if view.name == "away":
             raise ValueError("no pixel of away")
@@ -138,7 +138,7 @@ def known(exact_error):
     ]
     others = [
         Measurement("first order", None, [0.1, 0.2, 0.9], [4e-3], [1.0], [2.0]),
-        Measurement(SINGLE, None, [0.4], [2e-3], [exact_error], [1e-3]),
+        Measurement(LOOPS, None, [0.4], [2e-3], [exact_error], [1e-3]),
         Measurement("exact float64", None, [0.5], [2e-3], [0.0], [0.0]),
     ]
     return ErrorRuntime("v", 8, 6, 12, 0.75, 0.5, 2e-3, [0.1, 0.1], [*sampled, *others])
@@ -154,10 +154,10 @@ def test_the_table_holds_medians_and_root_mean_squares():
     assert "8x6, 12 Gaussians; the region covers 75%" in text
     # 12.5 / K = 25e-8 at K = 5e7, which takes 5e6 seconds.
     assert (
-        "falls as K^-0.50; continued as K^-0.5 it equals that of exact float32 at K = 5.0e+07, after 1.4e+03 hours"
+        "falls as K^-0.50; continued as K^-0.5 it equals that of exact, loops at K = 5.0e+07, after 1.4e+03 hours"
         in text
     )
-    assert "exact float32 has none" in error_runtime_table(known(0.0))
+    assert "exact, loops has none" in error_runtime_table(known(0.0))
 
 
 def test_the_figure_can_be_drawn_without_an_error_of_the_exact_estimate(tmp_path):

@@ -1,11 +1,10 @@
-"""The workloads of the growth study: along every axis one quantity grows and the others stay."""
+"""The workloads of the growth benchmark: along every axis one quantity grows and the others stay."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from reference_trainer.studies.speed.limits import covered_pairs
-from reference_trainer.studies.speed.workloads import WORKLOADS, WorkloadSpec
+from benchmarks.workloads import WORKLOADS, WorkloadSpec, covered_pairs
 
 __all__ = ["Axis", "calibrated", "gaussians_per_pixel", "growth_axes"]
 
@@ -34,7 +33,7 @@ class Axis(NamedTuple):
 
 
 def growth_axes(largest: int) -> dict[str, Axis]:
-    """Choose the workloads of the study.
+    """Choose the workloads.
 
     Args:
         largest: number of Gaussians that none exceeds.

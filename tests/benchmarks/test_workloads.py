@@ -7,9 +7,9 @@ import types
 import numpy as np
 import pytest
 import torch
+from oracles import brute_force
 
-from reference_trainer.studies.speed.limits import covered_pairs
-from reference_trainer.studies.speed.workloads import WORKLOADS, Workload, WorkloadSpec
+from benchmarks.workloads import WORKLOADS, Workload, WorkloadSpec, covered_pairs
 
 
 @pytest.fixture
@@ -69,3 +69,14 @@ def test_a_workload_moves_as_a_whole():
     assert {x.dtype for x in (*moved.parameters.values(), moved.target, moved.camera.world_to_camera)} == {
         torch.float64
     }
+
+
+def test_pairs_are_those_that_brute_force_draws():
+    # Some ellipses reach beyond the picture, some lie outside.
+    workload = WorkloadSpec(40, 30, 20, 0.02).make().to(dtype=torch.float64)
+    drawn = [
+        (brute_force(*(x[i : i + 1] for x in workload.parameters.values()), workload.camera)[1] > 0).sum().item()
+        for i in range(40)
+    ]
+    assert covered_pairs(workload) == sum(drawn)
+    assert min(drawn) == 0

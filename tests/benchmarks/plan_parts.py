@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -11,7 +10,7 @@ from torch import Tensor
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render import render
 from reference_trainer.runs.run import model_of
-from reference_trainer.studies.timing import now
+from reference_trainer.studies.timing import in_turns, processor_clock
 from reference_trainer.training.losses import photometric_loss
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
@@ -30,13 +29,6 @@ def parts_of_a_step(trainer: Trainer, *, repeats: int = 7) -> dict[str, float]:
 
     Returns:
         Seconds, of processors on a CPU: of the "step" (render, loss, gradients), and by how much each change differs.
-
-    Example:
-        >>> from reference_trainer.scenes import synthetic_scene
-        >>> from reference_trainer.training.config import TrainConfig
-        >>> trainer = Trainer(synthetic_scene(width=32, height=24, points=100), TrainConfig(iterations=1))
-        >>> list(parts_of_a_step(trainer, repeats=1))[:3]
-        ['step', 'all bands left out', 'background left out']
     """
     gaussians, view, background = trainer.gaussians, trainer.views[0], trainer.background
     leaves = [x for _, x in gaussians.named() if x.numel()]
@@ -63,17 +55,7 @@ def parts_of_a_step(trainer: Trainer, *, repeats: int = 7) -> dict[str, float]:
         f"{_DROP_RATE:.0%} of the Gaussians dropped": lambda: step(opacities=gaussians.opacities * kept),
     }
     calls["exact moments added"] = lambda: score(model.gaussians.opacities, view)
-    fastest = _fastest(calls, repeats, trainer.device)
+    seconds = in_turns(calls, repeats, processor_clock(trainer.device))
+    fastest = {name: min(times) for name, times in seconds.items()}
     fastest["exact moments added"] += fastest["step"]
     return {name: seconds - fastest["step"] * (name != "step") for name, seconds in fastest.items()}
-
-
-def _fastest(calls: Mapping[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
-    """Seconds of the fastest round of each call, in turns; of processors, so that other programs count less."""
-    clock = time.process_time if device.type == "cpu" else lambda: now(device)
-    fastest = dict.fromkeys(calls, float("inf"))
-    for name, call in list(calls.items()) * (repeats + 1):  # the first round warms up, and is seldom the fastest
-        start = clock()
-        call()
-        fastest[name] = min(fastest[name], clock() - start)
-    return fastest

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from reference_trainer.studies.speed.report import regressions
+from benchmarks.speed_report import regressions
 
 
 @pytest.fixture

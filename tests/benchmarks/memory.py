@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 import gc
+import os
 from pathlib import Path
+from unittest import mock
 
 import torch
 
+from benchmarks.calls import draw_of, gradients, image
+from benchmarks.workloads import WorkloadSpec
 from reference_trainer.runs.engines.engine import Failure, Task
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all
-from reference_trainer.studies.speed.calls import SUBJECT, gradients, image
-from reference_trainer.studies.speed.workloads import WorkloadSpec
 
 __all__ = ["peak_memory"]
 
 _PROCESS = Path("/proc/self")
+_TINY = WorkloadSpec(100, 64, 64, 0.05)
 
 
-def peak_memory(spec: WorkloadSpec, device: torch.device) -> dict[str, int] | None:
-    """Measure how far memory rises above the inputs during a first rendering, and during a first gradient.
+def peak_memory(spec: WorkloadSpec, engine: str, device: torch.device) -> dict[str, int] | None:
+    """Measure how far memory rises above the inputs during a rendering, and during a gradient.
 
-    On a CPU: the peak of the resident memory of a fresh process above what it had just before the first call (inputs
-    and libraries loaded). It includes what the allocator holds back between tensors, buffers of the libraries, and the
-    threads of the backward pass. On a GPU: the peak of the tensors above those of the inputs.
+    On a CPU: the peak of the resident memory of a fresh process above what it had just before the call. A tiny gradient
+    before that loads the libraries and the compiled loops; freed tensors of 64 KiB or more go back to the system at
+    once (glibc), so that what the allocator would hold back does not count. On a GPU: the peak of the tensors above
+    those of the inputs.
 
     Args:
         spec: of the workload.
+        engine: what draws.
         device: where to render.
 
     Returns:
@@ -36,28 +41,29 @@ def peak_memory(spec: WorkloadSpec, device: torch.device) -> dict[str, int] | No
         RuntimeError: if the process that measures fails, or is killed for taking too much memory.
     """
     if device.type == "cuda":
-        return _in_this_process(spec, str(device), torch.get_num_threads())
+        return _in_this_process(spec, engine, str(device), torch.get_num_threads())
     if not (_PROCESS / "clear_refs").exists():
         return None
-    task = Task("peak memory", _in_this_process, (spec, str(device), torch.get_num_threads()))
-    [(_, outcome)] = run_all(Processes(1), [task], retries=0)
+    task = Task("peak memory", _in_this_process, (spec, engine, str(device), torch.get_num_threads()))
+    with mock.patch.dict(os.environ, {"MALLOC_MMAP_THRESHOLD_": str(1 << 16)}):
+        [(_, outcome)] = run_all(Processes(1), [task], retries=0)
     if isinstance(outcome, Failure):
         raise RuntimeError(f"the process that measures peak memory failed: {outcome.error}\n{outcome.traceback}")
     measured: dict[str, int] = outcome.value
     return measured
 
 
-def _in_this_process(spec: WorkloadSpec, device: str, threads: int) -> dict[str, int]:
-    """Measure here; the workload must be the first of this process."""
+def _in_this_process(spec: WorkloadSpec, engine: str, device: str, threads: int) -> dict[str, int]:
+    """Measure here; nothing larger may have been rendered in this process before."""
     torch.set_num_threads(threads)
-    workload = spec.make().to(device)
+    draw, workload = draw_of(engine), spec.make().to(device)
+    gradients(draw, _TINY.make().to(device))
     before = _restart(workload.means.device)
-    image(SUBJECT, workload)
-    forward = _peak(workload.means.device)
-    # What the first rendering left behind (buffers of libraries) still counts as above the inputs.
-    _restart(workload.means.device)
-    gradients(SUBJECT, workload)
-    return {"forward": forward - before, "forward+backward": _peak(workload.means.device) - before}
+    image(draw, workload)
+    forward = _peak(workload.means.device) - before
+    before = _restart(workload.means.device)
+    gradients(draw, workload)
+    return {"forward": forward, "forward+backward": _peak(workload.means.device) - before}
 
 
 def _restart(device: torch.device) -> int:

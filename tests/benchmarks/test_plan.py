@@ -5,20 +5,19 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import get_args
 
 import pytest
 import sweep_tasks
 from stand_ins.engine import Here
 from waiting import PATIENCE, until
 
-from reference_trainer.cli import studies as commands
+from benchmarks import plan as plan_module
+from benchmarks.plan import ALTERNATIVES, plan_table, shortened, study_plan, variants
+from benchmarks.plan_parts import parts_of_a_step
 from reference_trainer.runs.engines.engine import Task
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all
-from reference_trainer.studies import plan as plan_module
-from reference_trainer.studies.plan import ALTERNATIVES, plan_table, shortened, study_plan, variants
-from reference_trainer.studies.plan_parts import parts_of_a_step
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import Plan, PlanItem
 from reference_trainer.training.trainer import Trainer
@@ -33,6 +32,18 @@ TWO = Plan(
 
 
 TESTS = Path(sweep_tasks.__file__).parent
+
+
+@pytest.fixture(scope="module")
+def options():
+    return SceneOptions("synthetic", downscale=8)
+
+
+@pytest.fixture(scope="module")
+def short():
+    return TrainConfig(
+        iterations=11, dropout=0.2, noise=0.3, sh_every=4, densify_from=2, densify_every=4, densify_gradient=2e-3
+    )
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +69,8 @@ def test_an_unknown_alternative_names_the_known_ones():
         variants(TWO, TrainConfig(), ["no sun"])
 
 
-def test_the_command_offers_the_same_alternatives():
-    assert get_args(commands.Alternative) == tuple(ALTERNATIVES)
+def test_the_help_names_the_alternatives():
+    assert all(f'"{name}"' in plan_module.plan.__doc__ for name in ALTERNATIVES)
 
 
 def test_a_shortened_schedule_keeps_its_proportions():
@@ -141,7 +152,7 @@ STUDY = """
 from pathlib import Path
 import sweep_tasks
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies import plan
+from benchmarks import plan
 from reference_trainer.training.config import TrainConfig
 plan._train = sweep_tasks.note_the_interruption_here
 plan.study_plan(SceneOptions("synthetic", downscale=8.0), Path("out"), config=TrainConfig(iterations=1), seeds=1)
@@ -178,8 +189,8 @@ def test_differences_are_taken_within_a_seed():
     assert "| 15.0 ± 7.1 |" in rows[2]
 
 
-def test_more_work_takes_longer_and_the_model_stays(tiny_scene):
-    trainer = Trainer(tiny_scene, TrainConfig(iterations=1, sh_every=1))
+def test_more_work_takes_longer_and_the_model_stays(options):
+    trainer = Trainer(options.load(), TrainConfig(iterations=1, sh_every=1))
     before = trainer.gaussians.map(lambda x: x.detach().clone())
     parts = parts_of_a_step(trainer, repeats=3)
     assert parts["step"] > 0

@@ -1,4 +1,7 @@
-"""What every item of the plan is worth: the same short training with the item on and off, over several seeds."""
+"""What every item of the plan is worth: the same short training with the item on and off, over several seeds.
+
+``PYTHONPATH=tests python -m benchmarks.plan --path SCENE``.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,12 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+import tyro
 
+from benchmarks.plan_parts import parts_of_a_step
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
 from reference_trainer.files import write_text
@@ -20,12 +25,11 @@ from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.plan_parts import parts_of_a_step
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import Plan, make_plan
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["ALTERNATIVES", "plan_table", "shortened", "study_plan", "variants"]
+__all__ = ["ALTERNATIVES", "plan", "plan_table", "shortened", "study_plan", "variants"]
 
 AS_ASKED = "as asked"
 WHOLE_PLAN = "the whole plan"
@@ -39,6 +43,34 @@ ALTERNATIVES: dict[str, dict[str, Any]] = {
     "no opacity reset": {"opacity_reset_every": 0},
 }
 """What a plan could change, whether or not it does."""
+
+
+Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
+Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
+
+
+def plan(
+    scene: Scene = SceneOptions(),  # noqa: B008
+    config: Config = TrainConfig(),  # noqa: B008
+    out: Path = Path("runs/plan"),
+    steps: int = 1_000,
+    seeds: int = 3,
+    alternatives: tuple[str, ...] = (),
+    device: str = "cpu",
+) -> None:
+    """Train a scene shortly with every item of its plan on and off; time, memory, quality.
+
+    Args:
+        scene: what to train.
+        config: what is asked for, in the length that the plan is made for.
+        out: folder for the JSON and the table; what is in it is not trained again.
+        steps: of each training; the schedule of --iterations is shortened alike.
+        seeds: number of seeds.
+        alternatives: changes to try besides those of the plan: "SH degree 0", "SH degree 1", "initial size 1/2",
+            "initial size 1/4", "no densification", "no opacity reset".
+        device: "cpu" or "cuda".
+    """
+    study_plan(scene, out, config=config, iterations=steps, seeds=seeds, alternatives=alternatives, device=device)
 
 
 def shortened(config: TrainConfig, iterations: int) -> TrainConfig:
@@ -255,3 +287,9 @@ def _peak_bytes() -> int:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak << 10  # bytes on macOS, KiB elsewhere
+
+
+if __name__ == "__main__":
+    from benchmarks import plan as module  # under its own name, by which the processes of the trainings find it
+
+    tyro.cli(module.plan)

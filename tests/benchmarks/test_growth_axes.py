@@ -1,10 +1,9 @@
-"""The workloads of the growth study hold still what they promise to hold still."""
+"""The workloads of the growth benchmark hold still what they promise to hold still."""
 
 import pytest
 
-from reference_trainer.studies.speed.growth_points import calibrated, gaussians_per_pixel, growth_axes
-from reference_trainer.studies.speed.limits import covered_pairs
-from reference_trainer.studies.speed.workloads import WORKLOADS, WorkloadSpec
+from benchmarks.growth_axes import calibrated, gaussians_per_pixel, growth_axes
+from benchmarks.workloads import WORKLOADS, WorkloadSpec, covered_pairs
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from reference_trainer.studies.speed.growth_report import fit_exponent, fits
+from benchmarks.growth_report import fit_exponent, fits
 
 
 def test_a_power_law_is_recovered_exactly():
@@ -51,10 +51,10 @@ def test_two_points_have_no_error_and_no_fit():
 
 def test_what_was_left_out_or_has_no_memory_is_not_fitted():
     points = [
-        {"x": x, "medians": {"forward": x, "forward+backward": x**2}, "memory": {"tensors": None}}
+        {"x": x, "medians": {"loops": {"forward": x, "forward+backward": x**2}}, "memory": {"loops": None}}
         for x in (1.0, 2.0, 4.0)
     ]
     found = fits([*points, {"x": 8.0, "skipped": "too large"}])
-    assert list(found) == ["forward, time", "forward+backward, time"]
-    assert found["forward+backward, time"]["exponent"] == pytest.approx(2)
-    assert found["forward, time"]["end"] == 4
+    assert list(found) == ["loops, forward, time", "loops, forward+backward, time"]
+    assert found["loops, forward+backward, time"]["exponent"] == pytest.approx(2)
+    assert found["loops, forward, time"]["end"] == 4

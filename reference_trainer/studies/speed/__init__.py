@@ -1,1 +1,0 @@
-"""The speed of the renderer as data: standard workloads, measured limits, a frozen baseline, and a regression gate."""

@@ -1,0 +1,39 @@
+"""Both engines in turn, and the choice of the user afterwards."""
+
+import os
+
+import pytest
+import torch
+
+from reference_trainer.render import describe_engine
+from reference_trainer.studies.engines import drawn_by, engines_on
+
+
+@pytest.mark.parametrize("chosen", [None, "auto", "torch"])
+@pytest.mark.parametrize("drawing", ["loops", "torch"])
+def test_what_was_chosen_is_chosen_again(chosen, drawing, monkeypatch):
+    if chosen is None:
+        monkeypatch.delenv("CA_REG_ENGINE", raising=False)
+    else:
+        monkeypatch.setenv("CA_REG_ENGINE", chosen)
+
+    def interrupted():
+        with drawn_by(drawing):
+            assert describe_engine("cpu").startswith(drawing)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert os.environ.get("CA_REG_ENGINE") == chosen
+
+
+def test_an_engine_that_is_not_there_changes_nothing(monkeypatch):
+    monkeypatch.setenv("CA_REG_ENGINE", "torch")
+    with pytest.raises(ValueError, match="no engine 'lasers'"), drawn_by("lasers"):
+        pass
+    assert os.environ["CA_REG_ENGINE"] == "torch"
+
+
+def test_loops_draw_on_a_cpu_alone():
+    assert engines_on(torch.device("cpu")) == ("loops", "torch")
+    assert engines_on(torch.device("cuda")) == ("torch",)
