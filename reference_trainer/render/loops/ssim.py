@@ -59,12 +59,12 @@ def blur(maps: Tensor, weights: list[float]) -> Tensor:
 @kernel
 def _similarity(first: int, last: int, blurred: Array, c1: float, c2: float, result: Array, slopes: Array) -> None:
     """Evaluate the formula at pixels."""
-    one, two, c1, c2 = f4(1), f4(2), f4(c1), f4(c2)
+    one, two, of_means, of_variances = f4(1), f4(2), f4(c1), f4(c2)
     for i in range(first, last):
         x, y, xy, squared = blurred[0, i], blurred[1, i], blurred[2, i], blurred[3, i]
         product, squares = x * y, x * x + y * y
-        a1, a2 = two * product + c1, two * (xy - product) + c2
-        b1, b2 = squares + c1, squared - squares + c2
+        a1, a2 = two * product + of_means, two * (xy - product) + of_variances
+        b1, b2 = squares + of_means, squared - squares + of_variances
         weight = one / (b1 * b2)
         value = a1 * a2 * weight
         result[i] = value
