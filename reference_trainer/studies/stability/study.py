@@ -38,8 +38,8 @@ def all_cases() -> list[Case]:
 def study_stability(out: Path, *, cases: Sequence[Case] | None = None, say: Say = print) -> dict[str, Any]:
     """Push both engines of the renderer and the functions of `ca_reg` to extremes, and say where they end and how.
 
-    Writes ``stability.json``, ``stability.md`` and ``stability.png``. It takes about a minute. The loops are left out
-    where numba is missing.
+    Writes ``stability.json``, ``stability.md`` and ``stability.png``. It takes two minutes of one core. The loops are
+    left out where numba is missing.
 
     Args:
         out: folder for the results.
