@@ -61,8 +61,9 @@ def _use_everything() -> None:
         trainer = Trainer(scene, TrainConfig(iterations=1, dropout=0.2, analytic=analytic))
         trainer.train_step()
     model, view = model_of(trainer), trainer.views[0]
-    with torch.no_grad():
-        model.rendering(model.gaussians.opacities, view)
-        splats = model.splats(model.gaussians.opacities, view)
-        render_moments(splats, Multiplier.dropout(0.5))
-        variance_shares(splats, Multiplier.dropout(0.5), torch.ones(splats.lists.height, splats.lists.width))
+    opacities = model.gaussians.opacities.detach().requires_grad_()
+    splats, multiplier = model.splats(opacities, view), Multiplier.dropout(0.5)
+    moments = render_moments(splats, multiplier)
+    assert moments.alpha_variance is not None
+    (moments.variance.sum() + moments.alpha_variance.sum()).backward()  # type: ignore[no-untyped-call]
+    variance_shares(splats, multiplier, torch.ones(splats.lists.height, splats.lists.width))

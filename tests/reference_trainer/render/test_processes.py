@@ -222,7 +222,7 @@ from reference_trainer.cli import main
 main(["warmup"])
 from reference_trainer.render.loops.compiling import KERNELS
 assert len(KERNELS) > 10
-print("unused:", [kernel.__name__ for kernel in KERNELS if not kernel.signatures])
+print("unused:", [kernel.py_func.__qualname__ for kernel in KERNELS if not kernel.signatures])
 """
     first = run(script, timeout=900, NUMBA_CACHE_DIR=str(tmp_path))
     assert "Compiling the renderer's loops, once on this machine" in first
