@@ -65,7 +65,7 @@ def _rotation(quaternions: Array, i: int) -> Any:
     scale = _ONE / (largest if largest > _NO_DIRECTION else _NO_DIRECTION)
     w, x, y, z = w * scale, x * scale, y * scale, z * scale
     norm = math.sqrt(w * w + x * x + y * y + z * z)
-    inverse = _ONE / norm if norm > f4(1e-12) else f4(1e12)
+    inverse = _ONE / norm if norm > f4(1e-12) else _ZERO  # of a zero quaternion nothing follows but the identity
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     matrix = (
         _ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y),
