@@ -114,7 +114,7 @@ def test_help_and_mistakes_need_no_torch():
     code = """if True:
         import contextlib, io, sys
         from reference_trainer.cli import main
-        commands = ("demo", "plan", "train", "evaluate", "bake", "render", "compare", "study", "study growth")
+        commands = ("demo", "plan", "train", "evaluate", "bake", "render", "compare", "study", "study stability", "warmup")
         for words in ([], *(command.split() for command in commands), ["train", "--nonsense"]):
             with contextlib.suppress(SystemExit), contextlib.redirect_stderr(io.StringIO()):
                 main([*words, "--help"])
@@ -123,7 +123,7 @@ def test_help_and_mistakes_need_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-@pytest.mark.parametrize("command", ["evaluate", "render", "train", "compare", "study growth", "study attribution x"])
+@pytest.mark.parametrize("command", ["evaluate", "render", "train", "compare", "study attribution x"])
 def test_a_card_that_is_not_there(command, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
