@@ -114,7 +114,7 @@ def test_help_and_mistakes_need_no_torch():
     code = """if True:
         import contextlib, io, sys
         from reference_trainer.cli import main
-        commands = ("demo", "plan", "train", "evaluate", "bake", "render", "compare", "study", "study stability", "warmup")
+        commands = ("demo", "plan", "train", "evaluate", "bake", "render", "compare", "study", "warmup")
         for words in ([], *(command.split() for command in commands), ["train", "--nonsense"]):
             with contextlib.suppress(SystemExit), contextlib.redirect_stderr(io.StringIO()):
                 main([*words, "--help"])
