@@ -156,7 +156,7 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
         blurred: x, y, x y and x^2 + y^2, shape (4, C, H, W).
     """
     if engine_for(blurred).name == "loops":
-        from reference_trainer.render.loops.ssim import similarity
+        from reference_trainer.training.ssim_loops import similarity
 
         return similarity(blurred, _C1, _C2)
     mean_x, mean_y, mean_xy, mean_squares = blurred
@@ -172,7 +172,7 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
 def _blur(maps: Tensor) -> Tensor:
     """Blur maps (..., H, W) with the zero-padded window."""
     if engine_for(maps).name == "loops":
-        from reference_trainer.render.loops.ssim import blur
+        from reference_trainer.training.ssim_loops import blur
 
         return blur(maps, _WEIGHTS)
     # Sums of shifted slices: on a CPU faster than a depthwise convolution, whose speed depends on the memory layout.

@@ -6,7 +6,7 @@ back as well: what lies behind a splat is what was drawn less what has been pass
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,9 +17,19 @@ from reference_trainer.render.loops.arithmetic import PIXELS, X, Y, exp2
 from reference_trainer.render.loops.compiling import inlined, kernel
 from reference_trainer.render.loops.threads import in_threads
 from reference_trainer.render.precision import without_autocast
-from reference_trainer.render.splats import TileLists
+from reference_trainer.render.splats import Splats, TileLists
 
-__all__ = ["Rows", "alpha_at", "composite", "footprint", "footprint_gradient", "is_faint", "make_table", "row_sums"]
+__all__ = [
+    "alpha_at",
+    "composite",
+    "footprint",
+    "footprint_gradient",
+    "geometry_gradients",
+    "is_faint",
+    "make_table",
+    "over_tiles",
+    "sum_rows",
+]
 
 Array = Any
 f4 = np.float32
@@ -30,32 +40,24 @@ _FAINT = f4(np.log2(MIN_ALPHA))
 _CHECK = 16  # entries between two looks at whether all pixels have ended
 
 
-class Rows(NamedTuple):
-    """Where a tile's entries are: arrays that the kernels share.
-
-    Args:
-        starts: of every tile's list, shape (tiles + 1,).
-        gaussians: of every entry, nearest first in a tile, shape (P,).
-        slots: of every entry a row of its own, those of a Gaussian one after the other, shape (P,).
-        offsets: of every Gaussian's rows, shape (M + 1,).
-    """
-
-    starts: Any
-    gaussians: Any
-    slots: Any
-    offsets: Any
-
-    @classmethod
-    def of(cls, lists: TileLists) -> Rows:
-        """Return the arrays of lists that were made by the loops."""
-        assert lists.slots is not None
-        assert lists.offsets is not None
-        return cls(*(x.numpy() for x in (lists.starts, lists.gaussians, lists.slots, lists.offsets)))
+def make_table(splats: Splats) -> Tensor:
+    """Return x, y, l11, l21, l22, log2 of the opacity, red, green and blue of M splats, shape (M, 9)."""
+    projection, logarithms = splats.projection, torch.log2(splats.opacities)[:, None]
+    return torch.cat([projection.means, projection.factors, logarithms, splats.colors], dim=1).detach()
 
 
-def make_table(means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor) -> Any:
-    """Return x, y, l11, l21, l22, log2 of the opacity, red, green and blue of M Gaussians: an array (M, 9)."""
-    return torch.cat([means, factors, torch.log2(opacities)[:, None], colors], dim=1).detach().numpy()
+def over_tiles(kernel: Any, lists: TileLists, *arguments: Any) -> None:
+    """Call a kernel with the lists of all tiles, and with more tensors, of which it fills some that are contiguous."""
+    arrays = (x.detach().contiguous().numpy() if isinstance(x, Tensor) else x for x in (lists.gaussians, *arguments))
+    in_threads(kernel, lists.columns * lists.rows, lists.starts.numpy(), *arrays, least=4)
+
+
+def sum_rows(rows: Tensor, lists: TileLists) -> Tensor:
+    """Add up the rows of every Gaussian's entries, (P, C), always in the same order; shape (M, C)."""
+    assert lists.offsets is not None
+    sums = rows.new_empty(lists.offsets.shape[0] - 1, rows.shape[1])
+    in_threads(_sum_rows, sums.shape[0], lists.offsets.numpy(), rows.numpy(), sums.numpy())
+    return sums
 
 
 @inlined
@@ -226,8 +228,7 @@ def _backward(
 
 
 @kernel
-def row_sums(first: int, last: int, offsets: Array, rows: Array, sums: Array) -> None:
-    """Add up the rows of every Gaussian, always in the same order."""
+def _sum_rows(first: int, last: int, offsets: Array, rows: Array, sums: Array) -> None:
     for i in range(first, last):
         for column in range(rows.shape[1]):
             sums[i, column] = 0
@@ -237,78 +238,37 @@ def row_sums(first: int, last: int, offsets: Array, rows: Array, sums: Array) ->
 
 
 class _Composite(torch.autograd.Function):
-    """Image over the background (3, H, W), and what light is left (H, W)."""
+    """Of a table of splats: their image over the background (3, H, W), and what light is left (H, W)."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        factors: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        background: Tensor,
-        lists: TileLists,
-    ) -> tuple[Tensor, Tensor]:
-        table, entries = make_table(means, factors, opacities, colors), Rows.of(lists)
-        image, light = means.new_empty(3, lists.height, lists.width), means.new_empty(lists.height, lists.width)
-        in_threads(
-            _forward,
-            lists.columns * lists.rows,
-            entries.starts,
-            entries.gaussians,
-            table,
-            background.numpy(),
-            image.numpy(),
-            light.numpy(),
-            least=4,
-        )
-        ctx.table, ctx.entries, ctx.lists = table, entries, lists
-        ctx.save_for_backward(opacities, image, light)
+    def forward(ctx: Any, splats: Splats, background: Tensor, *_differentiable: Tensor) -> tuple[Tensor, Tensor]:
+        table, lists = make_table(splats), splats.lists
+        image, light = table.new_empty(3, lists.height, lists.width), table.new_empty(lists.height, lists.width)
+        over_tiles(_forward, lists, table, background, image, light)
+        ctx.lists = lists
+        ctx.save_for_backward(table, image, light)
         return image, light
 
     @staticmethod
     @without_autocast
     def backward(ctx: Any, to_image: Tensor, to_light: Tensor) -> tuple[Tensor | None, ...]:
-        opacities, image, light = ctx.saved_tensors
-        entries = ctx.entries
-        rows = np.empty((entries.slots.shape[0], 9), f4)
-        in_threads(
-            _backward,
-            ctx.lists.columns * ctx.lists.rows,
-            entries.starts,
-            entries.gaussians,
-            entries.slots,
-            ctx.table,
-            image.numpy(),
-            light.numpy(),
-            to_image.contiguous().numpy(),
-            to_light.contiguous().numpy(),
-            rows,
-            least=4,
-        )
-        sums = opacities.new_empty(opacities.shape[0], 9)
-        in_threads(row_sums, opacities.shape[0], entries.offsets, rows, sums.numpy())
-        to_background = (to_image * light).sum((1, 2)) if ctx.needs_input_grad[4] else None
-        return sums[:, :2], sums[:, 2:5], sums[:, 5] / opacities.clamp_min(MIN_ALPHA), sums[:, 6:], to_background, None
+        table, image, light = ctx.saved_tensors
+        rows = table.new_empty(ctx.lists.gaussians.shape[0], 9)
+        over_tiles(_backward, ctx.lists, ctx.lists.slots, table, image, light, to_image, to_light, rows)
+        to_background = (to_image * light).sum((1, 2)) if ctx.needs_input_grad[1] else None
+        return None, to_background, *geometry_gradients(table, sum_rows(rows, ctx.lists))
 
 
-def composite(
-    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, background: Tensor, lists: TileLists
-) -> tuple[Tensor, Tensor]:
-    """Draw colours over a background.
+def geometry_gradients(table: Tensor, sums: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the gradients of means, factors, opacities and colours, given those of a table's rows (M, 9 or more)."""
+    # A splat that a mask has dropped has no logarithm, and a gradient of 0.
+    return sums[:, :2], sums[:, 2:5], sums[:, 5] / table[:, 5].exp2().clamp_min(MIN_ALPHA), sums[:, 6:9]
 
-    The gradient passes through the clamp at `MAX_ALPHA`, as in the INRIA rasterizer.
 
-    Args:
-        means: pixel coordinates, shape (M, 2).
-        factors: of the inverse covariances, see `Projection`, shape (M, 3).
-        opacities: activated, shape (M,).
-        colors: shape (M, 3).
-        background: shape (3,).
-        lists: the splats of every tile.
-
-    Returns:
-        The image, shape (3, H, W), and the light left at every pixel, 1 - alpha, shape (H, W).
-    """
-    result: tuple[Tensor, Tensor] = _Composite.apply(means, factors, opacities, colors, background, lists)  # type: ignore[no-untyped-call]
+def composite(splats: Splats, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw splats over a background (3,): image (3, H, W), and the light left at every pixel, 1 - alpha, (H, W)."""
+    p = splats.projection
+    result: tuple[Tensor, Tensor] = _Composite.apply(  # type: ignore[no-untyped-call]
+        splats, background, p.means, p.factors, splats.opacities, splats.colors
+    )
     return result

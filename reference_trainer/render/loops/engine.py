@@ -48,19 +48,16 @@ class LoopEngine:
 
     def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draw splats front to back; depth as the red of a second picture."""
-        geometry = (splats.projection.means, splats.projection.factors, splats.opacities)
-        image, light = composite(*geometry, splats.colors, background, splats.lists)
+        image, light = composite(splats, background)
         if not depth:
             return image, 1 - light, None
         red = torch.nn.functional.pad(splats.projection.depths[:, None], (0, 2))
-        return image, 1 - light, composite(*geometry, red, torch.zeros_like(background), splats.lists)[0][0]
+        return image, 1 - light, composite(splats._replace(colors=red), torch.zeros_like(background))[0][0]
 
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
         """Composite mean and variance back to front."""
-        geometry = (splats.projection.means, splats.projection.factors, splats.opacities)
-        return moments(*geometry, splats.colors, multiplier, behind, splats.lists, alpha=alpha)
+        return moments(splats, multiplier, behind, alpha=alpha)
 
     def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
         """Sum the summands of the variance over the pixels."""
-        geometry = (splats.projection.means, splats.projection.factors, splats.opacities)
-        return shares(*geometry, splats.colors, multiplier, behind, weights, splats.lists)
+        return shares(splats, multiplier, behind, weights)

@@ -16,21 +16,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
+from reference_trainer.render.constants import MAX_ALPHA, TILE
 from reference_trainer.render.loops.arithmetic import PIXELS, X, Y
 from reference_trainer.render.loops.compiling import kernel
 from reference_trainer.render.loops.drawing import (
-    Rows,
     alpha_at,
     footprint,
     footprint_gradient,
+    geometry_gradients,
     is_faint,
     make_table,
-    row_sums,
+    over_tiles,
+    sum_rows,
 )
-from reference_trainer.render.loops.threads import in_threads
 from reference_trainer.render.precision import without_autocast
-from reference_trainer.render.splats import TileLists
+from reference_trainer.render.splats import Splats
 
 __all__ = ["moments", "shares"]
 
@@ -279,86 +279,39 @@ class _Moments(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, multiplier: Tensor,
-        behind: Tensor, lists: TileLists, alpha: bool,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        table, rows = make_table(means, factors, opacities, colors), Rows.of(lists)
-        mean, variance = (behind.new_empty(4, *behind.shape[1:]) for _ in range(2))
-        fixed = (table, multiplier.detach().contiguous().numpy(), behind.detach().contiguous().numpy())
-        arguments = (rows.starts, rows.gaussians, *fixed, mean.numpy(), variance.numpy())
-        in_threads(_forward, lists.columns * lists.rows, *arguments, least=4)
-        ctx.fixed, ctx.rows, ctx.lists, ctx.alpha = fixed, rows, lists, alpha
-        ctx.save_for_backward(opacities)
+        ctx: Any, splats: Splats, alpha: bool, multiplier: Tensor, behind: Tensor, *_differentiable: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        table = make_table(splats)
+        mean, variance = (table.new_empty(4, *behind.shape[1:]) for _ in range(2))
+        over_tiles(_forward, splats.lists, table, multiplier, behind, mean, variance)
+        ctx.lists, ctx.alpha = splats.lists, alpha
+        ctx.save_for_backward(table, multiplier, behind)
         return mean, variance
 
     @staticmethod
     @without_autocast
     def backward(ctx: Any, to_mean: Tensor, to_variance: Tensor) -> tuple[Tensor | None, ...]:
-        (opacities,), rows = ctx.saved_tensors, ctx.rows
-        complete = ctx.alpha or ctx.needs_input_grad[4]
-        to_rows = np.empty((rows.slots.shape[0], 11), f4)
-        to_behind = to_mean.new_empty(3, *to_mean.shape[1:])
-        upstream = (to_mean.contiguous().numpy(), to_variance.contiguous().numpy())
-        in_threads(
-            _complete_backward if complete else _backward,
-            ctx.lists.columns * ctx.lists.rows,
-            *rows[:3],
-            *ctx.fixed,
-            *upstream,
-            to_rows,
-            to_behind.numpy(),
-            least=4,
-        )
-        sums = opacities.new_empty(opacities.shape[0], 11)
-        in_threads(row_sums, opacities.shape[0], rows.offsets, to_rows, sums.numpy())
-        to_opacities = sums[:, 5] / opacities.clamp_min(MIN_ALPHA)
-        return sums[:, :2], sums[:, 2:5], to_opacities, sums[:, 6:9], sums[:, 9:], to_behind, None, None
+        table, multiplier, behind = ctx.saved_tensors
+        backward = _complete_backward if ctx.alpha or ctx.needs_input_grad[2] else _backward
+        rows, to_behind = table.new_empty(ctx.lists.gaussians.shape[0], 11), torch.empty_like(to_mean[:3])
+        fixed = (ctx.lists.slots, table, multiplier, behind, to_mean, to_variance)
+        over_tiles(backward, ctx.lists, *fixed, rows, to_behind)
+        sums = sum_rows(rows, ctx.lists)
+        return None, None, sums[:, 9:], to_behind, *geometry_gradients(table, sums)
 
 
-def moments(
-    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, multiplier: Tensor, behind: Tensor,
-    lists: TileLists, *, alpha: bool,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Return mean and variance of every pixel under random factors on the alphas; differentiable.
-
-    Args:
-        means: pixel coordinates, shape (M, 2).
-        factors: of the inverse covariances, see `Projection`, shape (M, 3).
-        opacities: activated, shape (M,).
-        colors: shape (M, 3).
-        multiplier: mean and variance of every splat's factor, shape (M, 2).
-        behind: colours behind everything, shape (3, H, W).
-        lists: the splats of every tile.
-        alpha: whether the gradients of the accumulated alpha count.
-
-    Returns:
-        Mean and variance of red, green, blue and accumulated alpha, shape (4, H, W) each.
-    """
-    result: tuple[Tensor, Tensor] = _Moments.apply(means, factors, opacities, colors, multiplier, behind, lists, alpha)  # type: ignore[no-untyped-call]
+def moments(splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
+    """Return mean and variance of every pixel under random factors, (4, H, W) each, see `Engine.moments`."""
+    p = splats.projection
+    result: tuple[Tensor, Tensor] = _Moments.apply(  # type: ignore[no-untyped-call]
+        splats, alpha, multiplier, behind, p.means, p.factors, splats.opacities, splats.colors
+    )
     return result
 
 
-def shares(
-    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, multiplier: Tensor, behind: Tensor,
-    weights: Tensor, lists: TileLists,
-) -> Tensor:  # fmt: skip
-    """Return every splat's share of the weighted variance of the pixels, shape (M,), float64.
-
-    Args:
-        means: pixel coordinates, shape (M, 2).
-        factors: of the inverse covariances, see `Projection`, shape (M, 3).
-        opacities: activated, shape (M,).
-        colors: shape (M, 3).
-        multiplier: mean and variance of every splat's factor, shape (M, 2).
-        behind: colours behind everything, shape (3, H, W).
-        weights: of the pixels, shape (H, W).
-        lists: the splats of every tile.
-    """
-    rows = Rows.of(lists)
-    images = (multiplier, behind, weights)
-    arguments = (make_table(means, factors, opacities, colors), *(x.detach().contiguous().numpy() for x in images))
-    of_rows = np.empty((rows.slots.shape[0], 1))
-    in_threads(_shares, lists.columns * lists.rows, *rows[:3], *arguments, of_rows, least=4)
-    sums = np.empty((opacities.shape[0], 1))
-    in_threads(row_sums, opacities.shape[0], rows.offsets, of_rows, sums)
-    return torch.from_numpy(sums[:, 0])
+def shares(splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
+    """Return every splat's share of the weighted variance of the pixels, (M,), float64, see `Engine.shares`."""
+    lists = splats.lists
+    rows = torch.empty(lists.gaussians.shape[0], 1, dtype=torch.float64)
+    over_tiles(_shares, lists, lists.slots, make_table(splats), multiplier, behind, weights, rows)
+    return sum_rows(rows, lists)[:, 0]

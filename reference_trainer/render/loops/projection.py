@@ -291,13 +291,10 @@ class _Project(torch.autograd.Function):
         arrays = (x.detach().contiguous().numpy() for x in (indices, means, quaternions, scales, sh))
         view = (x.contiguous().numpy() for x in (camera.world_to_camera, camera.position))
         ctx.arguments = (*arrays, degree, next(view), np.array(lens, f4), next(view))
-        centers, factors, covariances, depths, colors = (
-            means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,))
-        )
-        outputs = (centers, factors, covariances, depths, colors)
+        outputs = [means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,))]
         finite = all(in_threads(_forward, count, *ctx.arguments, *(x.numpy() for x in outputs), least=1024))
-        ctx.save_for_backward(colors)
-        ctx.mark_non_differentiable(covariances)
+        ctx.save_for_backward(outputs[-1])
+        ctx.mark_non_differentiable(outputs[2])
         return (*outputs, finite)
 
     @staticmethod
