@@ -128,6 +128,7 @@ def _setting(state: dict[str, Any], rng: random.Random) -> None:
     match rng.randrange(8):
         case 0:
             text = state["config"]
+            text = text.decode() if isinstance(text, bytes) else text  # which an earlier change has made of it
             state["config"] = rng.choice((text[: rng.randrange(len(text))], text.encode(), "[" * 10**5, "9" * 5000))
             return
         case 1:
