@@ -18,7 +18,6 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, NEAR_PLANE
-from reference_trainer.render.splats import screen_radii
 
 __all__ = ["DrawnLists", "Ellipses", "GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
 
@@ -28,11 +27,9 @@ class Ellipses(NamedTuple):
 
     Args:
         means: pixel coordinates, shape (M, 2); keeps its gradient.
-        radii: three standard deviations of the longer axis, rounded up, pixels, shape (M,).
     """
 
     means: Tensor
-    radii: Tensor
 
 
 class DrawnLists(NamedTuple):
@@ -165,13 +162,7 @@ def render_by(
     image = images[0].permute(2, 0, 1)
     splats = GsplatSplats(
         indices=info["gaussian_ids"].long(),
-        projection=Ellipses(info["means2d"], _radii(info["conics"].detach())),
+        projection=Ellipses(info["means2d"]),
         lists=DrawnLists(info["tiles_per_gauss"] > 0),
     )
     return GsplatRendering(image[:3], alphas[0, ..., 0], image[3] if depth else None, splats)
-
-
-def _radii(conics: Tensor) -> Tensor:
-    """Radii of the covariances: gsplat's own follow the opacity instead."""
-    xx, xy, yy = conics.unbind(-1)  # of the inverse covariance
-    return screen_radii(torch.stack([yy, -xy, xx], dim=-1) / (xx * yy - xy * xy).unsqueeze(-1))

@@ -13,27 +13,9 @@ from reference_trainer.render.constants import TILE
 if TYPE_CHECKING:
     from reference_trainer.render.engine import Engine
 
-__all__ = ["MomentImages", "Projection", "Rendering", "Splats", "TileLists", "screen_radii"]
+__all__ = ["MomentImages", "Projection", "Rendering", "Splats", "TileLists"]
 
 _SMALLEST_SPREAD = 0.1**0.5  # px^2: half the difference of the variances along the axes is taken for no less
-
-
-def screen_radii(covariances: Tensor) -> Tensor:
-    """Three standard deviations of the longer axis, rounded up; as in the INRIA code, more for round splats.
-
-    Args:
-        covariances: ``(xx, xy, yy)``, square pixels, shape (M, 3).
-
-    Returns:
-        Radii in pixels, shape (M,), of the type of the covariances.
-
-    Example:
-        >>> screen_radii(torch.tensor([[1.0, 0.0, 1.0], [9.0, 0.0, 1.0]])).tolist()  # 3 sqrt(1.32), 3 sqrt(9)
-        [4.0, 9.0]
-    """
-    xx, xy, yy = covariances.unbind(-1)
-    spread = torch.hypot(0.5 * (xx - yy), xy).clamp_min(_SMALLEST_SPREAD)
-    return torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt())
 
 
 class Projection(NamedTuple):
@@ -57,8 +39,19 @@ class Projection(NamedTuple):
 
     @property
     def radii(self) -> Tensor:
-        """See `screen_radii`; shape (M,)."""
-        return screen_radii(self.covariances.detach())
+        """Three standard deviations of the longer axis, rounded up, pixels, shape (M,); no gradient.
+
+        As in the INRIA code, more for round splats.
+
+        Example:
+            >>> covariances = torch.tensor([[1.0, 0.0, 1.0], [9.0, 0.0, 1.0]])
+            >>> nothing = torch.zeros(2, 0)
+            >>> Projection(nothing, nothing, covariances, nothing).radii.tolist()  # 3 sqrt(1.32), 3 sqrt(9)
+            [4.0, 9.0]
+        """
+        xx, xy, yy = self.covariances.detach().unbind(-1)
+        spread = torch.hypot(0.5 * (xx - yy), xy).clamp_min(_SMALLEST_SPREAD)
+        return torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt())
 
 
 @dataclass(frozen=True)
