@@ -41,7 +41,7 @@ _DIGEST = _digest()
 def describe_compilation(folder: str | None) -> str:
     """Return what happens, for people, when something must be compiled that will be kept in a folder, or nowhere."""
     when = "once on this machine" if folder else "in every process, as no folder can be written (set NUMBA_CACHE_DIR)"
-    return f"Compiling the renderer's loops, {when}: about 15 s of one core."
+    return f"Compiling the renderer's loops, {when}: about 20 s of one core."
 
 
 class _Log:

@@ -108,7 +108,7 @@ def test_it_says_so_once(caplog, monkeypatch, folder, loaded):
     log("a", "/cache")
     log("b", "/cache")
     assert [record.getMessage() for record in caplog.records] == [
-        "Compiling the renderer's loops, once on this machine: about 15 s of one core."
+        "Compiling the renderer's loops, once on this machine: about 20 s of one core."
     ]
     compiling._Log()("a", None)
     assert "in every process, as no folder can be written (set NUMBA_CACHE_DIR)" in caplog.text

@@ -215,7 +215,7 @@ except ImportError as error:
 
 
 def test_warmup_leaves_nothing_to_compile(tmp_path):
-    """With every loop that a training, a score or shares use; about 15 s of one core."""
+    """With every loop that a training, a score or shares use; about 20 s of one core."""
     pytest.importorskip("numba")
     script = """
 from reference_trainer.cli import main
