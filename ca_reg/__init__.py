@@ -17,12 +17,15 @@ Importing this package loads torch and numpy only.
 
 from ca_reg import functional
 from ca_reg.attribution import CAAttribution, CATotalEffects, SharesFn, attribute, total_effects
+from ca_reg.chain import Chain
 from ca_reg.functional import ColorVariance, color_variance, expected_opacity, scale_opacity
 from ca_reg.lists import ListMoments, PixelLists
-from ca_reg.modules import GaussianDropout, OpacityNoise
 from ca_reg.monitor import CAMonitor
+from ca_reg.params import Draw, Params
 from ca_reg.penalty import CAPenalty
 from ca_reg.reason import Reason
+from ca_reg.regularizer import Learned, Regularizer
+from ca_reg.regularizers import GaussianDropout, IndependentDropout, OpacityNoise
 from ca_reg.result import CAResult, CASummary, summarize
 from ca_reg.schedules import Constant, LinearRamp, Schedule, StartStop
 from ca_reg.score import CAScore
@@ -38,15 +41,21 @@ __all__ = [
     "CAScore",
     "CASummary",
     "CATotalEffects",
+    "Chain",
     "ColorVariance",
     "Constant",
+    "Draw",
     "GaussianDropout",
+    "IndependentDropout",
+    "Learned",
     "LinearRamp",
     "ListMoments",
     "MomentsFn",
     "OpacityNoise",
+    "Params",
     "PixelLists",
     "Reason",
+    "Regularizer",
     "RenderFn",
     "Rendering",
     "Schedule",

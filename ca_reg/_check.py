@@ -27,7 +27,8 @@ __all__ = [
 ]
 
 Rate = float | Tensor
-"""A number; inside ``torch.compile`` also a scalar tensor, so that a rate that changes needs no other graph."""
+"""A number, or one for each Gaussian, shape (N,); inside ``torch.compile`` also a scalar tensor, so that a rate that
+changes needs no other graph."""
 
 
 def check_opacity(opacity: Any) -> None:
@@ -67,8 +68,15 @@ def check_per_gaussian(x: Any, opacity: Tensor, name: str) -> None:
 
 
 def check_rate(p: Any, name: str = "p") -> None:
-    """Raise unless ``p`` is a real number in [0, 1)."""
+    """Raise unless ``p`` is a real number in [0, 1), or a tensor (N,) of such. Reads the values of a tensor."""
     if _is_in_a_graph(p):
+        return
+    if isinstance(p, Tensor):
+        if p.ndim != 1 or not p.is_floating_point() or not bool(((p >= 0) & (p < 1)).all()):
+            raise ValueError(
+                f"{name} must be a number in [0, 1) or a floating-point tensor (N,) of such, got a {p.dtype} tensor of "
+                f"shape {tuple(p.shape)}" + (f" from {p.min():g} to {p.max():g}." if p.numel() else ".")
+            )
         return
     check_finite(p, name)
     if not 0.0 <= p < 1.0:

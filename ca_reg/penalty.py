@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from ca_reg._check import check_finite
-from ca_reg._regularizer import Regularizer
+from ca_reg._scheduled import Scheduled
 from ca_reg.functional import Multiplier
 from ca_reg.schedules import Schedule, as_schedule
 from ca_reg.types import Layout, MomentsFn, check_layout, read_moments
@@ -30,7 +30,7 @@ class PenalizedRender(NamedTuple):
     penalty: Tensor
 
 
-class CAPenalty(Regularizer):
+class CAPenalty(Scheduled):
     """Render what dropout training sees on average, and penalise what it sees vary.
 
     For the mean squared error, the expected loss of dropout training is the loss of the expected render plus the mean
@@ -128,10 +128,8 @@ class CAPenalty(Regularizer):
         """The factor of the penalty at the present step."""
         return self._present_rate()
 
-    def _present_rate(self) -> float:
-        weight = self._schedule(self.step)
-        check_finite(weight, f"weight at step {self.step}", minimum=0.0)
-        return weight
+    def _check_rate(self, rate: float, step: int) -> None:
+        check_finite(rate, f"weight at step {step}", minimum=0.0)
 
     def forward(self, opacity: Tensor, view: Any, background: Tensor | None = None) -> PenalizedRender:
         """Render the moments of one view.
@@ -156,7 +154,7 @@ class CAPenalty(Regularizer):
                 raise TypeError(f"the multiplier callable must return a Multiplier, got {type(multiplier).__name__}.")
         moments = read_moments(self.moments_fn(opacity, view, multiplier, background), layout=self.layout)
         # In a graph the weight is a float64 scalar, which another scalar does not outweigh.
-        penalty = (self._rate_to_apply() * moments.variance.mean()).to(moments.variance.dtype)
+        penalty = (self._rate_at(self.step) * moments.variance.mean()).to(moments.variance.dtype)
         return PenalizedRender(moments.mean, moments.variance, penalty)
 
     def extra_repr(self) -> str:

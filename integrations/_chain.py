@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ca_reg.modules import OpacityNoise
+from ca_reg import OpacityNoise
 
 __all__ = ["Chain"]
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ca_reg.modules import GaussianDropout, OpacityNoise
+from ca_reg import GaussianDropout, OpacityNoise
 
 from ._after_import import AfterImport
 from ._caller import calling_render, find_instance, is_viewer, own_dropout, own_noise

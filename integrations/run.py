@@ -23,7 +23,7 @@ from typing import Any, get_args
 
 from torch import nn
 
-from ca_reg.modules import GaussianDropout, OpacityNoise
+from ca_reg import GaussianDropout, OpacityNoise
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
 from ._script import run_script, set_command_line

@@ -20,7 +20,7 @@ def draw_keep_mask(
 
     Args:
         n: number of Gaussians.
-        p: drop rate in [0, 1).
+        p: drop rate in [0, 1); a number, or one for each Gaussian, shape (n,).
         generator: source of the draw; the global state of the random numbers is then untouched. It decides where the
             numbers are drawn, so one CPU generator gives the same mask for every device. Not inside a function that
             ``torch.utils.checkpoint`` recomputes: draw outside it.
@@ -43,7 +43,8 @@ def draw_keep_mask(
     check_rate(p)
     check_draw(generator)
     source = device if generator is None else generator.device
-    keep = torch.rand(n, generator=generator, dtype=torch.float32, device=source) >= p
+    uniform = torch.rand(n, generator=generator, dtype=torch.float32, device=source)
+    keep = uniform >= (p.to(source) if isinstance(p, Tensor) and p.ndim else p)
     return keep if device is None else keep.to(device)
 
 
@@ -57,7 +58,7 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: b
     Args:
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
         keep: True where the Gaussian stays, shape (N,), bool.
-        p: the rate that ``keep`` was drawn with; used only by ``compensate``.
+        p: the rate or rates that ``keep`` was drawn with; used only by ``compensate``.
         compensate: multiply the survivors by ``1 / (1 - p)``, so that the mean over masks is ``opacity`` and nothing
             needs to be scaled at test time. Survivors may then exceed 1; they are not clamped here, because every
             3DGS rasterizer clamps the alpha of a splat at 0.99 or 0.999. With that clamp the mean alpha is lower than

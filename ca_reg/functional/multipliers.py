@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ca_reg._check import check_finite, check_opacity_range, check_rate
+from ca_reg._check import Rate, check_finite, check_opacity_range, check_rate
 
 __all__ = ["Multiplier"]
 
@@ -68,7 +68,7 @@ class Multiplier:
         return Multiplier(self.mean * other.mean, variance)
 
     @classmethod
-    def dropout(cls, p: float, *, compensate: bool = False) -> Multiplier:
+    def dropout(cls, p: Rate, *, compensate: bool = False) -> Multiplier:
         """Return the multiplier of :func:`~ca_reg.functional.gaussian_dropout` (paper, Eq. dropout_train).
 
         Exact for renderers that clamp alpha, because a factor of 0 or 1 commutes with the clamp. With ``compensate``
@@ -78,7 +78,7 @@ class Multiplier:
         ``compensate``.
 
         Args:
-            p: drop rate in [0, 1).
+            p: drop rate in [0, 1), a number or one for each Gaussian.
             compensate: survivors are multiplied by ``1 / (1 - p)``, without the renderer's clamp.
 
         Raises:
@@ -108,16 +108,16 @@ class Multiplier:
         return cls(1.0, unit * sigma * sigma)
 
     @classmethod
-    def clamped_noise(cls, opacity: Tensor, sigma: float, *, clip: bool = False, gain: float = 1.0) -> Multiplier:
+    def clamped_noise(cls, opacity: Tensor, sigma: float, *, clip: bool = False) -> Multiplier:
         """Return the multiplier of :func:`~ca_reg.functional.opacity_noise`, the clamp to [0, 1] included.
 
         Per Gaussian, ``xi = clamp(o (1 + eps), 0, 1) / o`` is one plus ``sigma`` times a standard normal number that is
         cut at ``-1 / sigma`` and at ``(1 / o - 1) / sigma``, whose moments are elementary. The upper cut lowers the
         mean of opacities near 1, the lower one raises the mean of all. Differentiable in ``opacity``.
 
-        After compensated dropout the noise acts on the opacities of the survivors, ``o / (1 - p)``, which may exceed 1.
-        With ``gain = 1 / (1 - p)`` the result is their factor, to be put on what the renderer is then to be given,
-        ``min(gain o, 1)``; times ``Multiplier.dropout(p)``, without its ``compensate``, it is that of both.
+        After compensated dropout the noise acts on the opacities of the survivors, ``o / (1 - p)``, which may exceed 1:
+        give it those. The result is then the factor of what the renderer is to be given, ``min(o, 1)``; times
+        ``Multiplier.dropout(p)``, without its ``compensate``, it is that of both.
 
         Left out is what the renderer does to the noisy alpha. With R the range of the colours and the background:
 
@@ -127,19 +127,18 @@ class Multiplier:
           takes across the cut-off.
 
         Args:
-            opacity: activated opacities ``o`` in [0, 1], any shape.
+            opacity: activated opacities ``o``, at least 0, any shape.
             sigma: standard deviation of the relative noise, at least 0.
             clip: the draw is clipped to [-sigma, sigma] before it is applied.
-            gain: what the opacities are multiplied by before the noise, at least 1.
 
         Returns:
-            Mean and variance per Gaussian of ``clamp(gain o (1 + eps), 0, 1) / min(gain o, 1)``, shape and dtype of
-            ``opacity``. At ``o = 0`` the limit of small opacities.
+            Mean and variance per Gaussian of ``clamp(o (1 + eps), 0, 1) / min(o, 1)``, shape and dtype of ``opacity``.
+            At ``o = 0`` the limit of small opacities.
 
         Raises:
-            TypeError: if ``opacity`` is not a floating-point tensor, or ``sigma`` or ``gain`` not a number.
-            ValueError: if an opacity is outside [0, 1], ``sigma`` negative or not finite, ``gain`` below 1 or not
-                finite, or a variance overflows.
+            TypeError: if ``opacity`` is not a floating-point tensor, or ``sigma`` not a number.
+            ValueError: if an opacity is negative or not finite, ``sigma`` negative or not finite, or a variance
+                overflows.
 
         Example:
             >>> noise = Multiplier.clamped_noise(torch.tensor([0.01, 1.0]), 0.2)
@@ -148,23 +147,20 @@ class Multiplier:
         """
         if not isinstance(opacity, Tensor) or not opacity.is_floating_point():
             raise TypeError("opacity must be a floating-point torch tensor of activated opacities.")
-        check_opacity_range(opacity)
+        check_opacity_range(opacity, upper=math.inf)
         check_finite(sigma, "sigma", minimum=0.0)
-        check_finite(gain, "gain", minimum=1.0)
         if sigma == 0:
             return cls(torch.ones_like(opacity), torch.zeros_like(opacity))
         cut = 1.0 if clip else _FAR
-        # Above 1 the variance is a small difference, and survivors reach any opacity: float64.
-        raised = opacity if gain == 1 else gain * opacity.double()
+        # Above 1 the variance is a small difference: float64.
+        raised = opacity.double() if bool((opacity > 1).any()) else opacity
         # At half the opacity from which on the cut is ``cut``: keeps 0 * inf out of the gradient at o = 0.
         raised = raised.clamp(min=0.5 / (1.0 + cut * sigma))
         highest = ((1.0 - raised) / (sigma * raised)).clamp(max=cut)
-        lowest = torch.tensor(min(1.0 / sigma, cut), dtype=torch.float64)
-        if gain > 1:  # a clipped draw may leave all of a survivor's opacities at 1: then both cuts are one
-            lowest = (-highest).clamp(min=lowest.item())
+        # A clipped draw may leave all opacities of a survivor at 1: then both cuts are one.
+        lowest = (-highest).clamp(min=min(1.0 / sigma, cut))
         (up, up_square), (down, down_square) = _upper_half(highest), _upper_half(lowest)
         shift, over = up - down, raised.clamp(min=1.0)
-        # At gain 1 half of the draws are on either side, so shift^2 is at most half of the mean square.
         variance = (sigma * over).square() * (up_square + down_square - shift.square()).clamp(min=0.0)
         return cls((over * (1.0 + sigma * shift)).to(opacity.dtype), variance.to(opacity.dtype))
 

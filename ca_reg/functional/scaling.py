@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ca_reg._check import Rate, check_finite, check_opacity, check_rate, is_zero
+from ca_reg._check import Rate, check_finite, check_opacity, check_opacity_range, check_rate, is_zero
 from ca_reg.functional.multipliers import Multiplier
 
 __all__ = ["expected_opacity", "scale_opacity"]
@@ -19,7 +19,7 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
 
     Args:
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
-        p: the drop rate of the training, in [0, 1).
+        p: the drop rate of the training, in [0, 1); a number, or one for each Gaussian, shape (N,).
 
     Returns:
         The scaled opacities, same shape and dtype; with ``p = 0`` the very same ``opacity``.
@@ -71,5 +71,6 @@ def expected_opacity(opacity: Tensor, sigma: float, *, clip: bool = False) -> Te
         tensor([0.1040, 0.5000, 0.7213])
     """
     check_opacity(opacity)
+    check_opacity_range(opacity)
     check_finite(sigma, "sigma", minimum=0.0)
     return opacity if sigma == 0 else opacity * Multiplier.clamped_noise(opacity, sigma, clip=clip).mean

@@ -52,7 +52,7 @@ def expected_draw(config: TrainConfig, opacities: Tensor) -> tuple[Tensor, Multi
     dropout, survivors = Multiplier.dropout(config.dropout), opacities * gain
     if config.noise == 0:
         return survivors, dropout
-    noise = Multiplier.clamped_noise(opacities, config.noise, clip=config.clip_noise, gain=gain)
+    noise = Multiplier.clamped_noise(survivors, config.noise, clip=config.clip_noise)
     return survivors.clamp(max=1), dropout * noise
 
 

@@ -1,4 +1,4 @@
-"""What the modules of this package share: a rate that follows the step, and a look at the first opacities."""
+"""A module whose rate may follow the step, and that looks at the first opacities."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ca_reg._check import check_count, check_opacity, check_opacity_range
+from ca_reg._check import Rate, check_count, check_opacity, check_opacity_range
 from ca_reg.schedules import Constant, Schedule
 
-__all__ = ["Regularizer"]
+__all__ = ["Scheduled"]
 
 
-class Regularizer(nn.Module):
+class Scheduled(nn.Module):
     """A module without parameters whose rate may depend on the step, and that looks at the first opacities.
 
     ``state_dict`` holds nothing if the rate is constant, and ``step``, a float64 scalar that may be averaged like a
     parameter, if it follows a schedule. A checkpoint without it leaves the step as it is, also with ``strict``.
     """
 
-    def __init__(self, schedule: Schedule) -> None:
+    def __init__(self, schedule: Schedule | None = None) -> None:
         super().__init__()
-        self._schedule = schedule
+        self._schedule = Constant(0.0) if schedule is None else schedule
         self._opacity_seen = False
         self._rate: Tensor | None = None
         self.step = 0
@@ -44,17 +44,24 @@ class Regularizer(nn.Module):
             # step. A new tensor, because one that was made in inference mode cannot be overwritten outside.
             self._rate = torch.tensor(self._present_rate(), dtype=torch.float64, device="cpu")
 
+    def _check_rate(self, rate: float, step: int) -> None:
+        """Raise unless the rate of a step is in its range."""
+
     def _present_rate(self) -> float:
         """Return the rate at the present step, checked."""
-        raise NotImplementedError
+        rate = self._schedule(self.step)
+        self._check_rate(rate, self.step)
+        return rate
 
-    def _rate_to_apply(self) -> float | Tensor:
-        """Return the rate at the present step: a number, or inside ``torch.compile`` a scalar tensor if it changes."""
+    def _rate_at(self, step: int) -> Rate:
+        """Return the rate at a step: a number, or inside ``torch.compile`` the present one as a scalar tensor."""
         if isinstance(self._schedule, Constant):
             return self._schedule.value  # checked at construction; a graph that read the step would not outlive it
         if self._rate is not None and torch.compiler.is_compiling():
             return self._rate
-        return self._present_rate()
+        rate = self._schedule(step)
+        self._check_rate(rate, step)
+        return rate
 
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)

@@ -1,0 +1,207 @@
+"""Several regularizers as one."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ca_reg.functional import Multiplier
+from ca_reg.params import Draw, Params
+from ca_reg.regularizer import Learned, Regularizer
+
+__all__ = ["Chain", "Foreign"]
+
+
+class Chain(Regularizer):
+    """Regularizers, applied one after the other; what every trainer and hook makes of what it is given.
+
+    A Gaussian is dropped if a member drops it. Members in ``eval()`` render their test-time value in training, too. At
+    test time the members whose test-time value is a mean give the mean of all of them together, in whatever order they
+    stand; ``nn.Sequential`` would take the mean of the second at the mean of the first.
+
+    Args:
+        members: regularizers; ``nn.Sequential`` of them are taken apart, and any other module counts as a function of
+            the opacities alone, see :class:`Foreign`.
+
+    Raises:
+        TypeError: if a member is no module.
+
+    Example:
+        >>> from ca_reg import GaussianDropout, OpacityNoise
+        >>> chain = Chain(GaussianDropout(0.5), OpacityNoise(0.8))
+        >>> opacity = chain(torch.full((9,), 0.6))
+        >>> bool((opacity[~chain.keep] == 0).all())
+        True
+    """
+
+    def __init__(self, *members: nn.Module) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(part for member in members for part in _flatten(member))
+
+    def __iter__(self) -> Iterator[Regularizer]:
+        return iter(self.members)  # type: ignore[arg-type]
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    @property
+    def needs(self) -> tuple[str, ...]:  # type: ignore[override]
+        """What the members need."""
+        return tuple(dict.fromkeys(name for member in self for name in member.needs))
+
+    @property
+    def learns(self) -> Mapping[str, Learned]:  # type: ignore[override]
+        """What the members learn."""
+        return {name: learned for member in self for name, learned in member.learns.items()}
+
+    @property
+    def drops(self) -> bool:  # type: ignore[override]
+        """Whether a member may drop Gaussians."""
+        return any(member.drops for member in self)
+
+    def set_step(self, step: int) -> None:
+        """Tell the step to every member."""
+        super().set_step(step)
+        for member in self:
+            member.set_step(step)
+
+    def regularize(self, x: Params, generator: torch.Generator | None = None) -> Params:
+        """Let every member draw in its turn, each for what those before it left."""
+        draws, keep = [], None
+        for member in self:
+            if not member.training:
+                member.check_needs(x)
+                x = member.expected(x)
+                continue
+            x = member.regularize(x, generator)
+            draws.append(member.last)
+            if member.keep is not None:
+                keep = member.keep if keep is None else keep & member.keep
+        self.last = Draw(tuple(draws), keep)
+        return x
+
+    def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
+        """Draw for every member."""
+        self.regularize(x, generator)
+        assert self.last is not None
+        return self.last
+
+    def replay(self, x: Params, draw: Draw) -> Params:
+        """Apply the draws of the members that are in ``train()``."""
+        for member, own in zip((member for member in self if member.training), draw.value, strict=True):
+            x = member.replay(x, own)
+        return x
+
+    def expected(self, x: Params) -> Params:
+        """Return the test-time value of all members."""
+        means = [member for member in self if member.renders_mean]
+        if len(means) > 1 and (both := _multiplied(means, x)) is not None:
+            x = both[0]._replace(opacities=both[0].opacities * both[1].mean)
+        else:
+            for member in means:
+                x = member.expected(x)
+        for member in self:
+            if not member.renders_mean:
+                x = member.expected(x)
+        return x
+
+    def multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
+        """Return the product of the multipliers; None if a member has none."""
+        return _multiplied(list(self), x)
+
+
+class Foreign(Regularizer):
+    """A module that knows nothing of this package: from activated opacities (N,) to those to render, in its own mode.
+
+    It drops what its attribute ``keep`` says, (N,) bool, or, without that attribute, what it sets to 0. A ``set_step``
+    of it or of a part of it is told the step. Test-time values come from a copy in ``eval()`` that shares all tensors,
+    so that another thread, or an exception, finds the module as it was.
+
+    Args:
+        module: called as ``module(opacity)``, or ``module(opacity, generator=...)`` if there is a generator.
+
+    Raises:
+        TypeError: if it is no module.
+
+    Example:
+        >>> Foreign(nn.Dropout(0.5)).eval()(torch.full((3,), 0.5))
+        tensor([0.5000, 0.5000, 0.5000])
+    """
+
+    def __init__(self, module: nn.Module) -> None:
+        if not isinstance(module, nn.Module):
+            raise TypeError(f"a regularizer must be a torch module, got {type(module).__name__}.")
+        super().__init__()
+        self.module = module
+        self.train(module.training)
+
+    @property
+    def takes_generator(self) -> bool:
+        """Whether its ``forward`` has an argument ``generator``, or takes any."""
+        parameters = inspect.signature(self.module.forward).parameters
+        return "generator" in parameters or any(x.kind is x.VAR_KEYWORD for x in parameters.values())
+
+    def set_step(self, step: int) -> None:
+        """Tell the step to the module and its parts, if they have a `set_step`."""
+        super().set_step(step)
+        for part in self.module.modules():
+            if callable(set_step := getattr(part, "set_step", None)):
+                set_step(step)
+
+    def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
+        """Call the module."""
+        before = x.opacities
+        after: Tensor = self.module(before) if generator is None else self.module(before, generator=generator)
+        if after is before:
+            return Draw(after)
+        if hasattr(self.module, "keep"):
+            keep: Any = self.module.keep
+            return Draw(after, None if keep is None else keep.reshape(-1))
+        return Draw(after, ((after.detach() != 0) | (before.detach() == 0)).reshape(-1))
+
+    def replay(self, x: Params, draw: Draw) -> Params:
+        """Take what the module returned."""
+        return x if draw.value is x.opacities else x._replace(opacities=draw.value)
+
+    def expected(self, x: Params) -> Params:
+        """Call the copy in ``eval()``."""
+        twin = _evaluating(self.module)
+        for part in twin.modules():
+            if callable(set_step := getattr(part, "set_step", None)):
+                set_step(x.step)
+        opacities: Tensor = twin(x.opacities)
+        return x if opacities is x.opacities else x._replace(opacities=opacities)
+
+
+def _flatten(module: nn.Module) -> list[Regularizer]:
+    """Return the members of a chain in order."""
+    if isinstance(module, Chain):
+        return list(module)
+    if isinstance(module, nn.Sequential) and type(module).forward is nn.Sequential.forward:
+        return [member for child in module for member in _flatten(child)]
+    return [module if isinstance(module, Regularizer) else Foreign(module)]
+
+
+def _multiplied(members: list[Regularizer], x: Params) -> tuple[Params, Multiplier] | None:
+    """Compose multipliers."""
+    total = Multiplier(1.0, 0.0)
+    for member in members:
+        one = member.multiplied(x)
+        if one is None:
+            return None
+        x, total = one[0], total * one[1]
+    return x, total
+
+
+def _evaluating(module: nn.Module) -> nn.Module:
+    """Return a copy in ``eval()`` that shares all tensors with the module."""
+    module = getattr(module, "_orig_mod", module)  # a compiled module calls the original, in its mode
+    twin = object.__new__(type(module))
+    vars(twin).update(vars(module))
+    parts = {name: None if part is None else _evaluating(part) for name, part in module._modules.items()}
+    vars(twin).update(training=False, _modules=parts)
+    return twin

@@ -1,0 +1,127 @@
+"""Objects by name: ``dropout(0.2) + noise(0.8, scale=True)`` or ``my_module:MyDropout(0.3)`` as text."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Generic, TypeVar
+
+__all__ = ["Registry"]
+
+T = TypeVar("T")
+_Factory = TypeVar("_Factory", bound=Callable[..., Any])
+
+
+class Registry(Generic[T]):
+    """What can be asked for by name, on a command line or in a file.
+
+    An expression is one call, or several joined by ``+``. A name without brackets is a call without arguments; a name
+    of the form ``module:Class`` is imported, also from the working directory. Arguments are literals of Python, or
+    calls of the registry's ``values``, such as schedules. Nothing else is evaluated, and what is called belongs to the
+    registry or is a subclass of its base: text from a file cannot call anything else.
+
+    Args:
+        kind: what its members are, for messages.
+        base: the class of all of them.
+        values: functions that may stand among the arguments, by name.
+
+    Example:
+        >>> from ca_reg.regularizers import REGULARIZERS
+        >>> REGULARIZERS.make("dropout(ramp(0, 0.2, 0, 100)) + noise(0.8)")
+        [GaussianDropout(p=LinearRamp(...), compensate=False), OpacityNoise(sigma=0.8, clip=False, scale=False)]
+    """
+
+    def __init__(self, kind: str, base: type[T], values: Mapping[str, Callable[..., Any]] | None = None) -> None:
+        self.kind = kind
+        self.base = base
+        self._values = dict(values or {})
+        self._factories: dict[str, Callable[..., T]] = {}
+
+    def register(self, name: str) -> Callable[[_Factory], _Factory]:
+        """Return a decorator that enters a class, or a function that makes an object, under a name.
+
+        Raises:
+            ValueError: if the name is taken by something else.
+        """
+
+        def enter(factory: _Factory) -> _Factory:
+            if self._factories.setdefault(name, factory) is not factory:
+                raise ValueError(f"there is a {self.kind} {name!r} already: {self._factories[name]!r}.")
+            return factory
+
+        return enter
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._factories)
+
+    def __getitem__(self, name: str) -> Callable[..., T]:
+        """Return what makes the objects of a name.
+
+        Raises:
+            ValueError: if there is no such name, module or class, or the class is of another kind.
+        """
+        if "." not in name:
+            if name not in self._factories:
+                known = ", ".join(sorted(self._factories))
+                raise ValueError(f"there is no {self.kind} {name!r}; choose one of {known}, or write module:Class.")
+            return self._factories[name]
+        module_name, _, class_name = name.rpartition(".")
+        if "" not in sys.path:
+            sys.path.append("")  # installed commands do not look into the working directory, as python -m does
+        try:
+            found = getattr(importlib.import_module(module_name), class_name)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"the {self.kind} {module_name}:{class_name} cannot be had: {error}.") from error
+        if not (isinstance(found, type) and issubclass(found, self.base)):
+            raise ValueError(f"{module_name}:{class_name} is no subclass of {self.base.__name__}: {found!r:.80}.")
+        return found
+
+    def make(self, text: str) -> list[T]:
+        """Make the objects of an expression; none of an empty one.
+
+        Raises:
+            ValueError: if the text cannot be understood, a name is not known, or an argument is refused; says which.
+        """
+        if not text.strip():
+            return []
+        # module:Class is no Python, module.Class is.
+        source = re.sub(r"(?<=\w):(?=[A-Za-z_])", ".", text.strip())
+        try:
+            node: ast.expr = ast.parse(source, mode="eval").body
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+            raise ValueError(f"{text!r:.200} cannot be read as {self.kind}s: {error}; {self._form()}") from error
+        terms: list[ast.expr] = []
+        while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+            terms.insert(0, node.right)
+            node = node.left
+        return [self._make(term, text) for term in [node, *terms]]
+
+    def _make(self, node: ast.expr, text: str) -> T:
+        """Make one object."""
+        call = node if isinstance(node, ast.Call) else ast.Call(node, [], [])
+        if not re.fullmatch(r"[A-Za-z_][\w.]*", name := ast.unparse(call.func)):
+            raise ValueError(f"{ast.unparse(node)!r:.80} in {text!r:.200} is no {self.kind}; {self._form()}")
+        factory = self[name]
+        try:
+            arguments, named = self._arguments(call)
+            return factory(*arguments, **named)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{ast.unparse(node)!r:.200}: {error}") from error
+
+    def _arguments(self, call: ast.Call) -> tuple[list[Any], dict[str, Any]]:
+        """Evaluate arguments: literals, and calls of the values of the registry."""
+        named = {keyword.arg: self._value(keyword.value) for keyword in call.keywords if keyword.arg}
+        return [self._value(argument) for argument in call.args], named
+
+    def _value(self, node: ast.expr) -> Any:
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in self._values:
+            arguments, named = self._arguments(node)
+            return self._values[node.func.id](*arguments, **named)
+        return ast.literal_eval(node)
+
+    def _form(self) -> str:
+        example = f"{next(iter(self._factories), 'name')}(...)"
+        return f"write {example}, or several with + between them."

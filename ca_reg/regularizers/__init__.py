@@ -1,0 +1,34 @@
+"""Every regularizer, one file each, and their registry: what ``--regularizer`` and the launcher know by name."""
+
+from ca_reg.chain import Chain
+from ca_reg.registry import Registry
+from ca_reg.regularizer import Regularizer
+from ca_reg.regularizers.dropout import GaussianDropout
+from ca_reg.regularizers.independent import IndependentDropout
+from ca_reg.regularizers.noise import OpacityNoise
+from ca_reg.schedules import LinearRamp, StartStop
+
+__all__ = ["REGULARIZERS", "GaussianDropout", "IndependentDropout", "OpacityNoise", "parse"]
+
+REGULARIZERS: Registry[Regularizer] = Registry("regularizer", Regularizer, {"ramp": LinearRamp, "between": StartStop})
+"""What can be asked for by name; ``REGULARIZERS.register("name")`` adds a class."""
+
+for _name, _class in {"dropout": GaussianDropout, "noise": OpacityNoise}.items():
+    REGULARIZERS.register(_name)(_class)
+
+
+def parse(text: str) -> Chain:
+    """Make regularizers of an expression: names of the registry or ``module:Class``, joined by ``+``.
+
+    Args:
+        text: such as ``"dropout(0.2) + noise(0.8, scale=True)"``, ``"dropout(ramp(0, 0.2, 0, 10_000))"`` or
+            ``"my_module:MyDropout(0.3)"``; an empty one makes an empty chain.
+
+    Raises:
+        ValueError: if it cannot be understood; says what.
+
+    Example:
+        >>> [type(member).__name__ for member in parse("dropout(0.2) + noise(0.8)")]
+        ['GaussianDropout', 'OpacityNoise']
+    """
+    return Chain(*REGULARIZERS.make(text))

@@ -1,0 +1,99 @@
+"""The paper's Gaussian dropout: every Gaussian with the same rate."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ca_reg._check import Rate, check_rate
+from ca_reg.params import Draw, Params
+from ca_reg.regularizer import Given
+from ca_reg.regularizers.independent import IndependentDropout
+from ca_reg.schedules import Schedule, as_schedule
+
+__all__ = ["GaussianDropout"]
+
+
+class GaussianDropout(IndependentDropout):
+    """Drop a random subset of Gaussians in training; scale the opacities in evaluation (paper, Gaussian dropout).
+
+    ``train()``: ``opacity * keep``. ``eval()``: ``opacity * (1 - p)``, the mean over all masks. With ``compensate`` the
+    survivors are multiplied by ``1 / (1 - p)`` in training instead, and evaluation leaves the opacities as they are.
+    The two schemes are not equivalent: compositing is not linear in the opacities, and rasterizers clamp the alpha of
+    survivors, so that Gaussians of an opacity above ``0.99 (1 - p)`` are more opaque in evaluation than the mean over
+    all masks. The module has no
+    parameters; put it between the activation of the opacities and the rasterizer.
+
+    Dropped Gaussians must leave no trace in density control: pass the radii through
+    :meth:`~ca_reg.Regularizer.mask_radii`.
+
+    Inside ``torch.compile`` one graph serves all steps, with ``fullgraph=True`` as well: the values of the opacities
+    are then not looked at, and a schedule draws also where its rate is 0. Inside ``torch.utils.checkpoint`` draw
+    without ``generator``, or outside and give ``keep``. :class:`OpacityNoise` does the same.
+
+    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call checks this.
+
+    Args:
+        p: drop rate in [0, 1), or a schedule of it. The paper uses 0.2.
+        compensate: scale the survivors in training rather than all opacities in evaluation.
+
+    Attributes:
+        keep: the last mask, True where the Gaussian stayed, (N,) bool; None if nothing was dropped.
+        p: the rate at the present step.
+        step: the training step, set with :meth:`set_step`; a module with a schedule saves it in ``state_dict``.
+
+    Raises:
+        TypeError: if ``p`` is neither a number nor callable.
+        ValueError: if a constant ``p`` is outside [0, 1); a schedule is checked at each use.
+
+    Example:
+        >>> dropout = GaussianDropout(p=0.2)
+        >>> opacity = torch.full((5,), 0.5)
+        >>> in_training = dropout(opacity)
+        >>> torch.equal(in_training, opacity * dropout.keep)
+        True
+        >>> torch.equal(dropout(opacity, keep=dropout.keep), in_training)  # replay
+        True
+        >>> dropout.eval()(opacity)
+        tensor([0.4000, 0.4000, 0.4000, 0.4000, 0.4000])
+    """
+
+    def __init__(self, p: float | Schedule, *, compensate: bool = False) -> None:
+        if not callable(p):
+            check_rate(p)
+        super().__init__(as_schedule(p), compensate=compensate)
+
+    @property
+    def p(self) -> float:
+        """The drop rate at the present step."""
+        return self._present_rate()
+
+    def _check_rate(self, rate: float, step: int) -> None:
+        check_rate(rate, f"p at step {step}")
+
+    def forward(  # type: ignore[override]
+        self, opacity: Given, *, keep: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> Given:
+        """Return the opacities to render.
+
+        Args:
+            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+            keep: a former mask to apply again instead of drawing one, shape (N,), bool; in training only.
+            generator: source of the draw; the global state of the random numbers is then untouched.
+
+        Returns:
+            Opacities of the same shape and dtype; the very same tensor if there is nothing to do.
+
+        Raises:
+            TypeError: if ``opacity`` is not a floating-point tensor or ``keep`` not a bool one.
+            ValueError: if a shape is wrong, ``opacity`` looks like logits, or ``keep`` is given in evaluation.
+        """
+        return super().forward(opacity, drawn=None if keep is None else Draw(keep, keep), generator=generator)
+
+    def rates(self, x: Params) -> Rate:
+        """Return the rate of the step."""
+        return self._rate_at(x.step)
+
+    def extra_repr(self) -> str:
+        """Return the arguments, for ``print``."""
+        return f"p={self._rate_repr()}, compensate={self.compensate}"

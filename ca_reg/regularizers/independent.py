@@ -1,0 +1,75 @@
+"""Dropping Gaussians independently of each other: the base class of every dropout that is a rule for the rates."""
+
+from __future__ import annotations
+
+import torch
+
+from ca_reg import functional
+from ca_reg._check import Rate, is_zero
+from ca_reg.functional import Multiplier
+from ca_reg.params import Draw, Params
+from ca_reg.regularizer import Regularizer
+from ca_reg.schedules import Schedule
+
+__all__ = ["IndependentDropout"]
+
+
+class IndependentDropout(Regularizer):
+    """Drop each Gaussian with a rate of its own, independently of the others; a subclass says the rates.
+
+    ``train()``: ``opacity * keep``, with ``compensate`` times ``1 / (1 - p)``. ``eval()``: with ``scale``
+    ``opacity * (1 - p)``, the mean over all masks; otherwise, and after ``compensate``, the opacities as they are.
+
+    Args:
+        schedule: a rate that follows the step, for :attr:`step` to be saved with it.
+        compensate: scale the survivors in training rather than all opacities in evaluation.
+        scale: scale the opacities in evaluation, as the paper does; most published schemes do not.
+
+    Example:
+        >>> class DropFaint(IndependentDropout):
+        ...     def rates(self, x):
+        ...         return 0.4 * (1 - x.opacities.detach())
+        >>> DropFaint().eval()(torch.tensor([0.5, 1.0]))
+        tensor([0.4000, 1.0000])
+    """
+
+    def __init__(self, schedule: Schedule | None = None, *, compensate: bool = False, scale: bool = True) -> None:
+        super().__init__(schedule)
+        self.compensate = compensate
+        self.scale = scale
+        self.renders_mean = compensate or scale
+
+    def rates(self, x: Params) -> Rate:
+        """Return the drop rates in [0, 1) at ``x``: a number, or one for each Gaussian, shape (N,)."""
+        raise NotImplementedError
+
+    def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
+        """Draw which Gaussians stay."""
+        rates = self.rates(x)
+        if is_zero(rates):
+            return Draw()
+        count, device = x.opacities.shape[0], x.opacities.device
+        keep = functional.draw_keep_mask(count, rates, generator=generator, device=device)
+        return Draw(keep, keep)
+
+    def replay(self, x: Params, draw: Draw) -> Params:
+        """Set the opacities of the dropped to 0."""
+        if draw.keep is None:
+            return x
+        rates = self.rates(x) if self.compensate else 0.0
+        opacities = functional.apply_dropout(x.opacities, draw.keep, p=rates, compensate=self.compensate)
+        return x._replace(opacities=opacities)
+
+    def expected(self, x: Params) -> Params:
+        """Scale by ``1 - p``, or not."""
+        if self.compensate or not self.scale:
+            return x
+        opacities = functional.scale_opacity(x.opacities, self.rates(x))
+        return x if opacities is x.opacities else x._replace(opacities=opacities)
+
+    def multiplied(self, x: Params) -> tuple[Params, Multiplier]:
+        """Return the opacities of survivors, and the factor 0 or 1: exact where a rasterizer clamps the alpha, too."""
+        rates = self.rates(x)
+        if self.compensate:
+            x = x._replace(opacities=x.opacities / (1.0 - rates))
+        return x, Multiplier.dropout(rates)

@@ -1,0 +1,123 @@
+"""Chains against enumeration of all their draws, and what they make of modules that know nothing of them."""
+
+import itertools
+
+import pytest
+import torch
+from torch import nn
+
+from ca_reg import Chain, Draw, GaussianDropout, IndependentDropout, OpacityNoise, Params, Regularizer
+
+OPACITY = torch.tensor([0.1, 0.45, 0.8, 0.97], dtype=torch.float64)
+
+
+class ByOpacity(IndependentDropout):
+    """Rates of its own for every Gaussian."""
+
+    def rates(self, x):
+        return 0.1 + 0.6 * x.opacities.detach()
+
+
+class ScaleUp(Regularizer):
+    """Changes something else than the opacities."""
+
+    needs = ("scales",)
+    drops = False
+
+    def draw(self, x, generator=None):
+        return Draw(1 + torch.rand(len(x.scales), 1, generator=generator))
+
+    def replay(self, x, draw):
+        return x._replace(scales=x.scales * draw.value)
+
+
+def all_masks(n):
+    return [torch.tensor(mask) for mask in itertools.product([False, True], repeat=n)]
+
+
+@pytest.mark.parametrize("compensate", [False, True])
+def test_test_time_value_and_multiplier_are_the_mean_and_variance_over_all_masks(compensate):
+    rule = ByOpacity(compensate=compensate)
+    x = Params(OPACITY)
+    rates = rule.rates(x)
+    mean = torch.zeros_like(OPACITY)
+    square = torch.zeros_like(OPACITY)
+    for keep in all_masks(4):
+        weight = torch.where(keep, 1 - rates, rates).prod()
+        drawn = rule.replay(x, Draw(keep, keep)).opacities
+        mean, square = mean + weight * drawn, square + weight * drawn**2
+    torch.testing.assert_close(rule.expected(x).opacities, mean, rtol=1e-14, atol=0)
+    raised, multiplier = rule.multiplied(x)
+    torch.testing.assert_close(raised.opacities * multiplier.mean, mean, rtol=1e-14, atol=0)
+    torch.testing.assert_close(raised.opacities**2 * multiplier.variance, square - mean**2, rtol=1e-12, atol=1e-16)
+
+
+# Nodes and weights of the standard normal distribution: the mean over the noise to 1e-3, as the clamp has kinks.
+_NODES = torch.linspace(-8, 8, 20_001, dtype=torch.float64)
+_WEIGHTS = torch.exp(-(_NODES**2) / 2) / torch.exp(-(_NODES**2) / 2).sum()
+
+
+@pytest.mark.parametrize("compensate", [False, True])
+@pytest.mark.parametrize("noise_first", [False, True])
+def test_the_test_time_value_of_dropout_and_noise_is_their_common_mean_in_either_order(noise_first, compensate):
+    """`nn.Sequential` is wrong here: the noise of the second would be that of an opacity scaled by the first."""
+    p, sigma = 0.3, 0.8
+    factor = 1 + sigma * _NODES[:, None]
+    survivors = OPACITY / (1 - p) if compensate else OPACITY
+    noisy = (OPACITY * factor).clamp(0, 1) / OPACITY * survivors if noise_first else (survivors * factor).clamp(0, 1)
+    mean = (1 - p) * (_WEIGHTS[:, None] * noisy).sum(0)
+    members = [GaussianDropout(p, compensate=compensate), OpacityNoise(sigma, scale=True)]
+    chain = Chain(*(members[::-1] if noise_first else members)).eval()
+    torch.testing.assert_close(chain(OPACITY), mean, rtol=1e-6, atol=0)
+
+
+def test_a_chain_drops_what_a_member_drops_and_replays():
+    chain = Chain(GaussianDropout(0.5), ByOpacity(), OpacityNoise(0.5))
+    opacity = torch.full((400,), 0.6)
+    out = chain(opacity, generator=torch.Generator().manual_seed(1))
+    first, second, _ = chain
+    assert torch.equal(chain.keep, first.keep & second.keep)
+    assert torch.equal(out, opacity * chain.keep * (1 + chain.last.value[2].value).clamp(0, 1 / 0.6))
+    assert torch.equal(chain(opacity, drawn=chain.last), out)
+
+
+def test_members_may_change_other_parameters_and_say_what_they_need():
+    chain = Chain(GaussianDropout(0.5), ScaleUp())
+    assert chain.needs == ("scales",)
+    x = chain(Params(torch.full((6,), 0.5), scales=torch.ones(6, 3)))
+    assert bool((x.scales > 1).all())
+    with pytest.raises(ValueError, match=r"ScaleUp needs scales .*Params\(opacities, scales"):
+        chain(torch.full((6,), 0.5))
+
+
+def test_a_chain_has_a_multiplier_only_if_every_member_has_one():
+    assert Chain(GaussianDropout(0.5), ScaleUp()).multiplied(Params(OPACITY)) is None
+    _, multiplier = Chain(GaussianDropout(0.5), ByOpacity()).multiplied(Params(OPACITY))
+    expected = ByOpacity().multiplied(Params(OPACITY))[1]
+    torch.testing.assert_close(multiplier.mean, 0.5 * expected.mean)
+
+
+class Halves(nn.Module):
+    """Knows nothing of this package."""
+
+    def __init__(self):
+        super().__init__()
+        self.inner = GaussianDropout(lambda step: step / 100)
+
+    def forward(self, opacity):
+        return opacity * torch.tensor([0.0, 1.0]).repeat(len(opacity) // 2) if self.training else opacity * 0.5
+
+
+def test_foreign_modules_are_members():
+    chain = Chain(nn.Sequential(GaussianDropout(0.0), nn.Sequential(Halves())))
+    opacity = torch.full((6,), 0.5)
+    chain.set_step(30)
+    assert torch.equal(chain(opacity) > 0, torch.tensor([False, True] * 3))
+    assert chain.keep.tolist() == [False, True] * 3
+    assert list(chain)[1].module.inner.step == 30
+    module = list(chain)[1].module
+    torch.testing.assert_close(chain.expected(Params(opacity, step=50)).opacities, opacity * 0.5)
+    assert module.training, "the module itself is not touched"
+    assert module.inner.step == 50 or module.inner.step == 30
+    with pytest.raises(TypeError, match="must be a torch module"):
+        Chain(torch.relu)

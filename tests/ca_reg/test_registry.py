@@ -1,0 +1,70 @@
+"""Expressions as text: what they make, and what they refuse."""
+
+import sys
+
+import pytest
+import torch
+
+from ca_reg import GaussianDropout, LinearRamp, OpacityNoise, Regularizer
+from ca_reg.registry import Registry
+from ca_reg.regularizers import REGULARIZERS, parse
+
+
+def test_names_arguments_schedules_and_sums():
+    chain = list(parse("dropout(ramp(0.0, 0.2, 0, 10_000), compensate=True) + noise(sigma=0.8)"))
+    assert repr(chain[0]) == repr(GaussianDropout(LinearRamp(0.0, 0.2, 0, 10_000), compensate=True))
+    assert repr(chain[1]) == repr(OpacityNoise(0.8))
+    assert len(parse("  ")) == 0
+
+
+def test_a_class_in_a_file_of_the_working_directory(tmp_path, monkeypatch):
+    (tmp_path / "mine_for_this_test.py").write_text(
+        "from ca_reg import IndependentDropout\n"
+        "class Half(IndependentDropout):\n"
+        "    def __init__(self, rate=0.5):\n"
+        "        super().__init__()\n"
+        "        self.rate = rate\n"
+        "    def rates(self, x):\n"
+        "        return self.rate\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p != ""])
+    monkeypatch.delitem(sys.modules, "mine_for_this_test", raising=False)
+    half, other = parse("mine_for_this_test:Half + mine_for_this_test:Half(0.25)")
+    assert isinstance(half, Regularizer)
+    assert torch.equal(other.eval()(torch.ones(2)), torch.full((2,), 0.75))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("dropot(0.2)", "there is no regularizer 'dropot'; choose one of .*dropout"),
+        ("dropout(", "cannot be read as regularizers"),
+        ("dropout(0.2) - noise(0.8)", "is no regularizer; write dropout"),
+        ("dropout(1.5)", r"dropout\(1.5\)\': p must be in \[0, 1\)"),
+        ("dropout(rate=0.2)", "unexpected keyword argument 'rate'"),
+        ("dropout(__import__('os').getcwd())", "malformed"),
+        ("dropout(**{'p': 0.2})", "missing 1 required positional argument"),
+        ("os:getcwd()", "os:getcwd is no subclass of Regularizer"),
+        ("torch.nn:Dropout(0.2)", "is no subclass of Regularizer"),
+        ("no_such_module:Thing", "cannot be had: No module named 'no_such_module'"),
+        ("ca_reg:NoSuchClass", "cannot be had"),
+        ("+".join(["dropout(0.1)"] * 9) + "+(", "cannot be read"),
+        ("(lambda: 0)()", "is no regularizer"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_by_name(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse(text)
+
+
+def test_a_name_is_entered_once():
+    registry = Registry("animal", object)
+    registry.register("cat")(dict)
+    registry.register("cat")(dict)
+    with pytest.raises(ValueError, match="there is a animal 'cat' already"):
+        registry.register("cat")(list)
+
+
+def test_every_name_makes_a_regularizer():
+    assert {"dropout", "noise"} <= set(REGULARIZERS)
