@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-__all__ = ["SH_C0", "Gaussians", "inverse_sigmoid"]
+from ca_reg import Params
+from reference_trainer.camera import Camera
+
+__all__ = ["PARAMETERS", "SH_C0", "Gaussians", "inverse_sigmoid"]
+
+PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
+"""What every Gaussian has, by the names of the fields."""
 
 SH_C0 = 0.28209479177387814  # the constant band of the spherical harmonics: sqrt(1 / (4 pi))
 
@@ -33,6 +39,7 @@ class Gaussians:
         opacity_logits: logits of the opacities, shape (N,).
         sh_dc: constant colour coefficients, shape (N, 1, 3).
         sh_rest: the other coefficients, shape (N, (degree + 1)^2 - 1, 3).
+        learned: what regularizers learn per Gaussian, by name, each (N,).
 
     Raises:
         ValueError: if the shapes disagree.
@@ -49,14 +56,16 @@ class Gaussians:
     opacity_logits: Tensor
     sh_dc: Tensor
     sh_rest: Tensor
+    learned: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
         expected = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "opacity_logits": (n,)}
         expected |= {"sh_dc": (n, 1, 3), "sh_rest": (n, self.sh_rest.shape[1] if self.sh_rest.ndim == 3 else -1, 3)}
-        for name, shape in expected.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {tuple(getattr(self, name).shape)}.")
+        expected |= {name: (n,) for name in self.learned}
+        for name, x in self.named():
+            if tuple(x.shape) != expected[name]:
+                raise ValueError(f"{name} must have shape {expected[name]}, got {tuple(x.shape)}.")
         if self.sh_rest.shape[1] not in (0, 3, 8, 15):
             raise ValueError(f"sh_rest must hold 0, 3, 8 or 15 coefficients, got {self.sh_rest.shape[1]}.")
 
@@ -106,7 +115,7 @@ class Gaussians:
 
     @property
     def opacities(self) -> Tensor:
-        """Activated opacities in [0, 1], shape (N,): what every `ca_reg` regularizer works on.
+        """Activated opacities in [0, 1], shape (N,).
 
         In float32 their gradient is off by more than 1 % for logits above 13, and 0 above 17, where they are 1.
         """
@@ -122,13 +131,32 @@ class Gaussians:
         """All colour coefficients, shape (N, (degree + 1)^2, 3)."""
         return torch.cat([self.sh_dc, self.sh_rest], dim=1)
 
+    def params(self, camera: Camera | None = None, *, step: int = 0) -> Params:
+        """Return what a rasterizer receives, activated: what every `ca_reg` regularizer works on.
+
+        Args:
+            camera: that is rendered.
+            step: of the training.
+        """
+        view_matrix = None if camera is None else camera.world_to_camera
+        return Params(
+            self.opacities, self.means, self.scales, self.quaternions, self.sh, view_matrix, self.learned, step
+        )
+
     def named(self) -> Iterator[tuple[str, Tensor]]:
-        """Iterate over the parameters with their names."""
-        return ((field.name, getattr(self, field.name)) for field in fields(self))
+        """Iterate over the parameters with their names, those that regularizers learn last."""
+        yield from ((name, getattr(self, name)) for name in PARAMETERS)
+        yield from self.learned.items()
+
+    @classmethod
+    def from_named(cls, tensors: Mapping[str, Tensor]) -> Gaussians:
+        """Return the Gaussians of these parameters, as `named` yields them."""
+        own = {name: tensors[name] for name in PARAMETERS}
+        return cls(**own, learned={name: x for name, x in tensors.items() if name not in PARAMETERS})
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """Return Gaussians whose tensors are ``function(tensor)``."""
-        return replace(self, **{name: function(tensor) for name, tensor in self.named()})
+        return Gaussians.from_named({name: function(tensor) for name, tensor in self.named()})
 
     def __getitem__(self, index: Tensor) -> Gaussians:
         return self.map(lambda x: x[index])

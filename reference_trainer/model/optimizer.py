@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -24,6 +25,7 @@ class LearningRates:
         opacity_logits: per step.
         sh_dc: per step.
         sh_rest: per step; a twentieth of ``sh_dc`` in the INRIA code.
+        learned: of what regularizers learn per Gaussian, by name.
     """
 
     means: float
@@ -32,6 +34,11 @@ class LearningRates:
     opacity_logits: float = 0.05
     sh_dc: float = 2.5e-3
     sh_rest: float = 2.5e-3 / 20
+    learned: Mapping[str, float] = field(default_factory=dict)
+
+    def of(self, name: str) -> float:
+        """Return the rate of a parameter as `Gaussians.named` calls it."""
+        return self.learned[name] if name in self.learned else getattr(self, name)
 
 
 class GaussianOptimizer:
@@ -53,7 +60,7 @@ class GaussianOptimizer:
 
     def __init__(self, gaussians: Gaussians, rates: LearningRates) -> None:
         self.gaussians = gaussians.map(lambda x: x.detach().clone().requires_grad_())
-        groups = [{"params": [x], "lr": getattr(rates, name), "name": name} for name, x in self.gaussians.named()]
+        groups = [{"params": [x], "lr": rates.of(name), "name": name} for name, x in self.gaussians.named()]
         self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def step(self) -> None:
@@ -110,7 +117,7 @@ class GaussianOptimizer:
         self._adam.state.clear()
         for name, x in tensors.items():
             self._group(name)["params"] = [x]
-        self.gaussians = Gaussians(**tensors)
+        self.gaussians = Gaussians.from_named(tensors)
 
     def _rebuild(self, parameter: Any, moment: Any) -> None:
         """Replace every parameter and its two moments by functions of the old ones."""

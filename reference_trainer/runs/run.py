@@ -43,7 +43,8 @@ from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.plan import Plan, make_plan
-from reference_trainer.training.trainer import Trainer, TrainingStoppedError
+from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.trainer import Trainer
 
 __all__ = ["load_run", "model_of", "run_experiment", "save_for_viewers", "summary"]
 

@@ -33,7 +33,7 @@ from reference_trainer.studies.gradient_noise_report import gradient_noise_figur
 from reference_trainer.studies.timing import now
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation
-from reference_trainer.training.losses import expected_photometric_loss, photometric_loss
+from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream
 
 __all__ = ["gradient_noise", "study_gradient_noise"]

@@ -7,6 +7,11 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from ca_reg import Chain, GaussianDropout, OpacityNoise
+from ca_reg.regularizers import REGULARIZERS
+from reference_trainer.density import DENSITY, DensityStrategy
+from reference_trainer.losses import LOSSES, LossTerm
+
 __all__ = ["PRESETS", "TrainConfig", "with_preset"]
 
 
@@ -21,20 +26,19 @@ class TrainConfig:
 
     dropout: float = 0.0
     """Rate p of Gaussian dropout, in [0, 1); at test time opacities are scaled by 1 - p."""
-    compensate: bool = False
-    """Inverted dropout: survivors scaled by 1 / (1 - p) in training, nothing at test time."""
     noise: float = 0.0
     """Standard deviation sigma of the multiplicative opacity noise; the paper uses up to 0.8."""
-    clip_noise: bool = False
-    """Clip the noise to [-sigma, sigma], as the authors' released code does; the paper does not."""
-    scale_noise: bool = False
-    """At test time multiply opacities by the mean of their noise, as after dropout by 1 - p; the paper does not."""
+    regularizer: str = ""
+    """Other regularizers: "d2gs", "dropout(0.2, compensate=True) + noise(0.8, scale=True)", "my_module:MyDropout(0.3)";
+    `ca-reg regularizers` lists them."""
     analytic: bool = False
-    """Train on the expectation over dropout and noise, computed exactly, instead of one random draw."""
-    ca_weight: float = 0.0
-    """With analytic: weight of the mean pixel variance, the exact co-adaptation, on top of the expected loss."""
+    """Train on the expectation over the regularizers, computed exactly, instead of one random draw."""
     regularize_from: int = 0
-    """Number of steps before dropout and noise begin; less than ``iterations`` if there are any."""
+    """Number of steps before the regularizers begin; less than ``iterations`` if there are any."""
+    loss: str = "photometric"
+    """Terms of the loss, such as "photometric(0.2) + co_adaptation(3.0)", or "my_module:MyTerm"."""
+    density: str = "adaptive"
+    """Density control, or "my_module:MyStrategy"."""
 
     renderer: Literal["torch", "gsplat"] = "torch"
     """What draws in training: "torch", this package's renderer, or "gsplat", which needs it and a CUDA device."""
@@ -44,8 +48,6 @@ class TrainConfig:
     sh_every: int = 500
     """A band of spherical harmonics is added every so many steps."""
 
-    lambda_dssim: float = 0.2
-    """The loss is (1 - lambda) L1 + lambda (1 - SSIM)."""
     means_rate: float = 1.6e-4
     """Initial learning rate of the means, in units of the scene's extent."""
     means_rate_final: float = 1.6e-6
@@ -105,17 +107,15 @@ class TrainConfig:
             raise ValueError(f"dropout must be in [0, 1), got {self.dropout}: 0 turns it off.")
         if self.noise < 0:
             raise ValueError(f"noise must not be negative, got {self.noise}: 0 turns it off.")
-        if self.scale_noise and self.noise == 0:
-            raise ValueError("scale_noise multiplies opacities by the mean of their noise: set noise, or leave it out.")
-        if self.scale_noise and self.dropout > 0 and self.compensate:
-            raise ValueError(
-                "scale_noise does not go with inverted dropout, whose survivors get noise at another opacity than the "
-                "one at test time: leave out compensate or scale_noise."
-            )
-        if self.ca_weight < 0 or (self.ca_weight > 0 and not self.analytic):
-            raise ValueError(f"ca_weight must not be negative and needs analytic=True, got {self.ca_weight}.")
-        if self.analytic and self.dropout == 0 == self.noise:
-            raise ValueError("analytic training needs something to average over: set dropout or noise.")
+        regularizer, terms = self.make_regularizer(), self.make_losses()
+        self.make_density()
+        if not terms:
+            raise ValueError("loss needs at least one term, such as photometric.")
+        if self.analytic and not len(regularizer):
+            raise ValueError("analytic training needs something to average over: set dropout, noise or regularizer.")
+        if self.analytic and not all(term.analytic for term in terms):
+            names = ", ".join(type(term).__name__ for term in terms if not term.analytic)
+            raise ValueError(f"analytic training has no draw, which {names} needs: leave out analytic, or the term.")
         if self.renderer not in ("torch", "gsplat"):
             raise ValueError(f"renderer must be 'torch' or 'gsplat', got {self.renderer!r}.")
         if self.analytic and self.renderer != "torch":
@@ -125,10 +125,10 @@ class TrainConfig:
         ):  # fmt: skip
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
-        if self.regularize_from >= self.iterations and not self.dropout == 0 == self.noise:
+        if self.regularize_from >= self.iterations and len(regularizer):
             raise ValueError(
                 f"regularize_from must be below iterations ({self.iterations}), got {self.regularize_from}: no step "
-                "would use dropout or noise, and opacities would be scaled for them at test time."
+                "would use the regularizers."
             )
         if self.sh_every < 1:
             raise ValueError(f"sh_every must be at least 1, got {self.sh_every}: set sh_degree=0 for constant colours.")
@@ -142,17 +142,26 @@ class TrainConfig:
         for name in ("initial_opacity", "opacity_reset"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name} must be in (0, 1), got {getattr(self, name)}.")
-        if not 0 <= self.lambda_dssim <= 1:
-            raise ValueError(f"lambda_dssim must be in [0, 1], got {self.lambda_dssim}.")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}.")
         if not 0 < self.opacity_decay <= 1:
             raise ValueError(f"opacity_decay must be in (0, 1], got {self.opacity_decay}: 1 turns it off.")
 
-    @property
-    def test_time_scale(self) -> float:
-        """Factor of the opacities at test time: 1 - p, or 1 for inverted dropout (paper, Eq. dropout_test)."""
-        return 1.0 if self.compensate else 1.0 - self.dropout
+    def make_regularizer(self) -> Chain:
+        """Make the regularizers; empty if there are none."""
+        own = [make(rate) for make, rate in ((GaussianDropout, self.dropout), (OpacityNoise, self.noise)) if rate]
+        return Chain(*own, *REGULARIZERS.make(self.regularizer))
+
+    def make_losses(self) -> list[LossTerm]:
+        """Make the terms of the loss."""
+        return LOSSES.make(self.loss)
+
+    def make_density(self) -> DensityStrategy:
+        """Make the density control."""
+        made = DENSITY.make(self.density)
+        if len(made) != 1:
+            raise ValueError(f"density must be one density strategy, got {self.density!r}.")
+        return made[0]
 
 
 PRESETS: dict[str, TrainConfig] = {

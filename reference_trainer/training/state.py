@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Collection
@@ -13,15 +12,13 @@ import torch
 from torch import Tensor
 
 from reference_trainer.json_files import settings_from
-from reference_trainer.model.density import DensityStatistics
-from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.gaussians import PARAMETERS, Gaussians
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["TrainingState", "read_state"]
 
 _ENTRIES = ("config", "scene", "train_views", "step", "seconds", "statistics", "gaussians", "moments")
-_STATISTICS = ("gradient_sum", "steps")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
@@ -39,7 +36,7 @@ class TrainingState(NamedTuple):
     config: TrainConfig
     step: int
     seconds: float
-    statistics: DensityStatistics
+    statistics: dict[str, Tensor]
     optimizer: dict[str, Any]
 
 
@@ -76,11 +73,11 @@ def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
     if type(seconds) is not float or not 0 <= seconds < math.inf:
         raise ValueError(f"{where}: seconds must be a positive number, got {seconds!r:.80}.")
     tensors, moments = state["gaussians"], state["moments"]
-    parameters = [field.name for field in dataclasses.fields(Gaussians)]
+    parameters = [*PARAMETERS, *config.make_regularizer().learns]
     _refuse_other_entries(tensors, parameters, f"{where}, gaussians")
     _refuse_other_entries(moments, parameters, f"{where}, moments")
     try:
-        gaussians = Gaussians(**tensors)
+        gaussians = Gaussians.from_named(tensors)
     except ValueError as error:
         raise ValueError(f"{where}, gaussians: {error}") from error
     if len(gaussians) == 0:
@@ -91,11 +88,14 @@ def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
         _check(x, tuple(x.shape), f"{where}, {name}")
         if moments[name] != {}:  # as before the first step
             _check_moments(moments[name], tuple(x.shape), step, f"{where}, moments of {name}")
-    _refuse_other_entries(state["statistics"], _STATISTICS, f"{where}, statistics")
+    counts = config.make_density()
+    counts.begin(config, scene, gaussians.means.device, len(gaussians))
+    expected = counts.state_dict()
+    _refuse_other_entries(state["statistics"], expected, f"{where}, statistics")
     for name, x in state["statistics"].items():
-        _check(x, (len(gaussians),), f"{where}, {name}", least=0)
+        _check(x, tuple(expected[name].shape), f"{where}, {name}", least=0)
     # They are counted up in place, which a file can forbid: by a gradient, or by memory that is shared.
-    statistics = DensityStatistics(**{name: x.detach().clone() for name, x in state["statistics"].items()})
+    statistics = {name: x.detach().clone() for name, x in state["statistics"].items()}
     plain = {name: {key: x.detach() for key, x in of.items()} for name, of in moments.items()}
     return TrainingState(config, step, seconds, statistics, {"gaussians": tensors, "moments": plain})
 

@@ -10,31 +10,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from ca_reg import GaussianDropout, OpacityNoise, StartStop
-from reference_trainer.camera import Camera
-from reference_trainer.model.density import DensityStatistics, decay_opacity, densify, prune, reset_opacity
+from ca_reg import Chain
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
-from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render import NotFiniteError, Splats, render
-from reference_trainer.render.gsplat import GsplatSplats, load_gsplat_render
-from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.render import NotFiniteError, render
+from reference_trainer.render.gsplat import load_gsplat_render
+from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.expectation import render_expectation
+from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.initial import initial_gaussians
 from reference_trainer.training.interruption import hold_interrupts
-from reference_trainer.training.losses import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream, view_order
 from reference_trainer.training.state import read_state
+from reference_trainer.training.step import Step
 
-__all__ = ["Trainer", "TrainingStoppedError"]
-
-
-class TrainingStoppedError(RuntimeError):
-    """Training cannot go on; the message says why and what to try."""
+__all__ = ["Trainer"]
 
 
 class Trainer:
@@ -51,7 +43,8 @@ class Trainer:
         renderer: what draws the draws of the regularizers.
 
     Raises:
-        ValueError: if the scene has no initial points.
+        ValueError: if the scene has no initial points, or the training is to be analytic and a regularizer has no
+            exact expectation.
         ImportError: if gsplat is to draw, and is missing.
         RuntimeError: if gsplat is to draw on something else than a CUDA device.
 
@@ -72,11 +65,13 @@ class Trainer:
         self.seconds = 0.0
         self.views = [view.to(self.device) for view in scene.train]
         self.background = scene.background.to(self.device)
-        start = config.regularize_from
-        self.dropout = GaussianDropout(StartStop(config.dropout, start), compensate=config.compensate)
-        self.noise = OpacityNoise(StartStop(config.noise, start), clip=config.clip_noise)
-        self.optimizer = GaussianOptimizer(initial_gaussians(scene, config).to(self.device), self._rates())
-        self.statistics = DensityStatistics.zeros(len(self.gaussians), self.device)
+        self.regularizer = config.make_regularizer()
+        self.losses = config.make_losses()
+        self.optimizer = GaussianOptimizer(self._start().to(self.device), self._rates())
+        self.density = config.make_density()
+        self.density.begin(config, scene, self.device, len(self.gaussians))
+        if config.analytic:
+            self._refuse_draws_without_multiplier()
 
     @property
     def gaussians(self) -> Gaussians:
@@ -130,28 +125,33 @@ class Trainer:
                 bar.update()
                 if after_step is not None:
                     after_step(self)
-            stop_if_interrupted()  # the last step is no shelter
+            stop_if_interrupted()  # also after the last step
 
     def train_step(self) -> tuple[float, float]:
         """Take one step on one view; return the loss and the mean squared error of the (regularized) render."""
-        config, step = self.config, self.step
-        self._control_density()
-        view = self.views[view_order(config.seed, step, len(self.views))]
+        self.density.before_step(self.optimizer, self.step)
+        step = self._begin_step()
         try:
-            loss, image, splats = self._expected_loss(view) if self._is_analytic() else self._sampled_loss(view)
+            if step.regularizer is self.regularizer and self.config.analytic:
+                step.expect()
+            else:
+                step.sample(depth=any("depth" in term.needs for term in self.losses))
+            loss = sum((term(step) for term in self.losses), start=step.image.new_zeros(()))
         except NotFiniteError as error:
-            raise TrainingStoppedError(f"step {step + 1} cannot be rendered: {error}") from error
+            raise TrainingStoppedError(f"step {self.step + 1} cannot be rendered: {error}") from error
         value = loss.item()
         if not math.isfinite(value):
-            raise TrainingStoppedError(f"the loss became {value} at step {step + 1}: lower the learning rates.")
-        if splats.indices.numel() > 0:
+            raise TrainingStoppedError(f"the loss became {value} at step {self.step + 1}: lower the learning rates.")
+        if loss.requires_grad:
             loss.backward()  # type: ignore[no-untyped-call]
-            self._count(splats, view.camera)
-            self.optimizer.set_means_rate(self._means_rate(step))
+            for splats, camera in step.observed:
+                if splats.indices.numel():
+                    self.density.observe(splats, camera)
+            self.optimizer.set_means_rate(self._means_rate(self.step))
             self.optimizer.step()
         self.step += 1
         with torch.no_grad():
-            mse = torch.mean((image.clamp(0, 1) - view.image) ** 2).item()
+            mse = torch.mean((step.image.clamp(0, 1) - step.view.image) ** 2).item()
         return value, mse
 
     def save(self, path: Path) -> None:
@@ -174,7 +174,7 @@ class Trainer:
             "train_views": [view.name for view in self.scene.train],
             "step": self.step,
             "seconds": self.seconds,
-            "statistics": vars(self.statistics),
+            "statistics": self.density.state_dict(),
             **optimizer,
         }
         save_checkpoint(path, state)
@@ -198,8 +198,10 @@ class Trainer:
             trainer = cls(scene, state.config, device)
         except ValueError as error:
             raise ValueError(f"{path}, config: {error}") from error
-        trainer.step, trainer.seconds, trainer.statistics = state.step, state.seconds, state.statistics
+        trainer.step, trainer.seconds = state.step, state.seconds
         trainer.optimizer.load_state_dict(state.optimizer)
+        trainer.density.reset(len(trainer.gaussians))
+        trainer.density.load_state_dict(state.statistics)
         return trainer
 
     def _rates(self) -> LearningRates:
@@ -211,6 +213,39 @@ class Trainer:
             opacity_logits=config.opacity_rate,
             sh_dc=config.color_rate,
             sh_rest=config.color_rate / 20,
+            learned={name: learned.rate for name, learned in self.regularizer.learns.items()},
+        )
+
+    def _start(self) -> Gaussians:
+        """Return the Gaussians to start from, with what the regularizers learn of each."""
+        start = initial_gaussians(self.scene, self.config)
+        learned = {name: torch.full((len(start),), x.start) for name, x in self.regularizer.learns.items()}
+        return dataclasses.replace(start, learned=learned)
+
+    def _refuse_draws_without_multiplier(self) -> None:
+        """Raise a ValueError if a regularizer has no exact expectation."""
+        with torch.no_grad():
+            x = self.gaussians.params(self.views[0].camera)
+            names = [type(member).__name__ for member in self.regularizer if member.multiplied(x) is None]
+        if names:
+            raise ValueError(
+                f"analytic training needs draws that are independent factors of the opacities, which those of "
+                f"{', '.join(names)} are not: leave out analytic."
+            )
+
+    def _begin_step(self) -> Step:
+        """Choose the view of the step, and what regularizes it."""
+        begun = self.step >= self.config.regularize_from
+        return Step(
+            self.step,
+            self.views[view_order(self.config.seed, self.step, len(self.views))],
+            self.views,
+            self.gaussians,
+            self.regularizer if begun else Chain(),
+            self.background,
+            sh_degree=self._sh_degree(self.step + 1),
+            seed=self.config.seed,
+            renderer=self.renderer,
         )
 
     def _sh_degree(self, number: int) -> int:
@@ -223,89 +258,3 @@ class Trainer:
         along = step / config.iterations
         rate = math.exp((1 - along) * math.log(config.means_rate) + along * math.log(config.means_rate_final))
         return rate * self.scene.extent
-
-    def _regularized(self) -> Tensor:
-        """Opacities of this step: some dropped, some shaken."""
-        opacities = self.gaussians.opacities
-        for regularizer, name in ((self.dropout, "dropout"), (self.noise, "noise")):
-            regularizer.set_step(self.step)
-            opacities = regularizer(opacities, generator=stream(self.config.seed, self.step, name, self.device))
-        return opacities
-
-    def _is_analytic(self) -> bool:
-        """Whether this step trains on the expectation over the regularizers."""
-        return self.config.analytic and self.step >= self.config.regularize_from
-
-    def _sampled_loss(self, view: View) -> tuple[Tensor, Tensor, Splats]:
-        """Loss and image of one draw of the regularizers."""
-        rendering = render_gaussians(
-            self.gaussians,
-            view.camera,
-            self.background,
-            opacities=self._regularized(),
-            sh_degree=self._sh_degree(self.step + 1),
-            renderer=self.renderer,
-        )
-        return (
-            photometric_loss(rendering.image, view.image, self.config.lambda_dssim),
-            rendering.image,
-            rendering.splats,
-        )
-
-    def _expected_loss(self, view: View) -> tuple[Tensor, Tensor, Splats]:
-        """Loss and image in expectation over the regularizers."""
-        degree = self._sh_degree(self.step + 1)
-        out = render_expectation(self.gaussians, view.camera, self.background, self.config, sh_degree=degree)
-        loss = expected_photometric_loss(out.image, out.variance, view.image, self.config.lambda_dssim)
-        return loss + out.penalty, out.image, out.splats
-
-    def _count(self, splats: Splats | GsplatSplats, camera: Camera) -> None:
-        """Enter the Gaussians that were drawn into the densification statistics."""
-        gradient = splats.projection.means.grad
-        assert gradient is not None
-        drawn = splats.lists.touched
-        self.statistics.update(splats.indices[drawn], gradient[drawn], camera.width, camera.height)
-
-    def _control_density(self) -> None:
-        """Densify, prune, reset and decay as the schedule says for the steps that are done.
-
-        This happens before a step and not after it, so that whoever looks at the model between steps finds it
-        optimized: a clone doubles the opacity of its place until the next steps have adapted to it.
-        """
-        config, step = self.config, self.step
-        until = config.iterations if config.densify_until is None else config.densify_until
-        if config.opacity_decay < 1 and step > config.densify_from:
-            decay_opacity(self.optimizer, config.opacity_decay)
-        every = config.densify_every
-        if every and config.densify_from < step < until and step % every == 0:
-            # The renderer would tell, but only after pruning has taken for faint what is not a number.
-            if not all(bool(x.isfinite().all()) for _, x in self.gaussians.named()):
-                raise TrainingStoppedError(
-                    f"Gaussians became nan or infinite by step {step}: lower the learning rates."
-                )
-            self._densify()
-            if len(self.gaussians) == 0:
-                raise TrainingStoppedError(
-                    f"all Gaussians were pruned after step {step}: lower prune_opacity or noise, raise opacity_reset."
-                )
-        if config.opacity_reset_every and step < until:
-            since = step - config.opacity_reset_from
-            early = config.opacity_reset_over_white and step == config.densify_from > 0
-            if (since >= 0 and since % config.opacity_reset_every == 0) or (early and self.scene.is_white):
-                reset_opacity(self.optimizer, config.opacity_reset)
-
-    def _densify(self) -> None:
-        config = self.config
-        if config.max_gaussians is None or len(self.gaussians) < config.max_gaussians:
-            densify(
-                self.optimizer,
-                self.statistics,
-                gradient_threshold=config.densify_gradient,
-                size_threshold=config.dense_fraction * self.scene.extent,
-                generator=stream(config.seed, self.step, "split", self.device),
-            )
-        max_scale = None
-        if config.prune_size is not None and self.step > config.prune_size_from:
-            max_scale = config.prune_size * self.scene.extent
-        prune(self.optimizer, min_opacity=config.prune_opacity, max_scale=max_scale)
-        self.statistics = DensityStatistics.zeros(len(self.gaussians), self.device)

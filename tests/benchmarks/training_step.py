@@ -16,7 +16,7 @@ from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.engines import drawn_by
 from reference_trainer.studies.timing import Clock, in_turns
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.losses import photometric_loss
+from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["MASKS", "PARTS", "analytic_step", "scores", "step_parts"]

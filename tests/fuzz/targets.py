@@ -22,7 +22,8 @@ from reference_trainer.scenes.llff import read_llff
 from reference_trainer.scenes.ply_points import ply_points
 from reference_trainer.scenes.splits import file_split
 from reference_trainer.training.checkpoint import load_checkpoint
-from reference_trainer.training.trainer import Trainer, TrainingStoppedError
+from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.trainer import Trainer
 
 __all__ = ["TARGETS"]
 

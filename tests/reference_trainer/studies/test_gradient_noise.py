@@ -27,7 +27,7 @@ from reference_trainer.studies.gradient_noise_moments import (
 )
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation
-from reference_trainer.training.losses import expected_photometric_loss, photometric_loss
+from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 

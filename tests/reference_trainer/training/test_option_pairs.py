@@ -26,7 +26,7 @@ from reference_trainer.training import trainer as trainer_module
 from reference_trainer.training.config import PRESETS, TrainConfig
 from reference_trainer.training.determinism import deterministic
 from reference_trainer.training.expectation import render_expectation
-from reference_trainer.training.losses import expected_photometric_loss, photometric_loss
+from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 

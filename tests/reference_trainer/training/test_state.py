@@ -9,7 +9,8 @@ import torch
 
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.trainer import Trainer, TrainingStoppedError
+from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.trainer import Trainer
 
 KEYS = ["config", "scene", "train_views", "step", "seconds", "statistics", "gaussians", "moments"]
 Change = Callable[[dict[str, Any]], object]

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.evaluation.metrics import ssim
-from reference_trainer.training.losses import expected_photometric_loss, photometric_loss, ssim_map
+from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss, ssim_map
 
 
 def pair(height: int, width: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> tuple[Tensor, Tensor]:

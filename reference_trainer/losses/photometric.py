@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from ca_reg.functional import expected_absolute_error
+from reference_trainer.losses.term import LossTerm
 from reference_trainer.render.engine import engine_for
 
-__all__ = ["expected_photometric_loss", "photometric_loss", "ssim_map"]
+if TYPE_CHECKING:
+    from reference_trainer.training.step import Step
+
+__all__ = ["Photometric", "expected_photometric_loss", "photometric_loss", "ssim_map"]
 
 _RADIUS = 5
 _SIGMA = 1.5
@@ -19,6 +23,32 @@ _SIDE = [math.exp(-(offset**2) / (2 * _SIGMA**2)) for offset in range(_RADIUS + 
 _WEIGHTS = [weight / (2 * sum(_SIDE) - 1) for weight in _SIDE]  # of the window's centre and one side; they add up to 1
 _C1 = 0.01**2
 _C2 = 0.03**2
+
+
+class Photometric(LossTerm):
+    """The loss of 3D Gaussian Splatting against the photograph, `photometric_loss`; in an analytic step its mean.
+
+    Args:
+        lambda_dssim: weight of the structural term, in [0, 1].
+        weight: of the whole.
+
+    Raises:
+        ValueError: if ``lambda_dssim`` is out of range.
+    """
+
+    analytic: ClassVar[bool] = True
+
+    def __init__(self, lambda_dssim: float = 0.2, *, weight: float = 1.0) -> None:
+        _check_lambda(lambda_dssim)
+        self.lambda_dssim = lambda_dssim
+        self.weight = weight
+
+    def __call__(self, step: Step) -> Tensor:
+        """Compare the render of the step with its photograph."""
+        target = step.view.image
+        if step.variance is None:
+            return self.weight * photometric_loss(step.image, target, self.lambda_dssim)
+        return self.weight * expected_photometric_loss(step.image, step.variance, target, self.lambda_dssim)
 
 
 def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -> Tensor:
@@ -156,7 +186,7 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
         blurred: x, y, x y and x^2 + y^2, shape (4, C, H, W).
     """
     if engine_for(blurred).name == "loops":
-        from reference_trainer.training.ssim_loops import similarity
+        from reference_trainer.losses.ssim_loops import similarity
 
         return similarity(blurred, _C1, _C2)
     mean_x, mean_y, mean_xy, mean_squares = blurred
@@ -172,7 +202,7 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
 def _blur(maps: Tensor) -> Tensor:
     """Blur maps (..., H, W) with the zero-padded window."""
     if engine_for(maps).name == "loops":
-        from reference_trainer.training.ssim_loops import blur
+        from reference_trainer.losses.ssim_loops import blur
 
         return blur(maps, _WEIGHTS)
     # Sums of shifted slices: on a CPU faster than a depthwise convolution, whose speed depends on the memory layout.

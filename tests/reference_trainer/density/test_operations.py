@@ -3,7 +3,8 @@ import math
 import pytest
 import torch
 
-from reference_trainer.model.density import DensityStatistics, decay_opacity, densify, prune, reset_opacity
+from reference_trainer.density.operations import decay_opacity, densify, prune, reset_opacity
+from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
 from reference_trainer.model.rendering import render_gaussians

@@ -1,0 +1,84 @@
+"""The density control of the INRIA code (Kerbl et al. 2023, Sec. 5.2), with the options of its descendants."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.density.operations import decay_opacity, densify, prune, reset_opacity
+from reference_trainer.density.statistics import DensityStatistics
+from reference_trainer.density.strategy import DensityStrategy
+from reference_trainer.model.optimizer import GaussianOptimizer
+from reference_trainer.render import Splats
+from reference_trainer.render.gsplat import GsplatSplats
+from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.randomness import stream
+
+__all__ = ["AdaptiveDensity"]
+
+
+class AdaptiveDensity(DensityStrategy):
+    """Clones and splits where the gradient of the projected centres is large, prunes what is faint, resets opacities.
+
+    All thresholds and steps are those of `TrainConfig`.
+    """
+
+    def reset(self, count: int) -> None:
+        """Forget the gradients."""
+        self.statistics = DensityStatistics.zeros(count, self.device)
+
+    def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
+        """Densify, prune, reset and decay as the schedule says for the steps that are done."""
+        config = self.config
+        until = config.iterations if config.densify_until is None else config.densify_until
+        if config.opacity_decay < 1 and step > config.densify_from:
+            decay_opacity(optimizer, config.opacity_decay)
+        every = config.densify_every
+        if every and config.densify_from < step < until and step % every == 0:
+            # The renderer would tell, but only after pruning has taken for faint what is not a number.
+            if not all(bool(x.isfinite().all()) for _, x in optimizer.gaussians.named()):
+                raise TrainingStoppedError(
+                    f"Gaussians became nan or infinite by step {step}: lower the learning rates."
+                )
+            self.densify(optimizer, step)
+            if len(optimizer.gaussians) == 0:
+                raise TrainingStoppedError(
+                    f"all Gaussians were pruned after step {step}: lower prune_opacity or noise, raise opacity_reset."
+                )
+            self.reset(len(optimizer.gaussians))
+        if config.opacity_reset_every and step < until:
+            since = step - config.opacity_reset_from
+            early = config.opacity_reset_over_white and step == config.densify_from > 0
+            if (since >= 0 and since % config.opacity_reset_every == 0) or (early and self.white):
+                reset_opacity(optimizer, config.opacity_reset)
+
+    def densify(self, optimizer: GaussianOptimizer, step: int) -> None:
+        """Clone, split and prune once."""
+        config = self.config
+        if config.max_gaussians is None or len(optimizer.gaussians) < config.max_gaussians:
+            densify(
+                optimizer,
+                self.statistics.mean_gradient >= config.densify_gradient,
+                size_threshold=config.dense_fraction * self.extent,
+                generator=stream(config.seed, step, "split", self.device),
+            )
+        large = config.prune_size is not None and step > config.prune_size_from
+        max_scale = config.prune_size * self.extent if large and config.prune_size is not None else None
+        prune(optimizer, min_opacity=config.prune_opacity, max_scale=max_scale)
+
+    def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:
+        """Count the gradients of what was drawn."""
+        gradient = splats.projection.means.grad
+        assert gradient is not None
+        drawn = splats.lists.touched
+        self.statistics.update(splats.indices[drawn], gradient[drawn], camera.width, camera.height)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the counts."""
+        return dict(vars(self.statistics))
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Go on counting."""
+        self.statistics = DensityStatistics(**state)

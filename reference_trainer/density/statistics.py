@@ -1,0 +1,50 @@
+"""What was seen of every Gaussian since the last densification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+__all__ = ["DensityStatistics"]
+
+
+@dataclass
+class DensityStatistics:
+    """What was seen of every Gaussian since the last densification.
+
+    A Gaussian that a step did not draw (outside the view, or dropped by a regularizer) is not counted in that step. If
+    dropped Gaussians were counted with their zero gradient, the threshold would in effect rise by 1 / (1 - p).
+
+    Args:
+        gradient_sum: summed norms of the loss gradient with respect to the projected centre, in units of half the image
+            size per unit (the INRIA code's normalised device coordinates), shape (N,).
+        steps: the number of steps that drew it, shape (N,).
+    """
+
+    gradient_sum: Tensor
+    steps: Tensor
+
+    @classmethod
+    def zeros(cls, count: int, device: torch.device | str = "cpu") -> DensityStatistics:
+        """Return empty statistics of ``count`` Gaussians."""
+        return cls(*(torch.zeros(count, device=device) for _ in range(2)))
+
+    def update(self, indices: Tensor, gradient: Tensor, width: int, height: int) -> None:
+        """Count one step.
+
+        Args:
+            indices: the Gaussians that were drawn, shape (M,).
+            gradient: of the loss with respect to their projected centres, per pixel, shape (M, 2).
+            width: image width, pixels.
+            height: image height, pixels.
+        """
+        half_size = gradient.new_tensor([0.5 * width, 0.5 * height])
+        self.gradient_sum[indices] += (gradient * half_size).norm(dim=1).to(self.gradient_sum)
+        self.steps[indices] += 1
+
+    @property
+    def mean_gradient(self) -> Tensor:
+        """Mean gradient norm over the steps that drew a Gaussian; 0 where none did, shape (N,)."""
+        return self.gradient_sum / self.steps.clamp(min=1)

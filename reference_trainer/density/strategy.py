@@ -1,0 +1,79 @@
+"""The base class of every density control: when and where Gaussians are added and removed."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.model.optimizer import GaussianOptimizer
+from reference_trainer.render import Splats
+from reference_trainer.render.gsplat import GsplatSplats
+from reference_trainer.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from reference_trainer.training.config import TrainConfig
+
+__all__ = ["DensityStrategy"]
+
+
+class DensityStrategy(abc.ABC):
+    """Adds and removes Gaussians between the steps; a strategy of one's own is a subclass.
+
+    It is made from its arguments alone and told of the training by `begin`. Every step the trainer calls `before_step`,
+    then `observe` for every render that trains, then moves the Gaussians. What it counts belongs into `state_dict`, for
+    a resumed training to be the same.
+
+    Gaussians that a regularizer dropped are not among those drawn: `observe` must not count them as seen. If they were
+    counted with their gradient of zero, a threshold would in effect rise by 1 / (1 - p).
+    """
+
+    config: TrainConfig
+    extent: float
+    white: bool
+    device: torch.device
+
+    def begin(self, config: TrainConfig, scene: Scene, device: torch.device, count: int) -> None:
+        """Prepare for a training.
+
+        Args:
+            config: all settings.
+            scene: its extent in world units is the unit of sizes.
+            device: of the Gaussians.
+            count: their number.
+        """
+        self.config, self.extent, self.white, self.device = config, scene.extent, scene.is_white, device
+        self.reset(count)
+
+    def reset(self, count: int) -> None:  # noqa: B027 (not every strategy counts)
+        """Forget what was counted, for so many Gaussians."""
+
+    @abc.abstractmethod
+    def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
+        """Change the set of Gaussians before the step with this number, the first being 0.
+
+        Before a step and not after it, so that whoever looks at the model between steps finds it optimized: a clone
+        doubles the opacity of its place until the next steps have adapted to it.
+
+        Raises:
+            TrainingStoppedError: if the Gaussians are not finite, or none is left.
+        """
+
+    def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:  # noqa: B027
+        """Look at a render whose gradients have been computed.
+
+        Args:
+            splats: what was drawn; ``splats.projection.means.grad`` is the gradient per pixel of the projected centres.
+            camera: of the render.
+        """
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what was counted, tensors by name, float32."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:  # noqa: B027
+        """Go on with what `state_dict` returned."""

@@ -1,0 +1,14 @@
+"""The terms of the training loss, one file each, and their registry: what ``--loss`` knows by name."""
+
+from ca_reg.registry import Registry
+from reference_trainer.losses.co_adaptation import CoAdaptation
+from reference_trainer.losses.photometric import Photometric
+from reference_trainer.losses.term import LossTerm
+
+__all__ = ["LOSSES", "CoAdaptation", "LossTerm", "Photometric"]
+
+LOSSES: Registry[LossTerm] = Registry("loss term", LossTerm)  # type: ignore[type-abstract]
+"""What can be asked for by name; ``LOSSES.register("name")`` adds a class."""
+
+for _name, _class in {"photometric": Photometric, "co_adaptation": CoAdaptation}.items():
+    LOSSES.register(_name)(_class)

@@ -1,0 +1,45 @@
+"""The exact co-adaptation of the view of a step as a term of the loss."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from torch import Tensor
+
+from ca_reg.functional import Multiplier
+from reference_trainer.losses.term import LossTerm
+
+if TYPE_CHECKING:
+    from reference_trainer.training.step import Step
+
+__all__ = ["CoAdaptation"]
+
+
+class CoAdaptation(LossTerm):
+    """``weight`` times the mean variance of the colours when each Gaussian is dropped with a rate of its own.
+
+    In an analytic step the variance of its expectation is taken, which costs nothing; in others the moments are
+    rendered, which takes about as long as the render.
+
+    Args:
+        weight: at least 0.
+        p: drop rate in [0, 1); in an analytic step the regularizer's own draws count instead.
+
+    Raises:
+        ValueError: if one is out of range.
+    """
+
+    analytic: ClassVar[bool] = True
+
+    def __init__(self, weight: float = 1.0, p: float = 0.5) -> None:
+        if not weight >= 0:
+            raise ValueError(f"weight must not be negative, got {weight}.")
+        self.weight = weight
+        self.multiplier = Multiplier.dropout(p)
+
+    def __call__(self, step: Step) -> Tensor:
+        """Return the weighted variance."""
+        variance = step.variance
+        if variance is None:
+            variance = step.moments(step.view.camera, self.multiplier).variance
+        return self.weight * variance.mean()

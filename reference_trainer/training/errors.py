@@ -1,0 +1,7 @@
+"""What ends a training."""
+
+__all__ = ["TrainingStoppedError"]
+
+
+class TrainingStoppedError(RuntimeError):
+    """Training cannot go on; the message says why and what to try."""

@@ -1,0 +1,135 @@
+"""One training step while it is taken: what a loss term may look at and ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ca_reg import Chain, Params
+from ca_reg.functional import Multiplier
+from reference_trainer.camera import Camera
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.rendering import render_gaussians, render_moments_of
+from reference_trainer.render import MomentImages, Rendering, Splats
+from reference_trainer.render.gsplat import GsplatSplats
+from reference_trainer.scenes.scene import View
+from reference_trainer.training.randomness import stream
+
+__all__ = ["Step"]
+
+
+class Step:
+    """A view, what was drawn of it, and the means to draw more.
+
+    Args:
+        number: of the step, the first being 0.
+        view: the training view, on the model's device.
+        views: all training views.
+        gaussians: the model.
+        regularizer: what acts in this step; an empty chain if nothing does.
+        background: colour behind the model, shape (3,).
+        sh_degree: highest band of spherical harmonics of this step.
+        seed: of the training.
+        renderer: what draws.
+
+    Attributes:
+        params: the parameters of the view's camera, activated, as they are without a regularizer.
+        drawn: the same as the regularizer returned it; in an analytic step what the expectation was rendered with.
+        image: the render, or in an analytic step its expectation, not clamped, shape (3, H, W).
+        variance: of the colours in an analytic step, shape (3, H, W); None in others.
+        rendering: with alpha, depth if a term needs it, and what was drawn; None in an analytic step.
+        observed: what density control is to see: splats and camera of every render that counts.
+    """
+
+    image: Tensor
+    drawn: Params
+
+    def __init__(
+        self,
+        number: int,
+        view: View,
+        views: Sequence[View],
+        gaussians: Gaussians,
+        regularizer: Chain,
+        background: Tensor,
+        *,
+        sh_degree: int,
+        seed: int,
+        renderer: Callable[..., Any],
+    ) -> None:
+        self.number = number
+        self.view = view
+        self.views = views
+        self.gaussians = gaussians
+        self.regularizer = regularizer
+        self.background = background
+        self.sh_degree = sh_degree
+        self.seed = seed
+        self.params = gaussians.params(view.camera, step=number)
+        self.variance: Tensor | None = None
+        self.rendering: Rendering | None = None
+        self.observed: list[tuple[Splats | GsplatSplats, Camera]] = []
+        self._renderer = renderer
+
+    def sample(self, *, depth: bool) -> None:
+        """Render the view with one draw of the regularizer."""
+        self.drawn = self.regularizer.regularize(self.params, self.generator("regularizer"))
+        self.rendering = self.render(self.view.camera, self.drawn, depth=depth, observed=True)
+        self.image = self.rendering.image
+
+    def expect(self) -> None:
+        """Render the view in expectation over the draws of the regularizer."""
+        multiplied = self.regularizer.multiplied(self.params)
+        assert multiplied is not None, "the trainer has refused this"
+        self.drawn, multiplier = multiplied
+        moments = self.moments(self.view.camera, multiplier, self.drawn, observed=True)
+        self.image, self.variance = moments.mean, moments.variance
+
+    def render(
+        self, camera: Camera, params: Params | None = None, *, depth: bool = False, observed: bool = False
+    ) -> Rendering:
+        """Render a camera with the model of this step.
+
+        Args:
+            camera: on the model's device.
+            params: what to render, by default the plain model.
+            depth: whether to accumulate depth.
+            observed: whether density control is to count it as it counts the view of the step.
+        """
+        out = render_gaussians(
+            self.params if params is None else params,
+            camera,
+            self.background,
+            sh_degree=self.sh_degree,
+            depth=depth,
+            renderer=self._renderer,
+        )
+        if observed:
+            self.observed.append((out.splats, camera))
+        return out
+
+    def moments(
+        self, camera: Camera, multiplier: Multiplier, params: Params | None = None, *, observed: bool = False
+    ) -> MomentImages:
+        """Render the exact mean and variance of a camera's colours under random factors on the alphas.
+
+        Args:
+            camera: on the model's device.
+            multiplier: moments of the factor.
+            params: what to render, by default the plain model.
+            observed: as of `render`.
+        """
+        params = self.params if params is None else params
+        moments, splats = render_moments_of(
+            params, multiplier, camera, self.background, sh_degree=self.sh_degree, alpha=False
+        )
+        if observed:
+            self.observed.append((splats, camera))
+        return moments
+
+    def generator(self, purpose: str) -> torch.Generator:
+        """Return random numbers that depend on the seed, the step and a label alone: a resumed training draws them."""
+        return stream(self.seed, self.number, purpose, self.gaussians.means.device)
