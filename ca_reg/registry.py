@@ -99,6 +99,17 @@ class Registry(Generic[T]):
             node = node.left
         return [self._make(term, text) for term in [node, *terms]]
 
+    def make_one(self, text: str) -> T:
+        """Make the one object of an expression.
+
+        Raises:
+            ValueError: as `make`, and if it is not one.
+        """
+        made = self.make(text)
+        if len(made) != 1:
+            raise ValueError(f"expected one {self.kind}, got {len(made)} of {text!r:.200}; {self._form()}")
+        return made[0]
+
     def _make(self, node: ast.expr, text: str) -> T:
         """Make one object."""
         call = node if isinstance(node, ast.Call) else ast.Call(node, [], [])

@@ -13,8 +13,8 @@ __all__ = ["REGULARIZERS", "GaussianDropout", "IndependentDropout", "OpacityNois
 REGULARIZERS: Registry[Regularizer] = Registry("regularizer", Regularizer, {"ramp": LinearRamp, "between": StartStop})
 """What can be asked for by name; ``REGULARIZERS.register("name")`` adds a class."""
 
-for _name, _class in {"dropout": GaussianDropout, "noise": OpacityNoise}.items():
-    REGULARIZERS.register(_name)(_class)
+REGULARIZERS.register("dropout")(GaussianDropout)
+REGULARIZERS.register("noise")(OpacityNoise)
 
 
 def parse(text: str) -> Chain:

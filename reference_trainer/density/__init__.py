@@ -9,5 +9,4 @@ __all__ = ["DENSITY", "AdaptiveDensity", "DensityStrategy"]
 DENSITY: Registry[DensityStrategy] = Registry("density strategy", DensityStrategy)  # type: ignore[type-abstract]
 """What can be asked for by name; ``DENSITY.register("name")`` adds a class."""
 
-for _name, _class in {"adaptive": AdaptiveDensity}.items():
-    DENSITY.register(_name)(_class)
+DENSITY.register("adaptive")(AdaptiveDensity)

@@ -10,5 +10,5 @@ __all__ = ["LOSSES", "CoAdaptation", "LossTerm", "Photometric"]
 LOSSES: Registry[LossTerm] = Registry("loss term", LossTerm)  # type: ignore[type-abstract]
 """What can be asked for by name; ``LOSSES.register("name")`` adds a class."""
 
-for _name, _class in {"photometric": Photometric, "co_adaptation": CoAdaptation}.items():
-    LOSSES.register(_name)(_class)
+LOSSES.register("photometric")(Photometric)
+LOSSES.register("co_adaptation")(CoAdaptation)

@@ -11,6 +11,7 @@ from ca_reg import Chain, GaussianDropout, OpacityNoise
 from ca_reg.regularizers import REGULARIZERS
 from reference_trainer.density import DENSITY, DensityStrategy
 from reference_trainer.losses import LOSSES, LossTerm
+from reference_trainer.render.renderers import RENDERERS, Renderer
 
 __all__ = ["PRESETS", "TrainConfig", "with_preset"]
 
@@ -40,8 +41,9 @@ class TrainConfig:
     density: str = "adaptive"
     """Density control, or "my_module:MyStrategy"."""
 
-    renderer: Literal["torch", "gsplat"] = "torch"
-    """What draws in training: "torch", this package's renderer, or "gsplat", which needs it and a CUDA device."""
+    renderer: str = "torch"
+    """What draws in training: "torch", this package's renderer, "gsplat", which needs it and a CUDA device, or
+    "my_module:MyRenderer"."""
 
     sh_degree: int = 3
     """Degree of the spherical harmonics of the colours, 0 to 3."""
@@ -108,7 +110,7 @@ class TrainConfig:
         if self.noise < 0:
             raise ValueError(f"noise must not be negative, got {self.noise}: 0 turns it off.")
         regularizer, terms = self.make_regularizer(), self.make_losses()
-        self.make_density()
+        renderer, _ = self.make_renderer(), self.make_density()
         if not terms:
             raise ValueError("loss needs at least one term, such as photometric.")
         if self.analytic and not len(regularizer):
@@ -116,10 +118,11 @@ class TrainConfig:
         if self.analytic and not all(term.analytic for term in terms):
             names = ", ".join(type(term).__name__ for term in terms if not term.analytic)
             raise ValueError(f"analytic training has no draw, which {names} needs: leave out analytic, or the term.")
-        if self.renderer not in ("torch", "gsplat"):
-            raise ValueError(f"renderer must be 'torch' or 'gsplat', got {self.renderer!r}.")
-        if self.analytic and self.renderer != "torch":
+        if self.analytic and "moments" not in renderer.capabilities:
             raise ValueError("analytic training needs the moments of the torch renderer: leave out renderer.")
+        lacking = set().union(*(term.needs for term in terms)) - renderer.capabilities
+        if lacking:
+            raise ValueError(f"the loss needs {', '.join(sorted(lacking))}, which the renderer {self.renderer} lacks.")
         for name in (
             "seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from"
         ):  # fmt: skip
@@ -158,10 +161,11 @@ class TrainConfig:
 
     def make_density(self) -> DensityStrategy:
         """Make the density control."""
-        made = DENSITY.make(self.density)
-        if len(made) != 1:
-            raise ValueError(f"density must be one density strategy, got {self.density!r}.")
-        return made[0]
+        return DENSITY.make_one(self.density)
+
+    def make_renderer(self) -> Renderer:
+        """Make the renderer."""
+        return RENDERERS.make_one(self.renderer)
 
 
 PRESETS: dict[str, TrainConfig] = {

@@ -14,8 +14,7 @@ import torch
 from ca_reg import Chain
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
-from reference_trainer.render import NotFiniteError, render
-from reference_trainer.render.gsplat import load_gsplat_render
+from reference_trainer.render import NotFiniteError
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
@@ -60,7 +59,8 @@ class Trainer:
         self.scene = scene
         self.config = config
         self.device = torch.device(device)
-        self.renderer = render if config.renderer == "torch" else load_gsplat_render(self.device)
+        self.renderer = config.make_renderer()
+        self.renderer.prepare(self.device)
         self.step = 0
         self.seconds = 0.0
         self.views = [view.to(self.device) for view in scene.train]

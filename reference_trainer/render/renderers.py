@@ -1,0 +1,68 @@
+"""What draws the training views: this package's renderer, gsplat's kernels, or one's own; what ``--renderer`` knows."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, ClassVar
+
+import torch
+
+from ca_reg.registry import Registry
+from reference_trainer.render.gsplat import load_gsplat_render
+from reference_trainer.render.renderer import render
+
+__all__ = ["RENDERERS", "GsplatRenderer", "OwnRenderer", "Renderer"]
+
+
+class Renderer(abc.ABC):
+    """Draws Gaussians, with the arguments of `reference_trainer.render.render`; one's own is a subclass.
+
+    Attributes:
+        capabilities: beside image and alpha: ``"depth"``; ``"moments"`` if `reference_trainer.render.render_moments`
+            draws the same picture, which analytic training and terms that render moments need.
+    """
+
+    capabilities: ClassVar[frozenset[str]] = frozenset()
+
+    def prepare(self, device: torch.device) -> None:  # noqa: B027
+        """Load what is needed to draw on a device.
+
+        Raises:
+            ImportError: if something is missing.
+            RuntimeError: if it does not draw there.
+        """
+
+    @abc.abstractmethod
+    def __call__(self, **arguments: Any) -> Any:
+        """Return a `Rendering`, or what has its fields as far as training reads them: `GsplatRendering` shows which."""
+
+
+class OwnRenderer(Renderer):
+    """The renderer of this package, by whichever engine is chosen."""
+
+    capabilities = frozenset({"depth", "moments"})
+
+    def __call__(self, **arguments: Any) -> Any:
+        """Draw."""
+        return render(**arguments)
+
+
+class GsplatRenderer(Renderer):
+    """gsplat's CUDA kernels."""
+
+    capabilities = frozenset({"depth"})
+
+    def prepare(self, device: torch.device) -> None:
+        """Load gsplat."""
+        self._render = load_gsplat_render(device)
+
+    def __call__(self, **arguments: Any) -> Any:
+        """Draw."""
+        return self._render(**arguments)
+
+
+RENDERERS: Registry[Renderer] = Registry("renderer", Renderer)  # type: ignore[type-abstract]
+"""What can be asked for by name; ``RENDERERS.register("name")`` adds a class."""
+
+RENDERERS.register("torch")(OwnRenderer)
+RENDERERS.register("gsplat")(GsplatRenderer)
