@@ -147,7 +147,7 @@ class Plan:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.evaluation.report import markdown_table, write_json
+        from reference_trainer.evaluation.results import markdown_table, write_json
         from reference_trainer.training.plan import make_plan
 
         logging.getLogger("reference_trainer.scenes.load").setLevel(logging.INFO)  # how far lens distortion goes

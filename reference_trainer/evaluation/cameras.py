@@ -15,9 +15,9 @@ from ca_reg import CAResult
 from reference_trainer.camera import Camera
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, mean_over
 from reference_trainer.evaluation.kept import KeptRecords
-from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import PANEL, heat_map, save_png, side_by_side
-from reference_trainer.evaluation.report import machine
+from reference_trainer.evaluation.results import machine
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.render.statistics import color_variance_map
 from reference_trainer.scenes.scene import View
 
@@ -65,7 +65,7 @@ class CameraEvaluation:
 
 @torch.no_grad()
 def evaluate_cameras(
-    model: Model,
+    model: TrainedModel,
     cameras: Sequence[Camera],
     *,
     samples: int = 5,

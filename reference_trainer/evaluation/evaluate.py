@@ -15,9 +15,9 @@ from torch import Tensor
 from ca_reg import CAScore
 from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.metrics import psnr, ssim
-from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import PANEL, error_map, file_names, heat_map, save_png, side_by_side
-from reference_trainer.evaluation.report import machine
+from reference_trainer.evaluation.results import machine
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.render.statistics import color_variance_map
 from reference_trainer.scenes.scene import Scene, View
 
@@ -102,7 +102,7 @@ def mean_over(views: Sequence[Any], quantity: str) -> float:
 
 @torch.no_grad()
 def evaluate(
-    model: Model,
+    model: TrainedModel,
     scene: Scene,
     *,
     samples: int = 5,
@@ -157,7 +157,7 @@ def evaluate(
 
 
 def _measure(
-    model: Model,
+    model: TrainedModel,
     photograph: View,
     split: str,
     index: int,

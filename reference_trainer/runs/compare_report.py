@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from reference_trainer.evaluation.pictures import file_names
-from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
+from reference_trainer.evaluation.results import format_mean_std, machine, markdown_table, write_json
 from reference_trainer.files import write_text
 from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.runs.figures import comparison_figure, dynamics_figure

@@ -10,9 +10,9 @@ import torch
 
 from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric, evaluate
 from reference_trainer.evaluation.kept import PARTIAL
-from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import file_names, save_gif, save_png
-from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.evaluation.results import machine, markdown_table, write_json
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import remove_leftovers, write_text
 from reference_trainer.model.rendering import render_gaussians
@@ -26,7 +26,7 @@ __all__ = ["evaluation_table", "measure", "of_run", "render_run"]
 Say = Callable[[str], None]
 
 
-def of_run(run: Path, device: str = "cpu", *, scale_noise: bool = False) -> tuple[Model, Scene, Path]:
+def of_run(run: Path, device: str = "cpu", *, scale_noise: bool = False) -> tuple[TrainedModel, Scene, Path]:
     """Return a run's model at its last checkpoint, its scene, and the folder for its evaluation.
 
     Args:
@@ -49,7 +49,7 @@ def of_run(run: Path, device: str = "cpu", *, scale_noise: bool = False) -> tupl
 
 
 def measure(
-    model: Model,
+    model: TrainedModel,
     scene: Scene,
     out: Path,
     *,

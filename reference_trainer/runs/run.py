@@ -18,8 +18,8 @@ from reference_trainer.evaluation.evaluate import PerceptualMetric, evaluate
 from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.lpips import lpips_option
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.evaluation.results import machine, markdown_table, write_json
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import remove_leftovers
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import (
@@ -48,10 +48,10 @@ from reference_trainer.training.trainer import Trainer, TrainingStoppedError
 __all__ = ["load_run", "model_of", "run_experiment", "save_for_viewers", "summary"]
 
 
-def model_of(trainer: Trainer) -> Model:
+def model_of(trainer: Trainer) -> TrainedModel:
     """Return the trainer's model as it is to be used at test time."""
     config = trainer.config
-    return Model(
+    return TrainedModel(
         gaussians=trainer.gaussians.map(Tensor.detach),
         background=trainer.background,
         dropout=0.0 if config.compensate else config.dropout,
@@ -62,7 +62,7 @@ def model_of(trainer: Trainer) -> Model:
     )
 
 
-def save_for_viewers(model: Model, path: Path, *, pad_to_degree: int | None = None) -> None:
+def save_for_viewers(model: TrainedModel, path: Path, *, pad_to_degree: int | None = None) -> None:
     """Write a model as a PLY with its test-time opacities, marked so that nothing scales them again.
 
     Args:

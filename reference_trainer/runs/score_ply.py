@@ -13,8 +13,8 @@ from reference_trainer.evaluation.cameras import CameraEvaluation, evaluate_came
 from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric
 from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.evaluation.results import machine, markdown_table, write_json
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import remove_leftovers, write_text
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
@@ -68,7 +68,9 @@ class PlyFacts:
         )
 
 
-def of_ply(ply: Path, *, background: Tensor, dropout: float = 0.0, device: str = "cpu") -> tuple[Model, PlyFacts]:
+def of_ply(
+    ply: Path, *, background: Tensor, dropout: float = 0.0, device: str = "cpu"
+) -> tuple[TrainedModel, PlyFacts]:
     """Return the model of a standard 3DGS PLY, and what the file says of it.
 
     A PLY that says that the test-time scaling is baked into its opacities says the rate as well. The scaling is undone,
@@ -101,7 +103,7 @@ def of_ply(ply: Path, *, background: Tensor, dropout: float = 0.0, device: str =
     facts = PlyFacts(
         len(gaussians), gaussians.sh_degree, bands[-1], loaded.opacity_scale, loaded.for_rendering, dropout
     )
-    model = Model(
+    model = TrainedModel(
         gaussians=gaussians.to(device),
         background=background.to(device),
         dropout=dropout,

@@ -9,17 +9,17 @@ from PIL import Image
 
 from reference_trainer.evaluation.cameras import CameraEvaluation, CameraScores, evaluate_cameras
 from reference_trainer.evaluation.evaluate import evaluate
-from reference_trainer.evaluation.model import Model
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 
 
 @pytest.fixture(scope="module")
-def model(tiny_scene) -> Model:
+def model(tiny_scene) -> TrainedModel:
     points = tiny_scene.points
     gaussians = Gaussians.from_points(
         points.positions, points.colors, torch.full((150,), 0.25), sh_degree=0, opacity=0.9
     )
-    return Model(gaussians, tiny_scene.background, dropout=0.2, opacity_scale=0.8)
+    return TrainedModel(gaussians, tiny_scene.background, dropout=0.2, opacity_scale=0.8)
 
 
 def test_photographs_are_not_needed_for_these_scores(model, tiny_scene):

@@ -12,7 +12,7 @@ from reference_trainer.evaluation import evaluate as evaluate_module
 from reference_trainer.evaluation.cameras import evaluate_cameras
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.kept import KeptRecords, fingerprint
-from reference_trainer.evaluation.model import Model
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 
 
@@ -20,7 +20,7 @@ from reference_trainer.model.gaussians import Gaussians
 def model(tiny_scene):
     points = tiny_scene.points
     sizes = torch.full((len(points.positions),), 0.1)
-    return Model(
+    return TrainedModel(
         Gaussians.from_points(points.positions, points.colors, sizes, sh_degree=0, opacity=0.9), tiny_scene.background
     )
 
@@ -106,7 +106,7 @@ def test_a_fingerprint_tells_everything_apart():
         *(None, 0, 0.0, -0.0, math.nan, True, "0", "", [], [[]], [0, 0], [[0], 0], [0, [0]], {"a": 0}, {"a": [0]}),
         *(torch.zeros(2), torch.zeros(2, 1), torch.zeros(1, 2), torch.zeros(4, dtype=torch.int16), torch.zeros(0)),
         *(torch.tensor(0.0), torch.tensor(-0.0), torch.zeros(2, dtype=torch.bfloat16), torch.ones(2)),
-        *(Model(torch.zeros(1), torch.zeros(3), p) for p in (0.0, 0.1)),
+        *(TrainedModel(torch.zeros(1), torch.zeros(3), p) for p in (0.0, 0.1)),
     ]
     digests = [fingerprint(x) for x in values]
     assert len(set(digests)) == len(digests)

@@ -8,7 +8,7 @@ from PIL import Image
 
 from ca_reg import attribute
 from reference_trainer.evaluation.evaluate import evaluate
-from reference_trainer.evaluation.report import write_json
+from reference_trainer.evaluation.results import write_json
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import model_of
 from reference_trainer.studies import pruning as pruning_module

@@ -8,7 +8,7 @@ import torch
 
 from ca_reg import CAScore, GaussianDropout, OpacityNoise, Reason, attribute
 from ca_reg.functional import Multiplier
-from reference_trainer.evaluation.model import MaskedRenders, Model
+from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.scene import Scene
@@ -20,14 +20,14 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def model(scene) -> Model:
+def model(scene) -> TrainedModel:
     points = scene.points
     assert points is not None
     generator = torch.Generator().manual_seed(0)
     gaussians = Gaussians.from_points(points.positions, points.colors, torch.full((300,), 0.3), sh_degree=1)
     logits = 2.0 * torch.randn(300, generator=generator)
     rest = 0.1 * torch.randn(gaussians.sh_rest.shape, generator=generator)
-    return Model(replace(gaussians, opacity_logits=logits, sh_rest=rest), scene.background, dropout=0.2)
+    return TrainedModel(replace(gaussians, opacity_logits=logits, sh_rest=rest), scene.background, dropout=0.2)
 
 
 def assert_equal_renders(mine, other) -> None:

@@ -23,11 +23,11 @@ from reference_trainer.render import (
 )
 from reference_trainer.scenes.scene import View
 
-__all__ = ["MaskedRenders", "Model"]
+__all__ = ["MaskedRenders", "TrainedModel"]
 
 
 @dataclass(frozen=True)
-class Model:
+class TrainedModel:
     """A trained model and how it is to be used at test time.
 
     Args:
@@ -146,13 +146,13 @@ class MaskedRenders:
     """The render callable of a `CAScore` over a model that does not change.
 
     Projection, colours, tile lists and their order are made once for a view, for all Gaussians; a mask only takes
-    entries out of the lists. The images are those of `Model.render`.
+    entries out of the lists. The images are those of `TrainedModel.render`.
 
     Args:
         model: what to render.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: TrainedModel) -> None:
         self._model = model
         self._view: View | None = None
         self._splats: Splats | None = None
