@@ -124,7 +124,7 @@ def score_view(model: TrainedModel, view: View, *, index: int) -> dict[str, floa
     half = model.ca_score(drop_rate=_HALF)(opacities, view, index=index)
     repeat = model.ca_score(drop_rate=_HALF, seed=1)(opacities, view, index=index)
     neutral = model.exact_ca_score(drop_rate=_HALF, neutral=True)(opacities, view)
-    if model.dropout > 0:
+    if model.treatment.dropout > 0:
         protocol = model.ca_score()(opacities, view, index=index)
         exact = model.exact_ca_score()(opacities, view)
     else:

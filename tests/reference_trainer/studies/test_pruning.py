@@ -112,7 +112,7 @@ def runs(tmp_path_factory, options, tiny_scene, busy):
         trainer.save(folder / CHECKPOINT)
         config = {"scene": dataclasses.asdict(options), "config": dataclasses.asdict(trainer.config)}
         write_json(folder / CONFIG, config)
-        out[folder] = evaluate(model_of(trainer), scene)
+        out[folder] = evaluate(model_of(trainer), {"test": scene.test})
     return out, scene
 
 
