@@ -104,7 +104,8 @@ class Train:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.runs.run import run_experiment, summary
+        from reference_trainer.evaluation.tables import summary
+        from reference_trainer.runs.run import run_experiment
         from reference_trainer.training.determinism import deterministic
 
         if self.deterministic and self.config.renderer == "gsplat":
@@ -147,7 +148,7 @@ class Plan:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.evaluation.report import markdown_table, write_json
+        from reference_trainer.evaluation.results import markdown_table, write_json
         from reference_trainer.training.plan import make_plan
 
         logging.getLogger("reference_trainer.scenes.load").setLevel(logging.INFO)  # how far lens distortion goes
@@ -201,40 +202,38 @@ class Evaluate:
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.evaluation.lpips import lpips_option
+        from reference_trainer.evaluation.trajectory import measured_views
         from reference_trainer.runs.measure import measure, of_run
-        from reference_trainer.runs.score_ply import score_ply, score_ply_on_orbit
+        from reference_trainer.runs.score_ply import score_ply
 
         if self.run is not None and self.ply is not None:
             raise ValueError(f"give the folder of a run or --ply FILE, not both: got {self.run} and {self.ply}.")
-        if self.run is not None and self.run.suffix.lower() == ".ply" and not self.run.is_dir():
-            replace(self, run=None, ply=self.run)()
-            return
-        if self.run is not None:
-            self.drawing.begin(self.device)
-            model, scene, default = of_run(self.run, self.device, scale_noise=self.scale_noise)
-            perceptual = lpips_option(self.lpips, device=self.device)
-            measure(model, scene, self.out or default, samples=self.samples, seed=self.seed, perceptual=perceptual)
-            return
-        if self.ply is None:
+        run, ply = self.run, self.ply
+        if run is not None and run.suffix.lower() == ".ply" and not run.is_dir():
+            run, ply = None, run
+        if run is None and ply is None:
             raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE (and --path SCENE).")
-        if self.scale_noise:
+        if ply is not None and self.scale_noise:
             raise ValueError(
                 "--scale-noise needs the folder of a run: a PLY does not say which noise it was trained with."
             )
-        self.drawing.begin(self.device)
-        shared: dict[str, Any] = {
-            "dropout": self.dropout, "samples": self.samples, "seed": self.seed, "device": self.device
-        }  # fmt: skip
-        if self.scene.path != "orbit":
-            perceptual = lpips_option(self.lpips, device=self.device)
-            score_ply(self.ply, self.scene, self.out, perceptual=perceptual, **shared)
-            return
-        if self.lpips is not None or replace(self.scene, background="auto") != PlyScene():
+        orbit = ply is not None and self.scene.path == "orbit"
+        if orbit and (self.lpips is not None or replace(self.scene, background="auto") != PlyScene()):
             raise ValueError(
                 "without photographs there is neither --lpips nor any option of a scene but --background: give --path."
             )
-        background = "black" if self.scene.background == "auto" else self.scene.background
-        score_ply_on_orbit(self.ply, self.orbit, self.out, background=background, **shared)
+        self.drawing.begin(self.device)
+        shared: dict[str, Any] = {
+            "samples": self.samples, "seed": self.seed, "perceptual": lpips_option(self.lpips, device=self.device)
+        }  # fmt: skip
+        if run is not None:
+            model, scene, default = of_run(run, self.device, scale_noise=self.scale_noise)
+            measure(model, measured_views(scene, print), self.out or default, about={"scene": scene.name}, **shared)
+        elif ply is not None:
+            where = self.orbit if orbit else self.scene
+            shared |= {"dropout": self.dropout, "device": self.device}
+            background = "black" if self.scene.background == "auto" else self.scene.background
+            score_ply(ply, where, self.out, background=background, **shared)
 
 
 @dataclass(frozen=True)

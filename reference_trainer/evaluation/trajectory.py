@@ -1,15 +1,16 @@
-"""Camera paths between given cameras."""
+"""Viewpoints from given ones: flights through cameras, and what a scene is measured from."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 
 from reference_trainer.camera import Camera
+from reference_trainer.scenes.scene import Scene, Viewpoint
 
-__all__ = ["interpolate_cameras"]
+__all__ = ["interpolate_cameras", "measured_views"]
 
 
 def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -34,16 +35,52 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """
     if len(cameras) < 2 or frames < 2:
         raise ValueError(f"a path needs at least 2 cameras and 2 frames, got {len(cameras)} and {frames}.")
-    from kornia.geometry.quaternion import Quaternion
-
-    rotations = [Quaternion.from_matrix(camera.world_to_camera[:3, :3]) for camera in cameras]
     path = []
     for along in torch.linspace(0, len(cameras) - 1, frames).tolist():
         i = min(int(along), len(cameras) - 2)
-        rotation = rotations[i].slerp(rotations[i + 1], along - i).matrix()
-        position = torch.lerp(cameras[i].position, cameras[i + 1].position, along - i)
-        pose = torch.eye(4, dtype=position.dtype, device=position.device)
-        pose[:3, :3] = rotation
-        pose[:3, 3] = -rotation @ position
+        pose = _on_the_way(cameras[i], cameras[i + 1], along - i).world_to_camera
         path.append(replace(cameras[0], world_to_camera=pose))
     return path
+
+
+def measured_views(scene: Scene, say: Callable[[str], None]) -> dict[str, Sequence[Viewpoint]]:
+    """Return the views of a scene that a model is measured at, by split: ``"train"`` and ``"test"``.
+
+    Where all photographs are trained on, viewpoints without one take the place of the test views: ``"between"``, half
+    the way from each training camera to its nearest neighbour, and ``"around"``, as far away on the other side. The
+    orientation turns on at the same rate. A single camera has neither.
+
+    Args:
+        scene: the scene.
+        say: receives a line if there is no test view.
+    """
+    if scene.test:
+        return {"train": scene.train, "test": scene.test}
+    say(
+        "No test views: no quality at unseen views, only what needs no photograph there, such as exact CA, measured "
+        "between and around the training views."
+    )
+    cameras = [view.camera for view in scene.train]
+    if len(cameras) < 2:
+        return {"train": scene.train}
+    places = torch.stack([camera.position for camera in cameras])
+    nearest = torch.cdist(places, places).fill_diagonal_(torch.inf).argmin(1).tolist()
+    pairs = sorted({(min(pair), max(pair)) for pair in enumerate(nearest)})
+    new = {
+        "between": [_on_the_way(cameras[i], cameras[j], 0.5) for i, j in pairs],
+        "around": [_on_the_way(cameras[i], cameras[j], -0.5) for i, j in enumerate(nearest)],
+    }
+    numbered = {split: [Viewpoint(f"{i:03d}", camera) for i, camera in enumerate(of)] for split, of in new.items()}
+    return {"train": scene.train, **numbered}
+
+
+def _on_the_way(first: Camera, second: Camera, along: float) -> Camera:
+    """Return the first camera moved and turned towards the second, 0 at the first and 1 at the second."""
+    from kornia.geometry.quaternion import Quaternion
+
+    start, end = (Quaternion.from_matrix(camera.world_to_camera[:3, :3]) for camera in (first, second))
+    rotation = start.slerp(end, along).matrix()
+    pose = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ torch.lerp(first.position, second.position, along)
+    return replace(first, world_to_camera=pose)

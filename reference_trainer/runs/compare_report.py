@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from reference_trainer.evaluation.pictures import file_names
-from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
+from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.tables import comparison_table
 from reference_trainer.files import write_text
 from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.runs.figures import comparison_figure, dynamics_figure
 
-__all__ = ["REPORT", "TABLE", "Comparison", "comparison_table", "report", "save"]
+__all__ = ["REPORT", "TABLE", "Comparison", "report", "save"]
 
 REPORT = "comparison.json"
 TABLE = "comparison.md"
@@ -43,37 +44,6 @@ def save(comparison: Comparison, out: Path) -> None:
     write_json(out / REPORT, {**dataclasses.asdict(comparison), "machine": machine()})
     if comparison.runs:
         write_text(out / TABLE, comparison_table(comparison.runs) + "\n")
-
-
-def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Return one row per strategy in Markdown, every entry the mean and sample standard deviation over the seeds.
-
-    CA is the paper's protocol, whose drop rate depends on p; "CA at 1/2" drops half of the Gaussians of every model.
-    Both are in units of 1e-3.
-    """
-    columns: dict[str, tuple[str, str, float]] = {
-        "test PSNR": ("test", "psnr", 1.0),
-        "test SSIM": ("test", "ssim", 1.0),
-        "test LPIPS": ("test", "lpips", 1.0),
-        "test CA x1e-3": ("test", "ca", 1e-3),
-        "test CA at 1/2": ("test", "ca_half", 1e-3),
-        "test CV": ("test", "cv", 1.0),
-        "train PSNR": ("train", "psnr", 1.0),
-        "train CA x1e-3": ("train", "ca", 1e-3),
-    }
-    rows: list[dict[str, object]] = []
-    for name, of in runs.items():
-        row: dict[str, object] = {"strategy": name, "seeds": len(of)}
-        for column, (split, quantity, unit) in columns.items():
-            values = [run["mean"].get(split, {}).get(quantity) for run in of]
-            known = [value for value in values if value is not None]
-            if known:
-                row[column] = format_mean_std(known, unit=unit)
-        row["Gaussians"] = format_mean_std([run["gaussians"] for run in of], unit=1e3) + "k"
-        row["seconds"] = format_mean_std([run["seconds"] for run in of])
-        rows.append(row)
-    present = [column for column in columns if any(column in row for row in rows)]
-    return markdown_table(rows, ["strategy", "seeds", *present, "Gaussians", "seconds"])
 
 
 def report(comparisons: Mapping[Path, Comparison], *, say: Callable[[str], None] = print) -> None:
@@ -110,7 +80,9 @@ def _report(comparison: Comparison, out: Path, say: Callable[[str], None]) -> No
     except (FileNotFoundError, ValueError) as error:  # runs of --monitor-every 0, or shorter than the first measurement
         say(f"no figure of CA and PSNR against the iteration: {error}")
     views = next(iter(comparison.runs.values()))[0]["views"]
-    for name in file_names([view["name"] for view in views if view["split"] == "test"]):
-        comparison_figure(first, out / f"test_{name}.png", view=name)
-        say(f"photograph, render, error and CA map of each strategy: {out / f'test_{name}.png'}")
+    splits = {view["split"] for view in views}
+    for split in sorted(splits - {"train"}) or splits:
+        for name in file_names([view["name"] for view in views if view["split"] == split]):
+            comparison_figure(first, out / f"{split}_{name}.png", view=name, split=split)
+            say(f"the pictures of each strategy: {out / f'{split}_{name}.png'}")
     say(f"table and all numbers: {out / TABLE}, {out / REPORT}; curves: tensorboard --logdir {out}")

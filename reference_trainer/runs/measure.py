@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -10,23 +10,23 @@ import torch
 
 from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric, evaluate
 from reference_trainer.evaluation.kept import PARTIAL
-from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import file_names, save_gif, save_png
-from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.tables import evaluation_table
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import remove_leftovers, write_text
-from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.folder import VIEWS
 from reference_trainer.runs.run import load_run, model_of
-from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.scene import Scene, Viewpoint
 from reference_trainer.threads import threads_for
 
-__all__ = ["evaluation_table", "measure", "of_run", "render_run"]
+__all__ = ["measure", "of_run", "render_run"]
 
 Say = Callable[[str], None]
 
 
-def of_run(run: Path, device: str = "cpu", *, scale_noise: bool = False) -> tuple[Model, Scene, Path]:
+def of_run(run: Path, device: str = "cpu", *, scale_noise: bool = False) -> tuple[TrainedModel, Scene, Path]:
     """Return a run's model at its last checkpoint, its scene, and the folder for its evaluation.
 
     Args:
@@ -49,52 +49,43 @@ def of_run(run: Path, device: str = "cpu", *, scale_noise: bool = False) -> tupl
 
 
 def measure(
-    model: Model,
-    scene: Scene,
+    model: TrainedModel,
+    views: Mapping[str, Sequence[Viewpoint]],
     out: Path,
     *,
+    about: Mapping[str, object],
     samples: int = 5,
     seed: int = 0,
     perceptual: PerceptualMetric | None = None,
-    about: Mapping[str, object] | None = None,
     say: Say = print,
 ) -> Evaluation:
-    """Measure a model on a scene; write ``evaluation.json``, ``evaluation.md`` and pictures, and print the table.
+    """Measure a model at views; write ``evaluation.json``, ``evaluation.md`` and pictures, and print the table.
 
     If it is interrupted, the same call continues with the next view.
 
     Args:
         model: what to measure.
-        scene: its views.
+        views: by split, see `evaluate`.
         out: folder for the results.
+        about: what else is written to the JSON file, such as the name of the scene.
         samples: K of the CA score.
         seed: of its masks.
         perceptual: a perceptual metric.
-        about: what a PLY says of itself, for the JSON file; None for a run, which has a file of its own.
         say: receives the table and the progress.
     """
-    keep = out / PARTIAL
     remove_leftovers(out / VIEWS)
-    with threads_for(scene.pixels):
+    keep = out / PARTIAL
+    with threads_for(max(view.camera.width * view.camera.height for group in views.values() for view in group)):
         result = evaluate(
-            model,
-            scene,
-            samples=samples,
-            seed=seed,
-            perceptual=perceptual,
-            pictures=out / VIEWS,
-            keep=keep,
-            progress=say,
+            model, views, samples=samples, seed=seed, perceptual=perceptual, pictures=out / VIEWS, keep=keep, say=say
         )
         computed_on = machine()
-    settings = model.ca_score(samples=samples, seed=seed).settings
     data = {
-        "scene": scene.name,
-        **({} if about is None else {"ply": dict(about)}),
+        **about,
         **result.as_dict(),
-        "ca_settings": asdict(settings),
+        "ca_settings": asdict(model.ca_score(samples=samples, seed=seed).settings),
         "background": model.background.tolist(),
-        "expected_noise": model.expected_noise,
+        "expected_noise": model.treatment.noise,
         "machine": computed_on,
     }
     write_json(out / "evaluation.json", data)
@@ -104,21 +95,6 @@ def measure(
     say(table)
     say(f"Scores and pictures are in {out}")
     return result
-
-
-def evaluation_table(result: Evaluation) -> str:
-    """Return one row per view and the means, in Markdown; CA in units of 1e-3."""
-    quantities = ("psnr", "ssim", "lpips", "ca", "ca_std_error", "ca_exact", "visible", "cv")
-    unit = {"ca": 1e-3, "ca_std_error": 1e-3, "ca_exact": 1e-3}
-    title = {name: f"{name} x1e-3" if name in unit else name for name in quantities}
-    rows: list[dict[str, object]] = [
-        {"view": f"{view.split} {view.name}"} | {title[q]: getattr(view, q) / unit.get(q, 1) for q in quantities}
-        for view in result.views
-    ]
-    for split in sorted({view.split for view in result.views}):
-        rows.append({"view": f"mean {split}"} | {title[q]: result.mean(split, q) / unit.get(q, 1) for q in quantities})
-    shown = [title[q] for q in quantities if q != "lpips" or result.perceptual_metric is not None]
-    return markdown_table(rows, ["view", *shown])
 
 
 @torch.no_grad()
@@ -137,25 +113,26 @@ def render_run(
 
     Returns:
         The folder.
+
+    Raises:
+        ValueError: if there is no test view to render.
     """
     trainer = load_run(run, device)
     model = model_of(trainer)
     folder = out or run / f"render_{what}"
+    views: Sequence[Viewpoint]
     if what == "flight":
         path = interpolate_cameras([view.camera for view in trainer.scene.train], frames)
-        cameras = {f"{i:04d}": camera for i, camera in enumerate(path)}
+        views = [Viewpoint(f"{i:04d}", camera) for i, camera in enumerate(path)]
     else:
         views = trainer.scene.test if what == "test" else trainer.scene.train
-        names = file_names([view.name for view in views])
-        cameras = {name: view.camera for name, view in zip(names, views, strict=True)}
-    opacities = model.test_opacities
+    if not views:
+        raise ValueError(f"the scene of {run} has no test view: give --what train or --what flight.")
     images = []
-    for name, camera in cameras.items():
-        with threads_for(camera.width * camera.height):
-            rendering = render_gaussians(
-                model.gaussians, camera, model.background, opacities=opacities, sh_degree=model.sh_degree
-            )
-        images.append(rendering.image.clamp(0, 1).cpu())
+    for name, view in zip(file_names([view.name for view in views]), views, strict=True):
+        with threads_for(view.camera.width * view.camera.height):
+            image, _ = model.render(model.test_opacities, view.to(device))
+        images.append(image.clamp(0, 1).cpu())
         save_png(folder / f"{name}.png", images[-1])
     if what == "flight":
         save_gif(folder / "flight.gif", images)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import signal
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,9 @@ from reference_trainer.evaluation.evaluate import PerceptualMetric, evaluate
 from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.lpips import lpips_option
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
+from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.files import remove_leftovers
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import (
@@ -46,24 +47,26 @@ from reference_trainer.training.plan import Plan, make_plan
 from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["load_run", "model_of", "run_experiment", "save_for_viewers", "summary"]
+__all__ = ["load_run", "model_of", "run_experiment", "save_for_viewers"]
 
 
-def model_of(trainer: Trainer) -> Model:
+def model_of(trainer: Trainer) -> TrainedModel:
     """Return the trainer's model as it is to be used at test time."""
     config = trainer.config
-    return Model(
+    return TrainedModel(
         gaussians=trainer.gaussians.map(Tensor.detach),
         background=trainer.background,
-        dropout=0.0 if config.compensate else config.dropout,
-        opacity_scale=config.test_time_scale if trainer.regularized else 1.0,
+        treatment=Treatment(
+            dropout=0.0 if config.compensate else config.dropout,
+            scale=config.test_time_scale if trainer.regularized else 1.0,
+            noise=config.noise if config.scale_noise and trainer.regularized else 0.0,
+            clip_noise=config.clip_noise,
+        ),
         sh_degree=trainer.sh_degree,
-        expected_noise=config.noise if config.scale_noise and trainer.regularized else 0.0,
-        clip_noise=config.clip_noise,
     )
 
 
-def save_for_viewers(model: Model, path: Path, *, pad_to_degree: int | None = None) -> None:
+def save_for_viewers(model: TrainedModel, path: Path, *, pad_to_degree: int | None = None) -> None:
     """Write a model as a PLY with its test-time opacities, marked so that nothing scales them again.
 
     Args:
@@ -71,10 +74,11 @@ def save_for_viewers(model: Model, path: Path, *, pad_to_degree: int | None = No
         path: the file.
         pad_to_degree: as of `save_ply`.
     """
-    if model.expected_noise > 0:
+    factor = model.treatment.factor
+    if factor is None:
         save_ply(model.gaussians, path, opacities=model.test_opacities, pad_to_degree=pad_to_degree)
-    else:  # one factor, which a reader can take out again
-        save_ply(model.gaussians, path, bake_p=1 - model.opacity_scale, pad_to_degree=pad_to_degree)
+    else:  # which a reader can take out again
+        save_ply(model.gaussians, path, bake_p=1 - factor, pad_to_degree=pad_to_degree)
 
 
 def run_experiment(
@@ -147,26 +151,6 @@ def run_experiment(
         with _saved_at_the_end(trainer, out, say):
             _train(trainer, out, monitor_every, checkpoint_every, resumed=resumed, progress=progress, say=say)
         return _measure(trainer, out, perceptual, say)
-
-
-def summary(results: Mapping[str, Any]) -> str:
-    """Return the content of ``results.json`` as a short table in Markdown; CA in units of 1e-3."""
-    rows: list[dict[str, object]] = []
-    for split, mean in sorted(results["mean"].items()):
-        known = {name: float("nan") if value is None else value for name, value in mean.items()}
-        rows.append(
-            {
-                "views": split,
-                "PSNR": known["psnr"],
-                "SSIM": known["ssim"],
-                "LPIPS": known["lpips"],
-                "CA x1e-3": known["ca"] * 1e3,
-                "CV": known["cv"],
-                "Gaussians": results["gaussians"],
-                "seconds": results["seconds"],
-            }
-        )
-    return markdown_table(rows, list(rows[0]))
 
 
 def load_run(folder: Path, device: torch.device | str = "cpu") -> Trainer:
@@ -280,10 +264,15 @@ def _measure(
     """Write the trained model, its pictures and its scores; return the results."""
     model = model_of(trainer)
     save_ply(model.gaussians, out / PLY)
-    if model.opacity_scale < 1 or model.expected_noise > 0:
+    if model.treatment.factor != 1:
         save_for_viewers(model, out / BAKED_PLY)
     evaluation = evaluate(
-        model, trainer.scene, perceptual=perceptual, pictures=out / VIEWS, keep=out / PARTIAL, progress=say
+        model,
+        measured_views(trainer.scene, say),
+        perceptual=perceptual,
+        pictures=out / VIEWS,
+        keep=out / PARTIAL,
+        say=say,
     )
     results = {
         "scene": trainer.scene.name,

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from reference_trainer.evaluation.cameras import CameraEvaluation, evaluate_cameras
 from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric
-from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.report import machine, markdown_table, write_json
-from reference_trainer.files import remove_leftovers, write_text
+from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
+from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
-from reference_trainer.runs.folder import VIEWS
 from reference_trainer.runs.frame_check import check_frame
 from reference_trainer.runs.measure import measure
 from reference_trainer.scenes.load import BACKGROUNDS
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.scenes.orbit import bounding_sphere
-from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.threads import threads_for
+from reference_trainer.scenes.scene import Scene, View, Viewpoint
 
-__all__ = ["PlyFacts", "camera_table", "of_ply", "score_ply", "score_ply_on_orbit"]
+__all__ = ["PlyFacts", "of_ply", "score_ply"]
 
 SMALLEST_RADIUS = 0.25
 """Smaller models are enlarged to this: the near plane of the renderer, at 0.2, would cut into them."""
@@ -68,7 +63,9 @@ class PlyFacts:
         )
 
 
-def of_ply(ply: Path, *, background: Tensor, dropout: float = 0.0, device: str = "cpu") -> tuple[Model, PlyFacts]:
+def of_ply(
+    ply: Path, *, background: Tensor, dropout: float = 0.0, device: str = "cpu"
+) -> tuple[TrainedModel, PlyFacts]:
     """Return the model of a standard 3DGS PLY, and what the file says of it.
 
     A PLY that says that the test-time scaling is baked into its opacities says the rate as well. The scaling is undone,
@@ -101,20 +98,20 @@ def of_ply(ply: Path, *, background: Tensor, dropout: float = 0.0, device: str =
     facts = PlyFacts(
         len(gaussians), gaussians.sh_degree, bands[-1], loaded.opacity_scale, loaded.for_rendering, dropout
     )
-    model = Model(
+    model = TrainedModel(
         gaussians=gaussians.to(device),
         background=background.to(device),
-        dropout=dropout,
-        opacity_scale=1.0 if loaded.for_rendering else 1.0 - dropout,
+        treatment=Treatment(dropout, scale=1.0 if loaded.for_rendering else 1.0 - dropout),
     )
     return model, facts
 
 
 def score_ply(
     ply: Path,
-    options: SceneOptions,
+    where: SceneOptions | OrbitOptions,
     out: Path | None = None,
     *,
+    background: str = "black",
     dropout: float = 0.0,
     samples: int = 5,
     seed: int = 0,
@@ -122,12 +119,13 @@ def score_ply(
     device: str = "cpu",
     say: Say = print,
 ) -> Evaluation:
-    """Measure the model of a PLY on the photographs of a scene; writes and prints what `measure` does.
+    """Measure the model of a PLY at the views of a scene or from an orbit; writes and prints what `measure` does.
 
     Args:
-        ply: the model, in the frame of the scene's cameras.
-        options: the scene.
+        ply: the model, in the frame of the scene's cameras; for an orbit in any frame and of any size.
+        where: the scene or the orbit.
         out: folder for the results; ``<ply>_evaluation`` by default.
+        background: of an orbit, ``"black"`` or ``"white"``; a scene has its own.
         dropout: as of `of_ply`.
         samples: K of the CA score.
         seed: of its masks.
@@ -136,25 +134,31 @@ def score_ply(
         say: receives the progress, the table, and doubts whether the frames agree.
 
     Raises:
-        ValueError: as `of_ply` and `check_frame`.
+        ValueError: as `of_ply`, `check_frame` and `OrbitOptions.views`, or if there is no such background.
         FileNotFoundError: if the PLY or the scene is missing.
     """
-    scene = options.load()
-    model, facts = of_ply(ply, background=scene.background, dropout=dropout, device=device)
+    scene = where.load() if isinstance(where, SceneOptions) else None
+    if scene is None and background not in BACKGROUNDS:
+        raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {background!r}.")
+    color = torch.tensor(BACKGROUNDS[background]) if scene is None else scene.background
+    model, facts = of_ply(ply, background=color, dropout=dropout, device=device)
     say(f"{ply}: {facts}")
-    for doubt in check_frame(model.gaussians, scene, ply):
-        say(doubt)
-    result = measure(
-        model,
-        scene,
-        out or _folder(ply),
-        samples=samples,
-        seed=seed,
-        perceptual=perceptual,
-        about=asdict(facts),
-        say=say,
-    )
-    if _worse_than_one_colour(result, scene):
+    about: dict[str, object] = {"ply": asdict(facts)}
+    views: Mapping[str, Sequence[Viewpoint]]
+    if isinstance(where, OrbitOptions):
+        model, views, about["orbit"] = _on_orbit(model, where, say)
+    elif scene is not None:
+        for doubt in check_frame(model.gaussians, scene, ply):
+            say(doubt)
+        views, about["scene"] = measured_views(scene, say), scene.name
+    folder = out or ply.with_name(ply.stem + "_evaluation")
+    result = measure(model, views, folder, about=about, samples=samples, seed=seed, perceptual=perceptual, say=say)
+    if scene is None:
+        say(
+            "An orbit sees the model from where no photograph may have been taken: compare these scores with others "
+            "from the same cameras alone; for those of the scene's own views give the scene (--scene FOLDER)."
+        )
+    elif _worse_than_one_colour(result, scene):
         say(
             f"Every training view is further from its photograph than a picture of one colour would be: {ply} is not "
             f"in the frame of {scene.name}, or not a model of it. The PSNR says nothing, CA is that of these views."
@@ -162,41 +166,10 @@ def score_ply(
     return result
 
 
-def score_ply_on_orbit(
-    ply: Path,
-    orbit: OrbitOptions,
-    out: Path | None = None,
-    *,
-    background: str = "black",
-    dropout: float = 0.0,
-    samples: int = 5,
-    seed: int = 0,
-    device: str = "cpu",
-    say: Say = print,
-) -> CameraEvaluation:
-    """Measure the model of a PLY without photographs; write ``evaluation.json``, ``evaluation.md`` and pictures.
-
-    If it is interrupted, the same call continues with the next camera.
-
-    Args:
-        ply: the model, in any frame and of any size.
-        orbit: the cameras.
-        out: folder for the results; ``<ply>_evaluation`` by default.
-        background: ``"black"`` or ``"white"``.
-        dropout: as of `of_ply`.
-        samples: K of the CA score.
-        seed: of its masks.
-        device: where to render.
-        say: receives the table, and what became of an interrupted measurement.
-
-    Raises:
-        ValueError: as `of_ply` and `OrbitOptions.views`, or if there is no such background.
-        FileNotFoundError: if the PLY is missing.
-    """
-    if background not in BACKGROUNDS:
-        raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {background!r}.")
-    model, facts = of_ply(ply, background=torch.tensor(BACKGROUNDS[background]), dropout=dropout, device=device)
-    say(f"{ply}: {facts}")
+def _on_orbit(
+    model: TrainedModel, orbit: OrbitOptions, say: Say
+) -> tuple[TrainedModel, dict[str, list[Viewpoint]], dict[str, object]]:
+    """Return the model, enlarged if it is tiny, the viewpoints around it, and what the JSON file says of them."""
     sphere = bounding_sphere(model.gaussians.means, model.gaussians.opacities)
     if sphere.surroundings and orbit.arc > 180:
         say(
@@ -206,57 +179,9 @@ def score_ply_on_orbit(
     enlarged = max(1.0, SMALLEST_RADIUS / sphere.radius)
     model = replace(model, gaussians=_scaled(model.gaussians, enlarged))
     cameras = orbit.views(model.gaussians.means, model.gaussians.opacities)
-    folder = out or _folder(ply)
-    keep = folder / PARTIAL
-    remove_leftovers(folder / VIEWS)
-    with threads_for(orbit.size**2):
-        result = evaluate_cameras(
-            model, cameras, samples=samples, seed=seed, pictures=folder / VIEWS, keep=keep, progress=True, say=say
-        )
-        computed_on = machine()
-    data = {
-        "ply": asdict(facts),
-        "orbit": asdict(orbit) | {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged},
-        **result.as_dict(),
-        "ca_settings": asdict(model.ca_score(samples=samples, seed=seed).settings),
-        "background": model.background.tolist(),
-        "machine": computed_on,
-    }
-    write_json(folder / "evaluation.json", data)
-    table = camera_table(result)
-    write_text(folder / "evaluation.md", f"{facts}\n\n{table}")
-    keep.unlink(missing_ok=True)
-    say(table)
-    say(
-        "An orbit sees the model from where no photograph may have been taken: compare these scores with others from"
-        " the same cameras alone; for those of the scene's own views give the scene (--scene FOLDER)."
-    )
-    say(f"Scores and pictures are in {folder}")
-    return result
-
-
-def camera_table(result: CameraEvaluation) -> str:
-    """Return one row per camera and the mean, in Markdown; CA in units of 1e-3."""
-    units = {
-        "ca": 1e-3,
-        "ca_std_error": 1e-3,
-        "ca_exact": 1e-3,
-        "ca_neutral": 1e-3,
-        "cv": 1.0,
-        "visible": 1.0,
-        "covered": 1.0,
-    }
-    title = {name: name if unit == 1 else f"{name} x1e-3" for name, unit in units.items()}
-    rows: list[dict[str, object]] = [
-        {"view": view.name} | {title[q]: getattr(view, q) / unit for q, unit in units.items()} for view in result.views
-    ]
-    rows.append({"view": "mean"} | {title[q]: result.mean(q) / unit for q, unit in units.items()})
-    return markdown_table(rows, ["view", *title.values()])
-
-
-def _folder(ply: Path) -> Path:
-    """Return the default folder for the results."""
-    return ply.with_name(ply.stem + "_evaluation")
+    views = [Viewpoint(f"{index:03d}", camera) for index, camera in enumerate(cameras)]
+    about = {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged}
+    return model, {"orbit": views}, asdict(orbit) | about
 
 
 def _band(gaussians: Gaussians, degree: int) -> Tensor:

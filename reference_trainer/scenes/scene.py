@@ -2,20 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
 
-__all__ = ["PointCloud", "Scene", "View"]
+__all__ = ["PointCloud", "Scene", "View", "Viewpoint"]
 
 _NAMES_SHOWN = 12
 
 
 @dataclass(frozen=True)
-class View:
+class Viewpoint:
+    """A camera that something can be looked at from; with its photograph it is a `View`.
+
+    Args:
+        name: a label, unique among its like.
+        camera: the camera.
+    """
+
+    name: str
+    camera: Camera
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the view on another device."""
+        parts = ((each.name, getattr(self, each.name)) for each in fields(self))
+        moved: dict[str, Any] = {name: x.to(device) for name, x in parts if isinstance(x, Tensor | Camera)}
+        return replace(self, **moved)
+
+
+@dataclass(frozen=True)
+class View(Viewpoint):
     """One photograph with its camera.
 
     Args:
@@ -26,19 +46,9 @@ class View:
         depth: true depth along the camera's z axis, shape (H, W), where it is known, else None; 0 where nothing is hit.
     """
 
-    name: str
-    camera: Camera
     image: Tensor
     alpha: Tensor | None = None
     depth: Tensor | None = None
-
-    def to(self, device: torch.device | str) -> View:
-        """Return the view on another device."""
-
-        def move(x: Tensor | None) -> Tensor | None:
-            return None if x is None else x.to(device)
-
-        return View(self.name, self.camera.to(device), self.image.to(device), move(self.alpha), move(self.depth))
 
 
 @dataclass(frozen=True)

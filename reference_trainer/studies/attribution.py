@@ -14,10 +14,10 @@ from torch import Tensor
 
 from ca_reg import CAResult, Reason, attribute, total_effects
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
-from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.rank_correlation import spearman
-from reference_trainer.evaluation.report import machine, markdown_table, write_json
+from reference_trainer.evaluation.results import machine, markdown_table, write_json
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.render import render
@@ -61,7 +61,7 @@ model: they show where its co-adaptation lives. How much there is, the score tel
 """
 
 
-def mean_shares(model: Model, views: Sequence[View], *, drop_rate: float = 0.5) -> tuple[Tensor, list[CAResult]]:
+def mean_shares(model: TrainedModel, views: Sequence[View], *, drop_rate: float = 0.5) -> tuple[Tensor, list[CAResult]]:
     """Split the exact score of several views over the Gaussians.
 
     Args:
@@ -80,7 +80,7 @@ def mean_shares(model: Model, views: Sequence[View], *, drop_rate: float = 0.5) 
     return _mean_over_views(lambda view: attribute(score, model.shares, opacities, view), views)
 
 
-def mean_effects(model: Model, views: Sequence[View], *, drop_rate: float = 0.5) -> Tensor:
+def mean_effects(model: TrainedModel, views: Sequence[View], *, drop_rate: float = 0.5) -> Tensor:
     """Return the total effects of the Gaussians, mean over the views that have a score, shape (N,), float64.
 
     Args:
@@ -95,7 +95,7 @@ def mean_effects(model: Model, views: Sequence[View], *, drop_rate: float = 0.5)
     return _mean_over_views(lambda view: total_effects(score, opacities, view), views)[0]
 
 
-def blend_weights(model: Model, views: Sequence[View]) -> Tensor:
+def blend_weights(model: TrainedModel, views: Sequence[View]) -> Tensor:
     """Return the weight with which every Gaussian enters the test-time renders, summed over all pixels and views.
 
     The image is linear in the colours, so the weights are the gradient of its sum: no approximation.
@@ -269,7 +269,9 @@ def _mean_over_views(
     return total / count, results
 
 
-def _correlations(model: Model, views: Sequence[View], shares: Tensor, weights: Tensor) -> dict[str, float | None]:
+def _correlations(
+    model: TrainedModel, views: Sequence[View], shares: Tensor, weights: Tensor
+) -> dict[str, float | None]:
     """Rank correlation of the share with what else is known of a Gaussian."""
     gaussians = model.gaussians
     poses = [view.camera.world_to_camera.to(gaussians.means) for view in views]
@@ -284,7 +286,7 @@ def _correlations(model: Model, views: Sequence[View], shares: Tensor, weights: 
 
 
 @torch.no_grad()
-def _picture(model: Model, colored: Iterable[Gaussians], view: View, result: CAResult) -> Tensor:
+def _picture(model: TrainedModel, colored: Iterable[Gaussians], view: View, result: CAResult) -> Tensor:
     """Lay the render, the CA map and the render in other colours side by side."""
     opacities = model.test_opacities
     ca_map = heat_map(result.variance.masked_fill(~result.visible, math.nan).float(), CA_PICTURE_RANGE)

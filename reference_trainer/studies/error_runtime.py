@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
-from reference_trainer.evaluation.model import Model
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.render import first_order_map
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.engines import drawn_by, engines_on
@@ -156,7 +156,7 @@ class ErrorRuntime:
 
 @torch.no_grad()
 def error_runtime(
-    model: Model,
+    model: TrainedModel,
     view: View,
     *,
     max_samples: int = 1024,
@@ -253,7 +253,7 @@ def error_runtime(
     )
 
 
-def _monte_carlo(model: Model, view: View, max_samples: int, seed: int) -> Iterator[tuple[int, float, Tensor]]:
+def _monte_carlo(model: TrainedModel, view: View, max_samples: int, seed: int) -> Iterator[tuple[int, float, Tensor]]:
     """Yield K = 2, 4, 8, ..., the seconds spent up to there, and the unbiased variance (3, H, W)."""
     opacities = model.gaussians.opacities
     device = opacities.device

@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 
-from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
+from reference_trainer.evaluation.results import format_mean_std, machine, markdown_table, write_json
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.model.ply import load_ply
@@ -72,7 +72,7 @@ def study_error_runtime(
         ValueError: if two sources have the same name, a PLY is damaged or its opacities are scaled already, or as
             `error_runtime`.
     """
-    models: dict[str, tuple[Model, View]] = {}
+    models: dict[str, tuple[TrainedModel, View]] = {}
     for source in sources:
         is_ply = source.suffix == ".ply"
         name = source.stem if is_ply else "/".join(source.resolve().parts[-3:])
@@ -83,7 +83,7 @@ def study_error_runtime(
 
 
 def study(
-    models: Mapping[str, tuple[Model, View]],
+    models: Mapping[str, tuple[TrainedModel, View]],
     out: Path,
     *,
     max_samples: int = 1024,
@@ -242,7 +242,7 @@ def _conclusion(result: ErrorRuntime, error: Error) -> str:
     return f"{text}; continued as K^-0.5 it equals that of {single} at K = {needed:.1e}, after {hours:.1e} hours."
 
 
-def _settings(model: Model, view: View, max_samples: int, seeds: int) -> dict[str, object]:
+def _settings(model: TrainedModel, view: View, max_samples: int, seeds: int) -> dict[str, object]:
     """Return all that the numbers depend on, the model and the camera as a fingerprint."""
     camera = view.camera
     digest = hashlib.sha256(repr((camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)).encode())
@@ -260,13 +260,13 @@ def _settings(model: Model, view: View, max_samples: int, seeds: int) -> dict[st
     }
 
 
-def _of_run(run: Path, device: str) -> tuple[Model, View]:
+def _of_run(run: Path, device: str) -> tuple[TrainedModel, View]:
     """Return a run's model and its first test view."""
     model, scene, _ = of_run(run, device)
     return model, (*scene.test, *scene.train)[0].to(device)
 
 
-def _of_ply(ply: Path, device: str) -> tuple[Model, View]:
+def _of_ply(ply: Path, device: str) -> tuple[TrainedModel, View]:
     """Return the model of a PLY over black, and a view from an orbit; it has a camera but no photograph."""
     loaded = load_ply(ply)
     if loaded.opacity_scale != 1 or loaded.for_rendering:
@@ -275,4 +275,4 @@ def _of_ply(ply: Path, device: str) -> tuple[Model, View]:
     gaussians = loaded.gaussians.to(device)
     camera = orbit_views(gaussians.means, gaussians.opacities, count=1, width=PICTURE, height=PICTURE)[0]
     nothing = torch.zeros(3, device=device)
-    return Model(gaussians, nothing), View("orbit", camera, nothing[:, None, None].expand(3, PICTURE, PICTURE))
+    return TrainedModel(gaussians, nothing), View("orbit", camera, nothing[:, None, None].expand(3, PICTURE, PICTURE))

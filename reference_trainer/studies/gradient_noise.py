@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import apply_dropout, draw_keep_mask, expected_squared_error
-from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.model.gaussians import Gaussians

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from reference_trainer.evaluation.report import format_mean_std, markdown_table
+from reference_trainer.evaluation.results import format_mean_std, markdown_table
 from reference_trainer.files import replacing
 from reference_trainer.studies.gradient_noise_moments import CANDIDATES, LOSSES, GradientNoise, Moments
 

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, mean_std, write_json
+from reference_trainer.evaluation.results import format_mean_std, machine, markdown_table, mean_std, write_json
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.density.statistics import DensityStatistics
@@ -76,7 +76,7 @@ class Pruned:
     ca_protocol: float
 
 
-def pruning_order(model: Model, views: Sequence[View], *, generator: torch.Generator) -> dict[str, Tensor]:
+def pruning_order(model: TrainedModel, views: Sequence[View], *, generator: torch.Generator) -> dict[str, Tensor]:
     """Return a number per Gaussian for every criterion; the lowest are to be removed first.
 
     Args:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.runs.folder import CHECKPOINT

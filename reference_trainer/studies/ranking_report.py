@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from reference_trainer.evaluation.rank_correlation import kendall, spearman
-from reference_trainer.evaluation.report import markdown_table, mean_std
+from reference_trainer.evaluation.results import markdown_table, mean_std
 from reference_trainer.files import replacing
 from reference_trainer.studies.ranking_scores import VARIANTS, Ranking, RunScores
 

@@ -17,8 +17,8 @@ from ca_reg.functional import Multiplier
 from ca_reg.types import read_moments
 from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.report import machine, mean_std
+from reference_trainer.evaluation.results import machine, mean_std
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.runs.folder import CONFIG
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.runs.settings import read_run_settings
@@ -105,7 +105,7 @@ class Ranking:
 
 
 @torch.no_grad()
-def score_view(model: Model, view: View, *, index: int) -> dict[str, float]:
+def score_view(model: TrainedModel, view: View, *, index: int) -> dict[str, float]:
     """Measure all variants at one view.
 
     Args:
@@ -124,7 +124,7 @@ def score_view(model: Model, view: View, *, index: int) -> dict[str, float]:
     half = model.ca_score(drop_rate=_HALF)(opacities, view, index=index)
     repeat = model.ca_score(drop_rate=_HALF, seed=1)(opacities, view, index=index)
     neutral = model.exact_ca_score(drop_rate=_HALF, neutral=True)(opacities, view)
-    if model.dropout > 0:
+    if model.treatment.dropout > 0:
         protocol = model.ca_score()(opacities, view, index=index)
         exact = model.exact_ca_score()(opacities, view)
     else:

@@ -22,7 +22,7 @@ from benchmarks.growth_axes import Axis, gaussians_per_pixel, growth_axes
 from benchmarks.growth_report import fits, growth_figure, growth_tables
 from benchmarks.memory import peak_memory
 from benchmarks.workloads import WorkloadSpec
-from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.studies.engines import engines_on

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.calls import PASSES
-from reference_trainer.evaluation.report import markdown_table
+from reference_trainer.evaluation.results import markdown_table
 from reference_trainer.files import replacing
 
 __all__ = ["Fit", "fit_exponent", "fits", "growth_figure", "growth_tables"]

@@ -17,7 +17,7 @@ import tyro
 
 from benchmarks.plan_parts import parts_of_a_step
 from reference_trainer.evaluation.evaluate import evaluate
-from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, write_json
+from reference_trainer.evaluation.results import format_mean_std, machine, markdown_table, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.runs.engines.engine import Failure, Task
@@ -262,7 +262,7 @@ def _train(options: SceneOptions, variant: str, config: TrainConfig, device: str
     start = time.process_time()
     trainer.train()
     seconds, peak = time.process_time() - start, _peak_bytes()
-    found = evaluate(model_of(trainer), dataclasses.replace(scene, train=() if scene.test else scene.train))
+    found = evaluate(model_of(trainer), {"test": scene.test} if scene.test else {"train": scene.train})
     split = "test" if scene.test else "train"
     return {
         "variant": variant,

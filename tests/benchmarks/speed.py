@@ -23,7 +23,7 @@ from benchmarks.speed_report import regressions, speed_tables
 from benchmarks.stages import STAGES, Staged, staged
 from benchmarks.training_step import MASKS, PARTS, analytic_step, scores, step_parts
 from benchmarks.workloads import WORKLOADS, Workload, WorkloadSpec, covered_pairs
-from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.scenes.options import SceneOptions

@@ -10,7 +10,7 @@ import torch
 from benchmarks import speed as module
 from benchmarks.speed import measure_speed
 from benchmarks.workloads import WorkloadSpec
-from reference_trainer.evaluation.report import write_json
+from reference_trainer.evaluation.results import write_json
 from reference_trainer.scenes import synthetic_scene
 
 TINY = {"tiny": WorkloadSpec(60, 40, 24, 0.05)}

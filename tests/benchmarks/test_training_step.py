@@ -58,13 +58,13 @@ def test_analytic_and_sampled_steps_take_turns(scene, steps):
 @pytest.mark.parametrize("engine", ["loops", "torch"])
 def test_scores_are_those_of_the_workload_drawn_by_the_engine(engine, monkeypatch):
     drawn = []
-    splats = training_step.Model.splats
+    splats = training_step.TrainedModel.splats
 
     def spy(self, opacities, view):
         drawn.append(splats(self, opacities, view))
         return drawn[-1]
 
-    monkeypatch.setattr(training_step.Model, "splats", spy)
+    monkeypatch.setattr(training_step.TrainedModel, "splats", spy)
     workload = WorkloadSpec(80, 40, 24, 0.06).make()
     calls = scores(workload, engine)
     found, _ = calls["render"]()

@@ -9,7 +9,7 @@ from itertools import pairwise
 import torch
 
 from benchmarks.workloads import Workload
-from reference_trainer.evaluation.model import Model
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.scene import Scene, View
@@ -116,7 +116,7 @@ def scores(workload: Workload, engine: str) -> dict[str, Callable[[], object]]:
         sh_dc=((w.colors - 0.5) / SH_C0)[:, None],
         sh_rest=w.colors.new_zeros(len(w.colors), 0, 3),
     )
-    model, view = Model(gaussians, w.colors.new_zeros(3)), View("workload", w.camera, w.target)
+    model, view = TrainedModel(gaussians, w.colors.new_zeros(3)), View("workload", w.camera, w.target)
     exact, sampled = model.exact_ca_score(drop_rate=_DROP_RATE), model.ca_score(samples=MASKS, drop_rate=_DROP_RATE)
     opacities = gaussians.opacities
 

@@ -163,7 +163,7 @@ def test_the_scene_of_a_training_may_be_given_either_way(arguments, monkeypatch,
 
 def test_a_ply_is_known_by_its_name(monkeypatch):
     asked: list = []
-    monkeypatch.setattr(score_module, "score_ply_on_orbit", lambda ply, *rest, **named: asked.append(str(ply)))
+    monkeypatch.setattr(score_module, "score_ply", lambda ply, *rest, **named: asked.append(str(ply)))
     main(["evaluate", "somewhere/a.PLY"])
     assert asked == ["somewhere/a.PLY"]
 
@@ -217,15 +217,16 @@ def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path
 def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch):
     asked: list = []
     monkeypatch.setattr(score_module, "score_ply", lambda *given, **named: asked.append((given, named)))
-    monkeypatch.setattr(score_module, "score_ply_on_orbit", lambda *given, **named: asked.append((given, named)))
     main(["evaluate", "--ply", "a.ply", flag, "garden", "--images", "images_8", "--views", "12", "--dropout", "0.1"])
     main(["evaluate", "--ply", "a.ply", "--cameras", "3", "--size", "64", "--world", "z-up", "--arc", "90",
           "--background", "white", "--samples", "7", "--seed", "1", "--out", "o"])  # fmt: skip
     ((ply, scene, out), named), ((other, orbit, folder), others) = asked
     assert (str(ply), scene.path, scene.images, scene.views, out) == ("a.ply", "garden", "images_8", 12, None)
-    assert named == {"dropout": 0.1, "samples": 5, "seed": 0, "device": "cpu", "perceptual": None}
+    assert named == {"dropout": 0.1, "samples": 5, "seed": 0, "device": "cpu", "perceptual": None,
+                     "background": "black"}  # fmt: skip
     assert (str(other), orbit, str(folder)) == ("a.ply", OrbitOptions(3, 64, "z-up", 90.0), "o")
-    assert others == {"dropout": 0.0, "samples": 7, "seed": 1, "device": "cpu", "background": "white"}
+    assert others == {"dropout": 0.0, "samples": 7, "seed": 1, "device": "cpu", "background": "white",
+                      "perceptual": None}  # fmt: skip
 
 
 def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):
@@ -235,15 +236,15 @@ def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):
     main(["evaluate", "--ply", str(tmp_path / "baked.ply"), *small])
     out = capsys.readouterr().out
     assert "0.8 baked in, taken out for CA; dropout rate of the training: 0.2" in out
-    assert "| mean |" in out
+    assert "| mean orbit |" in out
     ply = str(trained / "point_cloud.ply")
     main(["evaluate", "--ply", ply, "--dropout", "0.2", "--out", str(tmp_path / "p"), *small])
     one, other = (
         json.loads((tmp_path / folder / "evaluation.json").read_text()) for folder in ("baked_evaluation", "p")
     )
-    assert one["mean"]["covered"] > 0
+    assert one["mean"]["orbit"]["covered"] > 0
     for name in ("covered", "cv"):  # after three steps nothing is opaque enough for CA
-        assert one["mean"][name] == pytest.approx(other["mean"][name], rel=1e-4)
+        assert one["mean"]["orbit"][name] == pytest.approx(other["mean"]["orbit"][name], rel=1e-4)
 
 
 def test_training_again_says_that_nothing_is_to_be_done(trained, capsys):

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from reference_trainer.evaluation.report import markdown_table
+from reference_trainer.evaluation.results import markdown_table
 from reference_trainer.studies.stability.judge import GRADIENT_TOLERANCE, VALUE_TOLERANCE, Verdict
 from reference_trainer.studies.stability.quantities import SCENE_QUANTITIES
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from reference_trainer.evaluation.report import machine, write_json
+from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.studies.engines import drawn_by, engines_on
 from reference_trainer.studies.stability.blends import blend_cases

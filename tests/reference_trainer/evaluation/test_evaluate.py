@@ -11,12 +11,12 @@ from ca_reg import CAScore
 from ca_reg.functional import Multiplier, opacity_noise
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores, evaluate
 from reference_trainer.evaluation.metrics import psnr, ssim
-from reference_trainer.evaluation.model import Model
 from reference_trainer.evaluation.pictures import file_names
+from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.render import render
 from reference_trainer.scenes.images import read_image
-from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.scene import Scene, View, Viewpoint
 
 
 @pytest.fixture(scope="module")
@@ -27,13 +27,17 @@ def gaussians(tiny_scene: Scene) -> Gaussians:
     return dataclasses.replace(model, sh_rest=0.3 * torch.randn(150, 3, 3, generator=g))
 
 
+def of_scene(scene: Scene) -> dict[str, tuple[View, ...]]:
+    return {"train": scene.train, "test": scene.test}
+
+
 def scores(result: Evaluation, quantity: str) -> list[float]:
     return [getattr(view, quantity) for view in result.views]
 
 
 def test_scores_are_those_of_the_rendered_views(tiny_scene, gaussians):
-    model = Model(gaussians, tiny_scene.background, opacity_scale=0.8)
-    result = evaluate(model, tiny_scene)
+    model = TrainedModel(gaussians, tiny_scene.background, Treatment(scale=0.8))
+    result = evaluate(model, of_scene(tiny_scene))
     views = [*tiny_scene.train, *tiny_scene.test]
     assert [(v.split, v.name) for v in result.views] == [("train" if v in tiny_scene.train else "test", v.name)
                                                           for v in views]  # fmt: skip
@@ -51,9 +55,9 @@ def test_scores_are_those_of_the_rendered_views(tiny_scene, gaussians):
 
 def test_images_are_scaled_for_the_test_and_co_adaptation_is_not(tiny_scene, gaussians):
     half = dataclasses.replace(gaussians, opacity_logits=inverse_sigmoid(0.5 * gaussians.opacities))
-    plain = evaluate(Model(gaussians, tiny_scene.background), tiny_scene)
-    scaled = evaluate(Model(gaussians, tiny_scene.background, opacity_scale=0.5), tiny_scene)
-    halved = evaluate(Model(half, tiny_scene.background), tiny_scene)
+    plain = evaluate(TrainedModel(gaussians, tiny_scene.background), of_scene(tiny_scene))
+    scaled = evaluate(TrainedModel(gaussians, tiny_scene.background, Treatment(scale=0.5)), of_scene(tiny_scene))
+    halved = evaluate(TrainedModel(half, tiny_scene.background), of_scene(tiny_scene))
     for quantity in ("psnr", "ssim", "cv"):
         assert scores(scaled, quantity) == pytest.approx(scores(halved, quantity), rel=1e-4)
         assert scores(scaled, quantity) != pytest.approx(scores(plain, quantity), rel=1e-3)
@@ -66,11 +70,11 @@ def test_images_get_the_expected_noise_and_co_adaptation_does_not(tiny_scene, ga
                          generator=torch.Generator().manual_seed(1))[0].view(-1, 150).mean(0)  # fmt: skip
     drawn = dataclasses.replace(gaussians, opacity_logits=inverse_sigmoid(mean.float()))
     plain, scaled, sampled = (
-        evaluate(model, tiny_scene)
+        evaluate(model, of_scene(tiny_scene))
         for model in (
-            Model(gaussians, tiny_scene.background),
-            Model(gaussians, tiny_scene.background, expected_noise=0.8),
-            Model(drawn, tiny_scene.background),
+            TrainedModel(gaussians, tiny_scene.background),
+            TrainedModel(gaussians, tiny_scene.background, Treatment(noise=0.8)),
+            TrainedModel(drawn, tiny_scene.background),
         )
     )
     for quantity in ("psnr", "ssim", "cv"):
@@ -81,11 +85,14 @@ def test_images_get_the_expected_noise_and_co_adaptation_does_not(tiny_scene, ga
 
 
 def test_the_drop_rate_of_the_protocol_follows_the_training(tiny_scene, gaussians):
-    trained = Model(gaussians, tiny_scene.background, dropout=0.2, opacity_scale=0.8)
+    trained = TrainedModel(gaussians, tiny_scene.background, Treatment(dropout=0.2, scale=0.8))
     assert trained.ca_score().settings.drop_rate == pytest.approx(0.6)  # half of the four fifths that training kept
-    assert Model(gaussians, tiny_scene.background).ca_score().settings.drop_rate == 0.5
+    assert TrainedModel(gaussians, tiny_scene.background).ca_score().settings.drop_rate == 0.5
     assert trained.ca_score(drop_rate=0.3, samples=7, seed=4).settings.drop_rate == 0.3
-    dropped, plain = (evaluate(m, tiny_scene, samples=3) for m in (trained, dataclasses.replace(trained, dropout=0.0)))
+    dropped, plain = (
+        evaluate(m, of_scene(tiny_scene), samples=3)
+        for m in (trained, dataclasses.replace(trained, treatment=Treatment()))
+    )
     assert scores(plain, "ca_half") == scores(plain, "ca")
     assert scores(dropped, "ca_half") == scores(plain, "ca")
     assert scores(dropped, "ca") != scores(plain, "ca")
@@ -93,8 +100,8 @@ def test_the_drop_rate_of_the_protocol_follows_the_training(tiny_scene, gaussian
 
 def test_the_exact_score_is_the_limit_of_many_samples(tiny_scene, gaussians):
     scene = dataclasses.replace(tiny_scene, train=tiny_scene.train[:1], test=())
-    model = Model(gaussians, scene.background, dropout=0.2)
-    (view,) = evaluate(model, scene, samples=2).views
+    model = TrainedModel(gaussians, scene.background, Treatment(dropout=0.2))
+    (view,) = evaluate(model, of_scene(scene), samples=2).views
     score = model.exact_ca_score()
     result = score(gaussians.opacities, scene.train[0])
     assert view.ca_exact == result.value
@@ -105,7 +112,7 @@ def test_the_exact_score_is_the_limit_of_many_samples(tiny_scene, gaussians):
 
 
 def test_exact_scores_at_another_drop_rate_and_over_the_expected_colour(tiny_scene, gaussians):
-    view, model = tiny_scene.train[0], Model(gaussians, tiny_scene.background)
+    view, model = tiny_scene.train[0], TrainedModel(gaussians, tiny_scene.background)
     other = dataclasses.replace(model, background=1 - tiny_scene.background)
     assert model.exact_ca_score(drop_rate=0.3).settings.drop_rate == 0.3
     plain, bright = (m.exact_ca_score()(gaussians.opacities, view).value for m in (model, other))
@@ -118,7 +125,7 @@ def test_exact_scores_at_another_drop_rate_and_over_the_expected_colour(tiny_sce
 def test_moments_use_only_the_bands_and_the_background_of_the_model(tiny_scene, gaussians):
     view, sure = tiny_scene.train[0], Multiplier(1.0, 0.0)
     faint = 0.1 * gaussians.opacities  # no pixel ends early
-    model = Model(gaussians, torch.tensor([0.2, 0.7, 0.4]), sh_degree=0)
+    model = TrainedModel(gaussians, torch.tensor([0.2, 0.7, 0.4]), sh_degree=0)
     moments = model.moments(faint, view, sure)
     torch.testing.assert_close(moments.mean, model.render(faint, view)[0], rtol=0, atol=1e-5)
     black = dataclasses.replace(model, background=torch.zeros(3))
@@ -127,29 +134,34 @@ def test_moments_use_only_the_bands_and_the_background_of_the_model(tiny_scene, 
 
 def test_only_the_bands_of_the_model_are_used(tiny_scene, gaussians):
     grey = dataclasses.replace(gaussians, sh_rest=gaussians.sh_rest[:, :0])
-    cut = evaluate(Model(gaussians, tiny_scene.background, sh_degree=0), tiny_scene)
-    assert scores(cut, "psnr") == scores(evaluate(Model(grey, tiny_scene.background), tiny_scene), "psnr")
-    assert scores(cut, "psnr") != scores(evaluate(Model(gaussians, tiny_scene.background), tiny_scene), "psnr")
+    cut = evaluate(TrainedModel(gaussians, tiny_scene.background, sh_degree=0), of_scene(tiny_scene))
+    assert scores(cut, "psnr") == scores(
+        evaluate(TrainedModel(grey, tiny_scene.background), of_scene(tiny_scene)), "psnr"
+    )
+    assert scores(cut, "psnr") != scores(
+        evaluate(TrainedModel(gaussians, tiny_scene.background), of_scene(tiny_scene)), "psnr"
+    )
+
+
+class Brightness:
+    name = "brightness"
+
+    def __call__(self, image: torch.Tensor, target: torch.Tensor) -> float:
+        assert image.min() >= 0
+        assert image.max() <= 1
+        return float(image.mean() - target.mean())
 
 
 def test_a_perceptual_metric_sees_clamped_images(tiny_scene, gaussians):
-    class Brightness:
-        name = "brightness"
-
-        def __call__(self, image: torch.Tensor, target: torch.Tensor) -> float:
-            assert image.min() >= 0
-            assert image.max() <= 1
-            return float(image.mean() - target.mean())
-
     bright = dataclasses.replace(gaussians, sh_dc=gaussians.sh_dc + 4)
-    result = evaluate(Model(bright, tiny_scene.background), tiny_scene, perceptual=Brightness())
+    result = evaluate(TrainedModel(bright, tiny_scene.background), of_scene(tiny_scene), perceptual=Brightness())
     assert result.perceptual_metric == "brightness"
     assert all(value > 0 for value in scores(result, "lpips"))
 
 
 def test_an_empty_model_has_no_co_adaptation_and_says_so(tiny_scene, gaussians):
     nothing = gaussians[torch.zeros(150, dtype=torch.bool)]
-    result = evaluate(Model(nothing, tiny_scene.background), tiny_scene)
+    result = evaluate(TrainedModel(nothing, tiny_scene.background), of_scene(tiny_scene))
     assert all(math.isnan(value) for value in scores(result, "ca"))
     assert all(math.isnan(value) for value in scores(result, "ca_exact"))
     assert all(math.isnan(value) for value in scores(result, "cv"))
@@ -160,15 +172,15 @@ def test_an_empty_model_has_no_co_adaptation_and_says_so(tiny_scene, gaussians):
 def test_no_gradient_and_no_global_random_number(tiny_scene, gaussians):
     state = torch.get_rng_state()
     leaves = gaussians.map(lambda x: x.clone().requires_grad_())
-    one = evaluate(Model(leaves, tiny_scene.background), tiny_scene)
+    one = evaluate(TrainedModel(leaves, tiny_scene.background), of_scene(tiny_scene))
     assert torch.equal(torch.get_rng_state(), state)
     assert leaves.means.grad is None
-    again = evaluate(Model(gaussians, tiny_scene.background), tiny_scene)
+    again = evaluate(TrainedModel(gaussians, tiny_scene.background), of_scene(tiny_scene))
     assert scores(one, "ca") == scores(again, "ca")
 
 
 def of(name: str, split: str, value: float) -> ViewScores:
-    return ViewScores(name, split, *[value] * 9)
+    return ViewScores(name, split, *[value] * 11)
 
 
 def test_means_leave_out_what_does_not_exist():
@@ -180,8 +192,8 @@ def test_means_leave_out_what_does_not_exist():
 
 
 def test_the_error_of_the_mean_is_that_of_independent_views(tiny_scene, gaussians):
-    model = Model(gaussians, tiny_scene.background)
-    result = evaluate(model, tiny_scene)
+    model = TrainedModel(gaussians, tiny_scene.background)
+    result = evaluate(model, of_scene(tiny_scene))
     score = model.ca_score()  # counts views by itself, and knows the error of their mean
     for view in tiny_scene.test:
         score.update(gaussians.opacities, view)
@@ -212,7 +224,7 @@ def test_views_of_the_same_name_in_two_folders_keep_their_pictures(tiny_scene, g
     names = ["a/r_0.png", "b/r_0.png", "b/r_0_panel.jpg"]
     train = tuple(dataclasses.replace(v, name=n) for v, n in zip(tiny_scene.train, names, strict=True))
     scene = dataclasses.replace(tiny_scene, train=train, test=())
-    result = evaluate(Model(gaussians, scene.background), scene, samples=2, pictures=tmp_path)
+    result = evaluate(TrainedModel(gaussians, scene.background), of_scene(scene), samples=2, pictures=tmp_path)
     files = [tmp_path / "train" / f"{name}.png" for name in file_names(names)]
     assert len(list((tmp_path / "train").iterdir())) == 6
     for file, view, scores in zip(files, train, result.views, strict=True):
@@ -225,7 +237,7 @@ def test_every_view_gets_its_pictures(tiny_scene, gaussians, tmp_path):
     train = tuple(dataclasses.replace(v, name=n) for v, n in zip(tiny_scene.train, names, strict=True))
     said: list[str] = []
     scene = dataclasses.replace(tiny_scene, train=train, test=tiny_scene.test[:1])
-    evaluate(Model(gaussians, scene.background), scene, samples=2, pictures=tmp_path, progress=said.append)
+    evaluate(TrainedModel(gaussians, scene.background), of_scene(scene), samples=2, pictures=tmp_path, say=said.append)
     found = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*"))
     stems = ["test/test_0", "train/12.30.01", "train/12.30.02", "train/deep"]
     assert found == sorted(f"{stem}{end}.png" for stem in stems for end in ("", "_panel"))
@@ -237,3 +249,53 @@ def test_every_view_gets_its_pictures(tiny_scene, gaussians, tmp_path):
         f"[{number}/4] {member}" for number, member in enumerate(members, start=1)
     ]
     assert ["left" in text for text in said] == [False, True, True, True]
+
+
+def test_photographs_are_not_needed_for_co_adaptation(tiny_scene, gaussians):
+    model = TrainedModel(gaussians, tiny_scene.background, Treatment(dropout=0.2, scale=0.8))
+    bare = evaluate(model, {"orbit": [Viewpoint("v", view.camera) for view in tiny_scene.train]}, samples=4, seed=3)
+    full = evaluate(model, {"orbit": tiny_scene.train}, samples=4, seed=3, perceptual=Brightness())
+    for one, other in zip(bare.views, full.views, strict=True):
+        assert all(math.isnan(x) for x in (one.psnr, one.ssim, one.lpips))
+        assert all(math.isfinite(x) for x in (other.psnr, other.ssim, other.lpips))
+        same = dataclasses.replace(other, name="v", psnr=one.psnr, ssim=one.ssim, lpips=one.lpips)
+        assert repr(one) == repr(same)  # where nan is nan
+
+
+def test_the_neutral_score_is_that_of_a_background_of_expected_colour(tiny_scene, gaussians):
+    """Sampled: 400 masks, every render over the mean colour of its pixel; std error of the score below 2 %."""
+    model = TrainedModel(gaussians, tiny_scene.background, Treatment(dropout=0.2, scale=0.8))
+    generator = torch.Generator().manual_seed(0)
+    opacities, view = gaussians.opacities, tiny_scene.train[0]
+    colors, alphas = [], []
+    for _ in range(400):
+        keep = (torch.rand(150, generator=generator) >= 0.6).float()
+        image, alpha = dataclasses.replace(model, background=torch.zeros(3)).render(opacities * keep, view)
+        colors.append(image)
+        alphas.append(alpha)
+    color, alpha = torch.stack(colors), torch.stack(alphas)
+    behind = color.mean(0) / alpha.mean(0).clamp(min=1e-6)
+    variance = (color + (1 - alpha)[:, None] * behind).var(0).mean(0)
+    visible = model.exact_ca_score()(opacities, view).visible
+    (found,) = evaluate(model, {"train": [view]}).views
+    assert found.ca_neutral == pytest.approx(variance[visible].mean().item(), rel=0.08)
+    assert found.covered == pytest.approx(model.render(0.8 * opacities, view)[1].mean().item(), rel=1e-5)
+
+
+def test_a_camera_that_sees_nothing_has_a_reason(tiny_scene, gaussians):
+    away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ tiny_scene.train[0].camera.world_to_camera
+    camera = dataclasses.replace(tiny_scene.train[0].camera, world_to_camera=away)
+    (view,) = evaluate(TrainedModel(gaussians, tiny_scene.background), {"orbit": [Viewpoint("a", camera)]}).views
+    assert all(math.isnan(x) for x in (view.ca, view.ca_exact, view.ca_neutral, view.cv))
+    assert (view.visible, view.covered) == (0, 0)
+    assert view.ca_reason.startswith("no pixel counts")
+
+
+def test_the_pictures_of_a_viewpoint(tiny_scene, gaussians, tmp_path):
+    views = {"orbit": [Viewpoint("000", tiny_scene.train[0].camera)]}
+    evaluate(TrainedModel(gaussians, tiny_scene.background), views, pictures=tmp_path)
+    assert sorted(path.name for path in (tmp_path / "orbit").iterdir()) == ["000.png", "000_panel.png"]
+    with Image.open(tmp_path / "orbit/000_panel.png") as panel, Image.open(tmp_path / "orbit/000.png") as picture:
+        assert picture.size == (32, 24)
+        assert panel.width > 4 * 32 + 3 * 4  # as wide as the labels
+        assert panel.height == 24 + 16

@@ -7,20 +7,19 @@ import math
 import pytest
 import torch
 
-from reference_trainer.evaluation import cameras as cameras_module
 from reference_trainer.evaluation import evaluate as evaluate_module
-from reference_trainer.evaluation.cameras import evaluate_cameras
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.kept import KeptRecords, fingerprint
-from reference_trainer.evaluation.model import Model
+from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
 from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.scenes.scene import Viewpoint
 
 
 @pytest.fixture(scope="module")
 def model(tiny_scene):
     points = tiny_scene.points
     sizes = torch.full((len(points.positions),), 0.1)
-    return Model(
+    return TrainedModel(
         Gaussians.from_points(points.positions, points.colors, sizes, sh_degree=0, opacity=0.9), tiny_scene.background
     )
 
@@ -106,7 +105,7 @@ def test_a_fingerprint_tells_everything_apart():
         *(None, 0, 0.0, -0.0, math.nan, True, "0", "", [], [[]], [0, 0], [[0], 0], [0, [0]], {"a": 0}, {"a": [0]}),
         *(torch.zeros(2), torch.zeros(2, 1), torch.zeros(1, 2), torch.zeros(4, dtype=torch.int16), torch.zeros(0)),
         *(torch.tensor(0.0), torch.tensor(-0.0), torch.zeros(2, dtype=torch.bfloat16), torch.ones(2)),
-        *(Model(torch.zeros(1), torch.zeros(3), p) for p in (0.0, 0.1)),
+        *(TrainedModel(torch.zeros(1), torch.zeros(3), Treatment(p)) for p in (0.0, 0.1)),
     ]
     digests = [fingerprint(x) for x in values]
     assert len(set(digests)) == len(digests)
@@ -118,9 +117,9 @@ def test_a_fingerprint_tells_everything_apart():
 
 @pytest.mark.parametrize("done", [0, 1, 3])
 def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path, monkeypatch, done):
-    scene = dataclasses.replace(tiny_scene, test=tiny_scene.test[:1])
+    views = {"train": tiny_scene.train, "around": [Viewpoint("000", tiny_scene.test[0].camera)]}
     file, pictures = tmp_path / "kept.json", tmp_path / "views"
-    whole = evaluate(model, scene, samples=2, pictures=tmp_path / "whole")
+    whole = evaluate(model, views, samples=2, pictures=tmp_path / "whole")
     measure, measured = evaluate_module._measure, []
 
     def stopped(model, view, *arguments):
@@ -131,10 +130,10 @@ def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path
 
     monkeypatch.setattr(evaluate_module, "_measure", stopped)
     with pytest.raises(KeyboardInterrupt):
-        evaluate(model, scene, samples=2, pictures=pictures, keep=file)
+        evaluate(model, views, samples=2, pictures=pictures, keep=file)
     monkeypatch.setattr(evaluate_module, "_measure", measure)
     said = []
-    assert repr(evaluate(model, scene, samples=2, pictures=pictures, keep=file, progress=said.append)) == repr(whole)
+    assert repr(evaluate(model, views, samples=2, pictures=pictures, keep=file, say=said.append)) == repr(whole)
     assert sum(text.startswith("[") for text in said) == 4 - done
     names = sorted(path.relative_to(pictures) for path in pictures.rglob("*.png"))
     assert len(names) == 8
@@ -153,14 +152,18 @@ class Brightness:
         return (self.weight * (image - target).abs().amax()).item()
 
 
+def both(scene):
+    return {"train": scene.train, "test": scene.test}
+
+
 def changes(model, scene):
     brighter = dataclasses.replace(scene.test[0], image=scene.test[0].image * 0.5)
     moved = dataclasses.replace(model.gaussians, means=model.gaussians.means + 1e-6)
     return {
         "samples": (model, scene, {"samples": 3}),
         "seed": (model, scene, {"seed": 1}),
-        "dropout": (dataclasses.replace(model, dropout=0.1), scene, {}),
-        "scale": (dataclasses.replace(model, opacity_scale=0.9), scene, {}),
+        "dropout": (dataclasses.replace(model, treatment=Treatment(dropout=0.1)), scene, {}),
+        "scale": (dataclasses.replace(model, treatment=Treatment(scale=0.9)), scene, {}),
         "background": (dataclasses.replace(model, background=model.background + 0.1), scene, {}),
         "model": (dataclasses.replace(model, gaussians=moved), scene, {}),
         "photograph": (model, dataclasses.replace(scene, test=(brighter, *scene.test[1:])), {}),
@@ -178,36 +181,8 @@ def test_what_changed_is_not_mixed_with_what_was_measured(model, tiny_scene, tmp
     scene = dataclasses.replace(tiny_scene, train=tiny_scene.train[:2], test=tiny_scene.test[:1])
     changed, other, keywords = changes(model, scene)[name]
     before = {"samples": 2} | ({"perceptual": Brightness(1.0)} if name == "weights" else {})
-    evaluate(model, scene, keep=tmp_path / "kept.json", **before)
+    evaluate(model, both(scene), keep=tmp_path / "kept.json", **before)
     said = []
-    evaluate(changed, other, keep=tmp_path / "kept.json", **({"samples": 2} | keywords), progress=said.append)
+    evaluate(changed, both(other), keep=tmp_path / "kept.json", **({"samples": 2} | keywords), say=said.append)
     assert "everything is measured anew" in said[0]
     assert sum(text.startswith("[") for text in said) == len(other.train) + 1
-
-
-def test_an_interrupted_orbit_measures_the_rest(model, tiny_scene, tmp_path, monkeypatch):
-    views = [view.camera for view in tiny_scene.train]
-    file, pictures = tmp_path / "kept.json", tmp_path / "views"
-    whole = evaluate_cameras(model, views, samples=2, pictures=tmp_path / "whole")
-    draw, drawn = cameras_module._draw, []
-
-    def stopped(image, results, stem):
-        if len(drawn) == 2:
-            raise KeyboardInterrupt
-        drawn.append(stem.name)
-        draw(image, results, stem)
-
-    monkeypatch.setattr(cameras_module, "_draw", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        evaluate_cameras(model, views, samples=2, pictures=pictures, keep=file)
-    drawn.clear()
-    said = []
-    found = evaluate_cameras(model, views, samples=2, pictures=pictures, keep=file, say=said.append)
-    assert repr(found) == repr(whole)  # to the last digit
-    assert drawn == ["002"]
-    assert said == [f"2 measured before the interruption, kept: {file}"]
-    for path in (tmp_path / "whole").iterdir():
-        assert path.read_bytes() == (pictures / path.name).read_bytes()
-    turned = [dataclasses.replace(views[0], fx=views[0].fx * 1.01), *views[1:]]
-    evaluate_cameras(model, turned, samples=2, keep=file, say=said.append)
-    assert "everything is measured anew" in said[1]

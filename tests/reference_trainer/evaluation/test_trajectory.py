@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.trajectory import interpolate_cameras
+from reference_trainer.evaluation.trajectory import interpolate_cameras, measured_views
+from reference_trainer.scenes.scene import Scene, View
 
 
 def rotation(axis: torch.Tensor, degrees: float) -> torch.Tensor:
@@ -76,3 +77,36 @@ def test_intrinsics_are_those_of_the_first_camera():
 def test_too_few_of_something(count, frames):
     with pytest.raises(ValueError, match="at least 2 cameras and 2 frames"):
         interpolate_cameras(random_cameras(count), frames)
+
+
+def scene_of(cameras, test=()) -> Scene:
+    views = [View(f"photo {i}.png", each, torch.zeros(3, 24, 32)) for i, each in enumerate(cameras)]
+    return Scene("scene", tuple(views), test, None, torch.zeros(3))
+
+
+def test_a_scene_with_test_views_is_measured_there():
+    scene = scene_of(random_cameras(2))
+    scene = dataclasses.replace(scene, test=scene.train)
+    assert measured_views(scene, pytest.fail) == {"train": scene.train, "test": scene.test}
+
+
+def test_without_test_views_a_model_is_measured_between_and_around_the_training_views():
+    """Cameras at 0, 10 and 40 degrees of a circle, which is where the turns of the new ones are as well."""
+    axis = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    degrees = (0.0, 10.0, 40.0)
+    cameras = [camera(rotation(axis, x), torch.tensor([x, 0.0, 1.0]).double()) for x in degrees]
+    said: list[str] = []
+    found = measured_views(scene_of(cameras), said.append)
+    assert list(found) == ["train", "between", "around"]
+    assert len(said) == 1
+    assert said[0].startswith("No test views")
+    for split, places in {"between": [5.0, 25.0], "around": [-5.0, 15.0, 55.0]}.items():
+        for view, x in zip(found[split], places, strict=True):
+            expected = camera(rotation(axis, x), torch.tensor([x, 0.0, 1.0]).double())
+            torch.testing.assert_close(view.camera.world_to_camera, expected.world_to_camera, rtol=0, atol=1e-5)
+    assert [view.name for view in found["around"]] == ["000", "001", "002"]
+
+
+def test_one_training_view_has_nothing_around_it():
+    scene = scene_of(random_cameras(1))
+    assert measured_views(scene, lambda text: None) == {"train": scene.train}

@@ -11,11 +11,12 @@ from stand_ins.engine import Here
 
 from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.pictures import save_png
+from reference_trainer.evaluation.tables import comparison_table
 from reference_trainer.render import chosen_engine
 from reference_trainer.runs import demo as demo_module
 from reference_trainer.runs import grid
 from reference_trainer.runs.compare import compare, scene_folders, strategies
-from reference_trainer.runs.compare_report import REPORT, TABLE, Comparison, comparison_table, report
+from reference_trainer.runs.compare_report import REPORT, TABLE, Comparison, report
 from reference_trainer.runs.engines.choice import choose_engine
 from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.runs.engines.processes import Processes

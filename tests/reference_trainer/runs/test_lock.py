@@ -112,7 +112,7 @@ def test_a_run_is_locked_from_its_first_file_to_its_last(tmp_path, options, shor
 
         return call
 
-    from reference_trainer.evaluation.report import write_json
+    from reference_trainer.evaluation.results import write_json
 
     monkeypatch.setattr(write, locked(write_json))
     monkeypatch.setattr(Trainer, "save", locked(save))

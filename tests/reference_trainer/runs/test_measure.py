@@ -1,18 +1,25 @@
 import dataclasses
 import json
+import math
 
 import pytest
 import torch
 from PIL import Image
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
+from reference_trainer.evaluation.tables import evaluation_table
+from reference_trainer.evaluation.trained_model import Treatment
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import measure as measure_module
 from reference_trainer.runs.folder import BAKED_PLY, PLY
-from reference_trainer.runs.measure import evaluation_table, measure, of_run, render_run
+from reference_trainer.runs.measure import measure, of_run, render_run
 from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.images import read_image
 from reference_trainer.training.config import TrainConfig
+
+
+def both(scene):
+    return {"train": scene.train, "test": scene.test}
 
 
 def test_the_flag_of_the_evaluation_and_that_of_the_training_are_the_same(run, scaled, tmp_path):
@@ -21,7 +28,7 @@ def test_the_flag_of_the_evaluation_and_that_of_the_training_are_the_same(run, s
     assert (plain / PLY).read_bytes() == (out / PLY).read_bytes()
     model, scene, default = of_run(plain, scale_noise=True)
     assert default == plain / "evaluation_scale_noise"
-    measure(model, scene, tmp_path, say=lambda text: None)
+    measure(model, both(scene), tmp_path, about={}, say=lambda text: None)
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]
     assert found["expected_noise"] == 0.3
@@ -45,7 +52,7 @@ def test_noise_alone_has_a_ply_for_viewers_too(options, tmp_path):
     config = TrainConfig(iterations=1, noise=0.8, clip_noise=True, scale_noise=True)
     run_experiment(options, config, tmp_path, monitor_every=0)
     model = of_run(tmp_path)[0]
-    assert (model.dropout, model.opacity_scale, model.expected_noise, model.clip_noise) == (0.0, 1.0, 0.8, True)
+    assert model.treatment == Treatment(dropout=0.0, scale=1.0, noise=0.8, clip_noise=True)
     torch.testing.assert_close(load_ply(tmp_path / BAKED_PLY).gaussians.opacities, model.test_opacities)
 
 
@@ -65,11 +72,12 @@ def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):
     model, scene, default = of_run(out)
     assert default == out / "evaluation"
     said: list[str] = []
-    measure(model, scene, tmp_path / "new", say=said.append)
+    measure(model, both(scene), tmp_path / "new", about={"scene": "a name"}, say=said.append)
     found = json.loads((tmp_path / "new" / "evaluation.json").read_text())
     assert found["views"] == results["views"]
     assert found["mean"] == results["mean"]
     assert found["ca_settings"]["drop_rate"] == pytest.approx(0.6)
+    assert found["scene"] == "a name"
     assert found["background"] == [0.0, 0.0, 0.0]
     assert (tmp_path / "new" / "views" / "test" / "test_0_panel.png").exists()
     assert any("| mean test |" in text for text in said)
@@ -77,23 +85,29 @@ def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):
 
 def test_the_seed_decides_the_masks(run, tmp_path):
     model, scene, _ = of_run(run[0])
-    scene = dataclasses.replace(scene, train=scene.train[:1], test=())
+    views = {"train": scene.train[:1]}
     one, same, other = (
-        measure(model, scene, tmp_path, samples=3, seed=seed, say=lambda text: None) for seed in (0, 0, 1)
+        measure(model, views, tmp_path, about={}, samples=3, seed=seed, say=lambda text: None) for seed in (0, 0, 1)
     )
     assert one.views[0].ca == same.views[0].ca != other.views[0].ca
     assert one.views[0].psnr == other.views[0].psnr
 
 
 def test_the_table_has_one_row_per_view_and_the_means():
-    views = [ViewScores(f"v{i}", "test", 20.0 + i, 0.5, 0.25, 2e-3, 1e-4, 3e-3, 4e-3, 0.9, 0.04) for i in range(2)]
+    views = [
+        ViewScores(f"v{i}", "test", 20.0 + i, 0.5, 0.25, 2e-3, 1e-4, 3e-3, 4e-3, 5e-3, 0.9, 0.7, 0.04) for i in range(2)
+    ]
     lines = evaluation_table(Evaluation(views, 9, "vgg")).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    head = ["view", "psnr", "ssim", "lpips", "ca x1e-3", "ca_std_error x1e-3", "ca_exact x1e-3", "visible", "cv"]
+    head = ["view", "PSNR", "SSIM", "LPIPS", "CA x1e-3", "CA std error x1e-3", "exact CA x1e-3", "neutral CA x1e-3",
+            "visible", "covered", "CV"]  # fmt: skip
     assert cells[0] == head
-    assert cells[2] == ["test v0", "20", "0.5", "0.25", "2", "0.1", "4", "0.9", "0.04"]
+    assert cells[2] == ["test v0", "20", "0.5", "0.25", "2", "0.1", "4", "5", "0.9", "0.7", "0.04"]
     assert cells[4][:2] == ["mean test", "20.5"]
-    assert "lpips" not in evaluation_table(Evaluation(views, 9, None))
+    plain = [dataclasses.replace(view, psnr=math.nan, lpips=math.nan) for view in views]
+    head = evaluation_table(Evaluation([*plain, dataclasses.replace(views[0], lpips=math.nan)], 9)).splitlines()[0]
+    assert "PSNR" in head
+    assert "LPIPS" not in head
 
 
 @pytest.mark.parametrize(("what", "names"), [("test", ["test_0", "test_1", "test_outside"]), ("train", None)])

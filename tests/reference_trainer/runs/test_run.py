@@ -275,14 +275,14 @@ def test_a_run_can_be_loaded(finished):
     trainer = load_run(out)
     assert trainer.step == 11
     model = model_of(trainer)
-    assert (model.dropout, model.opacity_scale, model.sh_degree) == (0.2, 0.8, 2)
+    assert (model.treatment.dropout, model.treatment.scale, model.sh_degree) == (0.2, 0.8, 2)
     assert not model.gaussians.means.requires_grad
     assert len(model.gaussians) == results["gaussians"]
 
 
 def test_inverted_dropout_needs_nothing_at_test_time(tiny_scene):
     model = model_of(Trainer(tiny_scene, TrainConfig(dropout=0.2, compensate=True)))
-    assert (model.dropout, model.opacity_scale) == (0.0, 1.0)
+    assert (model.treatment.dropout, model.treatment.scale) == (0.0, 1.0)
 
 
 def test_a_folder_without_a_run(tmp_path):

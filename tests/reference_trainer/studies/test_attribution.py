@@ -10,8 +10,8 @@ from oracles import brute_force, random_scene
 from PIL import Image
 
 from ca_reg import Reason
-from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.report import write_json
+from reference_trainer.evaluation.results import write_json
+from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
@@ -156,7 +156,7 @@ def test_blend_weights_are_those_of_brute_force():
         torch.zeros(n, 1, 3, dtype=torch.float64),
         torch.zeros(n, 0, 3, dtype=torch.float64),
     )
-    model = Model(gaussians, torch.ones(3, dtype=torch.float64), opacity_scale=scale)
+    model = TrainedModel(gaussians, torch.ones(3, dtype=torch.float64), treatment=Treatment(scale=scale))
     views = [View(str(i), camera, torch.zeros(3, 18, 24)) for i, camera in enumerate(cameras)]
     identity = torch.eye(n, dtype=torch.float64)
     expected = sum(

@@ -12,7 +12,7 @@ from oracles import brute_force, random_scene
 
 from ca_reg.functional import apply_dropout, draw_keep_mask
 from reference_trainer.evaluation import model as model_module
-from reference_trainer.evaluation.model import Model
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.error_runtime import (
@@ -29,7 +29,7 @@ from reference_trainer.studies.error_runtime import (
 BACKGROUND = (0.9, 0.2, 0.4)
 
 
-def made_of(n, width, height, *, size) -> tuple[Model, View]:
+def made_of(n, width, height, *, size) -> tuple[TrainedModel, View]:
     """Opaque Gaussians that cover a part of the picture."""
     s = random_scene(n, width, height, seed=2, size=size)
     opacities = 0.8 + 0.19 * s.opacities
@@ -41,12 +41,12 @@ def made_of(n, width, height, *, size) -> tuple[Model, View]:
         sh_dc=((s.colors - 0.5) / SH_C0)[:, None],
         sh_rest=torch.zeros(n, 0, 3),
     )
-    model = Model(gaussians.map(torch.Tensor.float), torch.tensor(BACKGROUND))
+    model = TrainedModel(gaussians.map(torch.Tensor.float), torch.tensor(BACKGROUND))
     return model, View("tiny", s.camera.to(dtype=torch.float32), torch.zeros(3, height, width))
 
 
 @pytest.fixture(scope="module")
-def scene() -> tuple[Model, View]:
+def scene() -> tuple[TrainedModel, View]:
     return made_of(9, 14, 11, size=0.45)
 
 
@@ -182,7 +182,7 @@ def test_views_without_a_score_are_refused(scene):
         error_runtime(model, dataclasses.replace(view, camera=away))
     black = dataclasses.replace(model.gaussians, sh_dc=torch.full((9, 1, 3), -9.0))
     with pytest.raises(ValueError, match="nothing varies"):
-        error_runtime(Model(black, torch.zeros(3)), view)
+        error_runtime(TrainedModel(black, torch.zeros(3)), view)
 
 
 def test_every_engine_draws_its_own_moments(scene, monkeypatch):

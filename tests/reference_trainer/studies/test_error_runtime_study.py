@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.model import Model
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.measure import of_run
@@ -45,7 +45,7 @@ def models():
     """A model and a view, by the name of the scene."""
     gaussians = Gaussians.from_points(torch.rand(8, 3), torch.rand(8, 3), torch.full((8,), 0.3), sh_degree=0)
     camera = Camera(torch.eye(4), 9.0, 9.0, 4.0, 3.0, 8, 6)
-    return {"wall": (Model(gaussians, torch.zeros(3)), View("front", camera, torch.zeros(3, 6, 8)))}
+    return {"wall": (TrainedModel(gaussians, torch.zeros(3)), View("front", camera, torch.zeros(3, 6, 8)))}
 
 
 def quiet(text):
@@ -76,7 +76,7 @@ def test_a_finished_scene_is_kept_and_a_changed_one_measured_again(models, tmp_p
     study(models, tmp_path, max_samples=32, seeds=1, say=quiet)
     assert calls == [("front", 16), ("front", 32)]
     model, view = models["wall"]
-    brighter = Model(model.gaussians, torch.ones(3))
+    brighter = TrainedModel(model.gaussians, torch.ones(3))
     study({"wall": (brighter, view), "plain": (model, view)}, tmp_path, max_samples=32, seeds=1, say=quiet)
     assert len(calls) == 4
     shifted = dataclasses.replace(view, camera=dataclasses.replace(view.camera, cx=view.camera.cx + 1))

@@ -11,7 +11,7 @@ from oracles import brute_force, random_scene
 from PIL import Image
 
 from ca_reg.functional import draw_keep_mask
-from reference_trainer.evaluation.report import write_json
+from reference_trainer.evaluation.results import write_json
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.runs.folder import CHECKPOINT
 from reference_trainer.runs.folder import CONFIG as RUN_CONFIG

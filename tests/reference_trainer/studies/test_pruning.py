@@ -8,7 +8,7 @@ from PIL import Image
 
 from ca_reg import attribute
 from reference_trainer.evaluation.evaluate import evaluate
-from reference_trainer.evaluation.report import write_json
+from reference_trainer.evaluation.results import write_json
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import model_of
 from reference_trainer.studies import pruning as pruning_module
@@ -112,7 +112,7 @@ def runs(tmp_path_factory, options, tiny_scene, busy):
         trainer.save(folder / CHECKPOINT)
         config = {"scene": dataclasses.asdict(options), "config": dataclasses.asdict(trainer.config)}
         write_json(folder / CONFIG, config)
-        out[folder] = evaluate(model_of(trainer), scene)
+        out[folder] = evaluate(model_of(trainer), {"test": scene.test})
     return out, scene
 
 

@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.model import Model
-from reference_trainer.evaluation.report import write_json
+from reference_trainer.evaluation.results import write_json
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import run_experiment
@@ -35,13 +35,13 @@ def silent(text: str) -> None:
     """Say nothing."""
 
 
-def model_of_layers(greys: list[float], size: float) -> Model:
+def model_of_layers(greys: list[float], size: float) -> TrainedModel:
     """Grey Gaussians behind one another, over black."""
     n = len(greys)
     positions = torch.tensor([[0.0, 0.0, 1.0 + i] for i in range(n)])
     colors = torch.tensor(greys)[:, None].expand(n, 3)
     gaussians = Gaussians.from_points(positions, colors, torch.full((n,), size), sh_degree=0, opacity=OPACITY)
-    return Model(gaussians, torch.zeros(3))
+    return TrainedModel(gaussians, torch.zeros(3))
 
 
 def black_view(pixels: int) -> View:
@@ -118,7 +118,7 @@ def test_regions_and_variances_are_crossed_as_the_names_say(tiny_scene):
     points = tiny_scene.points
     scales = torch.full((150,), 0.2)
     gaussians = Gaussians.from_points(points.positions, points.colors, scales, sh_degree=0, opacity=0.9)
-    model, view = Model(gaussians, tiny_scene.background), tiny_scene.test[0]
+    model, view = TrainedModel(gaussians, tiny_scene.background), tiny_scene.test[0]
     images, alphas = [], []
 
     def spy(opacity, view):

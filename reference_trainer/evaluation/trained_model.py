@@ -21,54 +21,73 @@ from reference_trainer.render import (
     splat,
     variance_shares,
 )
-from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.scene import Viewpoint
 
-__all__ = ["MaskedRenders", "Model"]
+__all__ = ["MaskedRenders", "TrainedModel", "Treatment"]
 
 
 @dataclass(frozen=True)
-class Model:
+class Treatment:
+    """What training did to the opacities, and what takes its place at test time.
+
+    Args:
+        dropout: the rate p of the training; it decides the drop rate of the paper's CA protocol.
+        scale: what opacities are multiplied with at test time: 1 - p, or 1 for inverted dropout.
+        noise: sigma of the opacity noise whose mean opacities are multiplied with at test time as well; 0, as in the
+            paper, for none.
+        clip_noise: whether that noise is clipped to [-sigma, sigma].
+    """
+
+    dropout: float = 0.0
+    scale: float = 1.0
+    noise: float = 0.0
+    clip_noise: bool = False
+
+    def __call__(self, opacities: Tensor) -> Tensor:
+        """Return the opacities of the test from the plain ones, shape (N,)."""
+        # Training drops first. A factor of 0 or 1 commutes with the clamp: the noise has its mean at plain opacities.
+        return expected_opacity(opacities, self.noise, clip=self.clip_noise) * self.scale
+
+    @property
+    def factor(self) -> float | None:
+        """The factor of all opacities at test time; None where it depends on the opacity."""
+        return None if self.noise > 0 else self.scale
+
+
+@dataclass(frozen=True)
+class TrainedModel:
     """A trained model and how it is to be used at test time.
 
     Args:
         gaussians: the parameters.
         background: colour behind them, shape (3,).
-        dropout: the rate p that it was trained with; it decides the drop rate of the paper's CA protocol.
-        opacity_scale: what opacities are multiplied with at test time: 1 - p, or 1 for inverted dropout.
+        treatment: of the opacities at test time.
         sh_degree: highest band of spherical harmonics to use; None for all.
-        expected_noise: sigma of the opacity noise whose mean opacities are multiplied with at test time as well; 0, as
-            in the paper, for none.
-        clip_noise: whether that noise is clipped to [-sigma, sigma].
     """
 
     gaussians: Gaussians
     background: Tensor
-    dropout: float = 0.0
-    opacity_scale: float = 1.0
+    treatment: Treatment = Treatment()
     sh_degree: int | None = None
-    expected_noise: float = 0.0
-    clip_noise: bool = False
 
     @property
     def test_opacities(self) -> Tensor:
         """The opacities to render with at test time, shape (N,); co-adaptation is measured on the plain ones."""
-        # Training drops first. A factor of 0 or 1 commutes with the clamp: the noise has its mean at plain opacities.
-        mean = expected_opacity(self.gaussians.opacities, self.expected_noise, clip=self.clip_noise)
-        return mean * self.opacity_scale
+        return self.treatment(self.gaussians.opacities)
 
-    def render(self, opacities: Tensor, view: View) -> tuple[Tensor, Tensor]:
+    def render(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
         """Render a view with given opacities (N,): the render callable of `CAScore`; image (3, H, W), alpha (H, W)."""
         out = self.rendering(opacities, view)
         return out.image, out.alpha
 
-    def rendering(self, opacities: Tensor, view: View) -> Rendering:
+    def rendering(self, opacities: Tensor, view: Viewpoint) -> Rendering:
         """Render a view with given opacities (N,), with everything that the renderer tells."""
         return render_gaussians(
             self.gaussians, view.camera, self.background, opacities=opacities, sh_degree=self.sh_degree
         )
 
     def moments(
-        self, opacities: Tensor, view: View, multiplier: Multiplier, background: Tensor | None = None
+        self, opacities: Tensor, view: Viewpoint, multiplier: Multiplier, background: Tensor | None = None
     ) -> MomentImages:
         """Render the exact moments of a view under random factors: the moments callable of `CAScore`.
 
@@ -81,7 +100,7 @@ class Model:
         return render_moments(self.splats(opacities, view), multiplier, background=self._behind(background))
 
     def shares(
-        self, opacities: Tensor, view: View, multiplier: Multiplier, background: Tensor | None, weights: Tensor
+        self, opacities: Tensor, view: Viewpoint, multiplier: Multiplier, background: Tensor | None, weights: Tensor
     ) -> Tensor:
         """Attribute a weighted sum of the variance to the Gaussians: the shares callable of `ca_reg.attribute`.
 
@@ -100,7 +119,7 @@ class Model:
         shares[splats.indices] = variance_shares(splats, multiplier, weights, background=self._behind(background))
         return shares
 
-    def splats(self, opacities: Tensor, view: View) -> Splats:
+    def splats(self, opacities: Tensor, view: Viewpoint) -> Splats:
         """Project the model with given opacities (N,) and list it per tile."""
         model = self.gaussians
         return splat(
@@ -129,7 +148,7 @@ class Model:
             render_fn: instead of `MaskedRenders`, for a model that changes.
         """
         return CAScore(
-            render_fn or MaskedRenders(self), samples=samples, p=self.dropout, drop_rate=drop_rate, seed=seed
+            render_fn or MaskedRenders(self), samples=samples, p=self.treatment.dropout, drop_rate=drop_rate, seed=seed
         )
 
     def exact_ca_score(self, *, drop_rate: float | None = None, neutral: bool = False) -> CAScore:
@@ -139,25 +158,25 @@ class Model:
             drop_rate: instead of the paper's 1 - (1 - p) / 2.
             neutral: composite every pixel over its own expected colour instead of the background.
         """
-        return CAScore(exact=self.moments, p=self.dropout, drop_rate=drop_rate, neutral=neutral)
+        return CAScore(exact=self.moments, p=self.treatment.dropout, drop_rate=drop_rate, neutral=neutral)
 
 
 class MaskedRenders:
     """The render callable of a `CAScore` over a model that does not change.
 
     Projection, colours, tile lists and their order are made once for a view, for all Gaussians; a mask only takes
-    entries out of the lists. The images are those of `Model.render`.
+    entries out of the lists. The images are those of `TrainedModel.render`.
 
     Args:
         model: what to render.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: TrainedModel) -> None:
         self._model = model
-        self._view: View | None = None
+        self._view: Viewpoint | None = None
         self._splats: Splats | None = None
 
-    def __call__(self, opacities: Tensor, view: View) -> tuple[Tensor, Tensor]:
+    def __call__(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
         """Render a view with given opacities (N,); image (3, H, W), alpha (H, W)."""
         if bool((opacities > self._model.gaussians.opacities).any()):  # the lists would be too short
             return self._model.render(opacities, view)

@@ -8,7 +8,7 @@ import torch
 
 from ca_reg import CAScore, GaussianDropout, OpacityNoise, Reason, attribute
 from ca_reg.functional import Multiplier
-from reference_trainer.evaluation.model import MaskedRenders, Model
+from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel, Treatment
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.scene import Scene
@@ -20,14 +20,16 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def model(scene) -> Model:
+def model(scene) -> TrainedModel:
     points = scene.points
     assert points is not None
     generator = torch.Generator().manual_seed(0)
     gaussians = Gaussians.from_points(points.positions, points.colors, torch.full((300,), 0.3), sh_degree=1)
     logits = 2.0 * torch.randn(300, generator=generator)
     rest = 0.1 * torch.randn(gaussians.sh_rest.shape, generator=generator)
-    return Model(replace(gaussians, opacity_logits=logits, sh_rest=rest), scene.background, dropout=0.2)
+    return TrainedModel(
+        replace(gaussians, opacity_logits=logits, sh_rest=rest), scene.background, Treatment(dropout=0.2)
+    )
 
 
 def assert_equal_renders(mine, other) -> None:
@@ -76,8 +78,8 @@ def test_the_test_time_image_is_the_mean_of_the_training_images(model, scene, p)
     """Both regularizers in the order of the trainer, against one render with the expected opacities."""
     view, generator = scene.train[0], torch.Generator().manual_seed(2)
     logits = model.gaussians.opacity_logits + 2.0  # many opaque ones
-    model = replace(model, gaussians=replace(model.gaussians, opacity_logits=logits), opacity_scale=1.0 - p)
-    scaled = replace(model, expected_noise=0.8)
+    model = replace(model, gaussians=replace(model.gaussians, opacity_logits=logits), treatment=Treatment(scale=1 - p))
+    scaled = replace(model, treatment=replace(model.treatment, noise=0.8))
     dropout, noise = GaussianDropout(p), OpacityNoise(0.8)
     image, plain = (m.render(m.test_opacities, view)[0] for m in (scaled, model))
     step = plain - image
@@ -96,8 +98,9 @@ def test_the_test_time_image_is_the_mean_of_the_training_images(model, scene, p)
 def test_test_time_opacities(model):
     opacities = model.gaussians.opacities
     assert torch.equal(model.test_opacities, opacities)
-    assert torch.equal(replace(model, opacity_scale=0.8).test_opacities, opacities * 0.8)
-    both = replace(model, opacity_scale=0.8, expected_noise=0.6, clip_noise=True)
+    assert torch.equal(replace(model, treatment=Treatment(scale=0.8)).test_opacities, opacities * 0.8)
+    both = replace(model, treatment=Treatment(dropout=0.2, scale=0.8, noise=0.6, clip_noise=True))
     mean = Multiplier.clamped_noise(opacities, 0.6, clip=True).mean
     torch.testing.assert_close(both.test_opacities, 0.8 * mean * opacities)
+    assert (Treatment(scale=0.8).factor, both.treatment.factor) == (0.8, None)
     assert both.ca_score().settings == model.ca_score().settings

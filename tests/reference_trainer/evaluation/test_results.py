@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from reference_trainer.evaluation.report import format_mean_std, machine, markdown_table, mean_std, write_json
+from reference_trainer.evaluation.results import format_mean_std, machine, markdown_table, mean_std, write_json
 
 NAN = float("nan")
 
