@@ -79,8 +79,12 @@ class Registry(Generic[T]):
             raise ValueError(f"{module_name}:{class_name} is no subclass of {self.base.__name__}: {found!r:.80}.")
         return found
 
-    def make(self, text: str) -> list[T]:
+    def make(self, text: str, *, imports: bool = True) -> list[T]:
         """Make the objects of an expression; none of an empty one.
+
+        Args:
+            text: the expression.
+            imports: whether ``module:Class`` may be imported; False for text that somebody else wrote.
 
         Raises:
             ValueError: if the text cannot be understood, a name is not known, or an argument is refused; says which.
@@ -97,7 +101,7 @@ class Registry(Generic[T]):
         while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
             terms.insert(0, node.right)
             node = node.left
-        return [self._make(term, text) for term in [node, *terms]]
+        return [self._make(term, text, imports) for term in [node, *terms]]
 
     def make_one(self, text: str) -> T:
         """Make the one object of an expression.
@@ -110,11 +114,13 @@ class Registry(Generic[T]):
             raise ValueError(f"expected one {self.kind}, got {len(made)} of {text!r:.200}; {self._form()}")
         return made[0]
 
-    def _make(self, node: ast.expr, text: str) -> T:
+    def _make(self, node: ast.expr, text: str, imports: bool) -> T:
         """Make one object."""
         call = node if isinstance(node, ast.Call) else ast.Call(node, [], [])
         if not re.fullmatch(r"[A-Za-z_][\w.]*", name := ast.unparse(call.func)):
             raise ValueError(f"{ast.unparse(node)!r:.80} in {text!r:.200} is no {self.kind}; {self._form()}")
+        if "." in name and not imports:
+            raise ValueError(f"{name} in {text!r:.200} is not imported because a file says so: give it yourself.")
         factory = self[name]
         try:
             arguments, named = self._arguments(call)

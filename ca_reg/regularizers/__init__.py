@@ -17,12 +17,13 @@ REGULARIZERS.register("dropout")(GaussianDropout)
 REGULARIZERS.register("noise")(OpacityNoise)
 
 
-def parse(text: str) -> Chain:
+def parse(text: str, *, imports: bool = True) -> Chain:
     """Make regularizers of an expression: names of the registry or ``module:Class``, joined by ``+``.
 
     Args:
         text: such as ``"dropout(0.2) + noise(0.8, scale=True)"``, ``"dropout(ramp(0, 0.2, 0, 10_000))"`` or
             ``"my_module:MyDropout(0.3)"``; an empty one makes an empty chain.
+        imports: whether ``module:Class`` may be imported; False for text that somebody else wrote.
 
     Raises:
         ValueError: if it cannot be understood; says what.
@@ -31,4 +32,4 @@ def parse(text: str) -> Chain:
         >>> [type(member).__name__ for member in parse("dropout(0.2) + noise(0.8)")]
         ['GaussianDropout', 'OpacityNoise']
     """
-    return Chain(*REGULARIZERS.make(text))
+    return Chain(*REGULARIZERS.make(text, imports=imports))

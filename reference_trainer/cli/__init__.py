@@ -54,7 +54,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "plan": Plan(config=config, preset=preset, given=given),
         "train": Train(config=config, preset=preset, given=given),
         "evaluate": Evaluate(),
-        "bake": Bake(ply=tyro.MISSING, dropout=tyro.MISSING),
+        "bake": Bake(ply=tyro.MISSING),
         "render": Render(run=Path("runs/train")),
         "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
         "study": Study(tyro.MISSING),

@@ -13,19 +13,22 @@ __all__ = ["Bake"]
 
 @dataclass(frozen=True)
 class Bake:
-    """Scale the opacities of a PLY by 1 - p, for viewers that know nothing of dropout; a comment in it says so."""
+    """Give a PLY its test-time opacities, such as times 1 - p after dropout p, for viewers that know of no regularizer.
+
+    A comment in the file says so.
+    """
 
     ply: Annotated[Path, tyro.conf.Positional]
-    """A standard 3DGS PLY of a model that was trained with dropout, opacities plain."""
-    dropout: float
-    """The rate p of the training."""
+    """A standard 3DGS PLY of a model that was trained with regularizers, opacities plain."""
+    regularizer: str | None = None
+    """What it was trained with, such as "dropout(0.2)"; PLYs of `ca-reg train` say so themselves."""
     out: Path | None = None
     """The file to write; by default <ply>_for_viewers.ply."""
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.model.bake import bake_ply
+        from reference_trainer.runs.bake import bake_ply
 
         out = self.out or self.ply.with_name(f"{self.ply.stem}_for_viewers.ply")
-        bake_ply(self.ply, out, dropout=self.dropout)
-        print(f"{out}: opacities are scaled by {1 - self.dropout:g}, and marked so")
+        regularizer = bake_ply(self.ply, out, regularizer=self.regularizer)
+        print(f"{out}: opacities are those of the test after {regularizer}, and marked so")

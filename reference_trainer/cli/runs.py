@@ -25,7 +25,6 @@ Folder = Annotated[str | None, tyro.conf.Positional]
 Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="")]
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
 Given = Annotated[frozenset[str], tyro.conf.Suppress]  # filled in from the command line itself, see given_fields
-Strategy = Literal["baseline", "dropout", "noise", "both", "analytic-dropout", "analytic-noise"]
 
 
 def given_fields(arguments: Sequence[str]) -> frozenset[str]:
@@ -183,10 +182,9 @@ class Evaluate:
     """A standard 3DGS PLY instead of a run, with its scene or without."""
     scene: Annotated[PlyScene, tyro.conf.arg(name="")] = field(default_factory=PlyScene)
     orbit: Orbit = field(default_factory=OrbitOptions)
-    dropout: float = 0.0
-    """For a PLY: the dropout rate that it was trained with."""
-    scale_noise: bool = False
-    """For a run with noise: scale opacities by its mean, even if the run was trained without --scale-noise."""
+    regularizer: str | None = None
+    """Render as if it had been trained with these: "dropout(0.2)" for a PLY that does not say so, or "noise(0.8,
+    scale=True)" for a run with noise 0.8, to render with the mean opacities."""
     samples: int = 5
     """Renders per view for the CA score."""
     seed: int = 0
@@ -196,7 +194,7 @@ class Evaluate:
     device: str = "cpu"
     """"cpu" or "cuda"."""
     out: Path | None = None
-    """Folder for the results; by default <run>/evaluation, <run>/evaluation_scale_noise or <ply>_evaluation."""
+    """Folder for the results; by default <run>/evaluation, <run>/evaluation_<regularizer> or <ply>_evaluation."""
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
@@ -213,10 +211,6 @@ class Evaluate:
             run, ply = None, run
         if run is None and ply is None:
             raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE (and --path SCENE).")
-        if ply is not None and self.scale_noise:
-            raise ValueError(
-                "--scale-noise needs the folder of a run: a PLY does not say which noise it was trained with."
-            )
         orbit = ply is not None and self.scene.path == "orbit"
         if orbit and (self.lpips is not None or replace(self.scene, background="auto") != PlyScene()):
             raise ValueError(
@@ -227,11 +221,11 @@ class Evaluate:
             "samples": self.samples, "seed": self.seed, "perceptual": lpips_option(self.lpips, device=self.device)
         }  # fmt: skip
         if run is not None:
-            model, scene, default = of_run(run, self.device, scale_noise=self.scale_noise)
+            model, scene, default = of_run(run, self.device, regularizer=self.regularizer)
             measure(model, measured_views(scene, print), self.out or default, about={"scene": scene.name}, **shared)
         elif ply is not None:
             where = self.orbit if orbit else self.scene
-            shared |= {"dropout": self.dropout, "device": self.device}
+            shared |= {"regularizer": self.regularizer, "device": self.device}
             background = "black" if self.scene.background == "auto" else self.scene.background
             score_ply(ply, where, self.out, background=background, **shared)
 
@@ -283,8 +277,9 @@ class Compare:
     config: Config = field(default_factory=lambda: PRESETS["fsgs"])
     preset: Literal["fsgs", "inria", "binocular"] = "fsgs"
     """Schedule of a published code base; other options override it."""
-    strategies: tuple[Strategy, ...] = ("baseline", "dropout", "noise", "both")
-    """What to compare; --dropout and --noise give the rates (0.2 and 0.8 if they are 0)."""
+    strategies: tuple[str, ...] = ("baseline", "dropout", "noise", "both")
+    """What to compare: these, "analytic-dropout", "analytic-noise", whose rates --dropout and --noise give (0.2 and 0.8
+    if they are 0), or regularizers as of --regularizer, such as "d2gs"."""
     seeds: int = 3
     """Number of seeds."""
     jobs: int = 1
@@ -318,14 +313,9 @@ class Compare:
         from reference_trainer.runs.engines.choice import choose_engine
         from reference_trainer.runs.grid import Running
 
-        config = replace(self.config, dropout=0.0, noise=0.0, analytic=False, ca_weight=0.0, scale_noise=False)
-        every = strategies(
-            config,
-            dropout=self.config.dropout or 0.2,
-            noise=self.config.noise or 0.8,
-            scale_noise=self.config.scale_noise,
+        chosen = strategies(
+            self.strategies, self.config, dropout=self.config.dropout or 0.2, noise=self.config.noise or 0.8
         )
-        chosen: dict[str, TrainConfig] = {name: every[name] for name in self.strategies}
         running = Running(
             choose_engine(self.engine, jobs=self.jobs, address=self.address, device=self.device),
             retries=self.retries,

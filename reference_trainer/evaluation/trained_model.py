@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from ca_reg import CAScore, RenderFn
-from ca_reg.functional import Multiplier, expected_opacity
+from ca_reg import CAScore, Chain, GaussianDropout, Params, RenderFn
+from ca_reg.functional import Multiplier
+from ca_reg.regularizers import parse
 from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.model.rendering import render_gaussians, splat_gaussians
 from reference_trainer.render import (
     MomentImages,
     Rendering,
@@ -18,40 +21,11 @@ from reference_trainer.render import (
     draw,
     masked,
     render_moments,
-    splat,
     variance_shares,
 )
 from reference_trainer.scenes.scene import Viewpoint
 
-__all__ = ["MaskedRenders", "TrainedModel", "Treatment"]
-
-
-@dataclass(frozen=True)
-class Treatment:
-    """What training did to the opacities, and what takes its place at test time.
-
-    Args:
-        dropout: the rate p of the training; it decides the drop rate of the paper's CA protocol.
-        scale: what opacities are multiplied with at test time: 1 - p, or 1 for inverted dropout.
-        noise: sigma of the opacity noise whose mean opacities are multiplied with at test time as well; 0, as in the
-            paper, for none.
-        clip_noise: whether that noise is clipped to [-sigma, sigma].
-    """
-
-    dropout: float = 0.0
-    scale: float = 1.0
-    noise: float = 0.0
-    clip_noise: bool = False
-
-    def __call__(self, opacities: Tensor) -> Tensor:
-        """Return the opacities of the test from the plain ones, shape (N,)."""
-        # Training drops first. A factor of 0 or 1 commutes with the clamp: the noise has its mean at plain opacities.
-        return expected_opacity(opacities, self.noise, clip=self.clip_noise) * self.scale
-
-    @property
-    def factor(self) -> float | None:
-        """The factor of all opacities at test time; None where it depends on the opacity."""
-        return None if self.noise > 0 else self.scale
+__all__ = ["MaskedRenders", "TrainedModel"]
 
 
 @dataclass(frozen=True)
@@ -61,19 +35,48 @@ class TrainedModel:
     Args:
         gaussians: the parameters.
         background: colour behind them, shape (3,).
-        treatment: of the opacities at test time.
+        regularizer: what it was trained with, an expression of `ca_reg.regularizers.parse`; it decides what is rendered
+            at test time, and the drop rate of the paper's CA protocol.
+        step: of the training, which schedules follow.
         sh_degree: highest band of spherical harmonics to use; None for all.
     """
 
     gaussians: Gaussians
     background: Tensor
-    treatment: Treatment = Treatment()
+    regularizer: str = ""
+    step: int = 0
     sh_degree: int | None = None
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The regularizers of the training."""
+        return parse(self.regularizer)
+
+    @property
+    def dropout(self) -> float:
+        """The share of the Gaussians that every step left out, all alike and without making up for it; 0 for others."""
+        rates = [m.rates(self._plain) for m in self.chain if isinstance(m, GaussianDropout) and not m.compensate]
+        return 1.0 - math.prod(1.0 - float(rate) for rate in rates)
+
+    @property
+    def factor(self) -> float | None:
+        """The factor of all opacities at test time; None where it depends on the Gaussian."""
+        uniform = all(isinstance(member, GaussianDropout) or not member.renders_mean for member in self.chain)
+        return 1.0 - self.dropout if uniform else None
+
+    @property
+    def tested(self) -> Params:
+        """What is rendered at test time; co-adaptation is measured on the plain opacities."""
+        return self.chain.expected(self._plain)
+
+    @property
+    def _plain(self) -> Params:
+        return self.gaussians.params(step=self.step)
 
     @property
     def test_opacities(self) -> Tensor:
-        """The opacities to render with at test time, shape (N,); co-adaptation is measured on the plain ones."""
-        return self.treatment(self.gaussians.opacities)
+        """The opacities to render with at test time, shape (N,)."""
+        return self.tested.opacities
 
     def render(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
         """Render a view with given opacities (N,): the render callable of `CAScore`; image (3, H, W), alpha (H, W)."""
@@ -121,16 +124,7 @@ class TrainedModel:
 
     def splats(self, opacities: Tensor, view: Viewpoint) -> Splats:
         """Project the model with given opacities (N,) and list it per tile."""
-        model = self.gaussians
-        return splat(
-            model.means,
-            model.quaternions,
-            model.scales,
-            opacities,
-            view.camera,
-            sh=model.sh,
-            sh_degree=self.sh_degree,
-        )
+        return splat_gaussians(self.gaussians, view.camera, opacities=opacities, sh_degree=self.sh_degree)
 
     def _behind(self, background: Tensor | None) -> Tensor:
         """The background that was asked for, or the model's own."""
@@ -148,7 +142,7 @@ class TrainedModel:
             render_fn: instead of `MaskedRenders`, for a model that changes.
         """
         return CAScore(
-            render_fn or MaskedRenders(self), samples=samples, p=self.treatment.dropout, drop_rate=drop_rate, seed=seed
+            render_fn or MaskedRenders(self), samples=samples, p=self.dropout, drop_rate=drop_rate, seed=seed
         )
 
     def exact_ca_score(self, *, drop_rate: float | None = None, neutral: bool = False) -> CAScore:
@@ -158,7 +152,7 @@ class TrainedModel:
             drop_rate: instead of the paper's 1 - (1 - p) / 2.
             neutral: composite every pixel over its own expected colour instead of the background.
         """
-        return CAScore(exact=self.moments, p=self.treatment.dropout, drop_rate=drop_rate, neutral=neutral)
+        return CAScore(exact=self.moments, p=self.dropout, drop_rate=drop_rate, neutral=neutral)
 
 
 class MaskedRenders:

@@ -21,6 +21,8 @@ __all__ = ["PlyModel", "load_ply", "save_ply"]
 
 _SCALED = "ca_reg opacity_scaled_by"
 _FOR_RENDERING = "ca_reg opacity_for_rendering"
+_TRAINED_WITH = "ca_reg trained_with"
+_LEARNED = "ca_reg_learned_"
 _HEADER_LIMIT = 65_536  # bytes; a standard header has 1.6 kB, so more than this is not a header
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -48,11 +50,16 @@ class PlyModel:
             dropout ``p`` and saved with ``bake_p=p`` has ``1 - p`` here and must not be scaled again.
         for_rendering: whether the file was saved with ``opacities=``: those in it are to be rendered as they are, and
             the plain ones cannot be had from it.
+        regularizer: what the model was trained with, an expression of `ca_reg.regularizers.parse`, empty if the file
+            does not say. It is text from a file: do not import what it names.
+        step: of the training, 0 if the file does not say.
     """
 
     gaussians: Gaussians
     opacity_scale: float
     for_rendering: bool
+    regularizer: str = ""
+    step: int = 0
 
 
 def save_ply(
@@ -62,6 +69,8 @@ def save_ply(
     bake_p: float | None = None,
     opacities: Tensor | None = None,
     pad_to_degree: int | None = None,
+    regularizer: str = "",
+    step: int = 0,
 ) -> None:
     """Write Gaussians as a binary little-endian PLY of float32, the layout of the INRIA code, for any viewer.
 
@@ -80,6 +89,9 @@ def save_ply(
             after opacity noise. A header comment records that they are not the plain ones.
         pad_to_degree: store at least this degree of spherical harmonics, 0 to 3, with zeros for the missing
             coefficients; many viewers read degree 3 only.
+        regularizer: what the model was trained with, for a header comment; what regularizers learned per Gaussian is
+            stored in properties of its own.
+        step: of the training, likewise.
 
     Raises:
         ValueError: if ``bake_p``, ``opacities`` or ``pad_to_degree`` is out of range, or the first two are both given.
@@ -108,14 +120,18 @@ def save_ply(
     elif bake_p:
         # The decimal of 1 - 0.2 is written, not the neighbouring double that the subtraction gives.
         logits, comments = _scaled_logits(logits, 1 - bake_p), [f"comment {_SCALED} {round(1 - bake_p, 12)}"]
+    if regularizer:
+        comments.append(f"comment {_TRAINED_WITH} {step} {' '.join(regularizer.split())}")
     n, rest = len(gaussians), gaussians.sh_rest.detach().transpose(1, 2)  # [N, 3, K]
     padding = max(0, ((pad_to_degree or 0) + 1) ** 2 - 1 - rest.shape[2])
     rest = torch.cat([rest, rest.new_zeros(n, 3, padding)], dim=2).flatten(1)
     columns = [gaussians.means, torch.zeros_like(gaussians.means), gaussians.sh_dc.reshape(n, 3), rest]
     columns += [logits[:, None], gaussians.log_scales, gaussians.quaternions]
+    columns += [x[:, None] for x in gaussians.learned.values()]
     table = torch.cat([column.detach().to("cpu", torch.float32) for column in columns], dim=1)
     rest_names = [f"f_rest_{index}" for index in range(rest.shape[1])]
     names = [*_MEANS, *_NORMALS, *_DC, *rest_names, "opacity", *_SCALES, *_ROTATIONS]
+    names += [_LEARNED + name for name in gaussians.learned]
     header = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {n}"]
     header += [*(f"property float {name}" for name in names), "end_header", ""]
     with replacing(path) as place:
@@ -174,13 +190,15 @@ def load_ply(path: str | Path) -> PlyModel:
         opacity_logits=columns(["opacity"])[:, 0],
         sh_dc=columns(_DC)[:, None, :],
         sh_rest=columns(rest).reshape(count, 3, len(rest) // 3).transpose(1, 2).contiguous(),
+        learned={n.removeprefix(_LEARNED): columns([n])[:, 0] for n in properties if n.startswith(_LEARNED)},
     )
     # An opacity of exactly 0 or 1 has an infinite logit, which sigmoid takes: only NaN is wrong there.
     bad = [name for name, x in gaussians.named() if not torch.isfinite(x).all() and name != "opacity_logits"]
     bad += ["opacity_logits"] if bool(gaussians.opacity_logits.isnan().any()) else []
     if bad:
         raise ValueError(f"{path} holds values that are not finite in {', '.join(bad)}: remove those Gaussians first.")
-    return PlyModel(gaussians, _opacity_scale(header.comments, path), _FOR_RENDERING in header.comments)
+    scale, for_rendering = _opacity_scale(header.comments, path), _FOR_RENDERING in header.comments
+    return PlyModel(gaussians, scale, for_rendering, *_trained_with(header.comments, path))
 
 
 def _logits(opacities: Tensor, count: int) -> Tensor:
@@ -299,3 +317,14 @@ def _opacity_scale(comments: list[str], path: Path) -> float:
                 raise ValueError(f"{path}: expected a factor in (0, 1] after '{_SCALED}', got '{comment}'.")
             scale *= factor
     return scale
+
+
+def _trained_with(comments: list[str], path: Path) -> tuple[str, int]:
+    """Return the recorded regularizers and the step."""
+    for comment in comments:
+        if comment.startswith(_TRAINED_WITH):
+            step, _, regularizer = comment.removeprefix(_TRAINED_WITH).strip().partition(" ")
+            if not (step.isdecimal() and len(step) < 10):
+                raise ValueError(f"{path}: expected a step after '{_TRAINED_WITH}', got '{comment:.80}'.")
+            return regularizer, int(step)
+    return "", 0

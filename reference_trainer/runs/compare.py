@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,26 +13,51 @@ from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["compare", "scene_folders", "strategies"]
+__all__ = ["NAMED", "compare", "scene_folders", "strategies"]
+
+
+NAMED: dict[str, set[str]] = {
+    "baseline": set(),
+    "dropout": {"dropout"},
+    "noise": {"noise"},
+    "both": {"dropout", "noise"},
+    "analytic-dropout": {"dropout"},
+    "analytic-noise": {"noise"},
+}
+"""The settings of the paper's comparison, and dropout and noise in expectation: which rates they keep."""
 
 
 def strategies(
-    config: TrainConfig, *, dropout: float = 0.2, noise: float = 0.8, scale_noise: bool = False
+    names: Sequence[str], config: TrainConfig, *, dropout: float = 0.2, noise: float = 0.8
 ) -> dict[str, TrainConfig]:
-    """Return the four settings of the paper's comparison, and dropout and noise in expectation instead of sampled.
+    """Return the settings of a comparison, by a name that may be that of a folder.
+
+    Args:
+        names: keys of `NAMED`, or expressions of regularizers, such as ``"d2gs"`` or ``"dropout(0.1) + noise(0.4)"``.
+        config: everything else.
+        dropout: rate of those of `NAMED`.
+        noise: standard deviation of those of `NAMED`.
+
+    Raises:
+        ValueError: if an expression cannot be understood.
 
     Example:
-        >>> analytic = strategies(TrainConfig())["analytic-dropout"]
-        >>> analytic.dropout, analytic.noise, analytic.analytic
-        (0.2, 0.0, True)
+        >>> made = strategies(["analytic-dropout", "dropout(0.1) + noise(0.4)"], TrainConfig())
+        >>> made["analytic-dropout"].dropout, made["analytic-dropout"].analytic
+        (0.2, True)
+        >>> made["dropout_0.1_noise_0.4"].regularizer
+        'dropout(0.1) + noise(0.4)'
     """
-    rates = {"baseline": (0.0, 0.0), "dropout": (dropout, 0.0), "noise": (0.0, noise), "both": (dropout, noise)}
-    sampled = {
-        name: dataclasses.replace(config, dropout=p, noise=sigma, scale_noise=scale_noise and sigma > 0)
-        for name, (p, sigma) in rates.items()
-    }
-    expected = {f"analytic-{name}": dataclasses.replace(sampled[name], analytic=True) for name in ("dropout", "noise")}
-    return sampled | expected
+    rates = {"dropout": dropout, "noise": noise}
+    plain = dataclasses.replace(config, dropout=0.0, noise=0.0, regularizer="", analytic=False)
+    made = {}
+    for name in names:
+        if name in NAMED:
+            p, sigma = (rates[rate] if rate in NAMED[name] else 0.0 for rate in ("dropout", "noise"))
+            made[name] = dataclasses.replace(plain, dropout=p, noise=sigma, analytic=name.startswith("analytic"))
+        else:
+            made[re.sub(r"[^\w.=-]+", "_", name).strip("_")] = dataclasses.replace(plain, regularizer=name)
+    return made
 
 
 def scene_folders(paths: Sequence[str], options: SceneOptions, out: Path) -> dict[Path, SceneOptions]:

@@ -28,7 +28,7 @@ def demo(
         say: receives the text.
     """
     config = with_preset("fsgs", iterations=iterations, opacity_reset_every=0, densify_from=min(500, iterations // 4))
-    chosen = {name: settings for name, settings in strategies(config).items() if not settings.analytic}
+    chosen = strategies(["baseline", "dropout", "noise", "both"], config)
     say(f"Training the built-in scene (3 views) with {', '.join(chosen)}: {iterations} steps each, {jobs} at a time.")
     running = Running(Processes(jobs), monitor_every=max(1, iterations // 5), say=say)
     comparisons = compare({out: SceneOptions("synthetic")}, chosen, seeds, running)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
 
+from ca_reg.regularizers import parse
 from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric, evaluate
 from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.pictures import file_names, save_gif, save_png
@@ -26,26 +28,26 @@ __all__ = ["measure", "of_run", "render_run"]
 Say = Callable[[str], None]
 
 
-def of_run(run: Path, device: str = "cpu", *, scale_noise: bool = False) -> tuple[TrainedModel, Scene, Path]:
+def of_run(run: Path, device: str = "cpu", *, regularizer: str | None = None) -> tuple[TrainedModel, Scene, Path]:
     """Return a run's model at its last checkpoint, its scene, and the folder for its evaluation.
 
     Args:
         run: folder of the run.
         device: where to render.
-        scale_noise: scale by the mean of the noise at test time, also if the run does not; the training would have
-            been the same.
+        regularizer: render as if it had been trained with these, such as "noise(0.8, scale=True)" where the training
+            was the same with "noise(0.8)"; by default with what it was.
 
     Raises:
         FileNotFoundError: if the folder holds no run.
-        ValueError: if ``scale_noise`` is asked of a run without noise, or with inverted dropout.
+        ValueError: if the expression cannot be understood.
     """
     trainer = load_run(run, device)
-    if not scale_noise:
-        return model_of(trainer), trainer.scene, run / "evaluation"
-    if trainer.config.noise == 0:
-        raise ValueError(f"{run} was trained without noise, there is nothing to scale by: leave out --scale-noise.")
-    trainer.config = replace(trainer.config, scale_noise=True)
-    return model_of(trainer), trainer.scene, run / "evaluation_scale_noise"
+    model = model_of(trainer)
+    if regularizer is None:
+        return model, trainer.scene, run / "evaluation"
+    name = re.sub(r"\W+", "_", f"evaluation_{regularizer}").strip("_")
+    parse(regularizer)
+    return replace(model, regularizer=regularizer), trainer.scene, run / name
 
 
 def measure(
@@ -85,7 +87,7 @@ def measure(
         **result.as_dict(),
         "ca_settings": asdict(model.ca_score(samples=samples, seed=seed).settings),
         "background": model.background.tolist(),
-        "expected_noise": model.treatment.noise,
+        "regularizer": model.regularizer,
         "machine": computed_on,
     }
     write_json(out / "evaluation.json", data)

@@ -19,7 +19,7 @@ from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.lpips import lpips_option
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import machine, write_json
-from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.files import remove_leftovers
 from reference_trainer.model.ply import save_ply
@@ -42,9 +42,9 @@ from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.threads import threads_for
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.plan import Plan, make_plan
-from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["load_run", "model_of", "run_experiment", "save_for_viewers"]
@@ -52,16 +52,11 @@ __all__ = ["load_run", "model_of", "run_experiment", "save_for_viewers"]
 
 def model_of(trainer: Trainer) -> TrainedModel:
     """Return the trainer's model as it is to be used at test time."""
-    config = trainer.config
     return TrainedModel(
         gaussians=trainer.gaussians.map(Tensor.detach),
         background=trainer.background,
-        treatment=Treatment(
-            dropout=0.0 if config.compensate else config.dropout,
-            scale=config.test_time_scale if trainer.regularized else 1.0,
-            noise=config.noise if config.scale_noise and trainer.regularized else 0.0,
-            clip_noise=config.clip_noise,
-        ),
+        regularizer=trainer.config.regularizers if trainer.regularized else "",
+        step=trainer.step,
         sh_degree=trainer.sh_degree,
     )
 
@@ -74,11 +69,12 @@ def save_for_viewers(model: TrainedModel, path: Path, *, pad_to_degree: int | No
         path: the file.
         pad_to_degree: as of `save_ply`.
     """
-    factor = model.treatment.factor
+    factor = model.factor
+    trained_with: dict[str, Any] = {"regularizer": model.regularizer, "step": model.step}
     if factor is None:
-        save_ply(model.gaussians, path, opacities=model.test_opacities, pad_to_degree=pad_to_degree)
+        save_ply(model.gaussians, path, opacities=model.test_opacities, pad_to_degree=pad_to_degree, **trained_with)
     else:  # which a reader can take out again
-        save_ply(model.gaussians, path, bake_p=1 - factor, pad_to_degree=pad_to_degree)
+        save_ply(model.gaussians, path, bake_p=1 - factor, pad_to_degree=pad_to_degree, **trained_with)
 
 
 def run_experiment(
@@ -99,8 +95,8 @@ def run_experiment(
 
     The folder receives ``config.json`` with the settings that are trained with, with ``auto`` also ``plan.json`` with
     the reasons for those that were not asked for, ``checkpoint.pt``, ``ca.jsonl`` with TensorBoard events,
-    ``point_cloud.ply`` with the plain opacities (where those of the test are others, after dropout or with
-    ``scale_noise``, also ``point_cloud_for_viewers.ply`` with them, marked), ``views/`` with pictures of every view,
+    ``point_cloud.ply`` with the plain opacities (where those of the test are others, as after dropout,
+    also ``point_cloud_for_viewers.ply`` with them, marked), ``views/`` with pictures of every view,
     and ``results.json``, which marks the run as complete. While it is written it is locked (`run_lock`).
 
     Args:
@@ -263,8 +259,8 @@ def _measure(
 ) -> dict[str, Any]:
     """Write the trained model, its pictures and its scores; return the results."""
     model = model_of(trainer)
-    save_ply(model.gaussians, out / PLY)
-    if model.treatment.factor != 1:
+    save_ply(model.gaussians, out / PLY, regularizer=model.regularizer, step=model.step)
+    if model.factor != 1:
         save_for_viewers(model, out / BAKED_PLY)
     evaluation = evaluate(
         model,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -9,9 +10,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from ca_reg.regularizers import parse
 from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
@@ -40,7 +42,7 @@ class PlyFacts:
         sh_degree_used: highest band with a coefficient other than 0.
         opacity_scale: the factor that is baked into the stored opacities, 1 if none is.
         for_rendering: whether they are test-time opacities that the plain ones cannot be had from.
-        dropout: the rate that the model was trained with, from the file or as told.
+        regularizer: what the model was trained with, from the file or as told.
     """
 
     gaussians: int
@@ -48,7 +50,7 @@ class PlyFacts:
     sh_degree_used: int
     opacity_scale: float
     for_rendering: bool
-    dropout: float
+    regularizer: str
 
     def __str__(self) -> str:
         used = "" if self.sh_degree_used == self.sh_degree else f" (bands above {self.sh_degree_used} are zero)"
@@ -58,51 +60,55 @@ class PlyFacts:
         elif self.opacity_scale < 1:
             opacities = f"{self.opacity_scale:g} baked in, taken out for CA"
         return (
-            f"{self.gaussians:,} Gaussians, SH degree {self.sh_degree}{used}; opacities: {opacities}; dropout rate of "
-            f"the training: {self.dropout:g}"
+            f"{self.gaussians:,} Gaussians, SH degree {self.sh_degree}{used}; opacities: {opacities}; trained with: "
+            f"{self.regularizer or 'no regularizer, as far as is known'}"
         )
 
 
 def of_ply(
-    ply: Path, *, background: Tensor, dropout: float = 0.0, device: str = "cpu"
+    ply: Path, *, background: Tensor, regularizer: str | None = None, device: str = "cpu"
 ) -> tuple[TrainedModel, PlyFacts]:
     """Return the model of a standard 3DGS PLY, and what the file says of it.
 
-    A PLY that says that the test-time scaling is baked into its opacities says the rate as well. The scaling is undone,
-    because CA is measured on plain opacities and the evaluation scales by itself. Opacities that were scaled by the
-    mean of their noise are used as they are, for CA too.
+    A PLY of this package says what the model was trained with, and with it what is to be rendered at test time. One
+    whose opacities are scaled by 1 - p already says so as well: the scaling is undone, because CA is measured on plain
+    opacities and the evaluation scales by itself. Opacities that were replaced by those of the test in another way are
+    used as they are, for CA too.
 
     Args:
         ply: the model.
         background: colour behind it, shape (3,).
-        dropout: the rate that the model was trained with, if the PLY does not say it.
+        regularizer: what the model was trained with, instead of what the PLY says.
         device: where to render.
 
     Raises:
-        ValueError: if the PLY says another rate than ``dropout``, is damaged or holds no Gaussian, or the rate is not
-            in [0, 1).
+        ValueError: if the PLY is damaged or holds no Gaussian, has been scaled for another rate than ``regularizer``
+            says, or names regularizers that cannot be made.
         FileNotFoundError: if the PLY is missing.
     """
-    if not 0 <= dropout < 1:
-        raise ValueError(f"--dropout is the rate of the training, in [0, 1); got {dropout:g}.")
     loaded = load_ply(ply)
     gaussians, baked = loaded.gaussians, round(1.0 - loaded.opacity_scale, 12)
     if not len(gaussians):
         raise ValueError(f"{ply} holds no Gaussian: there is nothing to score.")
-    if baked > 0 and not loaded.for_rendering:
-        if dropout not in (0.0, baked):
-            raise ValueError(f"{ply} was trained with dropout {baked:g}, not {dropout:g}: leave out --dropout.")
-        plain = (gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6)
-        gaussians, dropout = replace(gaussians, opacity_logits=inverse_sigmoid(plain)), baked
+    text = regularizer
+    if text is None:
+        text = loaded.regularizer
+        try:
+            parse(text, imports=False)
+        except ValueError as error:
+            raise ValueError(f"{ply} says what it was trained with: {error} Give --regularizer.") from error
+    if loaded.for_rendering:
+        text = ""
+    elif baked > 0:
+        gaussians = replace(
+            gaussians, opacity_logits=inverse_sigmoid((gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6))
+        )
+        text = text or f"dropout({baked:g})"
     bands = [degree for degree in range(gaussians.sh_degree + 1) if degree == 0 or _band(gaussians, degree).any()]
-    facts = PlyFacts(
-        len(gaussians), gaussians.sh_degree, bands[-1], loaded.opacity_scale, loaded.for_rendering, dropout
-    )
-    model = TrainedModel(
-        gaussians=gaussians.to(device),
-        background=background.to(device),
-        treatment=Treatment(dropout, scale=1.0 if loaded.for_rendering else 1.0 - dropout),
-    )
+    facts = PlyFacts(len(gaussians), gaussians.sh_degree, bands[-1], loaded.opacity_scale, loaded.for_rendering, text)
+    model = TrainedModel(gaussians.to(device), background.to(device), text, loaded.step)
+    if baked > 0 and not loaded.for_rendering and not math.isclose(model.dropout, baked, rel_tol=1e-6):
+        raise ValueError(f"{ply} was scaled for dropout {baked:g}, not for {text}: leave out --regularizer.")
     return model, facts
 
 
@@ -112,7 +118,7 @@ def score_ply(
     out: Path | None = None,
     *,
     background: str = "black",
-    dropout: float = 0.0,
+    regularizer: str | None = None,
     samples: int = 5,
     seed: int = 0,
     perceptual: PerceptualMetric | None = None,
@@ -126,7 +132,7 @@ def score_ply(
         where: the scene or the orbit.
         out: folder for the results; ``<ply>_evaluation`` by default.
         background: of an orbit, ``"black"`` or ``"white"``; a scene has its own.
-        dropout: as of `of_ply`.
+        regularizer: as of `of_ply`.
         samples: K of the CA score.
         seed: of its masks.
         perceptual: a perceptual metric.
@@ -141,7 +147,7 @@ def score_ply(
     if scene is None and background not in BACKGROUNDS:
         raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {background!r}.")
     color = torch.tensor(BACKGROUNDS[background]) if scene is None else scene.background
-    model, facts = of_ply(ply, background=color, dropout=dropout, device=device)
+    model, facts = of_ply(ply, background=color, regularizer=regularizer, device=device)
     say(f"{ply}: {facts}")
     about: dict[str, object] = {"ply": asdict(facts)}
     views: Mapping[str, Sequence[Viewpoint]]

@@ -14,6 +14,7 @@ from ca_reg.functional import apply_dropout, draw_keep_mask, expected_squared_er
 from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
+from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.folder import CHECKPOINT
@@ -33,7 +34,6 @@ from reference_trainer.studies.gradient_noise_report import gradient_noise_figur
 from reference_trainer.studies.timing import now
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation
-from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream
 
 __all__ = ["gradient_noise", "study_gradient_noise"]

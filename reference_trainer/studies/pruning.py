@@ -13,12 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import format_mean_std, machine, markdown_table, mean_std, write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
 from reference_trainer.json_files import read_json
-from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.runs.settings import read_run_settings

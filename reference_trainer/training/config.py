@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from ca_reg import Chain, GaussianDropout, OpacityNoise
-from ca_reg.regularizers import REGULARIZERS
+from ca_reg import Chain
+from ca_reg.regularizers import parse
 from reference_trainer.density import DENSITY, DensityStrategy
 from reference_trainer.losses import LOSSES, LossTerm
 from reference_trainer.render.renderers import RENDERERS, Renderer
@@ -150,10 +150,15 @@ class TrainConfig:
         if not 0 < self.opacity_decay <= 1:
             raise ValueError(f"opacity_decay must be in (0, 1], got {self.opacity_decay}: 1 turns it off.")
 
+    @property
+    def regularizers(self) -> str:
+        """All regularizers as one expression, dropout and noise first."""
+        own = [f"{name}({rate!r})" for name, rate in (("dropout", self.dropout), ("noise", self.noise)) if rate]
+        return " + ".join([*own, *([self.regularizer] if self.regularizer.strip() else [])])
+
     def make_regularizer(self) -> Chain:
         """Make the regularizers; empty if there are none."""
-        own = [make(rate) for make, rate in ((GaussianDropout, self.dropout), (OpacityNoise, self.noise)) if rate]
-        return Chain(*own, *REGULARIZERS.make(self.regularizer))
+        return parse(self.regularizers)
 
     def make_losses(self) -> list[LossTerm]:
         """Make the terms of the loss."""

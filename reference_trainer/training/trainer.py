@@ -21,7 +21,7 @@ from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.initial import initial_gaussians
 from reference_trainer.training.interruption import hold_interrupts
-from reference_trainer.training.randomness import stream, view_order
+from reference_trainer.training.randomness import view_order
 from reference_trainer.training.state import read_state
 from reference_trainer.training.step import Step
 

@@ -12,9 +12,9 @@ from oracles import random_scene
 from stand_ins.gsplat import centred, rasterization
 
 from reference_trainer.density.statistics import DensityStatistics
+from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.render import render
 from reference_trainer.render.gsplat import load_gsplat_render, render_by
-from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.training.trainer import Trainer
 
 N, WIDTH, HEIGHT = 80, 40, 24

@@ -15,9 +15,9 @@ from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, CONFIG, PLAN, P
 from reference_trainer.runs.run import load_run, model_of, run_experiment, summary
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.plan import Plan
-from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
 EVERY = {"monitor_every": 3, "checkpoint_every": 4}

@@ -12,6 +12,7 @@ from PIL import Image
 
 from ca_reg.functional import draw_keep_mask
 from reference_trainer.evaluation.results import write_json
+from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.runs.folder import CHECKPOINT
 from reference_trainer.runs.folder import CONFIG as RUN_CONFIG
@@ -27,7 +28,6 @@ from reference_trainer.studies.gradient_noise_moments import (
 )
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.expectation import render_expectation
-from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 

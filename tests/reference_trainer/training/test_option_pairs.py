@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
+from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render import render
@@ -26,7 +27,6 @@ from reference_trainer.training import trainer as trainer_module
 from reference_trainer.training.config import PRESETS, TrainConfig
 from reference_trainer.training.determinism import deterministic
 from reference_trainer.training.expectation import render_expectation
-from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 

@@ -11,8 +11,8 @@ from reference_trainer.density.operations import reset_opacity
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.training import trainer as trainer_module
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.trainer import Trainer
 
 

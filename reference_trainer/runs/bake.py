@@ -1,0 +1,61 @@
+"""Give a finished model the opacities of the test for viewers, once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from reference_trainer.model.ply import load_ply
+from reference_trainer.runs.run import save_for_viewers
+from reference_trainer.runs.score_ply import of_ply
+
+__all__ = ["bake_ply"]
+
+
+def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> str:
+    """Write a PLY with the opacities that a model is to be rendered with, such as times 1 - p after dropout p.
+
+    Viewers know nothing of regularizers and would show the plain opacities. A header comment records what was done;
+    with it, no program of this package does it again. The layout is that of `save_ply`; unknown properties are left
+    out.
+
+    Args:
+        source: the PLY of a model that was trained with regularizers, opacities plain.
+        target: the file to write; it must not exist.
+        regularizer: what it was trained with, such as ``"dropout(0.2)"``, where the PLY does not say so.
+
+    Returns:
+        The expression of the regularizers.
+
+    Raises:
+        ValueError: if nobody says what it was trained with, the expression cannot be understood, the test-time
+            opacities are the plain ones, or those of the source are scaled already.
+        FileExistsError: if the target exists: plain opacities are needed to train on and are never overwritten.
+        FileNotFoundError: if there is no source.
+
+    Example:
+        >>> import tempfile
+        >>> from reference_trainer.model.gaussians import Gaussians
+        >>> from reference_trainer.model.ply import save_ply
+        >>> gaussians = Gaussians.from_points(torch.rand(5, 3), torch.rand(5, 3), torch.full((5,), 0.1), sh_degree=0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plain, baked = Path(folder, "plain.ply"), Path(folder, "baked.ply")
+        ...     save_ply(gaussians, plain)
+        ...     _ = bake_ply(plain, baked, regularizer="dropout(0.2)")
+        ...     load_ply(baked).opacity_scale
+        0.8
+    """
+    if target.exists():
+        raise FileExistsError(f"{target} exists already: give another --out, or delete it.")
+    loaded = load_ply(source)
+    if loaded.for_rendering or loaded.opacity_scale != 1:
+        by = "those of the test" if loaded.for_rendering else f"scaled by {loaded.opacity_scale:g}"
+        raise ValueError(f"the opacities of {source} are {by} already: give the PLY with plain ones.")
+    model, facts = of_ply(source, background=torch.zeros(3), regularizer=regularizer)
+    if not facts.regularizer:
+        raise ValueError(f"{source} does not say what it was trained with: give --regularizer, such as 'dropout(0.2)'.")
+    if model.factor == 1:
+        raise ValueError(f"a model trained with {facts.regularizer} is rendered as it is: there is nothing to bake.")
+    save_for_viewers(model, target)
+    return facts.regularizer
