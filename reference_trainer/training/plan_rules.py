@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from reference_trainer.losses import Photometric
 from reference_trainer.scenes.scene import PointCloud, Scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.initial import drawn_by_any, initial_gaussians, pixels_of
@@ -59,7 +60,10 @@ def background(scene: Scene, config: TrainConfig) -> Finding:
 
 def depth_output(scene: Scene, config: TrainConfig) -> Finding:
     """No loss looks at depth."""
-    return Finding("depth output", "left out", "by construction: no loss looks at depth, so it is not accumulated")
+    asking = [type(term).__name__ for term in config.make_losses() if "depth" in term.needs]
+    if asking:
+        return Finding("depth output", "used", f"asked for: {', '.join(asking)} looks at it")
+    return Finding("depth output", "left out", "by construction: no term of the loss looks at depth")
 
 
 def distortion(scene: Scene, config: TrainConfig) -> Finding:
@@ -96,10 +100,20 @@ def opacity_reset(scene: Scene, config: TrainConfig) -> Finding:
 def dropped(scene: Scene, config: TrainConfig) -> Finding:
     """Dropped Gaussians."""
     name = "dropped Gaussians"
-    if config.dropout == 0 or config.analytic:
+    regularizer = config.make_regularizer()
+    if not regularizer.drops or config.analytic:
         return Finding(name, "left out", "by construction: training draws no masks")
-    reason = f"by construction: {config.dropout:.0%} of the Gaussians are neither projected nor sorted in a step"
+    reason = "by construction: what a mask drops is neither projected nor sorted in the step"
     return Finding(name, "left out", reason)
+
+
+def regularizer_inputs(scene: Scene, config: TrainConfig) -> Finding:
+    """What the regularizers look at beside the opacities."""
+    needed = ", ".join(config.make_regularizer().needs)
+    if needed:
+        return Finding("inputs of the regularizers", "used", f"asked for: they need {needed}")
+    reason = "by construction: they look at opacities alone, so neither neighbors nor depths are computed"
+    return Finding("inputs of the regularizers", "left out", reason)
 
 
 def unseen(scene: Scene, config: TrainConfig) -> Finding:
@@ -125,8 +139,8 @@ def ssim_windows(scene: Scene, config: TrainConfig) -> Finding:
     colour = scene.background[:, None, None]
     busy = [(view.image != colour).any(0) for view in scene.train]
     share = sum(float(part.any(1).float().mean() * part.any(0).float().mean()) for part in busy) / len(busy)
-    if config.lambda_dssim == 0:
-        return Finding("SSIM windows without change", "left out", "by construction: lambda_dssim is 0")
+    if not any(isinstance(term, Photometric) and term.lambda_dssim > 0 for term in config.make_losses()):
+        return Finding("SSIM windows without change", "left out", "by construction: the loss has no SSIM")
     reason = (
         f"the box around what differs from the background is {share:.0%} of a picture; cutting it out gains nothing"
     )
@@ -160,6 +174,7 @@ RULES: tuple[Callable[[Scene, TrainConfig], Finding], ...] = (
     densification,
     opacity_reset,
     dropped,
+    regularizer_inputs,
     unseen,
     saturated,
     ssim_windows,
