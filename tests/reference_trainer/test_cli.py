@@ -8,6 +8,7 @@ import torch
 
 from reference_trainer import cli
 from reference_trainer.cli import main
+from reference_trainer.evaluation import tables
 from reference_trainer.runs import compare as compare_module
 from reference_trainer.runs import run as run_module
 from reference_trainer.runs import score_ply as score_module
@@ -155,7 +156,7 @@ def test_a_cluster_may_have_the_card(monkeypatch, tmp_path):
 def test_the_scene_of_a_training_may_be_given_either_way(arguments, monkeypatch, capsys, tmp_path):
     asked = []
     monkeypatch.setattr(run_module, "run_experiment", lambda scene, config, out, **rest: asked.append(scene))
-    monkeypatch.setattr(run_module, "summary", lambda results: "")
+    monkeypatch.setattr(tables, "summary", lambda results: "")
     main(["train", *arguments, "--views", "5", "--out", str(tmp_path)])
     assert asked == [SceneOptions("garden", views=5)]
     assert "not both: got garden and fern" in refused(["train", "garden", "--path", "fern"], capsys)
@@ -263,7 +264,7 @@ def test_options_override_the_preset(preset, monkeypatch, tmp_path):
         return {}
 
     monkeypatch.setattr(run_module, "run_experiment", fake)
-    monkeypatch.setattr(run_module, "summary", lambda results: "")
+    monkeypatch.setattr(tables, "summary", lambda results: "")
     main(["train", "--preset", preset, "--iterations", "3", "--noise", "0.8", "--path", "fern", "--images", "images_8",
           "--views", "5", "--out", str(tmp_path)])  # fmt: skip
     expected = PRESETS[preset]
@@ -275,7 +276,7 @@ def test_options_override_the_preset(preset, monkeypatch, tmp_path):
 def test_the_preset_of_binocular_decays_opacities(monkeypatch, tmp_path):
     asked = []
     monkeypatch.setattr(run_module, "run_experiment", lambda scene, config, out, **rest: asked.append(config))
-    monkeypatch.setattr(run_module, "summary", lambda results: "")
+    monkeypatch.setattr(tables, "summary", lambda results: "")
     main(["train", "--iterations", "3", "--preset=binocular", "--out", str(tmp_path)])
     assert (asked[0].opacity_decay, asked[0].iterations) == (0.995, 3)
 

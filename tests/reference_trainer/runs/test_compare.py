@@ -11,7 +11,7 @@ from stand_ins.engine import Here
 
 from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.pictures import save_png
-from reference_trainer.evaluation.tables import comparison_table
+from reference_trainer.evaluation.tables import comparison_table, summary
 from reference_trainer.render import chosen_engine
 from reference_trainer.runs import demo as demo_module
 from reference_trainer.runs import grid
@@ -22,6 +22,7 @@ from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.grid import Running
+from reference_trainer.runs.measure import render_run
 from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
@@ -130,6 +131,28 @@ def test_failed_runs_are_listed_at_the_end(tmp_path):
         "1 of 1 runs FAILED; the same command tries them again:",
         f"FAILED a, seed 0: ValueError: no ({tmp_path / REPORT} has the traceback)",
     ]
+
+
+def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch):
+    """Nothing is held out: exact CA is reported at the training views, between them and around them."""
+    load = SceneOptions.load
+    monkeypatch.setattr(SceneOptions, "load", lambda *a, **named: dataclasses.replace(load(*a, **named), test=()))
+    said: list[str] = []
+    results = run_experiment(options, short, tmp_path / "a" / "seed_0", say=said.append)
+    assert sum(line.startswith("No test views") for line in said) == 1
+    assert list(results["mean"]) == ["train", "between", "around"]
+    assert all(isinstance(results["mean"][split]["ca_exact"], float) for split in results["mean"])
+    assert [split for split in results["mean"] if results["mean"][split]["psnr"] is not None] == ["train"]
+    assert "| between | n/a |" in summary(results)
+    (row,) = cells(comparison_table({"a": [results]}))
+    for split in ("train", "between", "around"):
+        assert row[f"{split} exact CA x1e-3"] == f"{1e3 * results['mean'][split]['ca_exact']:.4g}"
+    assert not any(title.startswith("test") for title in row)
+    report({tmp_path: Comparison({"a": [results]}, {})}, say=said.append)
+    names = {f"{view['split']}_{view['name']}.png" for view in results["views"] if view["split"] != "train"}
+    assert {path.name for path in tmp_path.glob("*.png")} == {"dynamics.png", *names}
+    with pytest.raises(ValueError, match="no test view: give --what train"):
+        render_run(tmp_path / "a" / "seed_0", "test")
 
 
 @pytest.mark.parametrize("lines", [None, ""])

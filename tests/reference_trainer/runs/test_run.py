@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from ca_reg.monitor import LOG_NAME
+from reference_trainer.evaluation.tables import summary
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import run as run_module
 from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, CONFIG, PLAN, PLY, RESULTS
-from reference_trainer.runs.run import load_run, model_of, run_experiment, summary
+from reference_trainer.runs.run import load_run, model_of, run_experiment
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
