@@ -3,51 +3,90 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-__all__ = ["Deviations", "RenderMoments", "VarianceMap", "jackknife_error", "merge"]
+__all__ = ["Deviations", "RenderMoments"]
 
 
 class RenderMoments:
-    """Mean and scatter of the renders seen so far, by Welford's recursion in float64.
+    """Sums of the renders seen so far, and of their squares, in groups that take turns.
 
-    The memory is one image and two maps, however many renders are added. float64 and this recursion are both needed:
-    the variance of renders that hardly differ is lost in E[x^2] - E[x]^2.
+    The memory is two images, and an image and a map for each group, however many renders are added: in float32, or
+    in float64 if the renders are. All are taken from the first render: what renders have in common, which would drown
+    their variance in E[x^2] - E[x]^2, is gone before anything is squared. In a pixel where K renders agree and the
+    first differs, the square of the mean still is K - 1 times the variance, so a variance errs by at most about K^2
+    roundings there, and by a few of them as a rule.
+
+    Args:
+        groups: in which renders are pooled; each gets every ``groups``-th one.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, groups: int = 1) -> None:
         self.count = 0
-        self.mean = torch.empty(0)  # (3, H, W)
-        self.scatter = torch.empty(0)  # (H, W): sum of squared deviations, mean over RGB
-        self.visible = torch.empty(0)  # (H, W): visible in all renders
+        self._groups = groups
+        self._first = self._scratch = torch.empty(0)  # (3, H, W)
+        self._sums = self._squares = torch.empty(0)  # (G, 3, H, W) and (G, H, W)
 
-    def add(self, image: Tensor, visible: Tensor) -> None:
-        """Take in one render: colours (3, H, W) and visible pixels (H, W)."""
-        x = image.to(torch.float64)
+    def add(self, image: Tensor) -> None:
+        """Take in one render (3, H, W)."""
         if self.count == 0:
-            self.mean = torch.zeros_like(x)
-            self.scatter = torch.zeros_like(x[0])
-            self.visible = torch.ones_like(visible)
-        elif x.shape != self.mean.shape:
+            self._first = image.to(torch.promote_types(image.dtype, torch.float32), copy=True)
+            self._scratch = torch.empty_like(self._first)
+            self._sums = self._first.new_zeros(self._groups, *image.shape)
+            self._squares = self._first.new_zeros(self._groups, *image.shape[1:])
+        elif image.shape != self._first.shape:
             raise ValueError(
-                f"the renders of one view must have one size, got {tuple(self.mean.shape)} and then {tuple(x.shape)}."
+                f"the renders of one view must have one size, got {tuple(self._first.shape)} and then "
+                f"{tuple(image.shape)}."
             )
+        group = self.count % self._groups
+        deviation = torch.sub(image, self._first, out=self._scratch)
+        self._sums[group] += deviation
+        _add_squares(self._squares[group], deviation)
         self.count += 1
-        deviation = x - self.mean
-        self.mean += deviation / self.count
-        self.scatter += (deviation * (x - self.mean)).mean(0)
-        self.visible &= visible
+
+    def variance(self, ddof: int) -> Tensor:
+        """Return the variance of every pixel, mean over RGB, (H, W), float64; it divides by ``count - ddof``."""
+        scatter = _scatter(self._squares.sum(0), self._sums.sum(0), self.count)
+        return scatter.clamp_(min=0).to(torch.float64) / (3 * (self.count - ddof))
+
+    def jackknife_error(self, visible: Tensor) -> float:
+        """Return the standard error over masks of the unbiased variance, averaged over the visible pixels (H, W).
+
+        The delete-a-group jackknife: leave out one group after the other and see how the value moves. With groups of
+        one render it is the ordinary jackknife. Groups may differ in size (pseudo-values of Busing, Meijer and van der
+        Leeden 1999). The visible region is held fixed. nan below three renders, where nothing can be left out.
+        """
+        if self.count < 3:
+            return math.nan
+        weights = visible.to(self._first.dtype) / (3 * visible.sum())
+        squares, sums = self._squares.sum(0), self._sums.sum(0)
+
+        def value(squares: Tensor, sums: Tensor, count: int) -> float:
+            return float(_scatter(squares, sums, count).mul_(weights).sum()) / (count - 1)
+
+        ratios, left_out = [], []
+        for group in range(min(self._groups, self.count)):
+            rest = self.count - len(range(group, self.count, self._groups))
+            others = torch.sub(sums, self._sums[group], out=self._scratch)
+            left_out.append(value(squares - self._squares[group], others, rest))
+            ratios.append(self.count / (self.count - rest))
+        whole = value(squares, sums, self.count)
+        pseudo = [r * whole - (r - 1) * v for r, v in zip(ratios, left_out, strict=True)]
+        # The jackknife value, sum over groups of pseudo-values weighted by the share of their renders.
+        center = sum(x / r for x, r in zip(pseudo, ratios, strict=True))
+        spread = sum((x - center) ** 2 / (r - 1) for x, r in zip(pseudo, ratios, strict=True))
+        return math.sqrt(spread / len(ratios))
 
 
 class Deviations:
-    """Deviations of renders from the expected image over a fixed region: the error of their variance, in float64."""
+    """Deviations of renders from the expected image over a fixed region: the error of their variance."""
 
     def __init__(self, expected: Tensor, visible: Tensor) -> None:
-        """Take the expected image (3, H, W) and the visible pixels (H, W); nothing of the former is kept."""
-        self._expected = expected[:, visible].to(torch.float64)
+        """Take the expected image (3, H, W) and the visible pixels (H, W)."""
+        self._expected = expected.to(torch.promote_types(expected.dtype, torch.float32), copy=True)
         self._visible = visible
         self._last: Tensor | None = None
         self._squares: list[Tensor] = []
@@ -55,15 +94,15 @@ class Deviations:
 
     def add(self, image: Tensor) -> None:
         """Take in one render (3, H, W)."""
-        if image.shape[1:] != self._visible.shape:
+        if image.shape != self._expected.shape:
             raise ValueError(
-                f"the renders of one view must have one size, got {tuple(self._visible.shape)} and then "
-                f"{tuple(image.shape[1:])}."
+                f"the renders of one view must have one size, got {tuple(self._expected.shape)} and then "
+                f"{tuple(image.shape)}."
             )
-        deviation = image[:, self._visible] - self._expected
-        self._squares.append(deviation.square().mean())
+        deviation = (image - self._expected).mul_(self._visible)
+        self._squares.append(deviation.square().sum())
         if self._last is not None:
-            self._products.append((deviation * self._last).mean())
+            self._products.append((deviation * self._last).sum())
         self._last = deviation
 
     def std_error(self) -> float:
@@ -76,58 +115,18 @@ class Deviations:
         image that is not quite the expected one makes the error larger, as a rule.
         """
         count = len(self._squares)
-        first = float(torch.stack(self._squares).var()) / count
-        second = 2.0 * float(torch.stack(self._products).square().mean()) / (count * (count - 1))
-        return math.sqrt(first + second)
+        squares, products = (torch.stack(x).to(torch.float64) for x in (self._squares, self._products))
+        both = squares.var() / count + 2.0 * products.square().mean() / (count * (count - 1))
+        return math.sqrt(float(both)) / (3 * int(self._visible.sum()))
 
 
-@dataclass(frozen=True, eq=False)
-class VarianceMap:
-    """The moments of all groups together: count, mean (3, H, W), scatter (H, W) and visible pixels (H, W)."""
-
-    count: int
-    mean: Tensor
-    scatter: Tensor
-    visible: Tensor
+def _scatter(squares: Tensor, sums: Tensor, count: int) -> Tensor:
+    """Return the sum of squared deviations from the mean, over RGB as well; written over ``squares``."""
+    return _add_squares(squares, sums, -1 / count)
 
 
-def merge(groups: list[RenderMoments]) -> VarianceMap:
-    """Pool disjoint groups of renders: scatter within the groups plus scatter of the group means."""
-    sizes = {tuple(group.mean.shape) for group in groups}
-    if len(sizes) > 1:
-        raise ValueError(f"the renders of one view must have one size, got {' and '.join(map(str, sorted(sizes)))}.")
-    count = 0
-    mean = torch.zeros_like(groups[0].mean)
-    for group in groups:
-        count += group.count
-        mean += (group.mean - mean) * (group.count / count)  # exact when the groups are equal, unlike a weighted sum
-    scatter = torch.zeros_like(groups[0].scatter)
-    visible = torch.ones_like(groups[0].visible)
-    for group in groups:
-        scatter += group.scatter + group.count * (group.mean - mean).square().mean(0)
-        visible &= group.visible
-    return VarianceMap(count, mean, scatter, visible)
-
-
-def jackknife_error(groups: list[RenderMoments], total: VarianceMap) -> float:
-    """Return the standard error over masks of the unbiased variance, averaged over the visible pixels.
-
-    The delete-a-group jackknife: leave out one group after the other and see how the value moves. With groups of one
-    render it is the ordinary jackknife. Groups may differ in size (pseudo-values of Busing, Meijer and van der Leeden
-    1999). The visible region is held fixed. nan below three renders, where nothing can be left out.
-    """
-    if total.count < 3:
-        return math.nan
-    scatter = float(total.scatter[total.visible].mean())
-    value = scatter / (total.count - 1)
-    ratios, left_out = [], []
-    for group in groups:
-        rest = total.count - group.count
-        own = group.scatter + group.count * total.count / rest * (group.mean - total.mean).square().mean(0)
-        left_out.append((scatter - float(own[total.visible].mean())) / (rest - 1))
-        ratios.append(total.count / group.count)
-    pseudo = [r * value - (r - 1) * v for r, v in zip(ratios, left_out, strict=True)]
-    # The jackknife value, sum over groups of pseudo-values weighted by the share of their renders.
-    center = sum(x / r for x, r in zip(pseudo, ratios, strict=True))
-    spread = sum((x - center) ** 2 / (r - 1) for x, r in zip(pseudo, ratios, strict=True))
-    return math.sqrt(spread / len(groups))
+def _add_squares(to: Tensor, image: Tensor, factor: float = 1.0) -> Tensor:
+    """Add factor times the squares of an image (3, H, W), channel by channel, to a map (H, W)."""
+    for channel in image:
+        to.addcmul_(channel, channel, value=factor)
+    return to

@@ -12,10 +12,10 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from ca_reg._accumulate import Deviations, RenderMoments, jackknife_error, merge
+from ca_reg._accumulate import Deviations, RenderMoments
 from ca_reg._check import check_count, check_opacity, check_opacity_range, check_rate
 from ca_reg._settings import GROUPS, LEAST, ROUND, make_settings
-from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
+from ca_reg.functional import Multiplier, draw_keep_mask
 from ca_reg.reason import Reason
 from ca_reg.result import CAResult, CASummary, ViewTally
 from ca_reg.types import (
@@ -54,8 +54,8 @@ class CAScore:
     region held fixed. It errs on the large side when samples are few (by some 15 % at 5 samples, 50 % at 3), and needs
     at least three.
 
-    The memory does not grow with ``samples``: renders are pooled in at most 8 groups, each with one float64 image and
-    two maps.
+    The memory does not grow with ``samples``: renders are pooled in at most 8 groups, each with one image and one map
+    of the precision of the renders, at least float32.
 
     Two other methods go to the limit of infinitely many renders. For the paper's region, the pixels that all renders
     cover, there is no such limit, because it shrinks with every render; both take the pixels whose *expected* alpha
@@ -254,18 +254,20 @@ class CAScore:
                 raise TypeError("a score needs alpha_mean, the expected accumulated alpha, for its visible region.")
             return read, read.alpha_mean
 
-        broken, background = [], None
+        broken, background = False, None
         if settings.method == "exact_neutral":
             # Over black the mean is sum w c, and the expected alpha sum w: no background has to be taken out again.
             over_black, total = moments(opacity.new_zeros(3))
-            broken.append(_is_broken(over_black.mean, total))
-            neutral = over_black.mean / torch.where(total > 0, total, 1.0)
-            neutral = neutral.nan_to_num(0.0, 0.0, 0.0)
+            black, broken = _finite(over_black.mean, total, total, 0)
+            neutral = (black / torch.where(total > 0, total, 1.0)).nan_to_num(0.0, 0.0, 0.0)
             background = neutral if self.layout == "CHW" else neutral.permute(1, 2, 0)
         image, alpha = moments(background)
-        broken += [_is_broken(colors, alpha) for colors in (image.mean, image.variance)]
-        variance = image.variance.to(torch.float64).mean(0)
-        visible = alpha.to(variance.device) > settings.threshold
+        alpha = alpha.to(image.variance.device)
+        visible = alpha > settings.threshold
+        for colors in image[:2]:
+            colors, odd = _finite(colors, alpha, alpha, settings.threshold)
+            broken |= odd
+        variance = colors.mean(0).to(torch.float64)
         value, reason = _mean(variance, visible, broken)
         std_error = 0.0 if reason is Reason.OK else math.nan
         result = self._result(value, std_error, variance, visible, reason, None)
@@ -276,21 +278,21 @@ class CAScore:
         settings = self.settings
         assert settings.samples is not None
         assert settings.ddof is not None
-        groups = [RenderMoments() for _ in range(min(settings.samples, GROUPS))]
-        broken = []
-        for k, masked in enumerate(self._masked(opacity, index, settings.samples)):
+        moments, lowest, broken = RenderMoments(min(settings.samples, GROUPS)), torch.tensor(math.inf), False
+        for masked in self._masked(opacity, index, settings.samples):
             image, alpha = self._render(render_fn, masked, view)
-            groups[k % len(groups)].add(image, alpha > settings.threshold)
-            broken.append(_is_broken(image, alpha))
-        total = merge(groups)
-        divisor = total.count - settings.ddof
-        variance = total.scatter / divisor
-        value, reason = _mean(variance, total.visible, broken)
+            lowest = torch.minimum(lowest.to(alpha), alpha)
+            image, odd = _finite(image, alpha, lowest, settings.threshold)
+            broken |= odd
+            moments.add(image)
+        visible = lowest > settings.threshold
+        variance = moments.variance(settings.ddof)
+        value, reason = _mean(variance, visible, broken)
         std_error = math.nan
         if reason is Reason.OK:
             # For a given visible region the two variances differ by this factor exactly, and so do their errors.
-            std_error = jackknife_error(groups, total) * (total.count - 1) / divisor
-        return self._result(value, std_error, variance, total.visible, reason, total.count)
+            std_error = moments.jackknife_error(visible) * (moments.count - 1) / (moments.count - settings.ddof)
+        return self._result(value, std_error, variance, visible, reason, moments.count)
 
     def _adapt(self, render_fn: RenderFn, opacity: Tensor, view: Any, index: int) -> CAResult:
         """Render until the error is small enough, over the pixels that the expected image covers.
@@ -302,17 +304,18 @@ class CAScore:
         assert settings.max_samples is not None
         expected, alpha = self._render(render_fn, opacity * (1.0 - settings.drop_rate), view)
         visible = alpha > settings.threshold
-        broken = [_is_broken(expected, alpha)]
+        expected, broken = _finite(expected, alpha, visible, 0)
         moments, deviations = RenderMoments(), Deviations(expected, visible)
         del expected, alpha  # they may be a buffer of the renderer, which the next render fills
         result = None
         for k, masked in enumerate(self._masked(opacity, index, settings.max_samples), start=1):
             image, alpha = self._render(render_fn, masked, view)
-            moments.add(image, visible)
+            image, odd = _finite(image, alpha, visible, 0)
+            broken |= odd
+            moments.add(image)
             deviations.add(image)
-            broken.append(_is_broken(image, alpha))
             if k == settings.max_samples or (k >= LEAST and k % ROUND == 0):
-                variance = moments.scatter / (k - 1)
+                variance = moments.variance(ddof=1)
                 value, reason = _mean(variance, visible, broken)
                 result = self._result(value, self._error(value, deviations), variance, visible, reason, k)
                 if self._is_settled(result):
@@ -338,7 +341,7 @@ class CAScore:
         generator.manual_seed(int(entropy[0] >> np.uint64(1)))
         for _ in range(count):
             keep = draw_keep_mask(opacity.shape[0], self.settings.drop_rate, generator=generator, device=opacity.device)
-            yield apply_dropout(opacity, keep)
+            yield opacity * keep.view_as(opacity)  # all are finite
 
     def _render(self, render_fn: RenderFn, opacity: Tensor, view: Any) -> tuple[Tensor, Tensor]:
         """Render colours (3, H, W) and alpha (H, W) with masked opacities."""
@@ -354,7 +357,7 @@ class CAScore:
                 "(image, alpha); return a mapping or object with an alpha named alpha, rendered_alpha or accumulation; "
                 "or give CAScore an alpha_fn(opacity, view) that renders all colours 1 on a background of 0."
             )
-        return image, read_alpha.to(image.device)
+        return image.contiguous(), read_alpha.to(image.device)
 
     def _result(
         self, value: float, std_error: float, variance: Tensor, visible: Tensor, reason: Reason, samples: int | None
@@ -377,21 +380,25 @@ def view_position(count: int, group: dist.ProcessGroup | None = None) -> int:
     return dist.get_rank(group) + dist.get_world_size(group) * count
 
 
-def _is_broken(colors: Tensor, alpha: Tensor) -> Tensor:
-    """Whether there is NaN or infinity in the alpha (H, W), in the colours (3, H, W) where alpha is not 0, or all over.
+def _finite(colors: Tensor, alpha: Tensor, cover: Tensor, threshold: float) -> tuple[Tensor, bool]:
+    """Return colours (3, H, W) with 0 for those that are not finite, and whether these matter, or one in alpha (H, W).
 
-    Where nothing covers a pixel some renderers divide 0 by 0. A bool tensor, which nobody has waited for yet.
+    They do unless alpha is 0 there and ``cover`` (H, W) at most the threshold; some renderers divide 0 by 0 where
+    nothing covers a pixel. They always do if no pixel is left.
     """
+    if bool((colors.sum() + alpha.sum()).isfinite()):
+        return colors, False
     odd = ~colors.isfinite().all(0)
-    covered = alpha.to(colors.device)
-    return (~covered.isfinite() | (odd & (covered != 0))).any() | odd.all()
+    broken = (~alpha.isfinite() | (odd & ((alpha != 0) | (cover > threshold)))).any() | odd.all()
+    return colors.masked_fill(odd, 0.0), bool(broken)
 
 
-def _mean(variance: Tensor, visible: Tensor, broken: list[Tensor]) -> tuple[float, Reason]:
-    """Average over the visible pixels, or say why not; ``broken`` is what was found in each image."""
-    if bool(torch.stack(broken).any()):
+def _mean(variance: Tensor, visible: Tensor, broken: bool) -> tuple[float, Reason]:
+    """Average over the visible pixels, or say why not; ``broken`` is what `_finite` found."""
+    pixels = int(visible.count_nonzero())
+    if broken:
         return math.nan, Reason.NOT_FINITE
-    if not bool(visible.any()):
+    if pixels == 0:
         return math.nan, Reason.EMPTY
-    mean = float(variance[visible].mean())
+    mean = float((variance * visible).sum()) / pixels
     return (mean, Reason.OK) if math.isfinite(mean) else (math.nan, Reason.NOT_FINITE)
