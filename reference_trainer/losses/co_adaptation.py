@@ -29,6 +29,7 @@ class CoAdaptation(LossTerm):
         ValueError: if one is out of range.
     """
 
+    needs: ClassVar[frozenset[str]] = frozenset({"moments"})
     analytic: ClassVar[bool] = True
 
     def __init__(self, weight: float = 1.0, p: float = 0.5) -> None:

@@ -17,7 +17,7 @@ class LossTerm(abc.ABC):
     """A summand of the loss of a step, its weight included; a term of one's own is a subclass.
 
     Attributes:
-        needs: of the render of a step, beside image and alpha: ``"depth"``.
+        needs: of the renderer, beside image and alpha: ``"depth"``, which the render of the step then has, ``"moments"``.
         analytic: whether the term knows what to do with an expected image and its variance, without a draw.
     """
 

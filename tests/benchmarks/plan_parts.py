@@ -38,13 +38,13 @@ def parts_of_a_step(trainer: Trainer, *, repeats: int = 7) -> dict[str, float]:
 
     def step(*, degree: int | None = None, depth: bool = False, opacities: Tensor | None = None) -> None:
         out = render_gaussians(gaussians, view.camera, background, opacities=opacities, sh_degree=degree, depth=depth)
-        loss = photometric_loss(out.image, view.image, trainer.config.lambda_dssim)
+        loss = photometric_loss(out.image, view.image)
         torch.autograd.grad(loss if out.depth is None else loss + 0 * out.depth.mean(), leaves, allow_unused=True)
 
     def without_background() -> None:
         g = gaussians
         out = render(g.means, g.quaternions, g.scales, g.opacities, view.camera, sh=g.sh)
-        loss = photometric_loss(out.image, view.image, trainer.config.lambda_dssim)
+        loss = photometric_loss(out.image, view.image)
         torch.autograd.grad(loss, leaves, allow_unused=True)
 
     calls: dict[str, Callable[[], object]] = {

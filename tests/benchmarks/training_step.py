@@ -63,14 +63,14 @@ def _one_step(trainer: Trainer, clock: Clock) -> dict[str, float]:
     times = [clock()]
     trainer.train_step()
     times.append(clock())
-    opacities = trainer.dropout(trainer.gaussians.opacities, generator=torch.Generator().manual_seed(trainer.step))
+    opacities = trainer.regularizer(trainer.gaussians.opacities, generator=torch.Generator().manual_seed(trainer.step))
     times.append(clock())
     out = render_gaussians(
         trainer.gaussians, view.camera, trainer.background, opacities=opacities, sh_degree=trainer.sh_degree
     )
     times.append(clock())
     image = out.image.detach().requires_grad_()
-    (gradient,) = torch.autograd.grad(photometric_loss(image, view.image, trainer.config.lambda_dssim), image)
+    (gradient,) = torch.autograd.grad(photometric_loss(image, view.image), image)
     times.append(clock())
     out.image.backward(gradient)  # type: ignore[no-untyped-call]
     times.append(clock())

@@ -95,7 +95,7 @@ def _trainer_fits(trainer: Any) -> None:
         return
     count = len(trainer.gaussians)
     assert count > 0
-    for x in (*vars(trainer.gaussians).values(), *vars(trainer.statistics).values()):
+    for x in (*(x for _, x in trainer.gaussians.named()), *trainer.density.state_dict().values()):
         assert x.dtype == torch.float32
         assert len(x) == count
         assert bool(x.isfinite().all()), "values that are not finite"

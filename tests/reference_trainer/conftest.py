@@ -88,4 +88,6 @@ def run(tmp_path_factory, options, short):
 def scaled(tmp_path_factory, options, short):
     """The same training, evaluated with opacities times the mean of their noise."""
     out = tmp_path_factory.mktemp("scaled")
-    return out, run_experiment(options, dataclasses.replace(short, scale_noise=True), out)  # measured at its end
+    return out, run_experiment(
+        options, dataclasses.replace(short, noise=0.0, regularizer="noise(0.3, scale=True)"), out
+    )  # measured at its end

@@ -36,4 +36,4 @@ def test_a_checkpoint_goes_on_with_any_device(card, tiny_scene, busy, tmp_path, 
     trainer = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene, then)
     trainer.train(until=9)
     assert {x.device.type for _, x in trainer.gaussians.named()} == {then}
-    assert {x.device.type for x in vars(trainer.statistics).values()} == {then}
+    assert {x.device.type for x in trainer.density.state_dict().values()} == {then}

@@ -192,7 +192,7 @@ def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
     assert evaluation["ca_settings"]["samples"] == 3
     assert evaluation["mean"]["test"]["psnr"] == results["mean"]["test"]["psnr"]
 
-    main(["evaluate", "--ply", str(trained / "point_cloud.ply"), "--dropout", "0.2", "--scene", "synthetic",
+    main(["evaluate", "--ply", str(trained / "point_cloud.ply"), "--regularizer", "dropout(0.2)", "--scene", "synthetic",
           "--downscale", "8", "--out", str(tmp_path / "p")])  # fmt: skip
     of_ply = json.loads((tmp_path / "p" / "evaluation.json").read_text())
     assert of_ply["views"] == results["views"]
@@ -206,12 +206,10 @@ def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
 @pytest.mark.slow
 def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path):
     main(["train", "--out", str(tmp_path / "run"), "--noise", "0.8", *SMALL])
-    main(["evaluate", str(tmp_path / "run"), "--scale-noise", "--samples", "2"])
+    main(["evaluate", str(tmp_path / "run"), "--regularizer", "noise(0.8, scale=True)", "--samples", "2"])
     results = json.loads((tmp_path / "run" / "results.json").read_text())
-    found = json.loads((tmp_path / "run" / "evaluation_scale_noise" / "evaluation.json").read_text())
-    assert found["expected_noise"] == 0.8
+    found = json.loads((tmp_path / "run" / "evaluation_noise_0_8_scale_True" / "evaluation.json").read_text())
     assert found["mean"]["test"]["psnr"] != results["mean"]["test"]["psnr"]
-    assert "was trained without noise" in refused(["evaluate", str(trained), "--scale-noise"], capsys)
 
 
 @pytest.mark.parametrize("flag", ["--path", "--scene"])
@@ -374,10 +372,10 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["evaluate", "--ply", "a.ply", "--downscale", "8"], "without photographs there is neither"),
         (["evaluate", "--ply", "a.ply", "--lpips", "installed"], "give --path"),
         (["evaluate", "--ply", "a.ply", "--background", "red"], "background must be one of black, white, got 'red'"),
-        (["bake", "nowhere.ply", "--dropout", "0.2"], "nowhere.ply"),
-        (["bake", "a.ply", "--dropout", "0"], "--dropout is the rate of the training, in (0, 1); got 0"),
-        (["evaluate", "--ply", "nowhere.ply", "--scale-noise"], "--scale-noise needs the folder of a run"),
-        (["train", "--scale-noise"], "scale_noise multiplies opacities by the mean of their noise: set noise"),
+        (["bake", "nowhere.ply"], "nowhere.ply"),
+        (["train", "--regularizer", "dropot(0.2)"], "there is no regularizer 'dropot'; choose one of"),
+        (["train", "--loss", "photometric(2.0)"], "lambda_dssim must lie in [0, 1], got 2.0"),
+        (["train", "--density", "none"], "there is no density strategy 'none'"),
     ],
 )
 def test_mistakes(arguments, message, capsys, tmp_path, monkeypatch):

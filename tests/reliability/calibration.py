@@ -17,7 +17,7 @@ from oracles import random_scene
 from torch import Tensor
 
 from ca_reg import CAScore, MomentsFn, RenderFn
-from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.render import render, splat
 from reference_trainer.render.moments import render_moments
 from reference_trainer.scenes.synthetic import synthetic_scene
@@ -77,7 +77,7 @@ def built_in_scene(dropout: float) -> Case:
     config = TrainConfig(iterations=400, dropout=dropout, opacity_reset_every=0, densify_from=100)
     trainer = Trainer(scene, config)
     trainer.train()
-    model = TrainedModel(trainer.gaussians, scene.background, Treatment(dropout))
+    model = TrainedModel(trainer.gaussians, scene.background, f"dropout({dropout})")
     return Case(model.render, model.moments, trainer.gaussians.opacities.detach(), scene.test[-1], {"p": dropout})
 
 

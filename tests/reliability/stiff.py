@@ -127,7 +127,7 @@ CASES: dict[str, Push] = {
     "reset to 0.01, noise 3": _with(opacity_reset=0.01, noise=3.0),
     "reset below the pruning": _with(opacity_reset=0.004),
     "dropout 0.99": _with(dropout=0.99),
-    "dropout 0.99, inverted": _with(dropout=0.99, compensate=True),
+    "dropout 0.99, inverted": _with(regularizer="dropout(0.99, compensate=True)"),
     "noise 10": _with(noise=10.0),
     "noise 10, exact expectation": _with(noise=10.0, analytic=True),
     "densify at every step": _with(densify_every=1, densify_from=1, densify_gradient=1e-6, max_gaussians=20_000),

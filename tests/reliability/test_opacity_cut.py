@@ -79,5 +79,5 @@ def test_what_stays_below_is_pruned_at_the_next_densification(scene):
     trainer.optimizer.set_opacity_logits(logits, forget=True)
     before = len(trainer.gaussians)
     trainer.step = 4
-    trainer._control_density()
+    trainer.density.before_step(trainer.optimizer, trainer.step)
     assert len(trainer.gaussians) == before - 40

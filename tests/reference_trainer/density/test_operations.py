@@ -45,7 +45,7 @@ def test_small_ones_are_cloned_large_ones_split_and_quiet_ones_stay():
     optimizer = optimizer_of(start)
     # The threshold itself selects; a Gaussian of just the size threshold (the last) is cloned.
     statistics = seen([0.5, 0.5, 0.49, 0.49, 0.9])
-    densify(optimizer, statistics, gradient_threshold=0.5, size_threshold=float(start.scales[4].max()))
+    densify(optimizer, statistics.mean_gradient >= 0.5, size_threshold=float(start.scales[4].max()))
     new = optimizer.gaussians
     assert len(new) == 5 - 1 + 2 + 2
     stayed, clones, children = torch.arange(4), torch.tensor([4, 5]), torch.tensor([6, 7])
@@ -63,7 +63,7 @@ def test_small_ones_are_cloned_large_ones_split_and_quiet_ones_stay():
 def test_nothing_to_do_changes_nothing():
     start = some(3)
     optimizer = optimizer_of(start)
-    densify(optimizer, seen([0.1, 0.2, 0.3]), gradient_threshold=0.5, size_threshold=0.1)
+    densify(optimizer, torch.zeros(3, dtype=torch.bool), size_threshold=0.1)
     assert torch.equal(optimizer.gaussians.means, start.means)
 
 
@@ -74,7 +74,7 @@ def test_children_are_where_the_generator_puts_them():
         optimizer = optimizer_of(start)
         state = torch.get_rng_state()
         g = torch.Generator().manual_seed(4)
-        densify(optimizer, seen([1, 1]), gradient_threshold=0.5, size_threshold=0.1, generator=g)
+        densify(optimizer, torch.ones(2, dtype=torch.bool), size_threshold=0.1, generator=g)
         assert torch.equal(torch.get_rng_state(), state)
         results.append(optimizer.gaussians.means.detach())
     assert torch.equal(*results)
@@ -103,10 +103,8 @@ def test_children_scatter_like_their_parent():
     log_scales = torch.tensor([[0.7, 0.2, 1.5]]).log()
     start = some(n, quaternions=turn.repeat(n, 1), log_scales=log_scales.repeat(n, 1), means=torch.zeros(n, 3))
     optimizer = optimizer_of(start)
-    statistics = DensityStatistics(torch.ones(n), torch.ones(n))
-    densify(
-        optimizer, statistics, gradient_threshold=0.5, size_threshold=0.1, generator=torch.Generator().manual_seed(0)
-    )
+    everyone = torch.ones(n, dtype=torch.bool)
+    densify(optimizer, everyone, size_threshold=0.1, generator=torch.Generator().manual_seed(0))
     offsets = optimizer.gaussians.means.detach().double()
     assert len(offsets) == 2 * n
     w, x, y, z = torch.nn.functional.normalize(turn[0].double(), dim=0).tolist()

@@ -12,7 +12,7 @@ from ca_reg.functional import Multiplier, opacity_noise
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores, evaluate
 from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.evaluation.pictures import file_names
-from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
 from reference_trainer.render import render
 from reference_trainer.scenes.images import read_image
@@ -36,7 +36,7 @@ def scores(result: Evaluation, quantity: str) -> list[float]:
 
 
 def test_scores_are_those_of_the_rendered_views(tiny_scene, gaussians):
-    model = TrainedModel(gaussians, tiny_scene.background, Treatment(scale=0.8))
+    model = TrainedModel(gaussians, tiny_scene.background, "dropout(0.2)")
     result = evaluate(model, of_scene(tiny_scene))
     views = [*tiny_scene.train, *tiny_scene.test]
     assert [(v.split, v.name) for v in result.views] == [("train" if v in tiny_scene.train else "test", v.name)
@@ -56,7 +56,7 @@ def test_scores_are_those_of_the_rendered_views(tiny_scene, gaussians):
 def test_images_are_scaled_for_the_test_and_co_adaptation_is_not(tiny_scene, gaussians):
     half = dataclasses.replace(gaussians, opacity_logits=inverse_sigmoid(0.5 * gaussians.opacities))
     plain = evaluate(TrainedModel(gaussians, tiny_scene.background), of_scene(tiny_scene))
-    scaled = evaluate(TrainedModel(gaussians, tiny_scene.background, Treatment(scale=0.5)), of_scene(tiny_scene))
+    scaled = evaluate(TrainedModel(gaussians, tiny_scene.background, "dropout(0.5)"), of_scene(tiny_scene))
     halved = evaluate(TrainedModel(half, tiny_scene.background), of_scene(tiny_scene))
     for quantity in ("psnr", "ssim", "cv"):
         assert scores(scaled, quantity) == pytest.approx(scores(halved, quantity), rel=1e-4)
@@ -73,7 +73,7 @@ def test_images_get_the_expected_noise_and_co_adaptation_does_not(tiny_scene, ga
         evaluate(model, of_scene(tiny_scene))
         for model in (
             TrainedModel(gaussians, tiny_scene.background),
-            TrainedModel(gaussians, tiny_scene.background, Treatment(noise=0.8)),
+            TrainedModel(gaussians, tiny_scene.background, "noise(0.8, scale=True)"),
             TrainedModel(drawn, tiny_scene.background),
         )
     )
@@ -85,13 +85,12 @@ def test_images_get_the_expected_noise_and_co_adaptation_does_not(tiny_scene, ga
 
 
 def test_the_drop_rate_of_the_protocol_follows_the_training(tiny_scene, gaussians):
-    trained = TrainedModel(gaussians, tiny_scene.background, Treatment(dropout=0.2, scale=0.8))
+    trained = TrainedModel(gaussians, tiny_scene.background, "dropout(0.2)")
     assert trained.ca_score().settings.drop_rate == pytest.approx(0.6)  # half of the four fifths that training kept
     assert TrainedModel(gaussians, tiny_scene.background).ca_score().settings.drop_rate == 0.5
     assert trained.ca_score(drop_rate=0.3, samples=7, seed=4).settings.drop_rate == 0.3
     dropped, plain = (
-        evaluate(m, of_scene(tiny_scene), samples=3)
-        for m in (trained, dataclasses.replace(trained, treatment=Treatment()))
+        evaluate(m, of_scene(tiny_scene), samples=3) for m in (trained, dataclasses.replace(trained, regularizer=""))
     )
     assert scores(plain, "ca_half") == scores(plain, "ca")
     assert scores(dropped, "ca_half") == scores(plain, "ca")
@@ -100,7 +99,7 @@ def test_the_drop_rate_of_the_protocol_follows_the_training(tiny_scene, gaussian
 
 def test_the_exact_score_is_the_limit_of_many_samples(tiny_scene, gaussians):
     scene = dataclasses.replace(tiny_scene, train=tiny_scene.train[:1], test=())
-    model = TrainedModel(gaussians, scene.background, Treatment(dropout=0.2))
+    model = TrainedModel(gaussians, scene.background, "dropout(0.2)")
     (view,) = evaluate(model, of_scene(scene), samples=2).views
     score = model.exact_ca_score()
     result = score(gaussians.opacities, scene.train[0])
@@ -252,7 +251,7 @@ def test_every_view_gets_its_pictures(tiny_scene, gaussians, tmp_path):
 
 
 def test_photographs_are_not_needed_for_co_adaptation(tiny_scene, gaussians):
-    model = TrainedModel(gaussians, tiny_scene.background, Treatment(dropout=0.2, scale=0.8))
+    model = TrainedModel(gaussians, tiny_scene.background, "dropout(0.2)")
     bare = evaluate(model, {"orbit": [Viewpoint("v", view.camera) for view in tiny_scene.train]}, samples=4, seed=3)
     full = evaluate(model, {"orbit": tiny_scene.train}, samples=4, seed=3, perceptual=Brightness())
     for one, other in zip(bare.views, full.views, strict=True):
@@ -264,7 +263,7 @@ def test_photographs_are_not_needed_for_co_adaptation(tiny_scene, gaussians):
 
 def test_the_neutral_score_is_that_of_a_background_of_expected_colour(tiny_scene, gaussians):
     """Sampled: 400 masks, every render over the mean colour of its pixel; std error of the score below 2 %."""
-    model = TrainedModel(gaussians, tiny_scene.background, Treatment(dropout=0.2, scale=0.8))
+    model = TrainedModel(gaussians, tiny_scene.background, "dropout(0.2)")
     generator = torch.Generator().manual_seed(0)
     opacities, view = gaussians.opacities, tiny_scene.train[0]
     colors, alphas = [], []

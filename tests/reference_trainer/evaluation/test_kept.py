@@ -10,7 +10,7 @@ import torch
 from reference_trainer.evaluation import evaluate as evaluate_module
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.kept import KeptRecords, fingerprint
-from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.scenes.scene import Viewpoint
 
@@ -105,7 +105,7 @@ def test_a_fingerprint_tells_everything_apart():
         *(None, 0, 0.0, -0.0, math.nan, True, "0", "", [], [[]], [0, 0], [[0], 0], [0, [0]], {"a": 0}, {"a": [0]}),
         *(torch.zeros(2), torch.zeros(2, 1), torch.zeros(1, 2), torch.zeros(4, dtype=torch.int16), torch.zeros(0)),
         *(torch.tensor(0.0), torch.tensor(-0.0), torch.zeros(2, dtype=torch.bfloat16), torch.ones(2)),
-        *(TrainedModel(torch.zeros(1), torch.zeros(3), Treatment(p)) for p in (0.0, 0.1)),
+        *(TrainedModel(torch.zeros(1), torch.zeros(3), text) for text in ("", "dropout(0.1)")),
     ]
     digests = [fingerprint(x) for x in values]
     assert len(set(digests)) == len(digests)
@@ -162,8 +162,8 @@ def changes(model, scene):
     return {
         "samples": (model, scene, {"samples": 3}),
         "seed": (model, scene, {"seed": 1}),
-        "dropout": (dataclasses.replace(model, treatment=Treatment(dropout=0.1)), scene, {}),
-        "scale": (dataclasses.replace(model, treatment=Treatment(scale=0.9)), scene, {}),
+        "dropout": (dataclasses.replace(model, regularizer="dropout(0.1)"), scene, {}),
+        "scale": (dataclasses.replace(model, regularizer="noise(0.1, scale=True)"), scene, {}),
         "background": (dataclasses.replace(model, background=model.background + 0.1), scene, {}),
         "model": (dataclasses.replace(model, gaussians=moved), scene, {}),
         "photograph": (model, dataclasses.replace(scene, test=(brighter, *scene.test[1:])), {}),

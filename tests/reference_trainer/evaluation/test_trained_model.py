@@ -8,7 +8,7 @@ import torch
 
 from ca_reg import CAScore, GaussianDropout, OpacityNoise, Reason, attribute
 from ca_reg.functional import Multiplier
-from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel, Treatment
+from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.scene import Scene
@@ -27,9 +27,7 @@ def model(scene) -> TrainedModel:
     gaussians = Gaussians.from_points(points.positions, points.colors, torch.full((300,), 0.3), sh_degree=1)
     logits = 2.0 * torch.randn(300, generator=generator)
     rest = 0.1 * torch.randn(gaussians.sh_rest.shape, generator=generator)
-    return TrainedModel(
-        replace(gaussians, opacity_logits=logits, sh_rest=rest), scene.background, Treatment(dropout=0.2)
-    )
+    return TrainedModel(replace(gaussians, opacity_logits=logits, sh_rest=rest), scene.background, "dropout(0.2)")
 
 
 def assert_equal_renders(mine, other) -> None:
@@ -78,8 +76,8 @@ def test_the_test_time_image_is_the_mean_of_the_training_images(model, scene, p)
     """Both regularizers in the order of the trainer, against one render with the expected opacities."""
     view, generator = scene.train[0], torch.Generator().manual_seed(2)
     logits = model.gaussians.opacity_logits + 2.0  # many opaque ones
-    model = replace(model, gaussians=replace(model.gaussians, opacity_logits=logits), treatment=Treatment(scale=1 - p))
-    scaled = replace(model, treatment=replace(model.treatment, noise=0.8))
+    model = replace(model, gaussians=replace(model.gaussians, opacity_logits=logits), regularizer=f"dropout({p})")
+    scaled = replace(model, regularizer=f"dropout({p}) + noise(0.8, scale=True)")
     dropout, noise = GaussianDropout(p), OpacityNoise(0.8)
     image, plain = (m.render(m.test_opacities, view)[0] for m in (scaled, model))
     step = plain - image
@@ -97,10 +95,18 @@ def test_the_test_time_image_is_the_mean_of_the_training_images(model, scene, p)
 
 def test_test_time_opacities(model):
     opacities = model.gaussians.opacities
-    assert torch.equal(model.test_opacities, opacities)
-    assert torch.equal(replace(model, treatment=Treatment(scale=0.8)).test_opacities, opacities * 0.8)
-    both = replace(model, treatment=Treatment(dropout=0.2, scale=0.8, noise=0.6, clip_noise=True))
+    assert torch.equal(replace(model, regularizer="").test_opacities, opacities)
+    assert torch.equal(model.test_opacities, opacities * 0.8)
+    assert torch.equal(
+        replace(model, regularizer="dropout(ramp(0.0, 0.4, 0, 10))", step=5).test_opacities, opacities * 0.8
+    )
+    assert torch.equal(replace(model, regularizer="dropout(0.2, compensate=True)").test_opacities, opacities)
+    both = replace(model, regularizer="dropout(0.2) + noise(0.6, clip=True, scale=True)")
     mean = Multiplier.clamped_noise(opacities, 0.6, clip=True).mean
     torch.testing.assert_close(both.test_opacities, 0.8 * mean * opacities)
-    assert (Treatment(scale=0.8).factor, both.treatment.factor) == (0.8, None)
+    assert (model.factor, both.factor, replace(model, regularizer="dropout(0.2) + noise(0.6)").factor) == (
+        0.8,
+        None,
+        0.8,
+    )
     assert both.ca_score().settings == model.ca_score().settings

@@ -12,10 +12,8 @@ from oracles import random_scene
 from stand_ins.gsplat import centred, rasterization
 
 from reference_trainer.density.statistics import DensityStatistics
-from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.render import render
 from reference_trainer.render.gsplat import load_gsplat_render, render_by
-from reference_trainer.training.trainer import Trainer
 
 N, WIDTH, HEIGHT = 80, 40, 24
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
@@ -105,32 +103,6 @@ def test_the_constants_are_those_of_the_own_renderer():
     scene = scene_of()
     render_by(spy, *scene[:4], scene.camera, colors=scene.colors)
     assert (given["near_plane"], given["eps2d"], given["packed"]) == (0.2, 0.3, True)
-
-
-class GsplatTrainer(Trainer):
-    """A trainer that draws with the stand-in; all the rest is its own."""
-
-    def _sampled_loss(self, view):
-        model = self.gaussians
-        out = by_stand_in(
-            model.means, model.quaternions, model.scales, self._regularized(), view.camera,
-            sh=model.sh, sh_degree=self.sh_degree, background=self.background,
-        )  # fmt: skip
-        return photometric_loss(out.image, view.image, self.config.lambda_dssim), out.image, out.splats
-
-
-def test_the_trainer_counts_and_decides_as_with_the_own_renderer(tiny_scene, busy, monkeypatch):
-    monkeypatch.setenv("CA_REG_ENGINE", "torch")  # as in the stand-in: a splat at the 1/255 cut falls to the same side
-    ours, theirs = Trainer(tiny_scene, busy), GsplatTrainer(tiny_scene, busy)
-    for trainer in (ours, theirs):
-        trainer.train(until=4)  # up to the first densification
-    assert ours.statistics.steps.sum() > 0
-    seen = ours.statistics.steps > 0
-    torch.testing.assert_close(theirs.statistics.gradient_sum, ours.statistics.gradient_sum, rtol=1e-3, atol=1e-6)
-    assert (theirs.statistics.steps >= ours.statistics.steps)[seen].all()
-    before = len(theirs.gaussians)
-    theirs.train()
-    assert len(theirs.gaussians) != before  # its statistics reached density control
 
 
 def test_what_is_missing_is_told(monkeypatch):

@@ -4,9 +4,9 @@ import struct
 import pytest
 import torch
 
-from reference_trainer.model.bake import bake_ply
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
+from reference_trainer.runs.bake import bake_ply
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def plain(tmp_path):
 
 
 def test_only_the_opacities_change_and_a_comment_says_so(plain, tmp_path):
-    bake_ply(plain, tmp_path / "b.ply", dropout=0.3)
+    bake_ply(plain, tmp_path / "b.ply", regularizer="dropout(0.3)")
     header, body = (tmp_path / "b.ply").read_bytes().split(b"end_header\n")
     assert b"comment ca_reg opacity_scaled_by 0.7\n" in header
     names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property")]
@@ -32,21 +32,40 @@ def test_only_the_opacities_change_and_a_comment_says_so(plain, tmp_path):
 
 def test_nothing_is_scaled_twice_or_overwritten(plain, tmp_path):
     baked = tmp_path / "b.ply"
-    bake_ply(plain, baked, dropout=0.2)
+    bake_ply(plain, baked, regularizer="dropout(0.2)")
     with pytest.raises(ValueError, match=r"scaled by 0\.8 already"):
-        bake_ply(baked, tmp_path / "c.ply", dropout=0.2)
+        bake_ply(baked, tmp_path / "c.ply", regularizer="dropout(0.2)")
     content = baked.read_bytes()
     with pytest.raises(FileExistsError, match="exists already"):
-        bake_ply(plain, baked, dropout=0.5)
+        bake_ply(plain, baked, regularizer="dropout(0.5)")
     assert baked.read_bytes() == content
     gaussians = load_ply(plain).gaussians
     save_ply(gaussians, tmp_path / "noise.ply", opacities=gaussians.opacities * 0.5)
-    with pytest.raises(ValueError, match="mean of their noise already"):
-        bake_ply(tmp_path / "noise.ply", tmp_path / "c.ply", dropout=0.2)
+    with pytest.raises(ValueError, match="those of the test already"):
+        bake_ply(tmp_path / "noise.ply", tmp_path / "c.ply", regularizer="dropout(0.2)")
     assert not (tmp_path / "c.ply").exists()
 
 
-@pytest.mark.parametrize("dropout", [0.0, 1.0, -0.1, math.nan])
-def test_no_rate(plain, tmp_path, dropout):
-    with pytest.raises(ValueError, match=r"in \(0, 1\)"):
-        bake_ply(plain, tmp_path / "b.ply", dropout=dropout)
+@pytest.mark.parametrize(
+    ("regularizer", "message"),
+    [
+        (None, "does not say what it was trained with: give --regularizer"),
+        ("dropout(1.0)", r"p must be in \[0, 1\)"),
+        ("noise(0.8)", "is rendered as it is: there is nothing to bake"),
+        ("dropout(0.2, compensate=True)", "is rendered as it is"),
+    ],
+)
+def test_nothing_to_bake(plain, tmp_path, regularizer, message):
+    with pytest.raises(ValueError, match=message):
+        bake_ply(plain, tmp_path / "b.ply", regularizer=regularizer)
+    assert not (tmp_path / "b.ply").exists()
+
+
+def test_a_file_says_what_it_was_trained_with_but_nothing_is_imported_for_it(plain, tmp_path):
+    gaussians = load_ply(plain).gaussians
+    save_ply(gaussians, tmp_path / "a.ply", regularizer="noise(0.8, scale=True)", step=7)
+    assert bake_ply(tmp_path / "a.ply", tmp_path / "b.ply") == "noise(0.8, scale=True)"
+    assert load_ply(tmp_path / "b.ply").for_rendering
+    save_ply(gaussians, tmp_path / "c.ply", regularizer="antigravity:Fly", step=7)
+    with pytest.raises(ValueError, match=r"antigravity.Fly .* is not imported because a file says so"):
+        bake_ply(tmp_path / "c.ply", tmp_path / "d.ply")

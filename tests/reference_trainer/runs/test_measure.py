@@ -8,7 +8,6 @@ from PIL import Image
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
 from reference_trainer.evaluation.tables import evaluation_table
-from reference_trainer.evaluation.trained_model import Treatment
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import measure as measure_module
 from reference_trainer.runs.folder import BAKED_PLY, PLY
@@ -25,13 +24,14 @@ def both(scene):
 def test_the_flag_of_the_evaluation_and_that_of_the_training_are_the_same(run, scaled, tmp_path):
     """Also dropout and noise together: the run has both."""
     (plain, before), (out, results) = run, scaled
-    assert (plain / PLY).read_bytes() == (out / PLY).read_bytes()
-    model, scene, default = of_run(plain, scale_noise=True)
-    assert default == plain / "evaluation_scale_noise"
+    one, other = (load_ply(folder / PLY).gaussians for folder in (plain, out))
+    assert all(torch.equal(x, y) for (_, x), (_, y) in zip(one.named(), other.named(), strict=True))
+    model, scene, default = of_run(plain, regularizer="dropout(0.2) + noise(0.3, scale=True)")
+    assert default == plain / "evaluation_dropout_0_2_noise_0_3_scale_True"
     measure(model, both(scene), tmp_path, about={}, say=lambda text: None)
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]
-    assert found["expected_noise"] == 0.3
+    assert found["regularizer"] == "dropout(0.2) + noise(0.3, scale=True)"
     for one, other in zip(results["views"], before["views"], strict=True):
         assert one["psnr"] != other["psnr"]
         assert [one[name] for name in ("ca", "ca_half", "ca_exact")] == [
@@ -49,22 +49,16 @@ def test_the_monitor_and_the_pictures_use_the_same_opacities(scaled, tmp_path):
 
 
 def test_noise_alone_has_a_ply_for_viewers_too(options, tmp_path):
-    config = TrainConfig(iterations=1, noise=0.8, clip_noise=True, scale_noise=True)
+    config = TrainConfig(iterations=1, regularizer="noise(0.8, clip=True, scale=True)")
     run_experiment(options, config, tmp_path, monitor_every=0)
     model = of_run(tmp_path)[0]
-    assert model.treatment == Treatment(dropout=0.0, scale=1.0, noise=0.8, clip_noise=True)
+    assert (model.dropout, model.factor) == (0.0, None)
     torch.testing.assert_close(load_ply(tmp_path / BAKED_PLY).gaussians.opacities, model.test_opacities)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [({"noise": 0.0}, "was trained without noise"), ({"compensate": True}, "does not go with inverted dropout")],
-)
-def test_what_cannot_be_scaled_is_refused(changes, message, options, short, tmp_path):
-    config = dataclasses.replace(short, iterations=1, **changes)
-    run_experiment(options, config, tmp_path, monitor_every=0)
-    with pytest.raises(ValueError, match=message):
-        of_run(tmp_path, scale_noise=True)
+def test_a_run_is_not_rendered_as_if_trained_with_nonsense(run):
+    with pytest.raises(ValueError, match="there is no regularizer 'noize'"):
+        of_run(run[0], regularizer="noize(0.8)")
 
 
 def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):

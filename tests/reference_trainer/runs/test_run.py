@@ -225,11 +225,11 @@ def test_a_run_of_a_version_without_a_setting_was_at_its_default(finished, optio
     shutil.copytree(finished[0], tmp_path / "run")
     file = tmp_path / "run" / CONFIG
     claim = json.loads(file.read_text())
-    del claim["config"]["ca_weight"]
+    del claim["config"]["density"]
     file.write_text(json.dumps(claim))
     assert run_experiment(options, short, tmp_path / "run", **EVERY) == finished[1]
-    with pytest.raises(ValueError, match=r"analytic: False -> True; ca_weight: 0\.0 -> 1\.0"):
-        run_experiment(options, dataclasses.replace(short, analytic=True, ca_weight=1.0), tmp_path / "run")
+    with pytest.raises(ValueError, match=r"analytic: False -> True; loss: photometric -> photometric\(0\.1\)"):
+        run_experiment(options, dataclasses.replace(short, analytic=True, loss="photometric(0.1)"), tmp_path / "run")
 
 
 def test_a_mistyped_scene_does_not_claim_the_folder(options, short, tmp_path):
@@ -276,14 +276,14 @@ def test_a_run_can_be_loaded(finished):
     trainer = load_run(out)
     assert trainer.step == 11
     model = model_of(trainer)
-    assert (model.treatment.dropout, model.treatment.scale, model.sh_degree) == (0.2, 0.8, 2)
+    assert (model.dropout, model.factor, model.sh_degree) == (pytest.approx(0.2), pytest.approx(0.8), 2)
     assert not model.gaussians.means.requires_grad
     assert len(model.gaussians) == results["gaussians"]
 
 
 def test_inverted_dropout_needs_nothing_at_test_time(tiny_scene):
-    model = model_of(Trainer(tiny_scene, TrainConfig(dropout=0.2, compensate=True)))
-    assert (model.treatment.dropout, model.treatment.scale) == (0.0, 1.0)
+    model = model_of(Trainer(tiny_scene, TrainConfig(regularizer="dropout(0.2, compensate=True)")))
+    assert (model.dropout, model.factor) == (0.0, 1.0)
 
 
 def test_a_folder_without_a_run(tmp_path):

@@ -10,7 +10,6 @@ from PIL import Image
 
 from reference_trainer.evaluation import evaluate as evaluate_module
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.trained_model import Treatment
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import BAKED_PLY, PLY
@@ -43,14 +42,14 @@ def test_a_baked_ply_is_not_scaled_twice(run, options):
     out, _ = run
     scene = options.load()
     baked, facts = of_ply(out / BAKED_PLY, background=scene.background)  # it says its rate itself
-    plain, _ = of_ply(out / PLY, background=scene.background, dropout=0.2)
+    plain, _ = of_ply(out / PLY, background=scene.background, regularizer="dropout(0.2)")
     trained, _, _ = of_run(out)
-    assert (facts.opacity_scale, facts.for_rendering, facts.dropout) == (0.8, False, 0.2)
-    assert "0.8 baked in, taken out for CA; dropout rate of the training: 0.2" in str(facts)
-    assert baked.treatment == plain.treatment == trained.treatment == Treatment(0.2, 0.8)
+    assert (facts.opacity_scale, facts.for_rendering) == (0.8, False)
+    assert "0.8 baked in, taken out for CA; trained with: dropout(0.2)" in str(facts)
+    assert baked.factor == plain.factor == trained.factor == 0.8
     torch.testing.assert_close(baked.gaussians.opacities, trained.gaussians.opacities, rtol=0, atol=2e-6)
-    with pytest.raises(ValueError, match=r"was trained with dropout 0\.2, not 0\.5"):
-        of_ply(out / BAKED_PLY, background=scene.background, dropout=0.5)
+    with pytest.raises(ValueError, match=r"was scaled for dropout 0\.2, not for dropout\(0\.5\)"):
+        of_ply(out / BAKED_PLY, background=scene.background, regularizer="dropout(0.5)")
     for view in scene.test:
         images = [model.rendering(model.test_opacities, view).image for model in (baked, plain, trained)]
         torch.testing.assert_close(images[0], images[2], rtol=0, atol=1e-5)
@@ -62,13 +61,13 @@ def test_a_baked_ply_is_not_scaled_twice(run, options):
 def test_a_ply_without_dropout_is_used_as_it_is(tmp_path, run):
     model = of_run(run[0])[0]
     save_ply(model.gaussians, tmp_path / "model.ply")
-    assert of_ply(tmp_path / "model.ply", background=torch.zeros(3))[0].treatment == Treatment()
+    assert of_ply(tmp_path / "model.ply", background=torch.zeros(3))[0].regularizer == ""
 
 
 def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options, tmp_path):
     out, results = scaled
     scene = options.load()
-    model, facts = of_ply(out / BAKED_PLY, background=scene.background, dropout=0.2)
+    model, facts = of_ply(out / BAKED_PLY, background=scene.background, regularizer="dropout(0.2)")
     assert "those of the test, used as they are, for CA too" in str(facts)
     trained = of_run(out)[0]
     torch.testing.assert_close(model.test_opacities, trained.test_opacities, rtol=0, atol=1e-6)

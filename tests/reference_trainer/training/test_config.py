@@ -22,9 +22,19 @@ def test_an_unknown_preset_names_the_known_ones():
         with_preset("gsplat")
 
 
-@pytest.mark.parametrize(("compensate", "scale"), [(False, 0.8), (True, 1.0)])
-def test_test_time_scale(compensate, scale):
-    assert TrainConfig(dropout=0.2, compensate=compensate).test_time_scale == scale
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({}, ""),
+        ({"dropout": 0.2}, "dropout(0.2)"),
+        ({"noise": 0.8, "dropout": 0.2}, "dropout(0.2) + noise(0.8)"),
+        ({"dropout": 0.2, "regularizer": "noise(0.8, scale=True)"}, "dropout(0.2) + noise(0.8, scale=True)"),
+    ],
+)
+def test_all_regularizers_are_one_expression(settings, text):
+    config = TrainConfig(**settings)
+    assert config.regularizers == text
+    assert len(config.make_regularizer()) == (text.count("+") + 1 if text else 0)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +51,6 @@ def test_test_time_scale(compensate, scale):
         ("regularize_from", -1),
         ("sh_degree", 4),
         ("sh_every", 0),
-        ("lambda_dssim", 1.5),
         ("means_rate", 0.0),
         ("means_rate_final", -1e-6),
         ("initial_points", "some"),
@@ -56,8 +65,6 @@ def test_test_time_scale(compensate, scale):
         ("opacity_reset_every", -5),
         ("opacity_decay", 0.0),
         ("opacity_decay", 1.1),
-        ("ca_weight", -1.0),
-        ("ca_weight", 1.0),
     ],
 )
 def test_impossible_values_are_named(field, value):
@@ -65,13 +72,20 @@ def test_impossible_values_are_named(field, value):
         TrainConfig(**{field: value})
 
 
-def test_scaling_by_the_mean_of_the_noise_needs_noise_at_the_plain_opacities():
-    with pytest.raises(ValueError, match=r"scale_noise .* set noise"):
-        TrainConfig(scale_noise=True, dropout=0.2)
-    with pytest.raises(ValueError, match="scale_noise does not go with inverted dropout"):
-        TrainConfig(scale_noise=True, noise=0.8, dropout=0.2, compensate=True)
-    assert TrainConfig(scale_noise=True, noise=0.8, dropout=0.2).test_time_scale == 0.8
-    assert TrainConfig(scale_noise=True, noise=0.8, compensate=True).noise == 0.8
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"regularizer": "dropout"}, "missing 1 required positional argument"),
+        ({"loss": ""}, "loss needs at least one term"),
+        ({"loss": "photometric(2.0)"}, "lambda_dssim must lie in"),
+        ({"loss": "co_adaptation(-1.0)"}, "weight must not be negative"),
+        ({"density": "adaptive + adaptive"}, "expected one density strategy, got 2"),
+        ({"renderer": ""}, "expected one renderer, got 0"),
+    ],
+)
+def test_expressions_are_read_before_anything_is_trained(settings, message):
+    with pytest.raises(ValueError, match=message):
+        TrainConfig(**settings)
 
 
 @pytest.mark.parametrize("regularizer", [{"dropout": 0.2}, {"noise": 0.8}])
@@ -84,6 +98,6 @@ def test_regularizers_that_never_begin_are_refused(regularizer):
 
 
 def test_an_expectation_needs_something_random():
-    with pytest.raises(ValueError, match="set dropout or noise"):
+    with pytest.raises(ValueError, match="set dropout, noise or regularizer"):
         TrainConfig(analytic=True)
-    assert TrainConfig(analytic=True, noise=0.1, ca_weight=2.0).ca_weight == 2.0
+    assert TrainConfig(analytic=True, noise=0.1, loss="photometric + co_adaptation(2.0)").analytic

@@ -8,15 +8,19 @@ import pytest
 import torch
 from oracles import random_scene
 
-from ca_reg import OpacityNoise
+from ca_reg import Chain, GaussianDropout, OpacityNoise, Params
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.expectation import expected_draw, render_expectation
+from reference_trainer.model.rendering import render_gaussians, render_moments_of
 from reference_trainer.training.trainer import Trainer
 
 BLACK = torch.zeros(3, dtype=torch.float64)
+
+
+def expectation(gaussians, camera, chain):
+    """What an analytic step renders."""
+    x, multiplier = chain.multiplied(gaussians.params(camera))
+    return render_moments_of(x, multiplier, camera, BLACK, sh_degree=0)[0]
 
 
 def model(n: int, seed: int = 2) -> tuple[Gaussians, object]:
@@ -30,7 +34,7 @@ def model(n: int, seed: int = 2) -> tuple[Gaussians, object]:
 def test_mean_variance_and_their_gradients_are_those_of_all_masks(p, compensate):
     """At 0.5 most survivors are clamped at 0.99, somewhere or everywhere; the gradient passes the clamp in both."""
     start, camera = model(6)
-    config = TrainConfig(dropout=p, compensate=compensate, analytic=True)
+    chain = Chain(GaussianDropout(p, compensate=compensate))
     masks = torch.tensor(list(product([0.0, 1.0], repeat=6)), dtype=torch.float64)
     probability = (p + (1 - 2 * p) * masks).prod(1)
     found = []
@@ -44,9 +48,7 @@ def test_mean_variance_and_their_gradients_are_those_of_all_masks(p, compensate)
             mean = torch.einsum("k,kchw->chw", probability, images)
             variance = torch.einsum("k,kchw->chw", probability, (images - mean) ** 2)
         else:
-            out = render_expectation(gaussians, camera, BLACK, config, sh_degree=0)
-            mean, variance = out.image, out.variance
-            assert out.penalty.item() == 0
+            mean, variance, *_ = expectation(gaussians, camera, chain)
         (mean.square().sum() + 3 * variance.sum()).backward()
         found.append((mean, variance, *(x.grad for name, x in gaussians.named() if name != "sh_rest")))
     assert (found[0][1] > 1e-3).double().mean() > 0.1
@@ -66,9 +68,9 @@ def test_opaque_gaussians_are_drawn_more_opaque_at_test_time_than_inverted_dropo
     """As docs/theory.md says; plain dropout has no such gap."""
     white, camera = one_white(0.95)
     for compensate, trained, drawn in ((True, 0.495, 0.95), (False, 0.475, 0.475)):
-        config = TrainConfig(dropout=0.5, compensate=compensate, analytic=True)
-        mean = render_expectation(white, camera, BLACK, config, sh_degree=0).image[0, 2, 2].item()
-        tested = render_gaussians(white, camera, BLACK, opacities=white.opacities * config.test_time_scale).image
+        chain = Chain(GaussianDropout(0.5, compensate=compensate))
+        mean = expectation(white, camera, chain).mean[0, 2, 2].item()
+        tested = render_gaussians(chain.expected(white.params(camera)), camera, BLACK).image
         assert (mean, tested[0, 2, 2].item()) == (pytest.approx(trained, rel=1e-6), pytest.approx(drawn, rel=1e-6))
 
 
@@ -76,30 +78,33 @@ def test_opaque_gaussians_are_drawn_more_opaque_at_test_time_than_inverted_dropo
 def test_the_clamp_of_noisy_alphas_is_all_that_is_left_out(p):
     """Where a falloff exceeds 0.99 the noise reaches the clamp of alpha; it moves the mean by at most 1/99."""
     white, camera = one_white(0.95)
-    config = TrainConfig(dropout=p, compensate=True, noise=0.8, analytic=True)
+    chain = Chain(GaussianDropout(p, compensate=True), OpacityNoise(0.8))
     z, width = torch.linspace(-8, 8, 4001, dtype=torch.float64), 16 / 4000
     drawn = (0.95 / (1 - p) * (1 + 0.8 * z)).clamp(0, 1)
     levels, which = torch.unique((drawn * 100).round() / 100, return_inverse=True)
     weights = torch.zeros_like(levels).index_add_(0, which, width * torch.exp(-z * z / 2) / math.sqrt(2 * math.pi))
     images = torch.stack([render_gaussians(white, camera, BLACK, opacities=level[None]).image[0] for level in levels])
     mean = (1 - p) * torch.einsum("k,khw->hw", weights, images)
-    error = render_expectation(white, camera, BLACK, config, sh_degree=0).image[0] - mean
+    error = expectation(white, camera, chain).mean[0] - mean
     assert 4e-4 < error.abs().max() < 1 / 99
     assert error[0, 0].abs() < 1e-4
 
 
-def test_the_penalty_is_the_weighted_mean_variance():
-    gaussians, camera = model(9)
-    config = TrainConfig(dropout=0.3, analytic=True, ca_weight=3.0)
-    out = render_expectation(gaussians, camera, BLACK, config, sh_degree=0)
-    assert out.penalty.item() == pytest.approx(3 * out.variance.mean().item(), rel=1e-12)
+def test_the_co_adaptation_term_is_the_weighted_mean_variance(tiny_scene, busy):
+    """Of the step's own draws in an analytic step, of a dropout of its own in another."""
+    plain = dataclasses.replace(busy, dropout=0.3, noise=0.0, analytic=True)
+    losses = []
+    for loss in ("photometric", "photometric + co_adaptation(3.0)", "co_adaptation(3.0)"):
+        losses.append(Trainer(tiny_scene, dataclasses.replace(plain, loss=loss)).train_step()[0])
+    assert losses[1] - losses[0] == pytest.approx(losses[2], rel=1e-4)
+    sampled = dataclasses.replace(plain, analytic=False, loss="co_adaptation(3.0, p=0.3)")
+    assert Trainer(tiny_scene, sampled).train_step()[0] == pytest.approx(losses[2], rel=1e-5)
 
 
 def test_the_multiplier_is_that_of_what_training_samples():
     opacities = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
-    config = TrainConfig(dropout=0.2, noise=0.6, analytic=True)
-    rendered, multiplier = expected_draw(config, opacities)
-    assert torch.equal(rendered, opacities)
+    x, multiplier = Chain(GaussianDropout(0.2), OpacityNoise(0.6)).multiplied(Params(opacities))
+    assert torch.equal(x.opacities, opacities)
     noise = OpacityNoise(0.6)
     generator = torch.Generator().manual_seed(0)
     n = 200_000
@@ -122,7 +127,7 @@ def test_training_lowers_the_loss_and_draws_nothing(tiny_scene, busy):
         state = torch.random.get_rng_state()
         losses.append([trainer.train_step()[0] for _ in range(12)])
         assert torch.equal(torch.random.get_rng_state(), state)
-        assert trainer.dropout.keep is None
+        assert trainer.regularizer.keep is None
     assert losses[0] == losses[1]
     views = len(tiny_scene.train)
     assert sum(losses[0][-views:]) < sum(losses[0][:views])

@@ -114,7 +114,7 @@ def test_points_behind_all_cameras_are_left_out(tiny_scene):
         ("dropped Gaussians", TrainConfig(dropout=0.2), r"20% .* neither projected nor sorted"),
         ("dropped Gaussians", TrainConfig(), r"draws no masks"),
         ("moments", TrainConfig(), r"a step needs none"),
-        ("SSIM windows without change", TrainConfig(lambda_dssim=0.0), r"lambda_dssim is 0"),
+        ("SSIM windows without change", TrainConfig(loss="photometric(0.0)"), r"the loss has no SSIM"),
     ],
 )
 def test_left_out_by_construction(tiny_scene, name, config, said):

@@ -67,7 +67,7 @@ def control(monkeypatch: pytest.MonkeyPatch, scene: Scene, config: TrainConfig) 
     note("reset_opacity", lambda optimizer, ceiling: ceiling)
     note("decay_opacity", lambda optimizer, factor: factor)
     for trainer.step in range(config.iterations):
-        trainer._control_density()
+        trainer.density.before_step(trainer.optimizer, trainer.step)
     return events
 
 
@@ -109,7 +109,7 @@ def test_rates_and_thresholds(tiny_scene, name):
         "opacity_logits": 0.05, "log_scales": 0.005, "quaternions": 0.001,
     }  # fmt: skip
     assert all(group["eps"] == 1e-15 and group["betas"] == (0.9, 0.999) for group in groups.values())
-    assert (config.means_rate_final, config.lambda_dssim, config.dense_fraction) == (1.6e-6, 0.2, 0.01)
+    assert (config.means_rate_final, config.make_losses()[0].lambda_dssim, config.dense_fraction) == (1.6e-6, 0.2, 0.01)
     assert (config.prune_opacity, config.initial_opacity, config.initial_scale) == (0.005, 0.1, 1.0)
 
 
@@ -137,5 +137,5 @@ def test_large_gaussians_are_removed_by_their_size_in_the_world_only(tiny_scene)
             trainer.gaussians.opacity_logits[:] = 0.0
         trainer.step = step - 1
         trainer.train_step()
-        trainer._control_density()
+        trainer.density.before_step(trainer.optimizer, trainer.step)
         assert len(trainer.gaussians) == left

@@ -24,8 +24,8 @@ def assert_identical(one: Trainer, other: Trainer) -> None:
         assert torch.equal(x, right["gaussians"][name]), name
         for key, moment in left["moments"][name].items():
             assert torch.equal(moment, right["moments"][name][key]), (name, key)
-    for name, x in vars(one.statistics).items():
-        assert torch.equal(x, vars(other.statistics)[name]), name
+    for name, x in one.density.state_dict().items():
+        assert torch.equal(x, other.density.state_dict()[name]), name
 
 
 def straight(scene: Scene, config: TrainConfig) -> tuple[Trainer, list[int]]:
@@ -139,7 +139,7 @@ def test_training_fits_the_photographs(tiny_scene):
 
 
 def test_the_loss_of_a_step_is_that_of_the_view_it_renders(tiny_scene):
-    trainer = Trainer(tiny_scene, TrainConfig(iterations=3, lambda_dssim=0.0, sh_degree=0))
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=3, loss="photometric(0.0)", sh_degree=0))
     images = [
         trainer_module.render_gaussians(trainer.gaussians, v.camera, tiny_scene.background).image.detach()
         for v in tiny_scene.train
@@ -217,7 +217,7 @@ def test_views_that_show_nothing_are_steps_without_a_move(tiny_scene):
         trainer.train()
         assert trainer.step == 2
         assert torch.equal(trainer.gaussians.means, before)
-        assert trainer.statistics.steps.sum() == 0
+        assert trainer.density.statistics.steps.sum() == 0
 
 
 def test_a_scene_without_points_says_what_to_do(tiny_scene):
@@ -272,7 +272,7 @@ def control(monkeypatch, scene: Scene, config: TrainConfig, steps: int) -> dict[
     for name in calls:
         note(name)
     for trainer.step in range(steps):
-        trainer._control_density()
+        trainer.density.before_step(trainer.optimizer, trainer.step)
     return calls
 
 
@@ -302,7 +302,7 @@ def test_growth_ends_at_the_limit_but_pruning_goes_on(tiny_scene, monkeypatch):
 def test_resets_reach_the_model(tiny_scene):
     trainer = Trainer(tiny_scene, TrainConfig(iterations=9, opacity_reset_from=3, opacity_reset=0.02))
     trainer.step = 3
-    trainer._control_density()
+    trainer.density.before_step(trainer.optimizer, trainer.step)
     expected = Trainer(tiny_scene, trainer.config)
     reset_opacity(expected.optimizer, 0.02)
     assert torch.equal(trainer.gaussians.opacity_logits, expected.gaussians.opacity_logits)
