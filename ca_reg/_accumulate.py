@@ -27,29 +27,32 @@ class RenderMoments:
         self.count = 0
         self._groups = groups
         self._first = self._scratch = torch.empty(0)  # (3, H, W)
-        self._sums = self._squares = torch.empty(0)  # (G, 3, H, W) and (G, H, W)
+        self._sums: list[Tensor] = []  # (3, H, W)
+        self._squares: list[Tensor] = []  # (H, W)
 
     def add(self, image: Tensor) -> None:
         """Take in one render (3, H, W)."""
         if self.count == 0:
             self._first = image.to(torch.promote_types(image.dtype, torch.float32), copy=True)
             self._scratch = torch.empty_like(self._first)
-            self._sums = self._first.new_zeros(self._groups, *image.shape)
-            self._squares = self._first.new_zeros(self._groups, *image.shape[1:])
         elif image.shape != self._first.shape:
             raise ValueError(
                 f"the renders of one view must have one size, got {tuple(self._first.shape)} and then "
                 f"{tuple(image.shape)}."
             )
         group = self.count % self._groups
-        deviation = torch.sub(image, self._first, out=self._scratch)
-        self._sums[group] += deviation
-        _add_squares(self._squares[group], deviation)
+        if group == self.count:
+            self._sums.append(image - self._first)
+            self._squares.append(_add_squares(torch.zeros_like(self._first[0]), self._sums[group]))
+        else:
+            deviation = torch.sub(image, self._first, out=self._scratch)
+            self._sums[group] += deviation
+            _add_squares(self._squares[group], deviation)
         self.count += 1
 
     def variance(self, ddof: int) -> Tensor:
         """Return the variance of every pixel, mean over RGB, (H, W), float64; it divides by ``count - ddof``."""
-        scatter = _scatter(self._squares.sum(0), self._sums.sum(0), self.count)
+        scatter = _scatter(_total(self._squares), _total(self._sums), self.count)
         return scatter.clamp_(min=0).to(torch.float64) / (3 * (self.count - ddof))
 
     def jackknife_error(self, visible: Tensor) -> float:
@@ -62,13 +65,13 @@ class RenderMoments:
         if self.count < 3:
             return math.nan
         weights = visible.to(self._first.dtype) / (3 * visible.sum())
-        squares, sums = self._squares.sum(0), self._sums.sum(0)
+        squares, sums = _total(self._squares), _total(self._sums)
 
         def value(squares: Tensor, sums: Tensor, count: int) -> float:
             return float(_scatter(squares, sums, count).mul_(weights).sum()) / (count - 1)
 
         ratios, left_out = [], []
-        for group in range(min(self._groups, self.count)):
+        for group in range(len(self._sums)):
             rest = self.count - len(range(group, self.count, self._groups))
             others = torch.sub(sums, self._sums[group], out=self._scratch)
             left_out.append(value(squares - self._squares[group], others, rest))
@@ -118,6 +121,14 @@ class Deviations:
         squares, products = (torch.stack(x).to(torch.float64) for x in (self._squares, self._products))
         both = squares.var() / count + 2.0 * products.square().mean() / (count * (count - 1))
         return math.sqrt(float(both)) / (3 * int(self._visible.sum()))
+
+
+def _total(parts: list[Tensor]) -> Tensor:
+    """Return the sum of tensors, of which there is one at least."""
+    total = parts[0].clone()
+    for part in parts[1:]:
+        total += part
+    return total
 
 
 def _scatter(squares: Tensor, sums: Tensor, count: int) -> Tensor:

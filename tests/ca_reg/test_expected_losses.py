@@ -156,6 +156,15 @@ def test_gradients_stay_finite_without_variance_and_far_from_the_target(dtype):
         assert (by_variance[far] < 1e-30).all()
 
 
+def test_no_gradient_is_denormal():
+    """Processors take many times as long for such numbers, and most pixels of a photograph are far from the target."""
+    d, variance = torch.linspace(0, 1, 20_001), torch.zeros(20_001, requires_grad=True)
+    mean = d.clone().requires_grad_()
+    expected_absolute_error(mean, variance, torch.zeros_like(d)).sum().backward()
+    for gradient in (mean.grad, variance.grad):
+        assert ((gradient == 0) | (gradient >= torch.finfo(torch.float32).tiny)).all()
+
+
 @pytest.mark.parametrize(
     ("residual", "pixelwise", "total", "without"), [(0.05, 0.18, 0.07, 0.50), (0.2, 0.09, 0.01, 0.10)]
 )
