@@ -17,7 +17,8 @@ class LossTerm(abc.ABC):
     """A summand of the loss of a step, its weight included; a term of one's own is a subclass.
 
     Attributes:
-        needs: of the renderer, beside image and alpha: ``"depth"``, which the render of the step then has, ``"moments"``.
+        needs: of the renderer, beside image and alpha: ``"depth"``, which the render of the step then has, or
+            ``"moments"``.
         analytic: whether the term knows what to do with an expected image and its variance, without a draw.
     """
 

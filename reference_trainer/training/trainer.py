@@ -145,7 +145,7 @@ class Trainer:
         if loss.requires_grad:
             loss.backward()  # type: ignore[no-untyped-call]
             for splats, camera in step.observed:
-                if splats.indices.numel():
+                if splats.projection.means.grad is not None:  # it has none if nothing was drawn, or no term saw it
                     self.density.observe(splats, camera)
             self.optimizer.set_means_rate(self._means_rate(self.step))
             self.optimizer.step()

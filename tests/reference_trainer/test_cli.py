@@ -192,8 +192,8 @@ def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
     assert evaluation["ca_settings"]["samples"] == 3
     assert evaluation["mean"]["test"]["psnr"] == results["mean"]["test"]["psnr"]
 
-    main(["evaluate", "--ply", str(trained / "point_cloud.ply"), "--regularizer", "dropout(0.2)", "--scene", "synthetic",
-          "--downscale", "8", "--out", str(tmp_path / "p")])  # fmt: skip
+    main(["evaluate", "--ply", str(trained / "point_cloud.ply"), "--scene", "synthetic", "--downscale", "8",
+          "--out", str(tmp_path / "p")])  # fmt: skip
     of_ply = json.loads((tmp_path / "p" / "evaluation.json").read_text())
     assert of_ply["views"] == results["views"]
 

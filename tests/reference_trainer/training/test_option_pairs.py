@@ -86,7 +86,7 @@ def together(pair: tuple[str, ...]) -> tuple[TrainConfig, Draws, bool]:
     terms = []
     if draws.compensate:
         terms.append(f"dropout({settings.pop('dropout')}, compensate=True)")
-    if names & {"clip", "scale"}:
+    if draws.sigma and (draws.compensate or names & {"clip", "scale"}):  # in the order of the draws
         terms.append(f"noise({settings.pop('noise')}, clip={draws.clip}, scale={'scale' in names})")
     preset = PRESETS[settings.pop("preset", "fsgs")]
     short = {"iterations": 2, "sh_degree": 0, "sh_every": 1, "regularizer": " + ".join(terms)}

@@ -11,9 +11,10 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+from reference_trainer.density import adaptive
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.training import trainer as trainer_module
+from reference_trainer.training import step as step_module
 from reference_trainer.training.config import TrainConfig, with_preset
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
@@ -59,10 +60,10 @@ def control(monkeypatch: pytest.MonkeyPatch, scene: Scene, config: TrainConfig) 
 
     def note(name: str, number):
         monkeypatch.setattr(
-            trainer_module, name, lambda *a, **k: events.append((trainer.step, name.split("_")[0], number(*a, **k)))
+            adaptive, name, lambda *a, **k: events.append((trainer.step, name.split("_")[0], number(*a, **k)))
         )
 
-    note("densify", lambda *a, gradient_threshold, **k: gradient_threshold)
+    note("densify", lambda *a, **k: config.densify_gradient)
     note("prune", lambda *a, max_scale, **k: None if max_scale is None else pytest.approx(max_scale / scene.extent))
     note("reset_opacity", lambda optimizer, ceiling: ceiling)
     note("decay_opacity", lambda optimizer, factor: factor)
@@ -86,9 +87,9 @@ def test_events_happen_at_the_iterations_of_the_code_base(tiny_scene, monkeypatc
 def test_bands_begin_with_the_iteration_of_the_code_base(tiny_scene, monkeypatch, name, every, most):
     """They call ``oneupSHdegree`` before the render of every iteration that ``every`` divides."""
     trainer, used = Trainer(tiny_scene, with_preset(name, densify_every=0)), []
-    original = trainer_module.render_gaussians
+    original = step_module.render_gaussians
     monkeypatch.setattr(
-        trainer_module, "render_gaussians", lambda *a, **k: used.append(k["sh_degree"]) or original(*a, **k)
+        step_module, "render_gaussians", lambda *a, **k: used.append(k["sh_degree"]) or original(*a, **k)
     )
     near = [k * every + d for k in (1, 2, 3, 4) for d in (-1, 0)]
     expected = [min(most, iteration // every) for iteration in near]

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from reference_trainer.camera import Camera
+from reference_trainer.density import adaptive
 from reference_trainer.density.operations import reset_opacity
+from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.scene import PointCloud, Scene, View
-from reference_trainer.training import trainer as trainer_module
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.interruption import TrainingInterrupted
@@ -128,7 +129,7 @@ def test_training_fits_the_photographs(tiny_scene):
     def error(trainer: Trainer) -> float:
         total = 0.0
         for view in tiny_scene.train:
-            image = trainer_module.render_gaussians(trainer.gaussians, view.camera, tiny_scene.background).image
+            image = render_gaussians(trainer.gaussians, view.camera, tiny_scene.background).image
             total += (image - view.image).square().mean().item()
         return total / len(tiny_scene.train)
 
@@ -141,8 +142,7 @@ def test_training_fits_the_photographs(tiny_scene):
 def test_the_loss_of_a_step_is_that_of_the_view_it_renders(tiny_scene):
     trainer = Trainer(tiny_scene, TrainConfig(iterations=3, loss="photometric(0.0)", sh_degree=0))
     images = [
-        trainer_module.render_gaussians(trainer.gaussians, v.camera, tiny_scene.background).image.detach()
-        for v in tiny_scene.train
+        render_gaussians(trainer.gaussians, v.camera, tiny_scene.background).image.detach() for v in tiny_scene.train
     ]
     loss, mse = trainer.train_step()
     pairs = [
@@ -160,7 +160,7 @@ def test_draws_depend_on_seed_and_step_alone_and_leave_the_global_generator(tiny
         trainer, kept = Trainer(tiny_scene, dataclasses.replace(config, densify_every=0, iterations=5)), []
 
         def after_step(t: Trainer) -> None:
-            kept.append(t.dropout.keep)
+            kept.append(t.regularizer.keep)
             if shake:  # what else the process draws has no say
                 torch.rand(7)
 
@@ -252,8 +252,8 @@ def test_the_rate_of_the_means_falls_exponentially_in_units_of_the_extent(tiny_s
 def test_regularizers_wait_for_their_step(tiny_scene):
     config = TrainConfig(iterations=4, dropout=0.5, noise=0.3, regularize_from=2)
     trainer, seen = Trainer(tiny_scene, config), []
-    trainer.train(after_step=lambda t: seen.append((t.dropout.p, t.noise.sigma, t.dropout.keep is None)))
-    assert seen == [(0.0, 0.0, True)] * 2 + [(0.5, 0.3, False)] * 2
+    trainer.train(after_step=lambda t: seen.append((t.regularized, t.regularizer.keep is not None)))
+    assert seen == [(False, False)] * 2 + [(True, True)] * 2
     plain = Trainer(tiny_scene, dataclasses.replace(config, dropout=0.0, noise=0.0))
     plain.train(until=2)
     late = Trainer(tiny_scene, config)
@@ -267,7 +267,7 @@ def control(monkeypatch, scene: Scene, config: TrainConfig, steps: int) -> dict[
     calls: dict[str, list[int]] = {"densify": [], "prune": [], "reset_opacity": [], "decay_opacity": []}
 
     def note(name: str) -> None:
-        monkeypatch.setattr(trainer_module, name, lambda *args, **keywords: calls[name].append(trainer.step))
+        monkeypatch.setattr(adaptive, name, lambda *args, **keywords: calls[name].append(trainer.step))
 
     for name in calls:
         note(name)
