@@ -46,13 +46,13 @@ def choose_points(
         names = {frame.name for frame in train}
         honest = [cloud for cloud in offered if (cloud.seen_by or frozenset()) <= names]
         if honest:
-            best = max(honest, key=lambda cloud: len(cloud.positions))
+            best = max(reversed(honest), key=lambda cloud: len(cloud.positions))
             return best, f"initial points: {len(best.positions):,} from {best.source}"
         kind = "random"
         if offered:
             passed = (
-                f"; {', '.join(cloud.source for cloud in offered)} was passed over, because it has seen test views "
-                "(--test none holds none out; --points FOLDER --allow-test-points takes it all the same)"
+                f"; the points from {', '.join(cloud.source for cloud in offered)} have seen views that do not train "
+                "(--test none holds none out; --points FOLDER --allow-test-points takes them all the same)"
             )
     if kind == "random":
         if count and not (count.isdecimal() and int(count) > 0):
