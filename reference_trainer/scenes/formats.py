@@ -69,7 +69,8 @@ def register_format(format: SceneFormat) -> None:
 
     Example:
         >>> from reference_trainer.scenes.load import detect_format
-        >>> toy = SceneFormat("toy", "toy.txt", lambda root: (root / "toy.txt").exists(), lambda root, options: Capture([]))
+        >>> found = lambda root: (root / "toy.txt").exists()
+        >>> toy = SceneFormat("toy", "toy.txt", found, lambda root, options: Capture([]))
         >>> register_format(toy)
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
