@@ -76,6 +76,6 @@ def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, strai
     if straight and any(frame.distortion):
         names, sizes = list(layers), [len(layer) for layer in layers.values()]
         pixels, camera = undistort(torch.cat(list(layers.values())), camera, frame.distortion)
-        layers = dict(zip(names, pixels.split(sizes), strict=True))
+        layers = dict(zip(names, torch.split(pixels, sizes), strict=True))
     flat = {name: layer[0] for name, layer in layers.items() if name != "image"}
     return View(frame.name, camera.to(dtype=torch.float32), layers["image"], flat.get("alpha"), mask=flat.get("mask"))

@@ -56,7 +56,7 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
         missing = [str(file) for file in files if not file.is_file()]
         if missing:
             raise FileNotFoundError(f"{path} names {len(missing)} images that are not there, such as {missing[:3]}.")
-        back = np.linalg.inv(_applied(content))
+        back: NDArray[np.float64] = np.linalg.inv(_applied(content)).astype(np.float64)
         frames = [_frame(path, file, content | entry, back) for file, entry in zip(files, entries, strict=True)]
     except FileNotFoundError:
         raise
