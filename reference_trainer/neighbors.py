@@ -1,12 +1,13 @@
-"""The nearest neighbours of every point of a cloud."""
+"""The nearest neighbours of every point of a cloud, and how far they are."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-__all__ = ["nearest_neighbors"]
+__all__ = ["mean_neighbor_distance", "nearest_neighbors"]
 
+SMALLEST_SQUARED_DISTANCE = 1e-7  # INRIA's clamp: coinciding points still get a Gaussian of some size
 CHUNK_ELEMENTS = 4_000_000  # distances held at a time: 16 MB in float32
 CHUNK_ROWS = 256  # of the sorted points; more of them span a wider strip, fewer are too many calls
 
@@ -62,3 +63,29 @@ def _search(ordered: Tensor, start: int, stop: int, low: int, high: int, count: 
     distances.square_().diagonal(start - low).fill_(torch.inf)
     nearest = distances.topk(count, dim=1, largest=False)
     return nearest.values, nearest.indices + low
+
+
+def mean_neighbor_distance(positions: Tensor) -> Tensor:
+    """Return the root mean squared distance of each point to its three nearest others.
+
+    Convention: the INRIA code takes the logarithm of this as the initial scale of a Gaussian. Coinciding points get
+    sqrt(1e-7) instead of 0. With fewer than three other points, all others count.
+
+    Args:
+        positions: world coordinates, shape (N, 3), N at least 2.
+
+    Returns:
+        Distances, shape (N,), positive.
+
+    Raises:
+        ValueError: if the shape is not (N, 3) or N is less than 2.
+
+    Example:
+        >>> mean_neighbor_distance(torch.tensor([[0.0, 0, 0], [0, 0, 2]])).tolist()
+        [2.0, 2.0]
+    """
+    n = positions.shape[0]
+    if positions.ndim != 2 or positions.shape[1] != 3 or n < 2:
+        raise ValueError(f"positions must have shape (N, 3) with N >= 2, got {tuple(positions.shape)}.")
+    squares, _ = nearest_neighbors(positions, min(3, n - 1))
+    return squares.mean(1).clamp_min(SMALLEST_SQUARED_DISTANCE).sqrt()

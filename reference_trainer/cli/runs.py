@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -150,7 +149,6 @@ class Plan:
         from reference_trainer.evaluation.results import markdown_table, write_json
         from reference_trainer.training.plan import make_plan
 
-        logging.getLogger("reference_trainer.scenes.load").setLevel(logging.INFO)  # how far lens distortion goes
         scene = _chosen(self.scene, self.folder).load(seed=self.config.seed)
         plan = make_plan(scene, self.config, given=self.given)
         print(f"{scene}\n")
@@ -272,7 +270,7 @@ class Compare:
     out: Path
     """Folder of the comparison; each run has a folder <strategy>/seed_<k> in it, below <scene> if there are several."""
     path: tuple[str, ...] = ("synthetic",)
-    """Scene folders (COLMAP, LLFF or Blender files), or "synthetic"; the other options hold for all of them."""
+    """Scene folders, or "synthetic"; the other options hold for all of them."""
     scene: Annotated[EveryScene, tyro.conf.arg(name="")] = field(default_factory=EveryScene)
     config: Config = field(default_factory=lambda: PRESETS["fsgs"])
     preset: Literal["fsgs", "inria", "binocular"] = "fsgs"

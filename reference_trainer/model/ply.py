@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from reference_trainer.files import replacing
 from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.ply_files import CONVERT, read_ply
 
 __all__ = ["PlyModel", "load_ply", "save_ply"]
 
@@ -23,16 +20,7 @@ _SCALED = "ca_reg opacity_scaled_by"
 _FOR_RENDERING = "ca_reg opacity_for_rendering"
 _TRAINED_WITH = "ca_reg trained_with"
 _LEARNED = "ca_reg_learned_"
-_HEADER_LIMIT = 65_536  # bytes; a standard header has 1.6 kB, so more than this is not a header
-_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
-_OTHER_LINES = ("ply", "format", "obj_info", "end_header")  # of a header, besides those that are read
 _COMPRESSED = (".spz", ".splat", ".ksplat", ".sog")
-_CONVERT = "its values are rounded; give the PLY that it was made from, or convert it to one first (SuperSplat does)"
 _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -157,31 +145,22 @@ def load_ply(path: str | Path) -> PlyModel:
         OSError: if the file cannot be read.
     """
     path = Path(path)
-    with path.open("rb") as file:
-        if path.suffix.lower() in _COMPRESSED:
-            raise ValueError(f"{path} is a compressed format: {_CONVERT}.")
-        header = _read_header(file, path)
-        count, properties = header.count, header.properties
-        rest = [f"f_rest_{index}" for index in range(sum(name.startswith("f_rest_") for name in properties))]
-        required = (*_MEANS, *_DC, *rest, "opacity", *_SCALES, *_ROTATIONS)
-        missing = [name for name in required if name not in properties]
-        if missing:
-            raise ValueError(f"{path} is not a 3D Gaussian Splatting PLY: its vertices lack {', '.join(missing)}.")
-        if "filter_3D" in properties:
-            raise ValueError(
-                f"{path} has scales and opacities that need its filter_3D (Mip-Splatting): give the fused PLY, which "
-                "create_fused_ply.py of that code base writes."
-            )
-        if len(rest) not in (0, 9, 24, 45):
-            raise ValueError(f"{path} has {len(rest)} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45.")
-        rows = _read_rows(file, path, header)
-
-    def columns(names: tuple[str, ...] | list[str]) -> Tensor:
-        table = np.empty((count, len(names)), dtype=np.float32)
-        with np.errstate(over="ignore"):  # becomes infinite, which is reported below
-            for index, name in enumerate(names):
-                table[:, index] = rows[name]
-        return torch.from_numpy(table)
+    if path.suffix.lower() in _COMPRESSED:
+        raise ValueError(f"{path} is a compressed format: {CONVERT}.")
+    vertices = read_ply(path)
+    properties, columns = vertices.kinds, vertices.columns
+    rest = [f"f_rest_{index}" for index in range(sum(name.startswith("f_rest_") for name in properties))]
+    required = (*_MEANS, *_DC, *rest, "opacity", *_SCALES, *_ROTATIONS)
+    missing = [name for name in required if name not in properties]
+    if missing:
+        raise ValueError(f"{path} is not a 3D Gaussian Splatting PLY: its vertices lack {', '.join(missing)}.")
+    if "filter_3D" in properties:
+        raise ValueError(
+            f"{path} has scales and opacities that need its filter_3D (Mip-Splatting): give the fused PLY, which "
+            "create_fused_ply.py of that code base writes."
+        )
+    if len(rest) not in (0, 9, 24, 45):
+        raise ValueError(f"{path} has {len(rest)} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45.")
 
     gaussians = Gaussians(
         means=columns(_MEANS),
@@ -189,16 +168,18 @@ def load_ply(path: str | Path) -> PlyModel:
         quaternions=columns(_ROTATIONS),
         opacity_logits=columns(["opacity"])[:, 0],
         sh_dc=columns(_DC)[:, None, :],
-        sh_rest=columns(rest).reshape(count, 3, len(rest) // 3).transpose(1, 2).contiguous(),
-        learned={n.removeprefix(_LEARNED): columns([n])[:, 0] for n in properties if n.startswith(_LEARNED)},
+        sh_rest=columns(rest).reshape(len(vertices.rows), 3, len(rest) // 3).transpose(1, 2).contiguous(),
+        learned={
+            name.removeprefix(_LEARNED): columns([name])[:, 0] for name in properties if name.startswith(_LEARNED)
+        },
     )
     # An opacity of exactly 0 or 1 has an infinite logit, which sigmoid takes: only NaN is wrong there.
     bad = [name for name, x in gaussians.named() if not torch.isfinite(x).all() and name != "opacity_logits"]
     bad += ["opacity_logits"] if bool(gaussians.opacity_logits.isnan().any()) else []
     if bad:
         raise ValueError(f"{path} holds values that are not finite in {', '.join(bad)}: remove those Gaussians first.")
-    scale, for_rendering = _opacity_scale(header.comments, path), _FOR_RENDERING in header.comments
-    return PlyModel(gaussians, scale, for_rendering, *_trained_with(header.comments, path))
+    scale, for_rendering = _opacity_scale(vertices.comments, path), _FOR_RENDERING in vertices.comments
+    return PlyModel(gaussians, scale, for_rendering, *_trained_with(vertices.comments, path))
 
 
 def _logits(opacities: Tensor, count: int) -> Tensor:
@@ -217,91 +198,6 @@ def _scaled_logits(logits: Tensor, factor: float) -> Tensor:
     opaque, clear = logsigmoid(logits), logsigmoid(-logits)
     denominator = torch.logaddexp(opaque + math.log1p(-factor), clear)  # 1 - f s = (1 - f) s + (1 - s)
     return opaque + math.log(factor) - denominator
-
-
-@dataclass(frozen=True)
-class _Header:
-    """The format, the number of vertices, their properties with numpy types, comments, and if there is nothing else."""
-
-    layout: str
-    count: int
-    properties: dict[str, str]
-    comments: list[str]
-    alone: bool
-
-
-def _read_header(file: BinaryIO, path: Path) -> _Header:
-    """Read everything up to the first vertex."""
-    lines: list[str] = []
-    while not lines or lines[-1] != "end_header":
-        raw = file.readline(_HEADER_LIMIT)
-        if file.tell() > _HEADER_LIMIT or not raw.endswith(b"\n") or (not lines and raw.strip() != b"ply"):
-            raise ValueError(
-                f"{path} is not a PLY file: expected a header from 'ply' to 'end_header' in the first "
-                f"{_HEADER_LIMIT} bytes."
-            )
-        lines.append(raw.decode("latin-1").strip())
-    layout, count, properties, elements, comments = "", -1, dict[str, str](), list[str](), list[str]()
-    for line in lines:
-        match line.split():
-            case ["format", kind, "1.0"]:
-                layout = kind
-            case ["comment", *_]:
-                comments.append(line.removeprefix("comment").strip())
-            case ["element", name, number]:
-                elements.append(name)
-                if name == "vertex" and number.isdecimal() and len(number) < 19:
-                    count = int(number)
-            case ["property", kind, name] if elements[-1:] == ["vertex"]:
-                if kind not in _TYPES or name in properties:
-                    raise ValueError(f"{path}: the property line '{line}' has an unknown type or a repeated name.")
-                properties[name] = _TYPES[kind]
-            case ["property", "list", *_] if elements[-1:] == ["vertex"]:
-                raise ValueError(f"{path}: vertices with list properties ('{line}') are not Gaussians.")
-            case ["property", *_] if elements[-1:] != ["vertex"]:
-                pass
-            case [keyword, *_] if keyword not in _OTHER_LINES:
-                raise ValueError(f"{path}: the header line '{line[:80]}' is not one of a PLY file.")
-    if "chunk" in elements:
-        raise ValueError(f"{path} is a compressed PLY: {_CONVERT}.")
-    if layout not in (*_BYTE_ORDERS, "ascii"):
-        raise ValueError(f"{path}: the format must be {', '.join(_BYTE_ORDERS)} or ascii (1.0), got '{layout}'.")
-    if elements[:1] != ["vertex"] or "vertex" in elements[1:] or count < 0:
-        raise ValueError(f"{path}: the first element must be 'vertex' with a count, got {elements[:8] or 'none'}.")
-    return _Header(layout, count, properties, comments, alone=len(elements) == 1)
-
-
-def _read_rows(file: BinaryIO, path: Path, header: _Header) -> NDArray[np.void]:
-    """Read the vertices as a structured array; the file's size is compared first, so a false count costs nothing."""
-    layout, count, properties = header.layout, header.count, header.properties
-    available = os.fstat(file.fileno()).st_size - file.tell()
-    binary = layout != "ascii"
-    kinds = {name: _BYTE_ORDERS[layout] + kind if binary else "f8" for name, kind in properties.items()}
-    dtype = np.dtype(list(kinds.items()))
-    needed = count * (dtype.itemsize if binary else 2 * len(properties))  # a digit and a separator at least
-    if needed > available + (not binary):
-        raise ValueError(
-            f"{path} is cut short: {count} vertices need {needed} bytes after the header, {available} are there."
-        )
-    if binary:
-        if header.alone and available >= needed + dtype.itemsize:
-            raise ValueError(f"{path} announces {count} vertices, {needed} bytes, but {available} follow the header.")
-        return np.frombuffer(file.read(needed), dtype=dtype, count=count)
-    table, line = np.empty((count, len(properties))), b"\n"
-    try:
-        for row in table:
-            line = file.readline()
-            words = line.split()
-            if len(words) != len(row):
-                raise ValueError(f"got {len(words)}")
-            row[:] = np.array(words, np.float64)
-        if not line.endswith(b"\n"):
-            raise ValueError("the last line has no end")
-    except ValueError as error:
-        raise ValueError(f"{path}: the vertex lines do not hold {len(properties)} numbers each: {error}.") from error
-    if header.alone and file.read().strip():
-        raise ValueError(f"{path} announces {count} vertices, but more lines follow them.")
-    return table.view(dtype)[:, 0]
 
 
 def _opacity_scale(comments: list[str], path: Path) -> float:

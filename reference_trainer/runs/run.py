@@ -130,6 +130,8 @@ def run_experiment(
     if (out / RESULTS).exists():
         return _complete(out, say)
     scene = options.load(seed=config.seed)  # before the folder is made: a mistyped scene must not claim it
+    for note in scene.notes:
+        say(note)
     with run_lock(out), threads_for(scene.pixels):
         begun = begun_with(out, options, config, auto=auto, given=given)  # by another process since, perhaps to its end
         if (out / RESULTS).exists():

@@ -1,4 +1,4 @@
-"""Scenes: photographs with cameras and initial points, from COLMAP, LLFF and Blender files or built in.
+"""Scenes: photographs with cameras and initial points, from the files of one of the `formats`, or built in.
 
 ``load_scene`` is the way in; ``Scene`` is all that the rest of the program sees. What is asked for is imported then, so
 that the command line knows the options of a scene without torch.
@@ -8,25 +8,33 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from reference_trainer.scenes.formats import Capture, SceneFormat, register_format
+    from reference_trainer.scenes.frames import Frame
     from reference_trainer.scenes.load import load_scene
-    from reference_trainer.scenes.points import check_no_leak, mean_neighbor_distance
+    from reference_trainer.scenes.points import check_no_leak
     from reference_trainer.scenes.scene import PointCloud, Scene, View
     from reference_trainer.scenes.synthetic import synthetic_scene
 
 __all__ = [
+    "Capture",
+    "Frame",
     "PointCloud",
     "Scene",
+    "SceneFormat",
     "View",
     "check_no_leak",
     "load_scene",
-    "mean_neighbor_distance",
+    "register_format",
     "synthetic_scene",
 ]
 
 _MODULES = {
+    "Capture": "formats",
+    "SceneFormat": "formats",
+    "register_format": "formats",
+    "Frame": "frames",
     "load_scene": "load",
     "check_no_leak": "points",
-    "mean_neighbor_distance": "points",
     "PointCloud": "scene",
     "Scene": "scene",
     "View": "scene",

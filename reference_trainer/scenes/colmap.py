@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import TypeVar
 
 from reference_trainer.scenes.colmap_binary import read_cameras_binary, read_images_binary, read_points_binary
-from reference_trainer.scenes.colmap_model import ColmapModel
+from reference_trainer.scenes.colmap_model import ColmapModel, PointRecords
 from reference_trainer.scenes.colmap_text import read_cameras_text, read_images_text, read_points_text
+from reference_trainer.scenes.formats import Capture, SceneFormat
 from reference_trainer.scenes.frames import Frame
-from reference_trainer.scenes.images import match_images
+from reference_trainer.scenes.images import match_images, picture_folder
+from reference_trainer.scenes.options import SceneOptions
 
-__all__ = ["COLMAP_FOLDERS", "colmap_frames", "find_colmap", "read_colmap"]
-
-COLMAP_FOLDERS = ("sparse/0", "sparse")
-"""Where a scene folder has its reconstruction, unless the three files lie in the folder itself; the first counts."""
+__all__ = ["COLMAP", "colmap_folders", "colmap_frames", "read_colmap"]
 
 T = TypeVar("T")
 
@@ -27,7 +26,7 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         folder: the folder of the three files, often ``sparse/0``.
 
     Returns:
-        The reconstruction, its images sorted by name.
+        The reconstruction, its images sorted by name. It has no points if a ``points3D.ply`` stands in their place.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -36,25 +35,30 @@ def read_colmap(folder: str | Path) -> ColmapModel:
     folder = Path(folder)
     cameras = _read(folder, "cameras", read_cameras_binary, read_cameras_text)
     images = _read(folder, "images", read_images_binary, read_images_text)
-    points = _read(folder, "points3D", read_points_binary, read_points_text)
+    instantsplat = not _has(folder, "points3D") and (folder / "points3D.ply").is_file()
+    points = (
+        PointRecords().finish() if instantsplat else _read(folder, "points3D", read_points_binary, read_points_text)
+    )
     try:
         return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points)
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from error
 
 
-def find_colmap(root: Path) -> Path | None:
-    """Return the folder of the reconstruction of a scene, None if it has none."""
-    for folder in (*(root / name for name in COLMAP_FOLDERS), root):
-        if all(any((folder / f"{stem}{end}").is_file() for end in (".bin", ".txt")) for stem in ("cameras", "images")):
-            return folder
-    return root / COLMAP_FOLDERS[0] if (root / COLMAP_FOLDERS[0]).is_dir() else None  # to be told what is missing there
+def colmap_folders(root: Path) -> list[Path]:
+    """Return the folders of a scene with a reconstruction; the first has the cameras.
+
+    They are ``sparse/0`` (COLMAP), ``sparse`` (VGGT), the scene folder itself, and every ``sparse_<name>/0``
+    (InstantSplat, and clouds from the training views alone).
+    """
+    folders = [root / "sparse" / "0", root / "sparse", root, *sorted(root.glob("sparse_*/0"))]
+    return [folder for folder in folders if _has(folder, "cameras") and _has(folder, "images")]
 
 
 def colmap_frames(model: ColmapModel, folder: str | Path) -> list[Frame]:
     """Pair the images of a reconstruction with their files.
 
-    Lens distortion is ignored: the frame has the pinhole part of the camera, and says how far a corner is off.
+    The frame has the pinhole part of the camera, and its distortion beside it.
 
     Args:
         model: the reconstruction.
@@ -72,7 +76,7 @@ def colmap_frames(model: ColmapModel, folder: str | Path) -> list[Frame]:
     for image in model.images:
         camera = model.cameras[image.camera_id]
         pinhole = camera.pinhole(image.world_to_camera)
-        frames.append(Frame(image.name, files[image.name], pinhole, camera.corner_displacement()))
+        frames.append(Frame(image.name, files[image.name], pinhole, camera.distortion))
     return frames
 
 
@@ -87,3 +91,22 @@ def _read(folder: Path, stem: str, binary: Callable[[Path], T], text: Callable[[
                 raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
     found = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else "no such folder"
     raise FileNotFoundError(f"there is no {stem}.bin or {stem}.txt in {folder}; found: {found}.")
+
+
+def _has(folder: Path, stem: str) -> bool:
+    """Whether one of the three files is there in either form."""
+    return any((folder / (stem + suffix)).is_file() for suffix in (".bin", ".txt"))
+
+
+def _read_scene(root: Path, options: SceneOptions) -> Capture:
+    """Read a scene folder."""
+    folder = (colmap_folders(root) or [root / "sparse" / "0"])[0]  # to be told what is missing there
+    return Capture(colmap_frames(read_colmap(folder), picture_folder(root, options.images)))
+
+
+COLMAP = SceneFormat(
+    "colmap",
+    "a COLMAP model (cameras and images, .bin or .txt, in sparse/0, sparse, sparse_*/0 or the folder itself)",
+    lambda root: (root / "sparse" / "0").is_dir() or bool(colmap_folders(root)),
+    _read_scene,
+)

@@ -118,22 +118,6 @@ class ColmapCamera:
         cx, cy = self.principal_point
         return Camera(torch.from_numpy(world_to_camera), self.fx, self.fy, cx, cy, self.width, self.height)
 
-    def corner_displacement(self) -> float:
-        """Return how far the distortion moves an image corner, at most over the four, in pixels.
-
-        The renderer knows pinhole cameras only, so this is the error made at the corner by ignoring the distortion.
-        """
-        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *[0.0] * (8 - len(self.distortion)))
-        cx, cy = self.principal_point
-        x = np.array([0.0, self.width, 0.0, self.width])
-        y = np.array([0.0, 0.0, self.height, self.height])
-        x, y = (x - cx) / self.fx, (y - cy) / self.fy
-        r2 = x * x + y * y
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6))) - 1
-        dx = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        dy = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-        return float(np.hypot(dx * self.fx, dy * self.fy).max())
-
 
 @dataclass(frozen=True)
 class ColmapImage:

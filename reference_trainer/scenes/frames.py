@@ -11,6 +11,7 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.images import composite, read_image, resize_image
 from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.undistort import undistort
 
 __all__ = ["Frame", "load_view"]
 
@@ -26,33 +27,36 @@ class Frame:
         name: its name in the scene file, unique within the scene.
         path: the image file.
         camera: its camera, for the picture size that the scene file was written for; the pose is float64.
-        distortion_px: how far the lens distortion, which is ignored, moves a corner of that picture, pixels.
+        distortion: coefficients of the lens, in the order of `reference_trainer.scenes.undistort.distort`.
         bounds: nearest and farthest depth of the scene in this view, where the scene file has them.
+        mask: a picture that is white where the object is, where the scene has one.
     """
 
     name: str
     path: Path
     camera: Camera
-    distortion_px: float = 0.0
+    distortion: tuple[float, ...] = ()
     bounds: tuple[float, float] | None = None
+    mask: Path | None = None
 
 
-def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0) -> View:
+def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, straight: bool = True) -> View:
     """Read the photograph of a frame and fit its camera to the picture's size.
 
-    A picture with an alpha channel is composited on the background first and resized afterwards.
+    A picture with an alpha channel is composited on the background first, resized then, and undistorted last.
 
     Args:
         frame: the photograph.
         background: RGB in [0, 1], shape (3,).
         downscale: factor, at least 1, by which the picture is made smaller.
+        straight: whether to undo lens distortion.
 
     Returns:
         The view, float32.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is no image, or its aspect ratio is not the camera's.
+        ValueError: if the file is no image, its aspect ratio is not the camera's, or its distortion cannot be undone.
     """
     image, alpha = read_image(frame.path)
     height, width = image.shape[1:]
@@ -62,11 +66,16 @@ def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0) -> Vi
             f"{frame.path} is {width}x{height} but its camera is for {frame.camera.width}x{frame.camera.height}: the "
             f"aspect ratios differ by {abs(stretch - 1):.1%}. Choose the picture folder that belongs to the cameras."
         )
-    if alpha is not None:
-        image = composite(image, alpha, background)
-    if downscale != 1:
-        height, width = max(1, round(height / downscale)), max(1, round(width / downscale))
-        image = resize_image(image, width, height)
-        alpha = None if alpha is None else resize_image(alpha[None], width, height)[0]
-    camera = frame.camera.resized(width, height).to(dtype=torch.float32)
-    return View(frame.name, camera, image, alpha)
+    layers = {"image": image if alpha is None else composite(image, alpha, background)}
+    layers |= {} if alpha is None else {"alpha": alpha[None]}
+    layers |= {} if frame.mask is None else {"mask": read_image(frame.mask)[0].mean(0, keepdim=True)}
+    width, height = max(1, round(width / downscale)), max(1, round(height / downscale))
+    for name, layer in layers.items():
+        layers[name] = layer if layer.shape[1:] == (height, width) else resize_image(layer, width, height)
+    camera = frame.camera.resized(width, height)
+    if straight and any(frame.distortion):
+        names, sizes = list(layers), [len(layer) for layer in layers.values()]
+        pixels, camera = undistort(torch.cat(list(layers.values())), camera, frame.distortion)
+        layers = dict(zip(names, torch.split(pixels, sizes), strict=True))
+    flat = {name: layer[0] for name, layer in layers.items() if name != "image"}
+    return View(frame.name, camera.to(dtype=torch.float32), layers["image"], flat.get("alpha"), mask=flat.get("mask"))

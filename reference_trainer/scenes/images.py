@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ __all__ = [
     "list_images",
     "match_images",
     "path_inside",
+    "picture_folder",
     "read_image",
     "resize_image",
 ]
@@ -27,6 +29,7 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".
 # Pillow would otherwise try all formats that it knows on a file, whatever its name, and hand PostScript to Ghostscript.
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 LARGEST_IMAGE = 100_000_000  # pixels: a few bytes can announce any number, and each takes 25 bytes of memory
+LARGE_PICTURE = 500_000  # pixels: what a processor trains in about a second a step; larger ones are reduced
 _BAND = 100_000  # pixels that are converted at a time
 
 
@@ -222,3 +225,34 @@ def path_inside(root: str | Path, relative: str) -> Path:
     if os.path.isabs(relative) or normal.split(os.sep)[0] == os.pardir:
         raise ValueError(f"the path {relative!r} leads out of the scene folder {root}; it must stay inside.")
     return Path(root) / normal
+
+
+def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
+    """Return the folder of a scene's photographs.
+
+    Args:
+        root: the scene folder.
+        name: the folder that was asked for; if None, ``usual``, or of it and the ``<usual>_<factor>`` beside it the
+            largest pictures of at most half a megapixel, or the smallest if there are none.
+        usual: what this kind of scene calls it.
+
+    Raises:
+        FileNotFoundError: if there is none; the message lists the folders with pictures.
+    """
+    if name is not None:
+        found = [root / name] if (root / name).is_dir() else []
+    else:
+        factors = {path: path.name.removeprefix(f"{usual}_") for path in root.glob(f"{usual}_*") if path.is_dir()}
+        reduced = [path for path, factor in factors.items() if factor.isdecimal()]
+        found = [root / usual] if (root / usual).is_dir() else []
+        found += sorted(reduced, key=lambda path: int(factors[path]))
+    if not found:
+        others = sorted(each.name for each in root.iterdir() if each.is_dir() and any(map(is_image, each.iterdir())))
+        raise FileNotFoundError(
+            f"there is no folder {root / (name or usual)}; the folders of {root} with pictures are {others}: name one "
+            "with --images."
+        )
+    if len(found) == 1:
+        return found[0]
+    sizes = {path: image_size(list_images(path)[0]) for path in found}
+    return next((path for path in found if math.prod(sizes[path]) <= LARGE_PICTURE), found[-1])

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from reference_trainer.camera import Camera
+from reference_trainer.npy_files import read_npy
+from reference_trainer.scenes.formats import Capture, SceneFormat
 from reference_trainer.scenes.frames import Frame
-from reference_trainer.scenes.images import list_images
+from reference_trainer.scenes.images import list_images, picture_folder
+from reference_trainer.scenes.options import SceneOptions
 
-__all__ = ["read_llff"]
+__all__ = ["LLFF", "read_llff"]
 
 
 def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
@@ -52,23 +53,10 @@ def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
 
 
 def _rows(path: Path) -> NDArray[np.float64]:
-    """Read the array; its announced size is compared with the file's before anything is allocated for it."""
-    file = io.BytesIO(path.read_bytes())  # reading from the file itself would allocate whatever length the header has
-    try:
-        version = npy.read_magic(file)
-        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, columns_first, dtype = read_header(file)
-    except Exception as error:  # numpy evaluates the header as Python literals, with as many kinds of errors
-        raise ValueError(f"{path} is not a NumPy array of numbers: {error}") from error
-    data = file.read()
-    if len(shape) != 2 or shape[1] != 17 or dtype.kind != "f" or dtype.itemsize not in (4, 8):
-        raise ValueError(f"{path} must hold floats of 4 or 8 bytes of shape (N, 17), got shape {shape} of {dtype}.")
-    if len(data) != shape[0] * 17 * dtype.itemsize:
-        raise ValueError(f"{path} is damaged: {shape[0]} rows of 17 {dtype} do not make {len(data)} bytes.")
-    with np.errstate(over="ignore"):  # becomes infinite, which is reported
-        rows = np.frombuffer(data, dtype).reshape(shape, order="F" if columns_first else "C").astype(np.float64)
-    if not np.isfinite(rows).all():
-        raise ValueError(f"{path} must hold finite numbers; some of its {rows.size} are not.")
+    """Read the array."""
+    rows = read_npy(path.read_bytes(), path)
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise ValueError(f"{path} must hold floats of shape (N, 17), got shape {rows.shape}.")
     return rows
 
 
@@ -86,3 +74,11 @@ def _camera(row: NDArray[np.float64]) -> Camera:
     pose[:3, :3] = rotation
     pose[:3, 3] = -rotation @ matrix[:, 3]
     return Camera(torch.from_numpy(pose), focal, focal, width / 2, height / 2, width=round(width), height=round(height))
+
+
+def _read(root: Path, options: SceneOptions) -> Capture:
+    """Read a scene folder."""
+    return Capture(read_llff(root / "poses_bounds.npy", picture_folder(root, options.images)))
+
+
+LLFF = SceneFormat("llff", "poses_bounds.npy", lambda root: (root / "poses_bounds.npy").is_file(), _read)

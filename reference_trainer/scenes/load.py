@@ -2,66 +2,46 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
+import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from reference_trainer.scenes.blender import read_transforms
-from reference_trainer.scenes.colmap import COLMAP_FOLDERS, colmap_frames, find_colmap, read_colmap
+from reference_trainer.scenes.colmap import COLMAP
+from reference_trainer.scenes.formats import Capture, find_format, only_default, register_format
 from reference_trainer.scenes.frames import Frame, load_view
-from reference_trainer.scenes.images import is_image
-from reference_trainer.scenes.initial_points import choose_points
-from reference_trainer.scenes.llff import read_llff
-from reference_trainer.scenes.points import check_no_leak
+from reference_trainer.scenes.idr import IDR
+from reference_trainer.scenes.images import LARGE_PICTURE, image_size
+from reference_trainer.scenes.llff import LLFF
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.points import check_no_leak, choose_points
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.scenes.splits import blender_split, file_split, llff_split
+from reference_trainer.scenes.splits import blender_split, dtu_split, evenly_spaced, file_split, llff_split
 from reference_trainer.scenes.synthetic import synthetic_scene
+from reference_trainer.scenes.transforms import BLENDER, TRANSFORMS
+from reference_trainer.scenes.undistort import corner_displacement
 
-__all__ = ["FORMATS", "detect_format", "load_scene"]
+__all__ = ["detect_format", "load_options", "load_scene"]
 
-logger = logging.getLogger(__name__)
+for _format in (BLENDER, IDR, COLMAP, TRANSFORMS, LLFF):  # the table; of several that a folder fits, the first counts
+    register_format(_format)
 
-FORMATS = ("synthetic", "blender", "colmap", "llff")
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-DEFAULT_VIEWS = {"synthetic": 3, "blender": 8, "colmap": 3, "llff": 3}  # the paper's protocols
+RULES = {"llff": llff_split, "dtu": dtu_split}
+FEW = 8
+"""Below so many photographs all train, unless a split is asked for: a held-out one would be missed."""
 
 
-def load_scene(
-    path: str | Path,
-    *,
-    format: str = "auto",
-    images: str | None = None,
-    views: int | None = None,
-    split: str = "auto",
-    points: str = "auto",
-    downscale: float = 1.0,
-    background: str = "auto",
-    allow_test_points: bool = False,
-    seed: int = 0,
-) -> Scene:
+def load_scene(path: str | Path, *, seed: int = 0, **options: Any) -> Scene:
     """Load a scene: photographs with cameras, split into training and test views, and initial points.
 
     Args:
         path: the scene folder, or ``"synthetic"`` for the built-in scene.
-        format: ``"blender"`` (``transforms_train.json``), ``"colmap"`` (``sparse/0``, ``sparse`` or the
-            folder itself), ``"llff"`` (``poses_bounds.npy``), or ``"auto"`` for the first of these that is there.
-        images: the image folder within the scene, such as ``"images_8"``; cameras are scaled to its pictures. By
-            default ``images``, else the ``images_<factor>`` with the smallest factor. Not for Blender scenes.
-        views: number of training views. By default the split file's own choice, else 3, and 8 for Blender scenes.
-        split: ``"llff"`` for the rule of that data set (see ``llff_split``), or the name of a JSON file in the scene
-            folder without its extension, such as ``"split_near"`` (see ``file_split``). ``"auto"`` takes ``split.json``
-            if there is one, else the LLFF rule. Blender scenes are split by their JSON files (see ``blender_split``).
-        points: a COLMAP folder within the scene, such as ``"sparse_3views/0"``, a ``.ply`` file within it, ``"random"``
-            or ``"random:<count>"``. ``"auto"`` takes, of the folders ``sparse_*/0`` made from training views alone, the
-            one with most points, else random points. It never takes ``sparse/0``, which has seen the test views.
-        downscale: factor by which pictures are made smaller, at least 1.
-        background: ``"black"`` or ``"white"``, which pictures with transparency are laid on. ``"auto"`` is white for
-            Blender scenes, else black.
-        allow_test_points: accept points that have seen test views. Results then do not count as sparse-view ones.
         seed: seed of random points, and of the points of the built-in scene.
+        options: the fields of `SceneOptions`, which says what each does.
 
     Returns:
         The scene, float32 on the CPU; views are in the order of their names, for Blender scenes of their JSON file.
@@ -75,123 +55,113 @@ def load_scene(
         >>> len(scene.train), len(scene.test), tuple(scene.train[0].image.shape)
         (3, 3, (3, 30, 40))
     """
-    if downscale < 1:
-        raise ValueError(f"downscale must be at least 1, got {downscale}.")
-    if background not in ("auto", *BACKGROUNDS):
-        raise ValueError(f"background must be auto, black or white, got {background!r}.")
-    format = "synthetic" if str(path) == "synthetic" else detect_format(path) if format == "auto" else format
-    if format not in FORMATS:
-        raise ValueError(f"format must be auto or one of {', '.join(FORMATS)}, got {format!r}.")
-    if views is not None and views < 1:
-        raise ValueError(f"views must be at least 1, got {views}.")
-    if format == "synthetic":
-        _only_default(format, images=images, split=split, points=points, background=background)
-        views = views or DEFAULT_VIEWS[format]
-        return synthetic_scene(round(160 / downscale), round(120 / downscale), train_views=views, seed=seed)
-    root = Path(path)
-    if format == "blender":
-        _only_default(format, images=images, split=split)
-        train, test = _blender_frames(root, views or DEFAULT_VIEWS[format])
-    else:
-        frames = _photo_frames(root, format, images)
-        train, test = _split_frames(root, frames, split, views, DEFAULT_VIEWS[format])
+    return load_options(SceneOptions(str(path), **options), seed)
+
+
+def load_options(options: SceneOptions, seed: int = 0) -> Scene:
+    """Load the scene that options describe; the same as `load_scene`."""
+    if options.downscale is not None and options.downscale < 1:
+        raise ValueError(f"downscale must be at least 1, got {options.downscale}.")
+    if options.background not in ("auto", *BACKGROUNDS):
+        raise ValueError(f"background must be auto, black or white, got {options.background!r}.")
+    if options.views is not None and options.views < 1:
+        raise ValueError(f"views must be at least 1, got {options.views}.")
+    if options.test not in ("auto", "none"):
+        raise ValueError(f"test must be auto or none, got {options.test!r}.")
+    if options.path == "synthetic":
+        return _built_in(options, seed)
+    root = Path(options.path)
+    _, read = find_format(root, options.format)
+    capture = read(root, options)
+    train, test = _split(root, capture, options)
     generator = torch.Generator().manual_seed(seed)
-    cloud = choose_points(root, points, train, generator)
-    check_no_leak(cloud, [frame.name for frame in train], allow=allow_test_points)
-    worst = max(frame.distortion_px for frame in [*train, *test])
-    if worst > 0:
-        logger.info("%s: lens distortion is ignored; it moves image corners by up to %.2f pixels.", root, worst)
-    chosen = background if background != "auto" else "white" if format == "blender" else "black"
-    colour: Tensor = torch.tensor(BACKGROUNDS[chosen])
+    cloud, about_points = choose_points(root, options.points, train, generator, own=capture.points)
+    check_no_leak(cloud, [frame.name for frame in train], allow=options.allow_test_points)
+    chosen = capture.background if options.background == "auto" else options.background
+    color: Tensor = torch.tensor(BACKGROUNDS[chosen])
+    downscale, about_size = _downscale([*train, *test], options.downscale)
+    views = {
+        kind: tuple(
+            load_view(frame, background=color, downscale=downscale, straight=options.undistort) for frame in frames
+        )
+        for kind, frames in (("train", train), ("test", test))
+    }
     return Scene(
         name=root.resolve().name,
-        train=tuple(load_view(frame, background=colour, downscale=downscale) for frame in train),
-        test=tuple(load_view(frame, background=colour, downscale=downscale) for frame in test),
+        **views,
         points=cloud,
-        background=colour,
+        background=color,
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
+        notes=tuple(filter(None, (about_size, _about_lenses([*train, *test], options), about_points))),
     )
 
 
 def detect_format(path: str | Path) -> str:
-    """Return the format of a scene folder: ``"blender"``, ``"colmap"`` or ``"llff"``, the first whose file is there.
+    """Return the format of a scene folder, the first in the table whose files are there.
 
     Raises:
         FileNotFoundError: if there is no such folder.
         ValueError: if it holds none of them; the message lists what it holds.
     """
-    root = Path(path)
-    if not root.is_dir():
-        raise FileNotFoundError(f"there is no scene folder {root}; for the built-in scene, say 'synthetic'.")
-    if (root / "transforms_train.json").exists():
-        return "blender"
-    if find_colmap(root) is not None:
-        return "colmap"
-    if (root / "poses_bounds.npy").exists():
-        return "llff"
-    raise ValueError(
-        f"{root} has none of transforms_train.json, a COLMAP model ({', '.join(COLMAP_FOLDERS)} or the folder itself) "
-        f"and poses_bounds.npy; it has {_contents(root)}."
+    return find_format(Path(path), "auto")[0]
+
+
+def _built_in(options: SceneOptions, seed: int) -> Scene:
+    """Make the built-in scene."""
+    only_default(
+        "synthetic", images=options.images, split=options.split, points=options.points, background=options.background
+    )
+    downscale = options.downscale or 1.0
+    scene = synthetic_scene(round(160 / downscale), round(120 / downscale), train_views=options.views or 3, seed=seed)
+    return scene if options.test == "auto" else replace(scene, test=())
+
+
+def _split(root: Path, capture: Capture, options: SceneOptions) -> tuple[list[Frame], list[Frame]]:
+    """Apply the split rule or file."""
+    frames, test, split = capture.frames, capture.test or [], options.split
+    if split == "auto":
+        split = "split" if (root / "split.json").is_file() else capture.split
+        few = split != "split" and options.views is None and capture.test is None and len(frames) < FEW
+    else:
+        few = False
+    if options.test == "none" or few:
+        return [frames[i] for i in evenly_spaced(len(frames), options.views or len(frames))], []
+    views = options.views or capture.views
+    if capture.test is not None:
+        train_ids, test_ids = blender_split(len(frames), len(test), views)
+        return [frames[i] for i in train_ids], [test[i] for i in test_ids]
+    if split in RULES:
+        train_ids, test_ids = RULES[split](len(frames), views)
+    elif (root / f"{split}.json").is_file():
+        train_ids, test_ids = file_split(root / f"{split}.json", [frame.name for frame in frames], options.views)
+    else:
+        found = sorted(file.stem for file in root.glob("*.json"))
+        raise ValueError(
+            f"{root} has no split {split!r}; choose auto, {', '.join(RULES)} or a JSON file of the scene: {found}."
+        )
+    return [frames[i] for i in train_ids], [frames[i] for i in test_ids]
+
+
+def _downscale(frames: list[Frame], asked: float | None) -> tuple[float, str]:
+    """Return by which factor pictures are made smaller, and a sentence if nobody asked for it."""
+    if asked is not None:
+        return asked, ""
+    width, height = max((image_size(frame.path) for frame in frames), key=math.prod)
+    factor = math.sqrt(width * height / LARGE_PICTURE)
+    if factor <= 1:
+        return 1.0, ""
+    return factor, (
+        f"photographs of {width}x{height} are made smaller by {factor:.2f}, to half a megapixel, which a processor "
+        "trains in reasonable time: --downscale 1 takes them as they are"
     )
 
 
-def _blender_frames(root: Path, views: int) -> tuple[list[Frame], list[Frame]]:
-    """Read both transforms files and pick their protocol's frames."""
-    train = read_transforms(root / "transforms_train.json")
-    test = read_transforms(root / "transforms_test.json")
-    train_ids, test_ids = blender_split(len(train), len(test), views)
-    return [train[i] for i in train_ids], [test[i] for i in test_ids]
-
-
-def _photo_frames(root: Path, format: str, images: str | None) -> list[Frame]:
-    """Read the frames of a scene of photographs in one folder."""
-    folder = root / (images or _image_folder(root))
-    if not folder.is_dir():
-        found = sorted(each.name for each in root.iterdir() if each.is_dir() and any(map(is_image, each.iterdir())))
-        raise FileNotFoundError(
-            f"there is no folder {folder} (--images); the folders of {root} with pictures are {found}."
-        )
-    if format == "llff":
-        return read_llff(root / "poses_bounds.npy", folder)
-    return colmap_frames(read_colmap(find_colmap(root) or root / COLMAP_FOLDERS[0]), folder)
-
-
-def _image_folder(root: Path) -> str:
-    """Find the folder of the largest pictures."""
-    factors = {"images": 1}
-    for folder in root.glob("images_*"):
-        factor = folder.name.removeprefix("images_")
-        if factor.isdecimal() and folder.is_dir():
-            factors[folder.name] = int(factor)
-    for name in sorted(factors, key=lambda name: factors[name]):
-        if (root / name).is_dir():
-            return name
-    raise FileNotFoundError(f"{root} has no folder images or images_<factor>; it has {_contents(root)}. Name one.")
-
-
-def _split_frames(
-    root: Path, frames: Sequence[Frame], split: str, views: int | None, default_views: int
-) -> tuple[list[Frame], list[Frame]]:
-    """Apply the split rule or file."""
-    if split == "auto":
-        split = "split" if (root / "split.json").is_file() else "llff"
-    if split == "llff":
-        train, test = llff_split(len(frames), views or default_views)
-    elif (root / f"{split}.json").is_file():
-        train, test = file_split(root / f"{split}.json", [frame.name for frame in frames], views)
-    else:
-        found = sorted(file.stem for file in root.glob("*.json"))
-        raise ValueError(f"{root} has no split {split!r}; choose auto, llff or a JSON file of the scene: {found}.")
-    return [frames[i] for i in train], [frames[i] for i in test]
-
-
-def _only_default(format: str, **options: str | None) -> None:
-    """Refuse options that this format has no use for."""
-    given = {name: value for name, value in options.items() if value not in (None, "auto")}
-    if given:
-        raise ValueError(f"a {format} scene has no use for {given}; leave them out.")
-
-
-def _contents(root: Path) -> list[str]:
-    """Names in a folder, for error messages."""
-    return sorted(entry.name for entry in root.iterdir())[:20]
+def _about_lenses(frames: list[Frame], options: SceneOptions) -> str:
+    """Say how far lens distortion goes, if there is any."""
+    worst = max(
+        (corner_displacement(frame.camera, frame.distortion) for frame in frames if frame.distortion), default=0.0
+    )
+    if worst == 0:
+        return ""
+    size = f"lens distortion, up to {worst:.2f} pixels at a corner of the pictures that the cameras are for,"
+    return f"{size} is undone (--no-undistort leaves it in)" if options.undistort else f"{size} is left in, as asked"

@@ -29,21 +29,31 @@ class SceneOptions:
     """
 
     path: str = "synthetic"
-    """Scene folder (COLMAP, LLFF or Blender files), or "synthetic" for the built-in scene."""
+    """Scene folder (COLMAP, VGGT, InstantSplat, nerfstudio, instant-ngp, Blender, LLFF or IDR/NeuS files), or
+    "synthetic" for the built-in scene."""
     format: str = "auto"
-    """"blender", "colmap", "llff", or "auto" to find out."""
+    """"blender", "transforms", "colmap", "llff", "idr", a reader of yours as my_module:my_function, or "auto" for the
+    first whose files are there."""
     images: str | None = None
-    """Image folder within the scene, such as images_8; the cameras are scaled to its pictures."""
+    """Image folder within the scene, such as images_8; the cameras are scaled to its pictures. By default "images", or
+    the largest images_<factor> of at most half a megapixel."""
     views: int | None = None
-    """Number of training views; by default the split file's, else 3, and 8 for Blender scenes."""
+    """Number of training views; by default the split file's; else all if nothing is held out, 8 for Blender scenes,
+    and 3."""
     split: str = "auto"
-    """"llff" for every 8th view as test, or the name of a split file within the scene, such as split_near."""
+    """"llff" for every 8th view as test, "dtu" for that protocol, or the name of a JSON file within the scene, such as
+    split_near; by default split.json, else the format's rule, or no test views below 8 photographs."""
+    test: Literal["auto", "none"] = "auto"
+    """"none" to hold nothing out: all photographs train, or --views of them."""
     points: str = "auto"
-    """Initial points: a COLMAP folder such as sparse_3views/0, a .ply file, or "random" or "random:COUNT"."""
-    downscale: float = 1.0
-    """Make pictures smaller by this factor."""
+    """Initial points: a COLMAP folder such as sparse_3views/0, a .ply file (points or 3DGS) within the scene, "random"
+    or "random:COUNT"; by default the largest cloud made from training views alone, else random ones."""
+    downscale: float | None = None
+    """Make pictures smaller by this factor; by default those above half a megapixel are reduced to that."""
     background: str = "auto"
     """"black" or "white" behind transparent pictures; "auto" is white for Blender scenes, else black."""
+    undistort: bool = True
+    """Undo lens distortion; published sparse-view protocols, such as LLFF's, leave it in."""
     allow_test_points: bool = False
     """Accept initial points that were triangulated from test views; such results are not comparable with others."""
 
@@ -53,20 +63,9 @@ class SceneOptions:
 
     def load(self, *, seed: int = 0) -> Scene:
         """Load the scene; ``seed`` decides random initial points. Errors are those of `load_scene`."""
-        from reference_trainer.scenes.load import load_scene
+        from reference_trainer.scenes.load import load_options
 
-        return load_scene(
-            self.path,
-            format=self.format,
-            images=self.images,
-            views=self.views,
-            split=self.split,
-            points=self.points,
-            downscale=self.downscale,
-            background=self.background,
-            allow_test_points=self.allow_test_points,
-            seed=seed,
-        )
+        return load_options(self, seed)
 
 
 @dataclass(frozen=True)

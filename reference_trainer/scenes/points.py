@@ -8,27 +8,72 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from reference_trainer.camera import Camera
-from reference_trainer.neighbors import nearest_neighbors
-from reference_trainer.scenes.colmap import read_colmap
+from reference_trainer.model.gaussians import SH_C0
+from reference_trainer.ply_files import PlyVertices, read_ply
+from reference_trainer.scenes.colmap import colmap_folders, read_colmap
+from reference_trainer.scenes.frames import Frame
+from reference_trainer.scenes.images import path_inside
+from reference_trainer.scenes.random_points import random_points
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = [
-    "check_no_leak",
-    "colmap_points",
-    "mean_neighbor_distance",
-    "random_points_in_box",
-    "random_points_in_frusta",
-]
+__all__ = ["check_no_leak", "choose_points", "colmap_points", "ply_points"]
 
-SMALLEST_SQUARED_DISTANCE = 1e-7  # INRIA's clamp: coinciding points still get a Gaussian of some size
+RANDOM_POINTS = 10_000  # as DNGaussian for the Blender scenes
+INSTANTSPLAT = "points3D.ply"
+
+
+def choose_points(
+    root: Path, points: str, train: Sequence[Frame], generator: torch.Generator, *, own: PointCloud | None = None
+) -> tuple[PointCloud, str]:
+    """Return the initial points that an option of a scene asks for, and a sentence about the choice.
+
+    Args:
+        root: the scene folder.
+        points: ``"auto"``, ``"random"``, ``"random:<count>"``, a ``.ply`` file or a COLMAP folder within the scene.
+        train: the training frames.
+        generator: source of randomness.
+        own: the points that the scene file names.
+
+    Raises:
+        FileNotFoundError: if the file or folder is missing.
+        ValueError: if the option or a file makes no sense.
+    """
+    kind, _, count = points.partition(":")
+    passed = ""
+    if points == "auto":
+        offered = [own] if own is not None else []
+        offered += [cloud for folder in colmap_folders(root) if (cloud := _points_of(folder)) is not None]
+        names = {frame.name for frame in train}
+        honest = [cloud for cloud in offered if (cloud.seen_by or frozenset()) <= names]
+        if honest:
+            best = max(reversed(honest), key=lambda cloud: len(cloud.positions))
+            return best, f"initial points: {len(best.positions):,} from {best.source}"
+        kind = "random"
+        if offered:
+            passed = (
+                f"; the points from {', '.join(cloud.source for cloud in offered)} have seen views that do not train "
+                "(--test none holds none out; --points FOLDER --allow-test-points takes them all the same)"
+            )
+    if kind == "random":
+        if count and not (count.isdecimal() and int(count) > 0):
+            raise ValueError(f"points must be random or random:<count>, such as random:10000, got {points!r}.")
+        cloud = random_points(train, int(count or RANDOM_POINTS), generator)
+        return cloud, f"initial points: {len(cloud.positions):,} random ones{passed}"
+    path = path_inside(root, points)
+    if not path.is_dir() and path.suffix != ".ply":
+        found = sorted(folder.relative_to(root).as_posix() for folder in colmap_folders(root))
+        raise FileNotFoundError(
+            f"there is no folder {path} to take points from; choose auto, random or one of {found}."
+        )
+    cloud = ply_points(path) if path.suffix == ".ply" else colmap_points(path)
+    return cloud, f"initial points: {len(cloud.positions):,} from {cloud.source}"
 
 
 def colmap_points(folder: str | Path) -> PointCloud:
-    """Read the points of a COLMAP reconstruction.
+    """Read the points of a COLMAP reconstruction, or InstantSplat's ``points3D.ply`` in their place.
 
     Args:
-        folder: the folder of its three files, such as ``sparse/0``.
+        folder: the folder of its files, such as ``sparse/0``.
 
     Returns:
         The points; ``seen_by`` names the images in their tracks, or all of the reconstruction's if tracks are missing.
@@ -37,89 +82,62 @@ def colmap_points(folder: str | Path) -> PointCloud:
         FileNotFoundError: if a file is missing.
         ValueError: if a file is damaged or there are no points.
     """
-    model = read_colmap(folder)
-    if len(model.points.ids) == 0:
+    cloud = _points_of(Path(folder))
+    if cloud is None:
         raise ValueError(f"{folder} has no points to start from; choose another folder or random points.")
-    positions = torch.from_numpy(model.points.positions).to(torch.float32)
-    colors = torch.from_numpy(model.points.colors).to(torch.float32) / 255
-    return PointCloud(positions, colors, source=str(folder), seen_by=model.seen_by())
+    return cloud
 
 
-def random_points_in_box(count: int, half_size: float, *, generator: torch.Generator | None = None) -> PointCloud:
-    """Draw grey points uniformly in a cube around the origin.
-
-    Args:
-        count: number of points.
-        half_size: half the edge of the cube, world units; 1.3 for the NeRF-synthetic scenes.
-        generator: source of randomness; the global one if None.
-
-    Example:
-        >>> cloud = random_points_in_box(5, 1.3, generator=torch.Generator().manual_seed(0))
-        >>> bool((cloud.positions.abs() <= 1.3).all())
-        True
-    """
-    positions = (2 * torch.rand(count, 3, generator=generator) - 1) * half_size
-    return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
+def _points_of(folder: Path) -> PointCloud | None:
+    """Read the points of a reconstruction, None if it has none."""
+    model = read_colmap(folder)
+    if len(model.points.ids):
+        positions = torch.from_numpy(model.points.positions).to(torch.float32)
+        colors = torch.from_numpy(model.points.colors).to(torch.float32) / 255
+        return PointCloud(positions, colors, source=str(folder), seen_by=model.seen_by())
+    if (folder / INSTANTSPLAT).is_file():
+        return ply_points(folder / INSTANTSPLAT, seen_by=frozenset(image.name for image in model.images))
+    return None
 
 
-def random_points_in_frusta(
-    cameras: Sequence[Camera],
-    count: int,
-    *,
-    near: float | None = None,
-    far: float | None = None,
-    generator: torch.Generator | None = None,
-) -> PointCloud:
-    """Draw grey points that some camera sees: uniform over its picture, and in inverse depth between two bounds.
-
-    Without bounds, the point closest to all optical axes is looked for; near and far are a quarter of its median depth
-    and four times that.
+def ply_points(path: str | Path, *, seen_by: frozenset[str] | None = None) -> PointCloud:
+    """Read the vertices of a PLY file: a point cloud, or the centres and plain colours of a 3DGS model.
 
     Args:
-        cameras: the training cameras, at least one.
-        count: number of points.
-        near: smallest depth, world units.
-        far: largest depth, world units.
-        generator: source of randomness; the global one if None.
+        path: a PLY file, binary or ASCII, whose first element is ``vertex`` with at least ``x y z``. Its colours are
+            ``red green blue``: bytes, or floats up to 1 or up to 255; or ``f_dc_0`` to ``f_dc_2``; else grey.
+        seen_by: names of the images that it was made from, where that is known, for a PLY file does not say.
 
     Raises:
-        ValueError: if no depth can be found because the optical axes do not meet in front of the cameras, or the bounds
-            are not ``0 < near < far``.
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is truncated, not a PLY, or has no points with finite positions and fitting colours.
     """
-    if near is None or far is None:
-        focus = _focus_depth(cameras)
-        near, far = focus / 4, focus * 4
-    if not 0 < near < far:
-        raise ValueError(f"the depth bounds must satisfy 0 < near < far, got {near} and {far}.")
-    chosen = torch.randint(len(cameras), (count,), generator=generator)
-    u, v, share = torch.rand(3, count, generator=generator)
-    depth = 1 / (share / near + (1 - share) / far)
-    intrinsics = torch.tensor([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], dtype=torch.float32)[
-        chosen
-    ]
-    fx, fy, cx, cy, width, height = intrinsics.unbind(1)
-    local = torch.stack([(u * width - cx) / fx * depth, (v * height - cy) / fy * depth, depth], dim=1)
-    poses = torch.stack([camera.world_to_camera.to(torch.float32) for camera in cameras])[chosen]
-    positions = torch.einsum("nji,nj->ni", poses[:, :3, :3], local - poses[:, :3, 3])
-    return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no point cloud {path}.")
+    vertices = read_ply(path)
+    missing = [axis for axis in "xyz" if axis not in vertices.kinds]
+    if missing:
+        raise ValueError(
+            f"{path} is no point cloud: its vertices lack {', '.join(missing)}; they have {vertices.kinds}."
+        )
+    positions, colors = vertices.columns("xyz"), _colors(vertices)
+    if len(positions) == 0 or not bool(positions.isfinite().all()):
+        raise ValueError(f"{path} must hold points with finite positions; it has {len(positions)} points.")
+    if not bool(((colors >= 0) & (colors <= 1)).all()):
+        raise ValueError(f"{path} must have colours as bytes, or as floats from 0 to 1 or to 255.")
+    return PointCloud(positions, colors, source=str(path), seen_by=seen_by)
 
 
-def _focus_depth(cameras: Sequence[Camera]) -> float:
-    """Median depth of the point with the least summed squared distance to the optical axes."""
-    axes = torch.stack([camera.forward.double() for camera in cameras])
-    centres = torch.stack([camera.position.double() for camera in cameras])
-    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
-    normal = across.sum(0)
-    # The smallest eigenvalue is the summed squared sine of the axes' angles to their common direction.
-    if torch.linalg.eigvalsh(normal)[0] > 1e-6 * len(cameras):
-        point = torch.linalg.solve(normal, (across @ centres[:, :, None]).sum(0)[:, 0])
-        depth = float(((point - centres) * axes).sum(1).median())
-        if depth > 0:
-            return depth
-    raise ValueError(
-        "cannot tell how far the scene is: the optical axes of the training cameras do not meet in front of them. "
-        "Start from points, not from random ones: --points (points=) takes a COLMAP folder or a .ply file of the scene."
-    )
+def _colors(vertices: PlyVertices) -> Tensor:
+    """Return the colours, in [0, 1] if they are any, shape (N, 3)."""
+    rgb, band = ("red", "green", "blue"), ("f_dc_0", "f_dc_1", "f_dc_2")
+    if vertices.kinds.keys() >= set(rgb):
+        colors = vertices.columns(rgb)
+        return colors / 255 if vertices.kinds["red"] == "u1" or bool((colors > 1).any()) else colors
+    if vertices.kinds.keys() >= set(band):
+        return (0.5 + SH_C0 * vertices.columns(band)).clamp(0, 1)
+    return torch.full((len(vertices.rows), 3), 0.5)
 
 
 def check_no_leak(points: PointCloud, train_names: Iterable[str], *, allow: bool = False) -> None:
@@ -152,29 +170,3 @@ def check_no_leak(points: PointCloud, train_names: Iterable[str], *, allow: bool
             f"training split: {shown}. Results would not count as sparse-view ones. Take points from the training "
             "views alone or random points, or pass --allow-test-points (allow_test_points=True) to use them anyway."
         )
-
-
-def mean_neighbor_distance(positions: Tensor) -> Tensor:
-    """Return the root mean squared distance of each point to its three nearest others.
-
-    Convention: the INRIA code takes the logarithm of this as the initial scale of a Gaussian. Coinciding points get
-    sqrt(1e-7) instead of 0. With fewer than three other points, all others count.
-
-    Args:
-        positions: world coordinates, shape (N, 3), N at least 2.
-
-    Returns:
-        Distances, shape (N,), positive.
-
-    Raises:
-        ValueError: if the shape is not (N, 3) or N is less than 2.
-
-    Example:
-        >>> mean_neighbor_distance(torch.tensor([[0.0, 0, 0], [0, 0, 2]])).tolist()
-        [2.0, 2.0]
-    """
-    n = positions.shape[0]
-    if positions.ndim != 2 or positions.shape[1] != 3 or n < 2:
-        raise ValueError(f"positions must have shape (N, 3) with N >= 2, got {tuple(positions.shape)}.")
-    squares, _ = nearest_neighbors(positions, min(3, n - 1))
-    return squares.mean(1).clamp_min(SMALLEST_SQUARED_DISTANCE).sqrt()

@@ -44,11 +44,14 @@ class View(Viewpoint):
         image: colours in [0, 1], shape (3, H, W), float32, already composited on the scene's background.
         alpha: coverage in [0, 1], shape (H, W), where the source has one, else None.
         depth: true depth along the camera's z axis, shape (H, W), where it is known, else None; 0 where nothing is hit.
+        mask: what an evaluation looks at, in [0, 1], shape (H, W), where the source has one: DTU's object. The
+            photograph itself is untouched by it.
     """
 
     image: Tensor
     alpha: Tensor | None = None
     depth: Tensor | None = None
+    mask: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,7 @@ class Scene:
         points: initial points, or None to let the trainer draw random ones.
         background: the colour (3,) behind everything, in [0, 1].
         source: where the photographs come from.
+        notes: what a user should know of how it was loaded, a sentence each.
     """
 
     name: str
@@ -87,9 +91,10 @@ class Scene:
     points: PointCloud | None
     background: Tensor
     source: str = "built in"
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """Say what a user looks at first: which photographs, their size, and the names of the views."""
+        """Say what a user looks at first: which photographs, their size, the names of the views, and the notes."""
         sizes = sorted({(view.camera.width, view.camera.height) for view in (*self.train, *self.test)})
         size = " to ".join(f"{width}x{height}" for width, height in dict.fromkeys((sizes[0], sizes[-1])))
         lines = [f"photographs: {self.source}, used at {size} pixels"]
@@ -97,7 +102,7 @@ class Scene:
             names = [view.name for view in views]
             shown = names if len(names) <= _NAMES_SHOWN else [*names[: _NAMES_SHOWN - 1], "...", names[-1]]
             lines.append(f"{len(names)} {kind} view{'s' * (len(names) != 1)}{': ' * bool(names)}{', '.join(shown)}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *self.notes])
 
     @property
     def pixels(self) -> int:

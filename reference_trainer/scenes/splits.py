@@ -9,11 +9,13 @@ import numpy as np
 
 from reference_trainer.json_files import read_json
 
-__all__ = ["blender_split", "evenly_spaced", "file_split", "llff_split"]
+__all__ = ["blender_split", "dtu_split", "evenly_spaced", "file_split", "llff_split"]
 
 BLENDER_TRAIN = (2, 16, 26, 55, 73, 76, 86, 93)  # the 8 views of DietNeRF, which every later paper takes
 BLENDER_TEST_FRAMES = 200  # the size of a full NeRF-synthetic test set
 TEST_EVERY = 8
+DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)  # PixelNeRF's, of which a protocol of 3 views takes the first 3
+DTU_TEST = (1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, *range(29, 36), 41, 42, 43, 45, 46, 47)
 
 
 def evenly_spaced(count: int, views: int) -> list[int]:
@@ -54,6 +56,29 @@ def llff_split(count: int, views: int) -> tuple[list[int], list[int]]:
     """
     pool = [i for i in range(count) if i % TEST_EVERY]
     return [pool[i] for i in evenly_spaced(len(pool), views)], list(range(0, count, TEST_EVERY))
+
+
+def dtu_split(count: int, views: int) -> tuple[list[int], list[int]]:
+    """Split a DTU scan of 49 or 64 pictures, sorted by name: the protocol of PixelNeRF and RegNeRF.
+
+    Args:
+        count: number of images.
+        views: number of training views, 1 to 9.
+
+    Returns:
+        Indices of the training views and of the 25 test views, each in increasing order.
+
+    Raises:
+        ValueError: if there are too few images, or ``views`` is out of range.
+
+    Example:
+        >>> train, test = dtu_split(49, 3)
+        >>> train, len(test)
+        ([22, 25, 28], 25)
+    """
+    if count <= max(DTU_TRAIN) or not 1 <= views <= len(DTU_TRAIN):
+        raise ValueError(f"the DTU split takes 1 to 9 views of a scan of 49 pictures or more, got {views} of {count}.")
+    return sorted(DTU_TRAIN[:views]), list(DTU_TEST)
 
 
 def blender_split(train_count: int, test_count: int, views: int) -> tuple[list[int], list[int]]:

@@ -8,7 +8,7 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.scenes.points import mean_neighbor_distance
+from reference_trainer.neighbors import mean_neighbor_distance
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.config import TrainConfig
 

@@ -68,7 +68,11 @@ def depth_output(scene: Scene, config: TrainConfig) -> Finding:
 
 def distortion(scene: Scene, config: TrainConfig) -> Finding:
     """Cameras are pinholes once they are loaded."""
-    return Finding("lens distortion", "left out", "by construction: cameras are pinholes; the loader says how far off")
+    return Finding(
+        "lens distortion",
+        "left out",
+        "by construction: cameras are pinholes; the loader undoes it and says how far it goes",
+    )
 
 
 def densification(scene: Scene, config: TrainConfig) -> Finding:

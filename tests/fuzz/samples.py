@@ -81,6 +81,14 @@ def write_llff(folder: Path) -> None:
     np.save(folder / "poses_bounds.npy", np.array([row] * VIEWS, np.float64))
 
 
+def write_idr(folder: Path) -> None:
+    """Three cameras K [R | t], the sphere around the object, and pictures."""
+    _pictures(folder / "image")
+    world = np.array([[9.0, 0.0, 4.0, 1.0], [0.0, 9.5, 3.0, 2.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
+    arrays = {f"{kind}_mat_{i}": x for kind, x in (("world", world), ("scale", np.eye(4))) for i in range(VIEWS)}
+    np.savez(folder / "cameras_sphere.npz", **arrays)
+
+
 def write_blender(folder: Path) -> None:
     """A transforms file with every key that is read, and pictures."""
     _pictures(folder / "train")

@@ -15,12 +15,13 @@ from ca_reg.dynamics import read_dynamics
 from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.settings import read_run_settings
-from reference_trainer.scenes.blender import read_transforms
 from reference_trainer.scenes.colmap import read_colmap
+from reference_trainer.scenes.idr import read_idr
 from reference_trainer.scenes.images import LARGEST_IMAGE, read_image
 from reference_trainer.scenes.llff import read_llff
-from reference_trainer.scenes.ply_points import ply_points
+from reference_trainer.scenes.points import ply_points
 from reference_trainer.scenes.splits import file_split
+from reference_trainer.scenes.transforms import read_transforms
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
@@ -121,6 +122,15 @@ TARGETS = (
         samples.write_llff,
         lambda folder: read_llff(folder / "poses_bounds.npy", folder / "images"),
         "binary",
+        check=_frames_fit,
+    ),
+    Target(
+        "IDR cameras_sphere.npz",
+        "cameras_sphere.npz",
+        samples.write_idr,
+        lambda folder: read_idr(folder / "cameras_sphere.npz", folder / "image"),
+        "binary",
+        checksummed=True,
         check=_frames_fit,
     ),
     Target(

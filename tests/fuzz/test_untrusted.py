@@ -14,11 +14,11 @@ from fuzz import samples
 from PIL import EpsImagePlugin, Image
 
 from reference_trainer.evaluation.lpips import load_lpips
-from reference_trainer.scenes.blender import read_transforms
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
 from reference_trainer.scenes.images import image_size, read_image
 from reference_trainer.scenes.llff import read_llff
 from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes.transforms import read_transforms
 from reference_trainer.tensor_files import load_tensors
 from reference_trainer.training.checkpoint import load_checkpoint
 

@@ -1,12 +1,11 @@
+import dataclasses
 import json
-import logging
 
 import pytest
 
 from reference_trainer.cli import main
 from reference_trainer.cli.runs import given_fields
 from reference_trainer.runs import run as run_module
-from reference_trainer.scenes import load
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.plan import Plan
 
@@ -81,13 +80,8 @@ def test_a_value_is_not_an_option():
     assert given_fields(["train", "--out", "seed", "--lpips", "noise"]) == frozenset()
 
 
-def test_plan_lets_the_loader_say_how_far_distortion_goes(tiny_scene, monkeypatch, caplog):
-    monkeypatch.setattr(load.logger, "level", logging.WARNING)  # and is put back after the test
-
-    def loading(self, **keywords):
-        load.logger.info("corners move by 3 pixels")
-        return tiny_scene
-
-    monkeypatch.setattr(SceneOptions, "load", loading)
+def test_plan_says_what_the_loader_did(tiny_scene, monkeypatch, capsys):
+    noted = dataclasses.replace(tiny_scene, notes=("lens distortion is undone",))
+    monkeypatch.setattr(SceneOptions, "load", lambda self, **keywords: noted)
     main(["plan", "garden"])
-    assert caplog.messages == ["corners move by 3 pixels"]
+    assert capsys.readouterr().out.splitlines()[3] == "lens distortion is undone"

@@ -1,10 +1,11 @@
 """Nearest neighbours against the full matrix of distances in float64."""
 
+import numpy as np
 import pytest
 import torch
 
 from reference_trainer import neighbors
-from reference_trainer.neighbors import nearest_neighbors
+from reference_trainer.neighbors import mean_neighbor_distance, nearest_neighbors
 
 
 def _points(kind: str, n: int) -> torch.Tensor:
@@ -41,3 +42,39 @@ def test_equal_to_the_full_matrix(monkeypatch, kind, n, count, chunk):
 def test_other_shapes_are_refused(shape):
     with pytest.raises(ValueError, match=r"\(N, 3\) with N > 3"):
         nearest_neighbors(torch.zeros(shape), 3)
+
+
+def brute_force(positions):
+    """Root mean squared distance to the three nearest others, in float64, one pair at a time."""
+    p = positions.double().numpy()
+    squared = ((p[:, None] - p[None]) ** 2).sum(-1)
+    result = []
+    for i, row in enumerate(squared):
+        nearest = sorted(np.delete(row, i))[:3]
+        result.append(max(np.mean(nearest), 1e-7) ** 0.5)
+    return torch.tensor(result)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 200])
+def test_neighbor_distance_equals_brute_force(n):
+    positions = torch.randn(n, 3, generator=torch.Generator().manual_seed(n))
+    torch.testing.assert_close(mean_neighbor_distance(positions).double(), brute_force(positions), rtol=1e-5, atol=0)
+
+
+def test_neighbor_distance_of_near_duplicates_far_from_the_origin():
+    generator = torch.Generator().manual_seed(0)
+    base = torch.rand(40, 3, generator=generator) + 3
+    shifts = 1e-3 * torch.randn(3, 40, 3, generator=generator)
+    positions = torch.cat([base, *(base + shift for shift in shifts)])
+    got = mean_neighbor_distance(positions)
+    torch.testing.assert_close(got.double(), brute_force(positions), rtol=1e-4, atol=0)
+
+
+def test_duplicates_get_the_floor():
+    assert torch.equal(mean_neighbor_distance(torch.ones(5, 3)), torch.full((5,), 1e-7).sqrt())
+
+
+@pytest.mark.parametrize("shape", [(1, 3), (0, 3), (4, 2), (12,)])
+def test_neighbor_distance_refuses_other_shapes(shape):
+    with pytest.raises(ValueError, match="shape"):
+        mean_neighbor_distance(torch.zeros(shape))

@@ -9,9 +9,8 @@ import torch
 
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
 from reference_trainer.scenes.colmap_binary import read_cameras_binary, read_images_binary, read_points_binary
-from reference_trainer.scenes.colmap_model import CAMERA_MODELS, ColmapCamera, ColmapImage
+from reference_trainer.scenes.colmap_model import CAMERA_MODELS, ColmapImage
 
-MODELS = {model.name: model for model in CAMERA_MODELS}
 READERS = {"cameras": read_cameras_binary, "images": read_images_binary, "points3D": read_points_binary}
 
 
@@ -149,26 +148,13 @@ def test_unknown_camera_model(tmp_path):
         read_cameras_binary(tmp_path / "cameras.bin")
 
 
-def test_corner_displacement_closed_forms():
-    f, k = 200.0, 0.02
-    radial = ColmapCamera(1, MODELS["SIMPLE_RADIAL"], 160, 120, (f, 80.0, 60.0, k))
-    # The corner is 100 px from the centre; a radial term moves it by k r^3 f with r = 100 / f.
-    assert radial.corner_displacement() == pytest.approx(k * (100 / f) ** 3 * f, rel=1e-12)
-    tangential = ColmapCamera(1, MODELS["OPENCV"], 160, 120, (f, f, 80.0, 60.0, 0.0, 0.0, 0.01, 0.0))
-    x, y = 80 / f, 60 / f
-    expected = f * math.hypot(2 * 0.01 * x * y, 0.01 * (x * x + y * y + 2 * y * y))
-    assert tangential.corner_displacement() == pytest.approx(expected, rel=1e-12)
-    assert ColmapCamera(1, MODELS["PINHOLE"], 160, 120, (f, f, 80.0, 60.0)).corner_displacement() == 0
-
-
-def test_frames_have_the_pinhole_part_and_say_what_is_ignored(tmp_path, colmap_binary):
+def test_frames_have_the_pinhole_part_and_the_distortion(tmp_path, colmap_binary):
     colmap_binary(tmp_path / "sparse")
     for name in ("a b.png", "b.png", "c.png"):
         (tmp_path / name).touch()
     frames = colmap_frames(read_colmap(tmp_path / "sparse"), tmp_path)
     assert [frame.name for frame in frames] == ["a b.png", "b.png", "c.png"]
-    assert frames[0].distortion_px > 0
-    assert frames[1].distortion_px == 0
+    assert [frame.distortion for frame in frames] == [(0.125,), (), ()]
     assert frames[1].camera.world_to_camera.dtype == torch.float64
     assert frames[1].path == tmp_path / "b.png"
 

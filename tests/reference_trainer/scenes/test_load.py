@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import logging
 
 import numpy as np
 import pytest
@@ -27,10 +26,9 @@ def photo_scene(tmp_path, colmap_text, save_image):
     return root
 
 
-def test_colmap_scene(photo_scene, caplog):
-    with caplog.at_level(logging.INFO):
-        scene = load_scene(photo_scene, points="sparse/0")
-    assert "distortion is ignored" in caplog.text
+def test_colmap_scene(photo_scene):
+    scene = load_scene(photo_scene, points="sparse/0", undistort=False)
+    assert "is left in, as asked" in str(scene)
     assert scene.name == "garden"
     assert [view.name for view in scene.train] == ["b.png", "c.png"]
     assert [view.name for view in scene.test] == ["a b.png"]
@@ -73,14 +71,12 @@ def test_a_reconstruction_beside_its_usual_place(photo_scene, place, format):
 
 
 def test_a_folder_of_pictures_that_is_not_there(photo_scene):
-    with pytest.raises(
-        FileNotFoundError, match=r"no folder .*images_8 \(--images\).*with pictures are \['images', 'images_4'\]"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"no folder .*images_8; .*with pictures are \['images', 'images_4'\]"):
         load_scene(photo_scene, images="images_8")
 
 
 def test_a_scene_says_what_a_user_checks_first(photo_scene, blender_scene):
-    assert str(load_scene(photo_scene, images="images_4", points="random:5")).splitlines() == [
+    assert str(load_scene(photo_scene, images="images_4", points="random:5")).splitlines()[:3] == [
         f"photographs: {photo_scene / 'images_4'}, used at 16x12 pixels",
         "2 training views: b.png, c.png",
         "1 test view: a b.png",
@@ -90,7 +86,7 @@ def test_a_scene_says_what_a_user_checks_first(photo_scene, blender_scene):
         f"photographs: {blender_scene / 'test'}, {blender_scene / 'train'}, used at 8x6 pixels"
     )
     many = dataclasses.replace(scene, train=scene.train * 5, test=())
-    assert str(many).splitlines()[1:] == [f"15 training views: {'train/r_0, train/r_1, train/r_2, ' * 3}train/r_0, "
+    assert str(many).splitlines()[1:3] == [f"15 training views: {'train/r_0, train/r_1, train/r_2, ' * 3}train/r_0, "
                                           "train/r_1, ..., train/r_2", "0 test views"]  # fmt: skip
 
 
@@ -189,7 +185,7 @@ def test_detect_format(photo_scene, blender_scene, tmp_path):
         ({"downscale": 0.5}, "downscale must be"),
         ({"views": 0}, "views must be"),
         ({"views": 5}, "no training set of 5 views"),
-        ({"split": "other"}, r"no split 'other'; choose auto, llff or a JSON file of the scene: \['split'\]"),
+        ({"split": "other"}, r"no split 'other'; choose auto, llff, dtu or a JSON file of the scene: \['split'\]"),
         ({"images": "pictures"}, "no folder"),
         ({"points": "sparse/1"}, r"choose auto, random or one of \['sparse/0'\]"),
         ({"points": "../sparse/0"}, "leads out of the scene"),

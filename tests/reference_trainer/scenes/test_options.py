@@ -1,29 +1,18 @@
-import dataclasses
-import inspect
-
+import pytest
 import torch
 
-from reference_trainer.scenes import load as load_module
 from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
 
 
-def test_every_option_of_loading_is_there_with_the_same_default():
-    expected = {name: p.default for name, p in inspect.signature(load_scene).parameters.items()}
-    expected.pop("seed")
-    expected["path"] = "synthetic"
-    assert {field.name: field.default for field in dataclasses.fields(SceneOptions)} == expected
-
-
-def test_every_option_arrives(monkeypatch):
-    given = {
-        "path": "a", "format": "llff", "images": "images_8", "views": 5, "split": "near", "points": "random:7",
-        "downscale": 2.0, "background": "white", "allow_test_points": True,
-    }  # fmt: skip
-    received: dict = {}
-    monkeypatch.setattr(load_module, "load_scene", lambda path, **rest: received.update(path=path, **rest))
-    SceneOptions(**given).load(seed=11)
-    assert received == given | {"seed": 11}
+def test_loading_takes_the_options_by_name():
+    assert (
+        load_scene("synthetic", downscale=8, views=2)
+        .train[0]
+        .image.equal(SceneOptions("synthetic", downscale=8, views=2).load().train[0].image)
+    )
+    with pytest.raises(TypeError, match="no_such_option"):
+        load_scene("synthetic", no_such_option=1)
 
 
 def test_the_seed_moves_the_points_and_not_the_photographs():

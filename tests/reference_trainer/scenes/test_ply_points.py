@@ -5,7 +5,7 @@ import struct
 import pytest
 import torch
 
-from reference_trainer.scenes.ply_points import ply_points
+from reference_trainer.scenes.points import ply_points
 
 POSITIONS = [(0.5, -1.0, 2.0), (3.0, 4.0, -5.5)]
 COLORS = [(0, 51, 255), (102, 153, 204)]
@@ -62,7 +62,9 @@ def test_ascii(tmp_path):
         header("binary_little_endian", count=2**60) + b"short",
         header("binary_little_endian", count=-1) + b"short",
         header("binary_little_endian", count=0),
-        header("binary_big_endian") + bytes(30),
+        header("binary_middle_endian") + bytes(30),
+        header("ascii") + b"1 2 3 4 5 6\n1 2 3 256 5 6\n",
+        header("ascii") + b"1 2 3 4 5 6\n1 2 3 4 5 -6\n",
         header("ascii") + b"1 2 3 4 5 6\n",
         header("ascii") + b"1 2 3 4 5 6\n1 2\n",
         header("ascii") + b"1 2 3 4 5 6\nnan 2 3 4 5 6\n",

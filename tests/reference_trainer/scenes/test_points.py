@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import struct
 
-import numpy as np
 import pytest
 import torch
 
@@ -10,47 +9,9 @@ from reference_trainer.camera import Camera
 from reference_trainer.scenes.points import (
     check_no_leak,
     colmap_points,
-    mean_neighbor_distance,
-    random_points_in_box,
-    random_points_in_frusta,
 )
+from reference_trainer.scenes.random_points import random_points_in_box, random_points_in_frusta
 from reference_trainer.scenes.scene import PointCloud
-
-
-def brute_force(positions):
-    """Root mean squared distance to the three nearest others, in float64, one pair at a time."""
-    p = positions.double().numpy()
-    squared = ((p[:, None] - p[None]) ** 2).sum(-1)
-    result = []
-    for i, row in enumerate(squared):
-        nearest = sorted(np.delete(row, i))[:3]
-        result.append(max(np.mean(nearest), 1e-7) ** 0.5)
-    return torch.tensor(result)
-
-
-@pytest.mark.parametrize("n", [2, 3, 4, 200])
-def test_neighbor_distance_equals_brute_force(n):
-    positions = torch.randn(n, 3, generator=torch.Generator().manual_seed(n))
-    torch.testing.assert_close(mean_neighbor_distance(positions).double(), brute_force(positions), rtol=1e-5, atol=0)
-
-
-def test_neighbor_distance_of_near_duplicates_far_from_the_origin():
-    generator = torch.Generator().manual_seed(0)
-    base = torch.rand(40, 3, generator=generator) + 3
-    shifts = 1e-3 * torch.randn(3, 40, 3, generator=generator)
-    positions = torch.cat([base, *(base + shift for shift in shifts)])
-    got = mean_neighbor_distance(positions)
-    torch.testing.assert_close(got.double(), brute_force(positions), rtol=1e-4, atol=0)
-
-
-def test_duplicates_get_the_floor():
-    assert torch.equal(mean_neighbor_distance(torch.ones(5, 3)), torch.full((5,), 1e-7).sqrt())
-
-
-@pytest.mark.parametrize("shape", [(1, 3), (0, 3), (4, 2), (12,)])
-def test_neighbor_distance_refuses_other_shapes(shape):
-    with pytest.raises(ValueError, match="shape"):
-        mean_neighbor_distance(torch.zeros(shape))
 
 
 def cloud(seen_by):

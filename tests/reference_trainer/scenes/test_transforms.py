@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from reference_trainer.scenes.blender import read_transforms
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
+from reference_trainer.scenes.transforms import read_transforms
 
 
 def rewrite(path, change):

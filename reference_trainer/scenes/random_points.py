@@ -1,0 +1,118 @@
+"""Random initial points: in a box, or where the cameras look."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from reference_trainer.camera import Camera
+from reference_trainer.scenes.frames import Frame
+from reference_trainer.scenes.scene import PointCloud
+
+__all__ = ["random_points", "random_points_in_box", "random_points_in_frusta"]
+
+BLENDER_BOX = 1.3  # half the edge of the box that holds every NeRF-synthetic object, as in the INRIA code
+
+
+def random_points(train: Sequence[Frame], count: int, generator: torch.Generator) -> PointCloud:
+    """Draw grey points where the training cameras look.
+
+    They fill the NeRF-synthetic box if its centre lies in all training pictures and all training cameras stand outside
+    it, else the cameras' frusta, between the scene file's depth bounds where it has them.
+    """
+    cameras = [frame.camera for frame in train]
+    if all(_looks_at_box(frame) for frame in train):
+        return random_points_in_box(count, BLENDER_BOX, generator=generator)
+    bounds = [frame.bounds for frame in train if frame.bounds is not None]
+    if bounds:
+        near, far = min(near for near, _ in bounds), max(far for _, far in bounds)
+        return random_points_in_frusta(cameras, count, near=near, far=far, generator=generator)
+    return random_points_in_frusta(cameras, count, generator=generator)
+
+
+def _looks_at_box(frame: Frame) -> bool:
+    """Whether the camera stands outside the NeRF-synthetic box and has its centre, the origin, in the picture."""
+    camera = frame.camera
+    x, y, z = camera.world_to_camera[:3, 3].tolist()
+    if float(camera.position.abs().max()) <= BLENDER_BOX or z <= 0:
+        return False
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return bool(0 <= u <= camera.width and 0 <= v <= camera.height)
+
+
+def random_points_in_box(count: int, half_size: float, *, generator: torch.Generator | None = None) -> PointCloud:
+    """Draw grey points uniformly in a cube around the origin.
+
+    Args:
+        count: number of points.
+        half_size: half the edge of the cube, world units; 1.3 for the NeRF-synthetic scenes.
+        generator: source of randomness; the global one if None.
+
+    Example:
+        >>> cloud = random_points_in_box(5, 1.3, generator=torch.Generator().manual_seed(0))
+        >>> bool((cloud.positions.abs() <= 1.3).all())
+        True
+    """
+    positions = (2 * torch.rand(count, 3, generator=generator) - 1) * half_size
+    return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
+
+
+def random_points_in_frusta(
+    cameras: Sequence[Camera],
+    count: int,
+    *,
+    near: float | None = None,
+    far: float | None = None,
+    generator: torch.Generator | None = None,
+) -> PointCloud:
+    """Draw grey points that some camera sees: uniform over its picture, and in inverse depth between two bounds.
+
+    Without bounds, the point closest to all optical axes is looked for; near and far are a quarter of its median depth
+    and four times that.
+
+    Args:
+        cameras: the training cameras, at least one.
+        count: number of points.
+        near: smallest depth, world units.
+        far: largest depth, world units.
+        generator: source of randomness; the global one if None.
+
+    Raises:
+        ValueError: if no depth can be found because the optical axes do not meet in front of the cameras, or the bounds
+            are not ``0 < near < far``.
+    """
+    if near is None or far is None:
+        focus = _focus_depth(cameras)
+        near, far = focus / 4, focus * 4
+    if not 0 < near < far:
+        raise ValueError(f"the depth bounds must satisfy 0 < near < far, got {near} and {far}.")
+    chosen = torch.randint(len(cameras), (count,), generator=generator)
+    u, v, share = torch.rand(3, count, generator=generator)
+    depth = 1 / (share / near + (1 - share) / far)
+    intrinsics = torch.tensor([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], dtype=torch.float32)[
+        chosen
+    ]
+    fx, fy, cx, cy, width, height = intrinsics.unbind(1)
+    local = torch.stack([(u * width - cx) / fx * depth, (v * height - cy) / fy * depth, depth], dim=1)
+    poses = torch.stack([camera.world_to_camera.to(torch.float32) for camera in cameras])[chosen]
+    positions = torch.einsum("nji,nj->ni", poses[:, :3, :3], local - poses[:, :3, 3])
+    return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
+
+
+def _focus_depth(cameras: Sequence[Camera]) -> float:
+    """Median depth of the point with the least summed squared distance to the optical axes."""
+    axes = torch.stack([camera.forward.double() for camera in cameras])
+    centres = torch.stack([camera.position.double() for camera in cameras])
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(0)
+    # The smallest eigenvalue is the summed squared sine of the axes' angles to their common direction.
+    if torch.linalg.eigvalsh(normal)[0] > 1e-6 * len(cameras):
+        point = torch.linalg.solve(normal, (across @ centres[:, :, None]).sum(0)[:, 0])
+        depth = float(((point - centres) * axes).sum(1).median())
+        if depth > 0:
+            return depth
+    raise ValueError(
+        "cannot tell how far the scene is: the optical axes of the training cameras do not meet in front of them. "
+        "Start from points, not from random ones: --points (points=) takes a COLMAP folder or a .ply file of the scene."
+    )

@@ -1,0 +1,167 @@
+"""``transforms.json`` of nerfstudio and instant-ngp, and Blender's (NeRF-synthetic) pair of train and test."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from reference_trainer.camera import Camera
+from reference_trainer.json_files import read_json
+from reference_trainer.scenes.formats import Capture, SceneFormat, only_default
+from reference_trainer.scenes.frames import Frame
+from reference_trainer.scenes.images import IMAGE_SUFFIXES, image_size, path_inside
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.points import ply_points
+from reference_trainer.scenes.scene import PointCloud
+
+__all__ = ["BLENDER", "TRANSFORMS", "read_transforms"]
+
+
+def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
+    """Read the frames of one ``transforms*.json``, in the order of the file.
+
+    Convention: ``transform_matrix`` is camera to world with OpenGL axes (x right, y up, z back); the frames' cameras
+    are OpenCV and world to camera. nerfstudio's ``applied_transform`` is taken back, so that the world is that of the
+    COLMAP files it came from. The focal length is ``fl_x`` and ``fl_y``, pixels, for a picture of ``w`` x ``h``, else
+    it follows from the horizontal field of view ``camera_angle_x``, radians. The principal point ``cx``, ``cy`` is the
+    centre of the picture unless given; ``k1 k2 p1 p2 k3`` are OpenCV's distortion. A frame may have its own of each.
+    ``file_path`` is relative to the JSON file; without an extension it means a PNG file.
+
+    Args:
+        path: the JSON file.
+        images: another folder, beside the file, for the pictures of the same names.
+
+    Returns:
+        The frames; their names are the file paths without a leading ``./`` and without extension.
+
+    Raises:
+        FileNotFoundError: if the file or images are missing.
+        ValueError: if the file is not what is described above, has a fisheye camera, or a path leads out of the scene
+            folder.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}.")
+    try:
+        content = read_json(path)
+        entries = content["frames"]
+        if not isinstance(entries, list):
+            raise TypeError(f"frames must be a list, got a {type(entries).__name__}")
+        files = [_file(path.parent, entry["file_path"], images) for entry in entries]
+        missing = [str(file) for file in files if not file.is_file()]
+        if missing:
+            raise FileNotFoundError(f"{path} names {len(missing)} images that are not there, such as {missing[:3]}.")
+        back: NDArray[np.float64] = np.linalg.inv(_applied(content)).astype(np.float64)
+        frames = [_frame(path, file, content | entry, back) for file, entry in zip(files, entries, strict=True)]
+    except FileNotFoundError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, OSError) as error:
+        reason = f"no entry {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path} is not a valid transforms file: {reason}") from error
+    if len({frame.name for frame in frames}) != len(frames):
+        raise ValueError(f"{path} lists an image twice.")
+    return frames
+
+
+def _file(root: Path, file_path: str, images: str | None) -> Path:
+    """Find the picture of a frame."""
+    file = path_inside(root, file_path)
+    if file == root:
+        raise ValueError(f"file_path {file_path!r} names the scene folder itself, not an image.")
+    if images is not None:
+        file = root / images / file.name
+    return file if file.suffix.lower() in IMAGE_SUFFIXES else file.with_name(file.name + ".png")
+
+
+def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float64]) -> Frame:
+    """Build one frame from its entry, which has the file's own values where it has none itself."""
+    width, height = (int(entry["w"]), int(entry["h"])) if "w" in entry else image_size(file)
+    if "fl_x" in entry:
+        fx = float(entry["fl_x"])
+    else:
+        angle = float(entry["camera_angle_x"])
+        if not 0 < angle < math.pi:
+            raise ValueError(f"camera_angle_x must be in (0, pi) radians, got {angle}.")
+        fx = 0.5 * width / math.tan(0.5 * angle)
+    camera = Camera(
+        _world_to_camera(entry, back),
+        fx=fx,
+        fy=float(entry.get("fl_y", fx)),
+        cx=float(entry.get("cx", width / 2)),
+        cy=float(entry.get("cy", height / 2)),
+        width=width,
+        height=height,
+    )
+    distortion = tuple(float(entry.get(name, 0)) for name in ("k1", "k2", "p1", "p2", "k3"))
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, *distortion)
+    if not all(map(math.isfinite, intrinsics)):
+        raise ValueError(f"focal lengths, principal point and distortion must be finite, got {intrinsics}.")
+    model = str(entry.get("camera_model", "OPENCV"))
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE") or entry.get("is_fisheye") or entry.get("k4"):
+        raise ValueError(f"its camera {model} is no lens of OpenCV's model with k1 k2 p1 p2 k3: undistort it first")
+    name = file.relative_to(path.parent).with_suffix("").as_posix()
+    return Frame(name, file, camera, distortion if any(distortion) else ())
+
+
+def _applied(content: dict[str, Any]) -> NDArray[np.float64]:
+    """Return what nerfstudio has applied to the world, (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3] = np.array(content.get("applied_transform", matrix[:3]), np.float64)[:3]
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
+        raise ValueError(f"applied_transform must be a finite 3x4 matrix with an inverse, got {matrix[:3].tolist()}.")
+    return matrix
+
+
+def _world_to_camera(entry: dict[str, Any], back: NDArray[np.float64]) -> torch.Tensor:
+    """Convert an OpenGL camera-to-world matrix to the OpenCV view matrix (4, 4), float64."""
+    matrix = np.array(entry["transform_matrix"], np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(
+            f"transform_matrix of {entry['file_path']} must be a finite 4x4 matrix, got {matrix.tolist()}."
+        )
+    matrix = back @ matrix
+    rotation = (matrix[:3, :3] * [1, -1, -1]).T
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise ValueError(f"transform_matrix of {entry['file_path']} holds no rotation: {matrix[:3, :3].tolist()}.")
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ matrix[:3, 3]
+    return torch.from_numpy(pose)
+
+
+def _points(path: Path, frames: list[Frame]) -> PointCloud | None:
+    """Read the points that the file names: they lie in the world of its matrices, and may come from any image."""
+    content = read_json(path)
+    if "ply_file_path" not in content:
+        return None
+    cloud = ply_points(path_inside(path.parent, str(content["ply_file_path"])))
+    back = torch.from_numpy(np.linalg.inv(_applied(content))).to(cloud.positions)
+    positions = cloud.positions @ back[:3, :3].T + back[:3, 3]
+    return PointCloud(positions, cloud.colors, cloud.source, frozenset(frame.name for frame in frames))
+
+
+def _read_transforms(root: Path, options: SceneOptions) -> Capture:
+    """Read a scene of one file."""
+    path = root / "transforms.json"
+    frames = read_transforms(path, options.images)
+    return Capture(sorted(frames, key=lambda frame: frame.name), points=_points(path, frames))
+
+
+def _read_blender(root: Path, options: SceneOptions) -> Capture:
+    """Read a scene of a training and a test file."""
+    only_default("blender", images=options.images, split=options.split)
+    train, test = (read_transforms(root / f"transforms_{kind}.json") for kind in ("train", "test"))
+    return Capture(train, test, views=8, background="white")
+
+
+BLENDER = SceneFormat(
+    "blender", "transforms_train.json", lambda root: (root / "transforms_train.json").is_file(), _read_blender
+)
+TRANSFORMS = SceneFormat(
+    "transforms", "transforms.json", lambda root: (root / "transforms.json").is_file(), _read_transforms
+)

@@ -1,0 +1,113 @@
+"""Photographs through a real lens, resampled to what a pinhole camera would have taken."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+
+__all__ = ["corner_displacement", "distort", "undistort"]
+
+LARGEST_ZOOM = 4.0
+"""Beyond this a lens shows so little of a straight picture that the file is more likely wrong."""
+
+
+def distort(points: Tensor, camera: Camera, distortion: Sequence[float]) -> Tensor:
+    """Return where the lens puts points that a pinhole camera without distortion would see at some pixel.
+
+    Convention: OpenCV's rational model; the coefficients are k1 k2 p1 p2 k3 k4 k5 k6 or a beginning of that list, which
+    is also the order of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV.
+
+    Args:
+        points: pixels (x, y), half-integer at pixel centres, shape (..., N, 2), float64.
+        camera: the pinhole camera of the picture, whose pose does not matter.
+        distortion: the coefficients.
+
+    Example:
+        >>> camera = Camera(torch.eye(4), 100.0, 100.0, 50.0, 40.0, 100, 80)
+        >>> distort(torch.tensor([[150.0, 40.0]], dtype=torch.float64), camera, [0.1]).tolist()  # 1 + 0.1 * 1^2
+        [[160.0, 40.0]]
+    """
+    from kornia.geometry.calibration import distort_points
+
+    matrix = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=points.dtype)
+    padded = torch.tensor([*distortion, *[0.0] * (8 - len(distortion))], dtype=points.dtype)
+    moved: Tensor = distort_points(points, matrix, padded)
+    return moved
+
+
+def corner_displacement(camera: Camera, distortion: Sequence[float]) -> float:
+    """Return how far the distortion moves a corner of the picture, at most over the four, in pixels."""
+    w, h = float(camera.width), float(camera.height)
+    corners = torch.tensor([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]], dtype=torch.float64)
+    return float((distort(corners, camera, distortion) - corners).norm(dim=1).max())
+
+
+def undistort(pixels: Tensor, camera: Camera, distortion: Sequence[float]) -> tuple[Tensor, Camera]:
+    """Resample a picture, bicubically and once, so that straight lines are straight.
+
+    The picture keeps its size. Where the lens saw less than the straight picture would show, the focal length grows
+    until no pixel is empty, as COLMAP's undistorter does by default.
+
+    Args:
+        pixels: values in [0, 1], shape (C, H, W).
+        camera: the camera of the picture, without its distortion.
+        distortion: as for `distort`.
+
+    Returns:
+        The picture, same shape, and its pinhole camera.
+
+    Raises:
+        ValueError: if the lens folds the picture over itself, or shows less than a quarter of it.
+    """
+    zoom = _zoom(camera, distortion)
+    straight = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
+    y, x = torch.meshgrid(
+        torch.arange(camera.height, dtype=torch.float64) + 0.5,
+        torch.arange(camera.width, dtype=torch.float64) + 0.5,
+        indexing="ij",
+    )
+    source = _distort_zoomed(torch.stack([x, y], -1).flatten(0, 1), camera, distortion, zoom)
+    grid = 2 * source / torch.tensor([camera.width, camera.height], dtype=torch.float64) - 1
+    grid = grid.to(pixels.dtype).reshape(1, camera.height, camera.width, 2)
+    # Without align_corners, -1 and 1 are the outer edges of the picture: the same half-pixel centres as the camera's.
+    resampled = torch.nn.functional.grid_sample(
+        pixels[None], grid, mode="bicubic", padding_mode="border", align_corners=False
+    )
+    return resampled[0].clamp(0, 1), straight
+
+
+def _distort_zoomed(points: Tensor, camera: Camera, distortion: Sequence[float], zoom: float) -> Tensor:
+    """Distort pixels of a picture whose focal length is larger by a factor."""
+    center = torch.tensor([camera.cx, camera.cy], dtype=points.dtype)
+    return distort(center + (points - center) / zoom, camera, distortion)
+
+
+def _zoom(camera: Camera, distortion: Sequence[float]) -> float:
+    """Find the smallest factor on the focal length, at least 1, with which the lens has seen all of the picture."""
+    x, y = (torch.linspace(0.5, size - 0.5, 65, dtype=torch.float64) for size in (camera.width, camera.height))
+    border = [torch.stack([x, torch.full_like(x, edge)], 1) for edge in (0.5, camera.height - 0.5)]
+    border += [torch.stack([torch.full_like(y, edge), y], 1) for edge in (0.5, camera.width - 0.5)]
+    center = torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
+    steps = torch.linspace(0, 1, 33, dtype=torch.float64)[:, None, None]
+    rays = center + steps * (torch.cat(border) - center)  # from the centre to every point of the border
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+
+    def seen(zoom: float) -> bool:
+        where = _distort_zoomed(rays, camera, distortion, zoom)
+        outward = (where - center).norm(dim=-1).diff(dim=0) > 0  # a lens beyond its fit folds back
+        return bool(outward.all() and (where[-1] >= 0).all() and (where[-1] <= size).all())
+
+    if seen(1.0):
+        return 1.0
+    if not seen(LARGEST_ZOOM):
+        raise ValueError(f"the lens distortion {tuple(distortion)} cannot be undone: it folds the picture over itself.")
+    low, high = 1.0, LARGEST_ZOOM
+    for _ in range(30):
+        middle = (low + high) / 2
+        low, high = (low, middle) if seen(middle) else (middle, high)
+    return high
