@@ -38,7 +38,8 @@ def make_settings(
     *,
     exact: bool,
     neutral: bool,
-    drop_rate: float,
+    drop_rate: float | None,
+    regularizer: str | None,
     threshold: float,
     seed: int,
     samples: int | None,
@@ -47,7 +48,8 @@ def make_settings(
     max_samples: int | None,
 ) -> CASettings:
     """Find the method and fill in its defaults; raise if an argument is out of range or does not apply."""
-    check_rate(drop_rate, "drop_rate")
+    if drop_rate is not None:
+        check_rate(drop_rate, "drop_rate")
     check_finite(threshold, "threshold")
     check_count(seed, "seed", minimum=0)
     method = _method(exact, neutral, relative_error)
@@ -58,7 +60,8 @@ def make_settings(
     settings = CASettings(
         method=method,
         samples=None,
-        drop_rate=float(drop_rate),
+        drop_rate=None if drop_rate is None else float(drop_rate),
+        regularizer=regularizer,
         threshold=float(threshold),
         ddof=None,
         seed=None,

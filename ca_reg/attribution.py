@@ -21,7 +21,6 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ca_reg._check import check_opacity, check_opacity_range
 from ca_reg.functional import Multiplier
 from ca_reg.reason import Reason
 from ca_reg.result import CAResult
@@ -109,12 +108,12 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor, view: Any) -
         >>> shares, round(result.value, 6)
         (tensor([0.0242, 0.0333], dtype=torch.float64), 0.0575)
     """
-    result, multiplier, background = _measure(score, opacity, view, "attribute")
+    result, opacity, multiplier, background = _measure(score, opacity, view, "attribute")
     if result.reason is not Reason.OK:
         return CAAttribution(_nothing(opacity), result)
     weights = result.visible.to(torch.float64) / result.visible.sum()
     with torch.no_grad():
-        shares = shares_fn(opacity.detach().clone(), view, multiplier, background, weights)
+        shares = shares_fn(opacity.clone(), view, multiplier, background, weights)
     if shares.shape != opacity.shape[:1]:
         raise ValueError(
             f"shares_fn must return one share per Gaussian, shape ({opacity.shape[0]},), got {tuple(shares.shape)}; "
@@ -151,12 +150,12 @@ def total_effects(score: CAScore, opacity: Tensor, view: Any) -> CATotalEffects:
         >>> total_effects(CAScore(exact=ListMoments(lists_fn), threshold=0.5), torch.tensor([0.5, 0.8]), None).effects
         tensor([0.0275, 0.0333], dtype=torch.float64)
     """
-    result, multiplier, background = _measure(score, opacity, view, "total_effects")
+    result, opacity, multiplier, background = _measure(score, opacity, view, "total_effects")
     if result.reason is not Reason.OK:
         return CATotalEffects(_nothing(opacity), result)
     assert score.exact is not None
-    opacity = opacity.detach().clone()
-    spread = opacity.new_full(opacity.shape[:1], float(multiplier.variance)).requires_grad_()
+    opacity = opacity.clone()
+    spread = (multiplier.variance * opacity.new_ones(opacity.shape[:1])).requires_grad_()
     gradient = None
     with torch.enable_grad():
         answer = score.exact(opacity, view, Multiplier(multiplier.mean, spread), background)
@@ -181,10 +180,9 @@ def _measure(score: CAScore, opacity: Tensor, view: Any, name: str) -> ExactView
             "CAScore(exact=moments_fn). A renderer without moments that can list the Gaussians of its pixels has them "
             "by ca_reg.ListMoments."
         )
-    check_opacity(opacity)
-    check_opacity_range(opacity)
+    x = score._params(opacity)
     with torch.no_grad():
-        return score._exact(score.exact, opacity.detach(), view)
+        return score._exact(score.exact, x, view)
 
 
 def _nothing(opacity: Tensor) -> Tensor:

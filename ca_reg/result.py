@@ -35,7 +35,8 @@ class CASettings:
             the error asks for; ``"exact"``, the limit of infinitely many, from the moments of the renderer; or
             ``"exact_neutral"``, the same over the expected colour of each pixel instead of the background.
         samples: number of renders K; None for adaptive scores too, where it is decided at each view.
-        drop_rate: fraction of the Gaussians that is dropped in each.
+        drop_rate: fraction of the Gaussians that is dropped in each; None where a regularizer decides.
+        regularizer: what drew instead of a dropout at the drop rate; None for that.
         threshold: a pixel is visible where the accumulated alpha exceeds this: in all K renders with ``"sampling"``, in
             the render with all opacities times ``1 - drop_rate`` with ``"adaptive"``, in expectation with the exact
             methods.
@@ -47,7 +48,8 @@ class CASettings:
 
     method: Method
     samples: int | None
-    drop_rate: float
+    drop_rate: float | None
+    regularizer: str | None
     threshold: float
     ddof: int | None
     seed: int | None

@@ -15,8 +15,11 @@ from torch import Tensor
 from ca_reg._accumulate import Deviations, RenderMoments
 from ca_reg._check import check_count, check_opacity, check_opacity_range, check_rate
 from ca_reg._settings import GROUPS, LEAST, ROUND, make_settings
-from ca_reg.functional import Multiplier, draw_keep_mask
+from ca_reg.functional import Multiplier
+from ca_reg.params import Params
 from ca_reg.reason import Reason
+from ca_reg.regularizer import Regularizer
+from ca_reg.regularizers import GaussianDropout
 from ca_reg.result import CAResult, CASummary, ViewTally
 from ca_reg.types import (
     ExactMoments,
@@ -36,6 +39,7 @@ class ExactView(NamedTuple):
     """An exact score and what the moments callable was asked for, in its own layout; no background is the model's."""
 
     result: CAResult
+    opacity: Tensor
     multiplier: Multiplier
     background: Tensor | None
 
@@ -81,6 +85,10 @@ class CAScore:
         p: dropout rate that the model was trained with, 0 if it was trained without (or with compensated) dropout.
         drop_rate: fraction of the Gaussians to drop in each render, in [0, 1); by default ``1 - (1 - p)/2``, that is
             half of those that training left.
+        regularizer: whose draws of the opacities take the place of that dropout, such as
+            :class:`~ca_reg.regularizers.ClusteredDropout`, which drops neighbors together; ``p`` and ``drop_rate`` then
+            do not apply. An exact or adaptive score needs its ``multiplied``. If it looks at more than opacities, give
+            the score :class:`~ca_reg.Params`.
         threshold: accumulated alpha above which a pixel is visible.
         ddof: the variance divides by ``samples - ddof``: 0 as in the released code, 1 for an unbiased estimate. By
             default 0; always 1 for adaptive scores, whose expectation would depend on the number of renders otherwise.
@@ -130,6 +138,7 @@ class CAScore:
         samples: int | None = None,
         p: float = 0.0,
         drop_rate: float | None = None,
+        regularizer: Regularizer | None = None,
         threshold: float = 0.8,
         ddof: int | None = None,
         layout: Layout = "CHW",
@@ -154,11 +163,15 @@ class CAScore:
             raise ValueError("alpha_fn does not apply to an exact score, whose moments hold the expected alpha.")
         check_layout(layout)
         check_rate(p)
-        drop_rate = 1.0 - (1.0 - p) / 2.0 if drop_rate is None else drop_rate
+        if regularizer is None:
+            drop_rate = 1.0 - (1.0 - p) / 2.0 if drop_rate is None else drop_rate
+        elif p != 0 or drop_rate is not None:
+            raise ValueError("p and drop_rate do not apply to the draws of a regularizer, which has rates of its own.")
         self.settings = make_settings(
             exact=exact is not None,
             neutral=neutral,
             drop_rate=drop_rate,
+            regularizer=None if regularizer is None else repr(regularizer),
             threshold=threshold,
             seed=seed,
             samples=samples,
@@ -170,15 +183,16 @@ class CAScore:
         self.alpha_fn = alpha_fn
         self.exact = exact
         self.layout: Layout = layout
+        self.regularizer = GaussianDropout(self.settings.drop_rate or 0.0) if regularizer is None else regularizer
         self.p = float(p)
         self.seed = int(seed)
         self.reset()
 
-    def __call__(self, opacity: Tensor, view: Any, *, index: int = 0) -> CAResult:
+    def __call__(self, opacity: Tensor | Params, view: Any, *, index: int = 0) -> CAResult:
         """Measure one view, and forget it.
 
         Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+            opacity: activated opacities in [0, 1], shape (N,) or (N, 1); or all parameters that a regularizer needs.
             view: passed on to the callables as it is.
             index: position of the view among all views, at least 0; it decides the masks together with the seed.
 
@@ -189,15 +203,22 @@ class CAScore:
             TypeError: if ``opacity`` or a render is not of the right type.
             ValueError: if a shape is wrong, ``opacity`` looks like logits, or no alpha can be had.
         """
-        check_opacity(opacity)
-        check_opacity_range(opacity)
+        x = self._params(opacity)
         check_count(index, "index", minimum=0)
         with torch.no_grad():
             if self.exact is not None:
-                return self._exact(self.exact, opacity.detach(), view).result
+                return self._exact(self.exact, x, view).result
             assert self.render_fn is not None
             sample = self._adapt if self.settings.method == "adaptive" else self._sample
-            return sample(self.render_fn, opacity.detach(), view, index)
+            return sample(self.render_fn, x, view, index)
+
+    def _params(self, given: Tensor | Params) -> Params:
+        """Check what a score is asked of, and return all that is known of the Gaussians, without gradients."""
+        x = given if isinstance(given, Params) else Params(given)
+        check_opacity(x.opacities)
+        check_opacity_range(x.opacities)
+        self.regularizer.check_needs(x)
+        return x._replace(opacities=x.opacities.detach())
 
     def update(self, opacity: Tensor, view: Any, *, index: int | None = None) -> CAResult:
         """Measure one view and count it in the mean that :meth:`compute` returns.
@@ -242,10 +263,11 @@ class CAScore:
         self._tally = ViewTally()
         self._updates = 0
 
-    def _exact(self, moments_fn: MomentsFn, opacity: Tensor, view: Any) -> ExactView:
+    def _exact(self, moments_fn: MomentsFn, x: Params, view: Any) -> ExactView:
         """Read the score off the moments of the renderer."""
         settings = self.settings
-        multiplier = Multiplier.dropout(settings.drop_rate)
+        rendered, multiplier = self._multiplied(x)
+        opacity = rendered.opacities.view_as(x.opacities)
 
         def moments(background: Tensor | None) -> tuple[ExactMoments, Tensor]:
             # A copy: the callable may edit its opacities in place.
@@ -271,15 +293,15 @@ class CAScore:
         value, reason = _mean(variance, visible, broken)
         std_error = 0.0 if reason is Reason.OK else math.nan
         result = self._result(value, std_error, variance, visible, reason, None)
-        return ExactView(result, multiplier, background)
+        return ExactView(result, opacity, multiplier, background)
 
-    def _sample(self, render_fn: RenderFn, opacity: Tensor, view: Any, index: int) -> CAResult:
+    def _sample(self, render_fn: RenderFn, x: Params, view: Any, index: int) -> CAResult:
         """Render a fixed number of times; the visible pixels are those that every render covers (the protocol)."""
         settings = self.settings
         assert settings.samples is not None
         assert settings.ddof is not None
         moments, lowest, broken = RenderMoments(min(settings.samples, GROUPS)), torch.tensor(math.inf), False
-        for masked in self._masked(opacity, index, settings.samples):
+        for masked in self._drawn(x, index, settings.samples):
             image, alpha = self._render(render_fn, masked, view)
             lowest = torch.minimum(lowest.to(alpha), alpha)
             image, odd = _finite(image, alpha, lowest, settings.threshold)
@@ -294,7 +316,7 @@ class CAScore:
             std_error = moments.jackknife_error(visible) * (moments.count - 1) / (moments.count - settings.ddof)
         return self._result(value, std_error, variance, visible, reason, moments.count)
 
-    def _adapt(self, render_fn: RenderFn, opacity: Tensor, view: Any, index: int) -> CAResult:
+    def _adapt(self, render_fn: RenderFn, x: Params, view: Any, index: int) -> CAResult:
         """Render until the error is small enough, over the pixels that the expected image covers.
 
         The region must not come from the renders that the variance comes from: pixels that happen to be covered happen
@@ -302,13 +324,14 @@ class CAScore:
         """
         settings = self.settings
         assert settings.max_samples is not None
-        expected, alpha = self._render(render_fn, opacity * (1.0 - settings.drop_rate), view)
+        mean, multiplier = self._multiplied(x)
+        expected, alpha = self._render(render_fn, (mean.opacities * multiplier.mean).view_as(x.opacities), view)
         visible = alpha > settings.threshold
         expected, broken = _finite(expected, alpha, visible, 0)
         moments, deviations = RenderMoments(), Deviations(expected, visible)
         del expected, alpha  # they may be a buffer of the renderer, which the next render fills
         result = None
-        for k, masked in enumerate(self._masked(opacity, index, settings.max_samples), start=1):
+        for k, masked in enumerate(self._drawn(x, index, settings.max_samples), start=1):
             image, alpha = self._render(render_fn, masked, view)
             image, odd = _finite(image, alpha, visible, 0)
             broken |= odd
@@ -334,14 +357,25 @@ class CAScore:
         target = self.settings.relative_error
         return result.reason is not Reason.OK or (target is not None and result.std_error <= target * result.value)
 
-    def _masked(self, opacity: Tensor, index: int, count: int) -> Iterator[Tensor]:
-        """Yield the opacities of one view under one random mask after the other, each time a new tensor."""
+    def _multiplied(self, x: Params) -> tuple[Params, Multiplier]:
+        """Return what to render, and the factor on its alphas, that are all draws."""
+        multiplied = self.regularizer.multiplied(_flat(x))
+        if multiplied is None:
+            raise ValueError(
+                f"the draws of {type(self.regularizer).__name__} are no independent factors of the opacities, which an "
+                "exact or adaptive score needs: give samples instead."
+            )
+        return multiplied
+
+    def _drawn(self, x: Params, index: int, count: int) -> Iterator[Tensor]:
+        """Yield the opacities of one view under one random draw after the other, each time a new tensor."""
         generator = torch.Generator()
         entropy = np.random.SeedSequence([self.seed, index]).generate_state(1, np.uint64)
         generator.manual_seed(int(entropy[0] >> np.uint64(1)))
+        flat = _flat(x)
         for _ in range(count):
-            keep = draw_keep_mask(opacity.shape[0], self.settings.drop_rate, generator=generator, device=opacity.device)
-            yield opacity * keep.view_as(opacity)  # all are finite
+            drawn = self.regularizer.replay(flat, self.regularizer.draw(flat, generator)).opacities
+            yield (drawn.clone() if drawn is flat.opacities else drawn).view_as(x.opacities)
 
     def _render(self, render_fn: RenderFn, opacity: Tensor, view: Any) -> tuple[Tensor, Tensor]:
         """Render colours (3, H, W) and alpha (H, W) with masked opacities."""
@@ -371,6 +405,11 @@ class CAScore:
             reason=reason,
             **asdict(replace(self.settings, samples=samples)),
         )
+
+
+def _flat(x: Params) -> Params:
+    """Return the same with opacities of shape (N,)."""
+    return x._replace(opacities=x.opacities.reshape(-1))
 
 
 def view_position(count: int, group: dist.ProcessGroup | None = None) -> int:

@@ -57,6 +57,8 @@ def strategies(
             made[name] = dataclasses.replace(plain, dropout=p, noise=sigma, analytic=name.startswith("analytic"))
         else:
             made[re.sub(r"[^\w.=-]+", "_", name).strip("_")] = dataclasses.replace(plain, regularizer=name)
+    for settings in made.values():
+        settings.check()
     return made
 
 

@@ -125,6 +125,7 @@ def run_experiment(
             SIGTERM the checkpoint is saved, too, and the signal raised again, which ends the process.
         OSError: if a file cannot be written, such as on a full disk; what was there before is kept.
     """
+    config.check()
     perceptual = lpips_option(lpips, device=device)
     begun_with(out, options, config, auto=auto, given=given)
     if (out / RESULTS).exists():

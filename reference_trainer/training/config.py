@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from ca_reg import Chain
-from ca_reg.regularizers import parse
-from reference_trainer.density import DENSITY, DensityStrategy
-from reference_trainer.losses import LOSSES, LossTerm
-from reference_trainer.render.renderers import RENDERERS, Renderer
+if TYPE_CHECKING:
+    from ca_reg import Chain
+    from reference_trainer.density import DensityStrategy
+    from reference_trainer.losses import LossTerm
+    from reference_trainer.render.renderers import Renderer
 
 __all__ = ["PRESETS", "TrainConfig", "with_preset"]
 
@@ -109,26 +109,14 @@ class TrainConfig:
             raise ValueError(f"dropout must be in [0, 1), got {self.dropout}: 0 turns it off.")
         if self.noise < 0:
             raise ValueError(f"noise must not be negative, got {self.noise}: 0 turns it off.")
-        regularizer, terms = self.make_regularizer(), self.make_losses()
-        renderer, _ = self.make_renderer(), self.make_density()
-        if not terms:
-            raise ValueError("loss needs at least one term, such as photometric.")
-        if self.analytic and not len(regularizer):
+        if self.analytic and not self.regularizers:
             raise ValueError("analytic training needs something to average over: set dropout, noise or regularizer.")
-        if self.analytic and not all(term.analytic for term in terms):
-            names = ", ".join(type(term).__name__ for term in terms if not term.analytic)
-            raise ValueError(f"analytic training has no draw, which {names} needs: leave out analytic, or the term.")
-        if self.analytic and "moments" not in renderer.capabilities:
-            raise ValueError("analytic training needs the moments of the torch renderer: leave out renderer.")
-        lacking = set().union(*(term.needs for term in terms)) - renderer.capabilities
-        if lacking:
-            raise ValueError(f"the loss needs {', '.join(sorted(lacking))}, which the renderer {self.renderer} lacks.")
         for name in (
             "seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from"
         ):  # fmt: skip
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
-        if self.regularize_from >= self.iterations and len(regularizer):
+        if self.regularize_from >= self.iterations and self.regularizers:
             raise ValueError(
                 f"regularize_from must be below iterations ({self.iterations}), got {self.regularize_from}: no step "
                 "would use the regularizers."
@@ -156,21 +144,47 @@ class TrainConfig:
         own = [f"{name}({rate!r})" for name, rate in (("dropout", self.dropout), ("noise", self.noise)) if rate]
         return " + ".join([*own, *([self.regularizer] if self.regularizer.strip() else [])])
 
+    # What follows imports torch, which the command line does without until it has to.
+
     def make_regularizer(self) -> Chain:
         """Make the regularizers; empty if there are none."""
+        from ca_reg.regularizers import parse
+
         return parse(self.regularizers)
 
     def make_losses(self) -> list[LossTerm]:
         """Make the terms of the loss."""
+        from reference_trainer.losses import LOSSES
+
         return LOSSES.make(self.loss)
 
     def make_density(self) -> DensityStrategy:
         """Make the density control."""
+        from reference_trainer.density import DENSITY
+
         return DENSITY.make_one(self.density)
 
     def make_renderer(self) -> Renderer:
         """Make the renderer."""
+        from reference_trainer.render.renderers import RENDERERS
+
         return RENDERERS.make_one(self.renderer)
+
+    def check(self) -> None:
+        """Raise a ValueError unless the expressions can be made, and what they make goes together."""
+        self.make_regularizer()
+        self.make_density()
+        renderer, terms = self.make_renderer(), self.make_losses()
+        if not terms:
+            raise ValueError("loss needs at least one term, such as photometric.")
+        if self.analytic and "moments" not in renderer.capabilities:
+            raise ValueError("analytic training needs the moments of the torch renderer: leave out renderer.")
+        if lacking := set().union(*(term.needs for term in terms)) - renderer.capabilities:
+            raise ValueError(f"the loss needs {', '.join(sorted(lacking))}, which the renderer {self.renderer} lacks.")
+        if self.analytic and (drawn := [type(term).__name__ for term in terms if not term.analytic]):
+            raise ValueError(
+                f"analytic training has no draw, which {', '.join(drawn)} needs: leave out analytic, or the term."
+            )
 
 
 PRESETS: dict[str, TrainConfig] = {

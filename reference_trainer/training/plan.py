@@ -105,6 +105,7 @@ def make_plan(scene: Scene, config: TrainConfig, *, given: Collection[str] = ())
         raise ValueError(f"given must name fields of TrainConfig, got {sorted(unknown)}.")
     if scene.points is None:
         raise ValueError(f"scene {scene.name!r} has no initial points: load it with points='random'.")
+    config.check()
     kept = _kept(config, given)
     return Plan(tuple(_item(rule(scene, config), config, kept) for rule in RULES))
 

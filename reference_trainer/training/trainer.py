@@ -56,6 +56,7 @@ class Trainer:
     """
 
     def __init__(self, scene: Scene, config: TrainConfig, device: torch.device | str = "cpu") -> None:
+        config.check()
         self.scene = scene
         self.config = config
         self.device = torch.device(device)

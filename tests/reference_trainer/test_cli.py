@@ -64,9 +64,9 @@ def trained(tmp_path_factory):
                 "--device",
             ],
         ),
-        (["evaluate"], ["--ply", "--path", "--scene", "--dropout", "--samples", "--lpips", "--scale-noise"]),
+        (["evaluate"], ["--ply", "--path", "--scene", "--regularizer", "--samples", "--lpips"]),
         (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
-        (["bake"], ["PATH", "--dropout", "--out"]),
+        (["bake"], ["PATH", "--regularizer", "--out"]),
         (["render"], ["--what", "--frames", "{test,train,flight}"]),
         (
             ["compare"],
@@ -102,7 +102,7 @@ def test_the_list_of_commands_says_what_each_does(capsys):
         "plan Say what",
         "train Train one model",
         "evaluate Measure a run",
-        "bake Scale the opacities",
+        "bake Give a PLY",
         "render Render a run",
         "compare Train baseline",
         "study Measure something",
@@ -216,28 +216,42 @@ def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path
 def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch):
     asked: list = []
     monkeypatch.setattr(score_module, "score_ply", lambda *given, **named: asked.append((given, named)))
-    main(["evaluate", "--ply", "a.ply", flag, "garden", "--images", "images_8", "--views", "12", "--dropout", "0.1"])
+    main(
+        [
+            "evaluate",
+            "--ply",
+            "a.ply",
+            flag,
+            "garden",
+            "--images",
+            "images_8",
+            "--views",
+            "12",
+            "--regularizer",
+            "noise",
+        ]
+    )
     main(["evaluate", "--ply", "a.ply", "--cameras", "3", "--size", "64", "--world", "z-up", "--arc", "90",
           "--background", "white", "--samples", "7", "--seed", "1", "--out", "o"])  # fmt: skip
     ((ply, scene, out), named), ((other, orbit, folder), others) = asked
     assert (str(ply), scene.path, scene.images, scene.views, out) == ("a.ply", "garden", "images_8", 12, None)
-    assert named == {"dropout": 0.1, "samples": 5, "seed": 0, "device": "cpu", "perceptual": None,
+    assert named == {"regularizer": "noise", "samples": 5, "seed": 0, "device": "cpu", "perceptual": None,
                      "background": "black"}  # fmt: skip
     assert (str(other), orbit, str(folder)) == ("a.ply", OrbitOptions(3, 64, "z-up", 90.0), "o")
-    assert others == {"dropout": 0.0, "samples": 7, "seed": 1, "device": "cpu", "background": "white",
+    assert others == {"regularizer": None, "samples": 7, "seed": 1, "device": "cpu", "background": "white",
                       "perceptual": None}  # fmt: skip
 
 
 def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):
     small = ["--cameras", "1", "--size", "24", "--samples", "2"]
-    main(["bake", str(trained / "point_cloud.ply"), "--dropout", "0.2", "--out", str(tmp_path / "baked.ply")])
+    main(["bake", str(trained / "point_cloud.ply"), "--out", str(tmp_path / "baked.ply")])
     assert "baked.ply: opacities are scaled by 0.8, and marked so" in plain(capsys.readouterr().out)
     main(["evaluate", "--ply", str(tmp_path / "baked.ply"), *small])
     out = capsys.readouterr().out
-    assert "0.8 baked in, taken out for CA; dropout rate of the training: 0.2" in out
+    assert "0.8 baked in, taken out for CA; trained with: dropout(0.2)" in out
     assert "| mean orbit |" in out
     ply = str(trained / "point_cloud.ply")
-    main(["evaluate", "--ply", ply, "--dropout", "0.2", "--out", str(tmp_path / "p"), *small])
+    main(["evaluate", "--ply", ply, "--out", str(tmp_path / "p"), *small])
     one, other = (
         json.loads((tmp_path / folder / "evaluation.json").read_text()) for folder in ("baked_evaluation", "p")
     )

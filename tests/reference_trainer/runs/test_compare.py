@@ -15,7 +15,7 @@ from reference_trainer.evaluation.tables import comparison_table, summary
 from reference_trainer.render import chosen_engine
 from reference_trainer.runs import demo as demo_module
 from reference_trainer.runs import grid
-from reference_trainer.runs.compare import compare, scene_folders, strategies
+from reference_trainer.runs.compare import NAMED, compare, scene_folders, strategies
 from reference_trainer.runs.compare_report import REPORT, TABLE, Comparison, report
 from reference_trainer.runs.engines.choice import choose_engine
 from reference_trainer.runs.engines.engine import Failure
@@ -59,9 +59,11 @@ def test_a_quality_that_one_strategy_lacks():
 
 def test_strategies_change_the_regularizers_only():
     base = TrainConfig(iterations=5, seed=3, dropout=0.4)
-    for config in strategies(base, dropout=0.1, noise=0.5).values():
+    for config in strategies(list(NAMED), base, dropout=0.1, noise=0.5).values():
         assert dataclasses.replace(config, dropout=0.4, noise=0.0, analytic=False) == base
-    assert strategies(base, dropout=0.1, noise=0.5)["both"] == dataclasses.replace(base, dropout=0.1, noise=0.5)
+    assert strategies(["both"], base, dropout=0.1, noise=0.5)["both"] == dataclasses.replace(
+        base, dropout=0.1, noise=0.5
+    )
 
 
 SCENE, CONFIG = {Path("x"): SceneOptions()}, {"a": TrainConfig()}

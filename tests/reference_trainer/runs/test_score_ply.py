@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 
 import pytest
 import torch
@@ -90,10 +89,15 @@ def test_the_bands_that_are_used(tmp_path, band, used):
     assert f"SH degree 3 (bands above {used} are zero); opacities: plain" in str(facts)
 
 
-@pytest.mark.parametrize("dropout", [-0.1, 1.0, math.nan])
-def test_a_rate_that_is_none(tmp_path, dropout):
-    with pytest.raises(ValueError, match=r"in \[0, 1\)"):
-        of_ply(tmp_path / "any.ply", background=torch.zeros(3), dropout=dropout)
+def test_what_the_caller_says_comes_first(tmp_path):
+    save_ply(ball(), tmp_path / "a.ply", regularizer="dropout(0.2)", step=5)
+    model, facts = of_ply(tmp_path / "a.ply", background=torch.zeros(3))
+    assert (facts.regularizer, model.dropout, model.step) == ("dropout(0.2)", pytest.approx(0.2), 5)
+    model, _ = of_ply(tmp_path / "a.ply", background=torch.zeros(3), regularizer="dropout(0.5)")
+    assert model.dropout == 0.5
+    save_ply(ball(), tmp_path / "b.ply", regularizer="dropout(1.5)")
+    with pytest.raises(ValueError, match=r"b\.ply says what it was trained with: .*p must be in .* Give --regularizer"):
+        of_ply(tmp_path / "b.ply", background=torch.zeros(3))
 
 
 def test_a_file_without_gaussians(tmp_path):
@@ -104,10 +108,10 @@ def test_a_file_without_gaussians(tmp_path):
 
 
 def test_what_is_written_for_an_orbit(tmp_path):
-    result, said = orbit(ball(), tmp_path, "ball", dropout=0.2, samples=3, seed=4)
+    result, said = orbit(ball(), tmp_path, "ball", regularizer="dropout(0.2)", samples=3, seed=4)
     data = json.loads((tmp_path / "ball" / "evaluation.json").read_text())
     assert data["ply"] == {"gaussians": 300, "sh_degree": 0, "sh_degree_used": 0, "opacity_scale": 1.0,
-                           "for_rendering": False, "dropout": 0.2}  # fmt: skip
+                           "for_rendering": False, "regularizer": "dropout(0.2)"}  # fmt: skip
     assert data["ca_settings"]["samples"] == 3
     assert data["ca_settings"]["seed"] == 4
     assert data["ca_settings"]["drop_rate"] == pytest.approx(0.6)  # 1 - (1 - 0.2) / 2
@@ -173,7 +177,7 @@ def test_another_model_in_the_same_file_is_measured_anew(tmp_path, monkeypatch):
 
 
 def test_a_baked_and_a_plain_ply_have_the_same_scores(tmp_path):
-    plain, _ = orbit(ball(), tmp_path, "plain", dropout=0.2)
+    plain, _ = orbit(ball(), tmp_path, "plain", regularizer="dropout(0.2)")
     save_ply(ball(), tmp_path / "baked.ply", bake_p=0.2)
     baked = score_ply(tmp_path / "baked.ply", FEW, tmp_path / "baked", say=lambda text: None)
     unscaled, _ = orbit(ball(), tmp_path, "unscaled")
@@ -220,10 +224,10 @@ def test_a_place_is_told_from_an_object(tmp_path):
 def test_a_ply_on_its_scene(run, options, tmp_path):
     out, results = run
     said: list[str] = []
-    score_ply(out / PLY, options, tmp_path, dropout=0.2, say=said.append)
+    score_ply(out / PLY, options, tmp_path, regularizer="dropout(0.2)", say=said.append)
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]
-    assert found["ply"]["dropout"] == 0.2
+    assert found["ply"]["regularizer"] == "dropout(0.2)"
     assert said[-1] == f"Scores and pictures are in {tmp_path}"
 
 

@@ -85,7 +85,7 @@ def test_impossible_values_are_named(field, value):
 )
 def test_expressions_are_read_before_anything_is_trained(settings, message):
     with pytest.raises(ValueError, match=message):
-        TrainConfig(**settings)
+        TrainConfig(**settings).check()
 
 
 @pytest.mark.parametrize("regularizer", [{"dropout": 0.2}, {"noise": 0.8}])

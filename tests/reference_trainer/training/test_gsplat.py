@@ -32,6 +32,6 @@ def test_the_choice_is_checked(tiny_scene):
     with pytest.raises(RuntimeError, match="--renderer torch"):
         Trainer(tiny_scene, TrainConfig(renderer="gsplat"))
     with pytest.raises(ValueError, match="there is no renderer 'cuda'; choose one of gsplat, torch"):
-        TrainConfig(renderer="cuda")
+        TrainConfig(renderer="cuda").check()
     with pytest.raises(ValueError, match="analytic training needs the moments of the torch renderer"):
-        TrainConfig(renderer="gsplat", analytic=True, dropout=0.2)
+        TrainConfig(renderer="gsplat", analytic=True, dropout=0.2).check()

@@ -1,0 +1,99 @@
+"""Scores whose draws are those of a regularizer, against enumeration of its masks."""
+
+import itertools
+
+import pytest
+import torch
+
+from ca_reg import CAScore, Draw, GaussianDropout, IndependentDropout, ListMoments, Params, PixelLists, Regularizer
+
+OPACITY = torch.tensor([0.7, 0.5, 0.9], dtype=torch.float64)
+MEANS = torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 3]], dtype=torch.float64)
+COLORS = torch.eye(3, dtype=torch.float64)
+
+
+class ByDepth(IndependentDropout):
+    needs = ("means",)
+
+    def rates(self, x):
+        return 0.2 * x.means[:, 2]
+
+
+class Pair(Regularizer):
+    """Drops the first two together, half of the time."""
+
+    def draw(self, x, generator=None):
+        keep = (
+            torch.tensor([True] * 3) if torch.rand(1, generator=generator) < 0.5 else torch.tensor([False, False, True])
+        )
+        return Draw(keep, keep)
+
+    def replay(self, x, draw):
+        return x._replace(opacities=x.opacities * draw.keep)
+
+
+def render(opacity, view):
+    """One pixel: three splats in front of black."""
+    o = opacity.reshape(-1)
+    weights = o * torch.cat([torch.ones(1, dtype=o.dtype), torch.cumprod(1 - o, 0)[:-1]])
+    return (weights @ COLORS).view(3, 1, 1), weights.sum().view(1, 1)
+
+
+def lists(opacity, view):
+    return PixelLists(torch.arange(3), torch.zeros(3, dtype=torch.int64), opacity.reshape(-1), COLORS, 1, 1)
+
+
+def variance_over(masks, probabilities):
+    images = torch.stack([render(OPACITY * mask, None)[0] for mask in masks])
+    weights = torch.tensor(probabilities, dtype=torch.float64).view(-1, 1, 1, 1)
+    mean = (weights * images).sum(0)
+    return (weights * (images - mean) ** 2).sum(0).mean().item()
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 1)])
+def test_an_exact_score_has_the_rates_of_the_regularizer(shape):
+    rates = ByDepth().rates(Params(OPACITY, means=MEANS))
+    masks = [torch.tensor(m) for m in itertools.product([False, True], repeat=3)]
+    probabilities = [torch.where(m, 1 - rates, rates).prod().item() for m in masks]
+    score = CAScore(exact=ListMoments(lists), regularizer=ByDepth(), threshold=0.1)
+    result = score(Params(OPACITY.reshape(shape), means=MEANS), None)
+    assert result.value == pytest.approx(variance_over(masks, probabilities), rel=1e-12)
+    assert (result.drop_rate, result.regularizer) == (None, "ByDepth()")
+
+
+def test_sampled_scores_draw_what_the_regularizer_draws():
+    score = CAScore(render, regularizer=Pair(), samples=2000, threshold=0.1, ddof=1)
+    exact = variance_over([torch.tensor([True] * 3), torch.tensor([False, False, True])], [0.5, 0.5])
+    result = score(OPACITY, None)
+    # The variance of a fair coin from 2000 throws: relative error below 1/2000 plus 4 (mean - 1/2)^2, five standard
+    # deviations of which are 1.3 %. False alarm below 1e-6, and the seed is fixed.
+    assert result.value == pytest.approx(exact, rel=0.015)
+    independent = CAScore(exact=ListMoments(lists), drop_rate=0.5, threshold=0.1)(OPACITY, None).value
+    assert abs(result.value - independent) > 0.05 * independent  # the neighbors' company shows
+
+
+def test_an_adaptive_score_takes_the_region_of_the_expected_image():
+    score = CAScore(render, regularizer=ByDepth(), relative_error=0.2, threshold=0.1)
+    result = score(Params(OPACITY, means=MEANS), None)
+    exact = CAScore(exact=ListMoments(lists), regularizer=ByDepth(), threshold=0.1)(Params(OPACITY, means=MEANS), None)
+    assert abs(result.value - exact.value) < 5 * result.std_error + 0.6 * exact.value  # a single pixel: docs/results.md
+
+
+def test_the_protocol_is_the_score_of_uniform_dropout():
+    plain = CAScore(render, drop_rate=0.6, threshold=0.0, samples=7)(OPACITY, None)
+    same = CAScore(render, regularizer=GaussianDropout(0.6), threshold=0.0, samples=7)(OPACITY, None)
+    assert plain.value == same.value
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"regularizer": ByDepth(), "p": 0.2}, "do not apply to the draws of a regularizer"),
+        ({"regularizer": ByDepth(), "drop_rate": 0.5}, "do not apply"),
+        ({"regularizer": ByDepth()}, r"ByDepth needs means .* Params\(opacities, means"),
+        ({"regularizer": Pair(), "relative_error": 0.1}, "give samples instead"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        CAScore(render, **arguments)(OPACITY, None)
