@@ -23,7 +23,7 @@ class Splatfacto(nn.Module):
 
     def __init__(self, config, holder):
         super().__init__()
-        self.config, self.crop_box, self.plain_holder = config, None, holder
+        self.config, self.crop_box, self.plain_holder, self.step = config, None, holder, 0
         self.populate_modules()
 
     def populate_modules(self):
@@ -47,12 +47,15 @@ class Splatfacto(nn.Module):
         )
         return {"rgb": image.squeeze(0), "accumulation": alpha.squeeze(0)}
 
+    def update_to_step(self, step):
+        pass
+
     def get_image_metrics_and_images(self, outputs, batch):
         return {"psnr": 20.0}, {"img": outputs["rgb"]}
 
 
 CAMERA = torch.eye(4)[None]
-CONFIG = {"dropout": 0.4, "opacity_noise": 0.0, "scale_noise": False, "ca_samples": 5}
+CONFIG = {"dropout": 0.4, "opacity_noise": 0.0, "regularizer": "", "ca_samples": 5}
 
 
 def make(**changes):
@@ -118,7 +121,7 @@ def test_noise_is_added_in_training_and_scaled_on_request():
     torch.manual_seed(0)
     assert not torch.equal(model.get_outputs(CAMERA)["rgb"], plain.get_outputs(CAMERA)["rgb"])
     assert torch.equal(model.eval().get_outputs(CAMERA)["rgb"], plain.get_outputs(CAMERA)["rgb"])
-    scaled, _ = make(dropout=0.0, opacity_noise=0.8, scale_noise=True)
+    scaled, _ = make(regularizer="noise(0.8, scale=True)")
     assert not torch.equal(scaled.eval().get_outputs(CAMERA)["rgb"], plain.get_outputs(CAMERA)["rgb"])
 
 
@@ -126,15 +129,15 @@ def test_other_models_of_the_module_are_left_alone_even_in_other_threads():
     model, plain = make()
     expected = plain.get_outputs(CAMERA)["rgb"]
     inside, done = threading.Event(), threading.Event()
-    noise = model._regularized.regularizer[0]
-    draw = noise.forward
+    member = next(iter(model._regularized.chain))
+    draw = member.draw
 
-    def wait(opacity):
+    def wait(x, generator):
         inside.set()
         assert done.wait(timeout=180)
-        return draw(opacity)
+        return draw(x, generator)
 
-    noise.forward = wait
+    member.draw = wait
     thread = threading.Thread(target=model.get_outputs, args=(CAMERA,))
     thread.start()
     assert inside.wait(timeout=180)
