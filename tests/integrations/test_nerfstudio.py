@@ -273,3 +273,42 @@ def test_a_users_command_takes_no_added_line(pytestconfig):
     lines = (pytestconfig.rootpath / "pyproject.toml").read_text().splitlines()
     place = lines.index('[project.entry-points."nerfstudio.method_configs"]')
     assert lines[place + 1] == f'splatfacto-ca = "{ENTRY_POINT}"'
+
+
+def test_a_users_own_regularizer_trains_and_renders(my_module):
+    model, plain = make(regularizer="my_module:MyDropout(0.8) + my_module:MyScaleNoise(0.3)")
+    torch.manual_seed(0)
+    image = model.get_outputs(CAMERA)["rgb"]
+    dropout, noise = model._regularized.chain
+    keep = dropout.keep
+    assert torch.equal(model.info["radii"][0] > 0, keep)
+    assert 0 < keep.sum() < N
+
+    def literal(opacities, scales):
+        arguments = {
+            "means": plain.means, "quats": torch.tensor([[1.0, 0, 0, 0]]).expand(N, 4), "scales": scales,
+            "opacities": opacities, "colors": plain.colors, "viewmats": CAMERA, "width": 24, "height": 20,
+            "Ks": torch.tensor([[[30.0, 0, 12], [0, 30, 10], [0, 0, 1]]]),
+        }  # fmt: skip
+        return rasterization(**arguments)[0][0]
+
+    scales = 0.2 * torch.exp(0.3 * noise.last.value).expand(N, 3)
+    torch.testing.assert_close(image, literal(activated(plain) * keep, scales), rtol=1e-5, atol=1e-6)
+    rates = 0.8 * torch.exp(-plain.means[:, 2] / 4.0)  # the camera looks along z from the origin
+    expected = literal(activated(plain) * (1 - rates), torch.full((N, 3), 0.2))
+    torch.testing.assert_close(model.eval().get_outputs(CAMERA)["rgb"], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_schedule_follows_the_steps_and_a_checkpoint():
+    model, plain = make(regularizer="dropout(ramp(0, 0.5, 0, 10))")
+    model.get_outputs(CAMERA)
+    assert model.info["radii"].all()
+    model.step = 10
+    model.get_outputs(CAMERA)
+    assert not model.info["radii"].all()
+    loaded, _ = make(regularizer="dropout(ramp(0, 0.5, 0, 10))")
+    loaded.update_to_step(10)
+    with torch.no_grad():
+        plain.opacities.copy_(logits_of(0.5 * activated(model)))
+    for ours in (model, loaded):
+        torch.testing.assert_close(ours.eval().get_outputs(CAMERA)["rgb"], plain.get_outputs(CAMERA)["rgb"])
