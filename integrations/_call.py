@@ -12,6 +12,8 @@ from ca_reg import Chain, Params
 
 __all__ = ["Call", "chain_of"]
 
+_OF_CALL = ("view_matrix", "step")  # fields that no argument with a row for each Gaussian holds
+
 
 def chain_of(regularizer: nn.Module) -> Chain:
     """Return a chain of what a user gave.
@@ -38,7 +40,7 @@ class Call:
 
     Attributes:
         arguments: by name.
-        names: of the arguments that are fields of :class:`~ca_reg.Params`; they can be read and replaced.
+        names: of the arguments, by field of :class:`~ca_reg.Params`, where the two names differ.
         instead: what takes their place in some calls, for messages.
     """
 
@@ -58,7 +60,7 @@ class Call:
     def check(cls, chain: Chain, signature: inspect.Signature) -> None:
         """Raise a ValueError if a regularizer asks for what no call with this signature can supply."""
         for name in chain.needs:
-            if name not in Params._fields or cls.names.get(name, "opacities") not in signature.parameters:
+            if name not in Params._fields or cls.names.get(name, name) not in (*signature.parameters, *_OF_CALL):
                 raise ValueError(
                     f"{_who(chain, 'needs', name)} needs {name}, which this rasterizer does not take; it takes "
                     f"{', '.join(signature.parameters)}."
@@ -66,14 +68,16 @@ class Call:
 
     def get(self, field: str) -> Tensor | None:
         """Return a field as the rasterizer takes it; None if this call is without."""
-        value: Tensor | None = self.arguments.get(self.names[field])
+        value: Tensor | None = self.arguments.get(self.names.get(field, field))
         return value
 
     def put(self, field: str, value: Tensor) -> None:
         """Replace a field."""
-        if field not in self.names:
-            raise ValueError(f"a regularizer changed {field}, which cannot be handed to this rasterizer.")
-        name = self.names[field]
+        if field in _OF_CALL:
+            raise ValueError(
+                f"a regularizer changed {field}, which belongs to the call and is no field of the Gaussians."
+            )
+        name = self.names.get(field, field)
         self.arguments[name] = value.reshape(self.arguments[name].shape)
 
     def params(self, chain: Chain, step: int) -> Params:

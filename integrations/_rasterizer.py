@@ -35,13 +35,7 @@ class ForwardCall(Call):
     Convention: its settings hold the view matrix transposed, for row vectors; ``viewmatrix.T`` is world to camera.
     """
 
-    names: ClassVar = {
-        "opacities": "opacities",
-        "means": "means3D",
-        "scales": "scales",
-        "quaternions": "rotations",
-        "sh": "shs",
-    }
+    names: ClassVar = {"means": "means3D", "quaternions": "rotations", "sh": "shs"}
     instead = (
         "cov3D_precomp takes the place of scales and rotations (switch off compute_cov3D_python), colors_precomp that "
         "of shs (convert_SHs_python, override_color)"

@@ -80,13 +80,7 @@ def regularized(
 class _Call(Call):
     """A call of ``gsplat.rasterization``."""
 
-    names: ClassVar = {
-        "opacities": "opacities",
-        "means": "means",
-        "scales": "scales",
-        "quaternions": "quats",
-        "sh": "colors",
-    }
+    names: ClassVar = {"quaternions": "quats", "sh": "colors"}
     instead = "covars take the place of scales and quats, colors without sh_degree or for each camera that of sh"
 
     def get(self, field: str) -> Tensor | None:
@@ -159,20 +153,16 @@ class Regularized:
         """Rasterize in a mode."""
         call = _Call(self.rasterization, self._signature.bind(*args, **kwargs))
         opacities: Tensor = call.arguments["opacities"]
-        keep: Tensor | None = None
-        if trains and torch.is_grad_enabled() and opacities.requires_grad:
-            if self._steps is not None:
-                self.chain.set_step(next(self._steps))
-            self.trained += 1
-            given = call.params(self.chain, self._step)
-            call.replace(given, self.chain(given, generator=self._generator))
-            keep = self.chain.keep
-            if self._watch is not None:
-                self._watch.regularized()
-        else:
-            self.evaluated += 1
-            given = call.params(self.chain, self._step)
-            call.replace(given, self.chain.expected(given))
+        trains = trains and torch.is_grad_enabled() and opacities.requires_grad
+        self.trained += trains
+        self.evaluated += not trains
+        if trains and self._steps is not None:
+            self.chain.set_step(next(self._steps))
+        given = call.params(self.chain, self._step)
+        call.replace(given, self.chain(given, generator=self._generator) if trains else self.chain.expected(given))
+        keep = self.chain.keep if trains else None
+        if trains and self._watch is not None:
+            self._watch.regularized()
         *images, info = call()
         # Several ranks exchange their Gaussians inside the call, after gsplat (1.5 on) has left out those of opacity 0.
         if keep is not None and not call.arguments.get("distributed"):

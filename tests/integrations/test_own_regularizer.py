@@ -42,7 +42,7 @@ class Concrete(Regularizer):
 
 
 class Misspelt(IndependentDropout):
-    needs = ("positions",)
+    needs = ("width",)  # gsplat has such an argument
 
 
 def literal_rates(means, world_to_camera, p, reach=4.0):
@@ -184,11 +184,11 @@ def test_what_no_render_has_is_refused_before_the_training(rasterizer):
     for make in (lambda x: RasterizerHook(x, rasterizer=rasterizer), lambda x: regularized(rasterization, x)):
         with pytest.raises(ValueError, match=r"Concrete learns drop_logits .* only the bundled trainer"):
             make(Concrete())
-    with pytest.raises(ValueError, match=r"Misspelt needs positions, which this rasterizer does not take"):
+    with pytest.raises(ValueError, match=r"Misspelt needs width, which this rasterizer does not take"):
         RasterizerHook(Misspelt(), rasterizer=rasterizer).install()
     with pytest.raises(ValueError, match=r"Move needs scales, which .* it takes self, means3D, means2D, opacities"):
         RasterizerHook(Move(), rasterizer=Minimal).install()
-    with pytest.raises(ValueError, match=r"Misspelt needs positions"):
+    with pytest.raises(ValueError, match=r"Misspelt needs width"):
         regularized(rasterization, Misspelt())
 
 
