@@ -144,6 +144,7 @@ class RasterizerHook:
             ImportError: if no rasterizer is installed and none was given.
             RuntimeError: if this hook or another one is in force already.
             TypeError: if the rasterizer is not one of the INRIA family.
+            ValueError: if it does not take what the regularizer needs.
         """
         if self._watch is not None:
             raise RuntimeError("this hook is installed already; uninstall it first.")
