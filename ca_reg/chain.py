@@ -137,7 +137,6 @@ class Foreign(Regularizer):
             raise TypeError(f"a regularizer must be a torch module, got {type(module).__name__}.")
         super().__init__()
         self.module = module
-        self.train(module.training)
 
     @property
     def takes_generator(self) -> bool:

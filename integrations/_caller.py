@@ -11,7 +11,9 @@ from collections.abc import Mapping
 from types import FrameType
 from typing import Any
 
-__all__ = ["calling_render", "find_instance", "is_viewer", "own_dropout", "own_noise"]
+from ca_reg import Chain, OpacityNoise
+
+__all__ = ["calling_render", "find_instance", "is_viewer", "refuse_a_second_regularizer"]
 
 _OUTWARD = 8  # frames to search: torch.nn.Module puts two between the rasterizer and its caller
 
@@ -45,17 +47,16 @@ def is_viewer(variables: Mapping[str, Any], camera: str | None) -> bool:
     return camera is not None and any(type(x).__name__ == camera for x in variables.values())
 
 
-def own_dropout(variables: Mapping[str, Any]) -> str | None:
-    """Say which dropout by index the calling render has (the paper's code), and how to switch it off; or None."""
-    factor = variables.get("dropout_factor")
-    if isinstance(factor, (int, float)) and factor > 0:
-        return f"dropout_factor={factor:g}; switch it off with --dropout_factor 0"
-    return None
-
-
-def own_noise(variables: Mapping[str, Any]) -> str | None:
-    """Say which opacity noise of its own the calling render adds, and how to switch it off; or None."""
-    sigma = variables.get("sigma_noise")
-    if isinstance(sigma, (int, float)) and sigma > 0 and variables.get("train", True):
-        return f"sigma_noise={sigma:g}; switch it off with --sigma_noise 0"
-    return None
+def refuse_a_second_regularizer(variables: Mapping[str, Any], chain: Chain) -> None:
+    """Raise a RuntimeError if the calling render, that of the paper's code, does itself what the chain does."""
+    perturbs = any(isinstance(member, OpacityNoise) for member in chain) and variables.get("train", True)
+    for name, kind, applies in (
+        ("dropout_factor", "GaussianDropout", chain.drops),
+        ("sigma_noise", "OpacityNoise", perturbs),
+    ):
+        value = variables.get(name)
+        if applies and isinstance(value, (int, float)) and value > 0:
+            raise RuntimeError(
+                f"{kind} would be applied twice: the calling render has {name}={value:g}; switch it off with "
+                f"--{name} 0."
+            )

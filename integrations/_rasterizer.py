@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
+
+from ._call import Call
 
 __all__ = [
     "MODULES",
@@ -28,23 +29,37 @@ MODULES = ("diff_gaussian_rasterization", "diff_gaussian_rasterization_abs")
 _CLASS = "GaussianRasterizer"
 
 
-class ForwardCall:
-    """One call of ``GaussianRasterizer.forward``, whose arguments may be changed before it is made.
+class ForwardCall(Call):
+    """One call of ``GaussianRasterizer.forward``.
 
-    Args:
-        forward: the method that does the work.
-        bound: its arguments by name, the rasterizer itself among them.
+    Convention: its settings hold the view matrix transposed, for row vectors; ``viewmatrix.T`` is world to camera.
     """
 
-    def __init__(self, forward: Callable[..., Any], bound: inspect.BoundArguments) -> None:
-        self.forward = forward
-        self.rasterizer = next(iter(bound.arguments.values()))
-        self.arguments = bound.arguments
-        self._bound = bound
+    names: ClassVar = {"means": "means3D", "quaternions": "rotations", "sh": "shs"}
+    instead = (
+        "cov3D_precomp takes the place of scales and rotations (switch off compute_cov3D_python), colors_precomp that "
+        "of shs (convert_SHs_python, override_color)"
+    )
 
-    def __call__(self) -> Any:
-        """Rasterize."""
-        return self.forward(*self._bound.args, **self._bound.kwargs)
+    @property
+    def rasterizer(self) -> Any:
+        """The rasterizer itself."""
+        return next(iter(self.arguments.values()))
+
+    def get(self, field: str) -> Tensor | None:
+        """Return a field; spherical harmonics are one even where "dc" holds the first band."""
+        if field == "view_matrix":
+            matrix = getattr(getattr(self.rasterizer, "raster_settings", None), "viewmatrix", None)
+            return None if matrix is None else matrix.T
+        value = super().get(field)
+        first = self.arguments.get("dc") if field == "sh" else None
+        return value if value is None or first is None else torch.cat([first, value], 1)
+
+    def put(self, field: str, value: Tensor) -> None:
+        """Replace a field."""
+        if field == "sh" and self.arguments.get("dc") is not None:
+            self.arguments["dc"], value = value[:, :1], value[:, 1:]
+        super().put(field, value)
 
 
 def check_installed() -> None:

@@ -1,4 +1,4 @@
-"""What is added to a splatfacto model: regularized opacities, and the co-adaptation score among its image metrics."""
+"""What is added to a splatfacto model: regularized Gaussians, and the co-adaptation score among its image metrics."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from types import ModuleType
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from ca_reg import CAScore, GaussianDropout, OpacityNoise
+from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise
+from ca_reg.regularizers import parse
 
 from .gsplat import Rasterization, regularized
 
@@ -53,23 +54,29 @@ class CoAdaptation(_Splatfacto):  # type: ignore[misc]
             self.holder.rasterization = _Dispatch(self.holder.rasterization)  # type: ignore[attr-defined]
         self._original: Rasterization = self.holder.rasterization.original
         config = self.config
-        # The noise comes first: scaled for evaluation, it must see the plain opacities.
-        regularizer = nn.Sequential(
-            OpacityNoise(config.opacity_noise, scale=config.scale_noise), GaussianDropout(config.dropout)
-        )
-        self._regularized = regularized(self._original, regularizer)
+        chain, p = Chain(GaussianDropout(config.dropout), OpacityNoise(config.opacity_noise)), config.dropout
+        if config.regularizer:
+            chain, p = parse(config.regularizer), 0.0
+        self._regularized = regularized(self._original, chain)
         self._score: CAScore | None = None
         if config.ca_samples > 0:
-            self._score = CAScore(self._render, samples=config.ca_samples, p=config.dropout, layout="HWC")
+            self._score = CAScore(self._render, samples=config.ca_samples, p=p, layout="HWC")
         self._cameras: MutableMapping[Tensor, Any] = WeakTensorKeyDictionary()
 
     def get_outputs(self, camera: Any) -> dict[str, Any]:
-        """Render a camera: with regularized opacities in training, with scaled ones in evaluation."""
+        """Render a camera: with regularized Gaussians in training, with test-time ones in evaluation."""
+        if self.training:
+            self._regularized.chain.set_step(self.step)
         with _rasterizing_by(self._regularized if self.training else self._regularized.evaluate):
             outputs: dict[str, Any] = super().get_outputs(camera)
         if not self.training and self.crop_box is None and "rgb" in outputs:
             self._cameras[outputs["rgb"]] = camera
         return outputs
+
+    def update_to_step(self, step: int) -> None:
+        """Take note of the step of a checkpoint that is loaded, which schedules follow in evaluation."""
+        super().update_to_step(step)
+        self._regularized.chain.set_step(step)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]

@@ -26,8 +26,8 @@ class SplatfactoCAModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
     """share of the Gaussians left out of each training step; evaluation scales the opacities by 1 - dropout"""
     opacity_noise: float = 0.0
     """standard deviation of the relative noise on the opacities in training; the paper uses 0.8"""
-    scale_noise: bool = False
-    """whether evaluation renders with the mean of the noisy opacities, which the paper does not"""
+    regularizer: str = ""
+    """instead of these two, such as "dropout(0.2) + noise(0.8, scale=True)" or my_module:MyDropout; scored at p = 0"""
     ca_samples: int = 5
     """renders per evaluation image for the co-adaptation score; 0 leaves it out"""
 

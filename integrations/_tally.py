@@ -68,15 +68,7 @@ class Tally:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts for JSON."""
-        skipped = {reason.name.lower(): count for reason, count in self.skipped.items()}
-        return {
-            "regularized": self.regularized,
-            "scaled": self.scaled,
-            "skipped": skipped,
-            "first_step": self.first_step,
-            "last_step": self.last_step,
-            "lost": self.lost,
-        }
+        return vars(self) | {"skipped": {reason.name.lower(): count for reason, count in self.skipped.items()}}
 
     def lines(self) -> list[str]:
         """Return the counts in words, a line each."""

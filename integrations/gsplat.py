@@ -1,4 +1,4 @@
-"""Dropout and opacity noise for every code base that calls ``gsplat.rasterization``.
+"""Regularizers for every code base that calls ``gsplat.rasterization``.
 
 In a script of one's own, one line wraps the function:
 
@@ -16,12 +16,12 @@ import inspect
 import itertools
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from types import TracebackType
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from ._chain import Chain
+from ._call import Call, chain_of
 from ._watch import Watch
 
 __all__ = ["Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized"]
@@ -35,27 +35,28 @@ _HOLDERS = ("gsplat", "gsplat.rendering")  # the two public places that scripts 
 def regularized(
     rasterization: Rasterization, regularizer: nn.Module, *, generator: torch.Generator | None = None
 ) -> Regularized:
-    """Wrap ``gsplat.rasterization`` so that the opacities pass through a regularizer.
+    """Wrap ``gsplat.rasterization`` so that the Gaussians pass through a regularizer.
 
     A call trains if the regularizer is in ``train()``, gradients are enabled, and the opacities require one; any other
     call evaluates, whatever the mode of the module: test views under ``no_grad`` get the scaled opacities of ``eval()``
     without a word from the script. Evaluation leaves the module as it is, so that another thread may train with it. All
-    cameras of a call see the same draw. A schedule needs ``set_step``, as always.
+    cameras of a call see the same draw, by the view matrix of the first. A schedule needs ``set_step``, as always.
 
     Dropped Gaussians leave no trace in density control: their ``info["radii"]`` are 0, in the shapes of gsplat 1.4
-    ([C, N]) and later ([C, N, 2]). In packed mode gsplat itself does not list them, from 1.5 on. A module says what it
-    dropped by its mask ``keep``, (N,) bool; one without that attribute drops what it sets to 0.
+    ([C, N]) and later ([C, N, 2]). In packed mode gsplat itself does not list them, from 1.5 on.
 
     Convention: activated opacities, [..., N]; several batches are drawn as one set of Gaussians.
 
     Args:
         rasterization: ``gsplat.rasterization`` or ``gsplat.rasterization_2dgs``, or a function with the same arguments.
-        regularizer: from activated opacities (N,) to those to render; ``nn.Sequential`` for several.
-        generator: source of the draws, passed to the regularizer, or to each member of an ``nn.Sequential``.
+        regularizer: a :class:`~ca_reg.Regularizer` or any other module, or several, as :class:`~ca_reg.Chain` takes
+            them. Spherical harmonics are ``colors`` with a ``sh_degree``.
+        generator: source of the draws, passed to every member.
 
     Raises:
         TypeError: if ``rasterization`` has no argument ``opacities``, or ``regularizer`` is not a module.
-        ValueError: if ``rasterization`` is regularized already.
+        ValueError: if ``rasterization`` is regularized already, or the regularizer learns numbers per Gaussian; at a
+            call, if that lacks what the regularizer needs.
         RuntimeError: at a call in training that drops Gaussians, if there are no radii to zero: in packed mode where
             gsplat lists Gaussians of opacity 0 (before 1.5, and 2DGS), or where ``info`` has none.
 
@@ -76,12 +77,31 @@ def regularized(
     return Regularized(rasterization, regularizer, generator)
 
 
+class _Call(Call):
+    """A call of ``gsplat.rasterization``."""
+
+    names: ClassVar = {"quaternions": "quats", "sh": "colors"}
+    instead = "covars take the place of scales and quats, colors without sh_degree or for each camera that of sh"
+
+    def get(self, field: str) -> Tensor | None:
+        """Return a field; of several cameras the first."""
+        if field == "view_matrix":
+            matrices: Tensor = self.arguments["viewmats"]
+            return matrices.reshape(-1, 4, 4)[0]
+        if field == "sh":
+            hidden = self.arguments.get("sh_degree") is None
+        else:
+            hidden = field != "means" and self.arguments.get("covars") is not None
+        return None if hidden else super().get(field)
+
+
 class Regularized:
-    """A rasterization whose opacities pass through a regularizer; made by :func:`regularized`.
+    """A rasterization whose Gaussians pass through a regularizer; made by :func:`regularized`.
 
     Attributes:
         rasterization: the function underneath.
-        regularizer: the module.
+        regularizer: the module, as given.
+        chain: what is made of it.
         trained: number of calls that were regularized as training.
         evaluated: number of calls that were rendered as evaluation.
     """
@@ -102,10 +122,11 @@ class Regularized:
                 "this rasterization is regularized already, and opacities would be dropped twice: compose regularizers "
                 "with nn.Sequential, or take its .rasterization."
             )
-        self._chain = Chain(regularizer)
+        self.chain = chain_of(regularizer)
         self._signature = inspect.signature(rasterization)
         if "opacities" not in self._signature.parameters:
             raise TypeError(f"expected gsplat.rasterization, got {rasterization!r}, which has no argument opacities.")
+        _Call.check(self.chain, self._signature)
         self.rasterization = rasterization
         self.regularizer = regularizer
         self.trained = self.evaluated = 0
@@ -130,27 +151,29 @@ class Regularized:
 
     def _rasterize(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, trains: bool) -> tuple[Any, ...]:
         """Rasterize in a mode."""
-        bound = self._signature.bind(*args, **kwargs)
-        opacities: Tensor = bound.arguments["opacities"]
-        given = opacities.reshape(-1)
-        keep: Tensor | None = None
-        if trains and torch.is_grad_enabled() and opacities.requires_grad:
-            if self._steps is not None:
-                self._chain.set_step(next(self._steps))
-            self.trained += 1
-            used, keep = self._chain.draw(given, self._generator)
-            if self._watch is not None:
-                self._watch.regularized()
-        else:
-            self.evaluated += 1
-            used = self._chain.evaluate(given, generator=self._generator)
-        if used is not given:
-            bound.arguments["opacities"] = used.view(opacities.shape)
-        *images, info = self.rasterization(*bound.args, **bound.kwargs)
+        call = _Call(self.rasterization, self._signature.bind(*args, **kwargs))
+        opacities: Tensor = call.arguments["opacities"]
+        trains = trains and torch.is_grad_enabled() and opacities.requires_grad
+        self.trained += trains
+        self.evaluated += not trains
+        if trains and self._steps is not None:
+            self.chain.set_step(next(self._steps))
+        given = call.params(self.chain, self._step)
+        call.replace(given, self.chain(given, generator=self._generator) if trains else self.chain.expected(given))
+        keep = self.chain.keep if trains else None
+        if trains and self._watch is not None:
+            self._watch.regularized()
+        *images, info = call()
         # Several ranks exchange their Gaussians inside the call, after gsplat (1.5 on) has left out those of opacity 0.
-        if keep is not None and not bound.arguments.get("distributed"):
+        if keep is not None and not call.arguments.get("distributed"):
             self._hide_dropped(info, keep.view(opacities.shape))
         return (*images, info)
+
+    @property
+    def _step(self) -> int:
+        """The step that the user told to the regularizer or to its parts."""
+        steps = (getattr(part, "step", 0) for part in self.chain.modules())
+        return max(step for step in steps if isinstance(step, int))
 
     def _hide_dropped(self, info: MutableMapping[str, Any], keep: Tensor) -> None:
         """Zero the radii of dropped Gaussians; ``keep`` is [..., N]."""

@@ -9,7 +9,7 @@ common: they hand activated opacities to ``GaussianRasterizer``, and take what w
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import ModuleType, TracebackType
 from typing import Any, Literal, get_args
 
@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ca_reg import GaussianDropout, OpacityNoise
+from ca_reg.chain import Foreign
 
 from ._after_import import AfterImport
-from ._caller import calling_render, find_instance, is_viewer, own_dropout, own_noise
-from ._chain import Chain
+from ._call import chain_of
+from ._caller import calling_render, find_instance, is_viewer, refuse_a_second_regularizer
 from ._iterations import Field, Iterations, Steps, leaf_of
 from ._override import is_overridden
 from ._patch import ClassPatch
@@ -62,9 +62,8 @@ class RasterizerHook:
     ``update_learning_rate``, its ``optimizer.step()`` or its ``backward()``; see ``patience``.
 
     Args:
-        regularizer: a module from activated opacities (N,) or (N, 1) to those to render, whose ``forward`` takes
-            ``generator=``, or an ``nn.Sequential`` of them. What it drops it says by its mask ``keep``, (N,) bool; one
-            without that attribute drops what it sets to 0. The hook sets its mode, and its step by ``set_step``.
+        regularizer: a :class:`~ca_reg.Regularizer`, or several, as :class:`~ca_reg.Chain` takes them; any other module
+            must take ``generator=`` in its ``forward``. The hook sets its mode and its step.
         scope: "main" regularizes the first training render of every model and iteration, as the paper's code does, and
             leaves second views and pseudo views alone; "all" regularizes all with one mask, for code bases with several
             views in an iteration (MVGS).
@@ -83,13 +82,15 @@ class RasterizerHook:
 
     Raises:
         TypeError: if ``regularizer`` is no module, or takes no ``generator``.
-        ValueError: if ``scope`` or ``steps`` is unknown, ``patience`` negative, or there is no regularizer.
+        ValueError: if ``scope`` or ``steps`` is unknown, ``patience`` negative, or there is no regularizer or one that
+            learns numbers per Gaussian; at a render, if that lacks what the regularizer needs.
 
     Example:
         >>> class GaussianRasterizer(nn.Module):
         ...     def forward(self, means3D, means2D, opacities):
         ...         return opacities.mean().expand(3, 4, 5), torch.full((len(means3D),), 7)
         >>> means, logits = torch.zeros(9, 3, requires_grad=True), torch.zeros(9, 1, requires_grad=True)
+        >>> from ca_reg import GaussianDropout
         >>> dropout = GaussianDropout(p=0.5)
         >>> with RasterizerHook(dropout, rasterizer=GaussianRasterizer) as hook:
         ...     hook.step(1)
@@ -113,14 +114,16 @@ class RasterizerHook:
         for name, value, choices in (("scope", scope, get_args(Scope)), ("steps", steps, get_args(Steps))):
             if value not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}.")
-        self._chain = Chain(regularizer)
-        if not self._chain.modules:
+        self._chain = chain_of(regularizer)
+        if not len(self._chain):
             raise ValueError("regularizer is empty; without one there is nothing to install.")
-        if without := self._chain.without_generator():
-            raise TypeError(
-                f"the forward of {', '.join(without)} takes no argument generator, by which the hook repeats the draws "
-                "of a step and leaves the global random numbers alone. Add generator=None to it, and draw from it."
-            )
+        for member in self._chain:
+            if isinstance(member, Foreign) and not member.takes_generator:
+                raise TypeError(
+                    f"the forward of {type(member.module).__name__} takes no argument generator, by which the hook "
+                    "repeats the draws of a step and leaves the global random numbers alone. Add generator=None to it, "
+                    "and draw from it."
+                )
         self._scope = scope
         self._seed = int(seed)
         self._rasterizer = rasterizer
@@ -141,6 +144,7 @@ class RasterizerHook:
             ImportError: if no rasterizer is installed and none was given.
             RuntimeError: if this hook or another one is in force already.
             TypeError: if the rasterizer is not one of the INRIA family.
+            ValueError: if it does not take what the regularizer needs.
         """
         if self._watch is not None:
             raise RuntimeError("this hook is installed already; uninstall it first.")
@@ -250,6 +254,7 @@ class RasterizerHook:
     def _wrap(self, rasterizer: type) -> None:
         """Wrap the forward of a rasterizer."""
         signature = forward_signature(rasterizer)
+        ForwardCall.check(self._chain, signature)
         function: Any = rasterizer.forward  # type: ignore[attr-defined]
         while function is not None:
             if isinstance(vars(function).get("ca_reg_hook"), RasterizerHook):
@@ -280,7 +285,7 @@ class RasterizerHook:
         render = calling_render()
         model = find_instance(render, self._models)
         if not torch.is_grad_enabled() or is_viewer(render, self._viewer):
-            self._refuse_a_second_regularizer(render)
+            refuse_a_second_regularizer(render, self._chain)
             return self._evaluate(call, self._iterations.evaluation_step(means if model is None else model))
         if not opacities.requires_grad:
             return self._leave(call, Skip.CONSTANT_OPACITY)
@@ -292,7 +297,7 @@ class RasterizerHook:
         field.count_render(parameters)
         if self._scope == "main" and field.renders > 1:
             return self._leave(call, Skip.FURTHER_VIEW)
-        self._refuse_a_second_regularizer(render)
+        refuse_a_second_regularizer(render, self._chain)
         self._refuse_zeros(opacities)
         return self._train(call, field)
 
@@ -302,43 +307,33 @@ class RasterizerHook:
         return call()
 
     def _evaluate(self, call: ForwardCall, step: int) -> Any:
-        """Make a call with the test-time opacities."""
-        given: Tensor = call.arguments["opacities"]
-        opacities = self._chain.evaluate(given, step)
-        if opacities is given:
-            self.tally.skipped[Skip.NOTHING_TO_SCALE] += 1
-        else:
+        """Make a call with the test-time values."""
+        given = call.params(self._chain, step)
+        if call.replace(given, self._chain.expected(given)):
             self.tally.scaled += 1
+        else:
+            self.tally.skipped[Skip.NOTHING_TO_SCALE] += 1
+        opacities: Tensor = call.arguments["opacities"]
         if torch.is_grad_enabled() and opacities.requires_grad:
-            opacities = opacities.view_as(opacities)
+            call.arguments["opacities"] = opacities = opacities.view_as(opacities)
             opacities.register_hook(self._refuse_to_train_on_a_viewer)  # type: ignore[no-untyped-call]
-        call.arguments["opacities"] = opacities
         return call()
 
     def _train(self, call: ForwardCall, field: Field) -> Any:
-        """Make a call with regularized opacities, and hide the dropped Gaussians from densification."""
-        given: Tensor = call.arguments["opacities"]
+        """Make a call with regularized Gaussians, and hide the dropped ones from densification."""
+        step = field.training_step
         # The same for every render of an iteration, so that all of them drop the same Gaussians.
-        entropy = np.random.SeedSequence([self._seed, field.index, field.training_step]).generate_state(1, np.uint64)
-        generator = torch.Generator(given.device).manual_seed(int(entropy[0]) >> 1)
-        for module in self._chain.modules:
-            module.train()
-        self._chain.set_step(field.training_step)
-        opacities, keep = self._chain.draw(given, generator)
+        entropy = np.random.SeedSequence([self._seed, field.index, step]).generate_state(1, np.uint64)
+        generator = torch.Generator(call.arguments["opacities"].device).manual_seed(int(entropy[0]) >> 1)
+        self._chain.train().set_step(step)
+        given = call.params(self._chain, step)
+        changed = call.replace(given, self._chain(given, generator=generator))
         self._watch_training.regularized()
-        if opacities is given:
+        if not changed:
             return self._leave(call, Skip.RATE_ZERO)
-        self.tally.count_regularized(field.training_step)
-        call.arguments["opacities"] = opacities
-        returned = call()
+        self.tally.count_regularized(step)
+        returned, keep = call(), self._chain.keep
         return returned if keep is None else hide_dropped(returned, keep)
-
-    def _refuse_a_second_regularizer(self, render: Mapping[str, Any]) -> None:
-        """Raise if the calling render regularizes as well, so that everything would be done twice."""
-        for kind, own in ((GaussianDropout, own_dropout(render)), (OpacityNoise, own_noise(render))):
-            applies = self._chain.drops if kind is GaussianDropout else self._chain.perturbs
-            if own is not None and applies:
-                raise RuntimeError(f"{kind.__name__} would be applied twice: the calling render has {own}.")
 
     def _refuse_zeros(self, opacities: Tensor) -> None:
         """Raise if Gaussians arrive dropped: activated opacities are above 0."""

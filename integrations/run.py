@@ -21,9 +21,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
-from torch import nn
-
-from ca_reg import GaussianDropout, OpacityNoise
+from ca_reg import Chain, GaussianDropout, OpacityNoise
+from ca_reg.regularizers import parse
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
 from ._script import run_script, set_command_line
@@ -39,17 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: of the launcher, the script and the arguments of the script; those of the process by default.
     """
     options = _parse(arguments)
-    hook = None
-    if options.regularizers:
-        hook = RasterizerHook(
-            nn.Sequential(*options.regularizers),
-            scope=options.scope,
-            seed=options.seed,
-            steps=options.steps,
-            viewer=None if options.viewer == "none" else options.viewer,
-            patience=options.patience,
-            allow_zeros=options.allow_zeros,
-        )
+    hook: RasterizerHook | None = options.hook
     set_command_line(options.script, options.arguments)
     with _reported(options, hook), ExitStack() as undo:
         if options.cpu:
@@ -70,7 +59,7 @@ def _uninstall(hook: RasterizerHook) -> None:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Read and check the options before anything runs; `regularizers` is a list of modules."""
+    """Read and check the options before anything runs; `hook` is what they ask for."""
     parser = argparse.ArgumentParser(
         prog="python -m ca_reg.integrations.run",
         description="Run a training or render script of the INRIA 3DGS family, regularized, with no edit.",
@@ -78,10 +67,12 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         allow_abbrev=False,
     )
     add = parser.add_argument
+    add("--regularizer", default="", metavar="EXPR", help="one or several, such as 'dropout(0.2) + noise(0.8)' or "
+        "my_module:MyDropout from the present folder")  # fmt: skip
     add("--dropout", type=float, metavar="P", help="share of Gaussians to drop in every training render, e.g. 0.2")
     add("--noise", type=float, metavar="SIGMA", help="standard deviation of the relative opacity noise, e.g. 0.8")
-    add("--start", type=int, default=0, metavar="STEP", help="first step that is regularized (default: 0)")
-    add("--ramp", type=int, metavar="STEPS", help="raise the rates linearly from 0 over so many steps after --start")
+    add("--start", type=int, default=0, metavar="STEP", help="first step with --dropout and --noise (default: 0)")
+    add("--ramp", type=int, metavar="STEPS", help="raise both rates linearly from 0 over so many steps after --start")
     add("--scope", choices=get_args(Scope), default="main", help="first training render of an iteration, or all")
     add("--seed", type=int, default=0, help="of masks and noise (default: 0); the script's random numbers are its own")
     add("--report", type=Path, metavar="FILE", help="write what was done as JSON, too")
@@ -120,28 +111,36 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     if options.outputs is not None and not options.cpu:
         parser.error("--outputs is about the stand-in, which --cpu asks for")
     try:
-        options.regularizers = _regularizers(options)
-    except ValueError as error:
+        options.hook = _hook(options)
+    except (TypeError, ValueError) as error:
         parser.error(str(error))
     return options
 
 
-def _regularizers(options: argparse.Namespace) -> list[nn.Module]:
-    """Build what the options ask for, dropout before noise."""
+def _hook(options: argparse.Namespace) -> RasterizerHook | None:
+    """Make the hook that the options ask for; None if they ask for no regularizer."""
 
     def scheduled(rate: float) -> Schedule:
         if options.ramp is None:
             return StartStop(rate, start=options.start)
         return LinearRamp(0.0, rate, options.start, options.start + options.ramp)
 
-    modules: list[nn.Module] = []
-    if options.dropout is not None:
-        GaussianDropout(options.dropout)  # a schedule is checked at its steps only
-        modules.append(GaussianDropout(scheduled(options.dropout)))
-    if options.noise is not None:
-        OpacityNoise(options.noise)
-        modules.append(OpacityNoise(scheduled(options.noise)))
-    return modules
+    members = list(parse(options.regularizer))
+    for kind, rate in ((GaussianDropout, options.dropout), (OpacityNoise, options.noise)):
+        if rate is not None:
+            kind(rate)  # a schedule is checked at its steps only
+            members.append(kind(scheduled(rate)))
+    if not members:
+        return None
+    return RasterizerHook(
+        Chain(*members),
+        scope=options.scope,
+        seed=options.seed,
+        steps=options.steps,
+        viewer=None if options.viewer == "none" else options.viewer,
+        patience=options.patience,
+        allow_zeros=options.allow_zeros,
+    )
 
 
 @contextmanager
@@ -163,6 +162,7 @@ def _reported(options: argparse.Namespace, hook: RasterizerHook | None) -> Itera
         report: dict[str, Any] = {
             "script": str(options.script),
             "arguments": options.arguments,
+            "regularizer": options.regularizer,
             "dropout": options.dropout,
             "noise": options.noise,
             "start": options.start,

@@ -1,9 +1,11 @@
 """What the tests of the INRIA hook share."""
 
+import importlib
 import sys
 from types import ModuleType
 
 import pytest
+from pages import ROOT, blocks
 from stand_ins.inria import Model, make_rasterizer
 
 
@@ -24,3 +26,15 @@ def model_class(monkeypatch):
     module.GaussianModel = GaussianModel
     monkeypatch.setitem(sys.modules, "scene.gaussian_model", module)
     return GaussianModel
+
+
+@pytest.fixture
+def my_module(tmp_path, monkeypatch):
+    """The file of docs/write_your_own.md in the present folder, imported."""
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "my_module.py").write_text(blocks(ROOT / "docs" / "write_your_own.md", "python")[0])
+    monkeypatch.chdir(tmp_path / "own")
+    monkeypatch.setattr(sys, "path", ["", *sys.path])
+    importlib.invalidate_caches()
+    yield importlib.import_module("my_module")
+    del sys.modules["my_module"]

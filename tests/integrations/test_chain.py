@@ -8,12 +8,9 @@ import torch
 from stand_ins.inria import PIPE, Model, make_rasterizer, make_render
 from torch import nn
 
-from ca_reg import GaussianDropout, OpacityNoise
-from ca_reg._regularizer import Regularizer
-from ca_reg.integrations._chain import Chain
+from ca_reg import Draw, GaussianDropout, OpacityNoise, Regularizer
 from ca_reg.integrations.gsplat import regularized
 from ca_reg.integrations.inria import RasterizerHook
-from ca_reg.schedules import Constant
 
 N = 60
 OPACITY = torch.full((N,), 0.8)
@@ -29,15 +26,13 @@ def call(wrapped, opacities):
 
 
 class DropEverySecond(Regularizer):
-    """A user's own regularizer; by the project's base, with the mask that it offers."""
+    """A user's own regularizer, by the base class."""
 
-    def __init__(self):
-        super().__init__(Constant(0.5))
-        self.keep = None
+    def draw(self, x, generator=None):
+        return Draw(keep=torch.arange(len(x.opacities)) % 2 == 0)
 
-    def forward(self, opacity, generator=None):
-        self.keep = torch.arange(len(opacity)) % 2 == 0 if self.training else None
-        return opacity if self.keep is None else opacity * self.keep.view(-1, *[1] * (opacity.ndim - 1))
+    def replay(self, x, draw):
+        return x._replace(opacities=x.opacities * draw.keep)
 
 
 class ZeroEverySecond(nn.Module):
@@ -79,13 +74,7 @@ def test_what_noise_clamps_to_zero_is_seen_all_the_same_in_every_hook():
     assert (noise.noise < -1).any()
 
 
-def test_masks_of_several_modules_are_combined():
-    _, keep = Chain(nn.Sequential(DropEverySecond(), GaussianDropout(0.5))).draw(OPACITY)
-    assert not keep[1::2].any()
-    assert 0 < keep.sum() < N // 2
-
-
-def test_an_evaluation_shares_the_tensors_and_nothing_else():
+def test_a_test_render_shares_the_tensors_and_nothing_else():
     class Learned(nn.Module):
         def __init__(self):
             super().__init__()
@@ -96,9 +85,10 @@ def test_an_evaluation_shares_the_tensors_and_nothing_else():
             return self.dropout(opacity) * self.factor
 
     module = Learned()
-    Chain(module).draw(OPACITY)
+    wrapped = regularized(rasterization, module)
+    call(wrapped, OPACITY.clone().requires_grad_())
     keep = module.dropout.keep
-    opacity = Chain(module).evaluate(OPACITY, step=7)
+    opacity = wrapped.evaluate(None, None, None, OPACITY, None, None, None, 8, 8)[0]
     torch.testing.assert_close(opacity, torch.full((N,), 0.32))
     opacity.sum().backward()
     assert module.factor.grad == pytest.approx(N * 0.64)
@@ -108,7 +98,16 @@ def test_an_evaluation_shares_the_tensors_and_nothing_else():
 
 def test_a_compiled_module_evaluates_too():
     compiled = torch.compile(GaussianDropout(0.25), backend="eager")
-    torch.testing.assert_close(Chain(compiled).evaluate(OPACITY), 0.75 * OPACITY)
+    with torch.no_grad():
+        torch.testing.assert_close(call(regularized(rasterization, compiled), OPACITY)[0], 0.75 * OPACITY)
+
+
+def test_a_module_that_was_in_eval_when_it_was_wrapped_trains_all_the_same():
+    module = ZeroEverySecond().eval()
+    wrapped = regularized(rasterization, module)
+    module.train()
+    info = call(wrapped, OPACITY.clone().requires_grad_())[2]
+    assert torch.equal(info["radii"][0] > 0, torch.arange(N) % 2 == 0)
 
 
 def test_an_exception_at_any_line_leaves_the_mode_alone():
@@ -122,7 +121,7 @@ def test_an_exception_at_any_line_leaves_the_mode_alone():
 
         def trace(frame, event, argument):
             nonlocal left
-            if not frame.f_code.co_filename.endswith(("gsplat.py", "_chain.py", "contextlib.py")):
+            if not frame.f_code.co_filename.endswith(("gsplat.py", "_call.py", "chain.py", "contextlib.py")):
                 return None
             if event == "line":
                 left -= 1
@@ -152,11 +151,10 @@ def test_a_training_call_during_an_evaluation_in_another_thread_is_regularized()
     inside, done = threading.Event(), threading.Event()
 
     class Slow(GaussianDropout):
-        def forward(self, opacity, **options):
-            if not torch.is_grad_enabled():
-                inside.set()
-                assert done.wait(timeout=30)
-            return super().forward(opacity, **options)
+        def expected(self, x):
+            inside.set()
+            assert done.wait(timeout=30)
+            return super().expected(x)
 
     wrapped = regularized(rasterization, Slow(0.5))
     seen = []

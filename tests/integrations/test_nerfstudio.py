@@ -23,7 +23,7 @@ class Splatfacto(nn.Module):
 
     def __init__(self, config, holder):
         super().__init__()
-        self.config, self.crop_box, self.plain_holder = config, None, holder
+        self.config, self.crop_box, self.plain_holder, self.step = config, None, holder, 0
         self.populate_modules()
 
     def populate_modules(self):
@@ -47,12 +47,15 @@ class Splatfacto(nn.Module):
         )
         return {"rgb": image.squeeze(0), "accumulation": alpha.squeeze(0)}
 
+    def update_to_step(self, step):
+        pass
+
     def get_image_metrics_and_images(self, outputs, batch):
         return {"psnr": 20.0}, {"img": outputs["rgb"]}
 
 
 CAMERA = torch.eye(4)[None]
-CONFIG = {"dropout": 0.4, "opacity_noise": 0.0, "scale_noise": False, "ca_samples": 5}
+CONFIG = {"dropout": 0.4, "opacity_noise": 0.0, "regularizer": "", "ca_samples": 5}
 
 
 def make(**changes):
@@ -118,7 +121,7 @@ def test_noise_is_added_in_training_and_scaled_on_request():
     torch.manual_seed(0)
     assert not torch.equal(model.get_outputs(CAMERA)["rgb"], plain.get_outputs(CAMERA)["rgb"])
     assert torch.equal(model.eval().get_outputs(CAMERA)["rgb"], plain.get_outputs(CAMERA)["rgb"])
-    scaled, _ = make(dropout=0.0, opacity_noise=0.8, scale_noise=True)
+    scaled, _ = make(regularizer="noise(0.8, scale=True)")
     assert not torch.equal(scaled.eval().get_outputs(CAMERA)["rgb"], plain.get_outputs(CAMERA)["rgb"])
 
 
@@ -126,15 +129,15 @@ def test_other_models_of_the_module_are_left_alone_even_in_other_threads():
     model, plain = make()
     expected = plain.get_outputs(CAMERA)["rgb"]
     inside, done = threading.Event(), threading.Event()
-    noise = model._regularized.regularizer[0]
-    draw = noise.forward
+    member = next(iter(model._regularized.chain))
+    draw = member.draw
 
-    def wait(opacity):
+    def wait(x, generator):
         inside.set()
         assert done.wait(timeout=180)
-        return draw(opacity)
+        return draw(x, generator)
 
-    noise.forward = wait
+    member.draw = wait
     thread = threading.Thread(target=model.get_outputs, args=(CAMERA,))
     thread.start()
     assert inside.wait(timeout=180)
@@ -270,3 +273,42 @@ def test_a_users_command_takes_no_added_line(pytestconfig):
     lines = (pytestconfig.rootpath / "pyproject.toml").read_text().splitlines()
     place = lines.index('[project.entry-points."nerfstudio.method_configs"]')
     assert lines[place + 1] == f'splatfacto-ca = "{ENTRY_POINT}"'
+
+
+def test_a_users_own_regularizer_trains_and_renders(my_module):
+    model, plain = make(regularizer="my_module:MyDropout(0.8) + my_module:MyScaleNoise(0.3)")
+    torch.manual_seed(0)
+    image = model.get_outputs(CAMERA)["rgb"]
+    dropout, noise = model._regularized.chain
+    keep = dropout.keep
+    assert torch.equal(model.info["radii"][0] > 0, keep)
+    assert 0 < keep.sum() < N
+
+    def literal(opacities, scales):
+        arguments = {
+            "means": plain.means, "quats": torch.tensor([[1.0, 0, 0, 0]]).expand(N, 4), "scales": scales,
+            "opacities": opacities, "colors": plain.colors, "viewmats": CAMERA, "width": 24, "height": 20,
+            "Ks": torch.tensor([[[30.0, 0, 12], [0, 30, 10], [0, 0, 1]]]),
+        }  # fmt: skip
+        return rasterization(**arguments)[0][0]
+
+    scales = 0.2 * torch.exp(0.3 * noise.last.value).expand(N, 3)
+    torch.testing.assert_close(image, literal(activated(plain) * keep, scales), rtol=1e-5, atol=1e-6)
+    rates = 0.8 * torch.exp(-plain.means[:, 2] / 4.0)  # the camera looks along z from the origin
+    expected = literal(activated(plain) * (1 - rates), torch.full((N, 3), 0.2))
+    torch.testing.assert_close(model.eval().get_outputs(CAMERA)["rgb"], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_schedule_follows_the_steps_and_a_checkpoint():
+    model, plain = make(regularizer="dropout(ramp(0, 0.5, 0, 10))")
+    model.get_outputs(CAMERA)
+    assert model.info["radii"].all()
+    model.step = 10
+    model.get_outputs(CAMERA)
+    assert not model.info["radii"].all()
+    loaded, _ = make(regularizer="dropout(ramp(0, 0.5, 0, 10))")
+    loaded.update_to_step(10)
+    with torch.no_grad():
+        plain.opacities.copy_(logits_of(0.5 * activated(model)))
+    for ours in (model, loaded):
+        torch.testing.assert_close(ours.eval().get_outputs(CAMERA)["rgb"], plain.get_outputs(CAMERA)["rgb"])

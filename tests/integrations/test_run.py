@@ -11,7 +11,11 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import torch
+from stand_ins.inria import Model, make_rasterizer, make_render
 
+from ca_reg import Chain
+from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.integrations.run import main
 
 FILES = {
@@ -122,6 +126,22 @@ def test_a_script_is_regularized_and_the_report_says_how(repository, tmp_path, c
     assert after[0] == before[0]
     assert all(a < 0.8 * b for a, b in zip(after[1:], before[1:], strict=True))
     assert draws(plain.out) == draws(regularized.out)  # the script's own random numbers
+
+
+def test_a_users_own_regularizer_from_the_present_folder(repository, my_module, tmp_path, capsys):
+    own, report = "my_module:MyDropout(0.8) + my_module:MyScaleNoise(0.0) + noise(0.5)", tmp_path / "report.json"
+    assert launch("--regularizer", own, "--seed", 4, "--report", report, repository / "train.py", 2) == 0
+    written = json.loads(report.read_text())
+    assert (written["regularizer"], written["renders"]["regularized"], written["renders"]["scaled"]) == (own, 2, 1)
+    rasterizer, model, counts = make_rasterizer(), Model(), []
+    dropout = my_module.MyDropout(0.8)
+    with RasterizerHook(Chain(dropout), rasterizer=rasterizer, seed=4) as hook:
+        for step in (1, 2):
+            hook.step(step)
+            radii = make_render(rasterizer)(model.camera, model, None, torch.zeros(3))["radii"]
+            counts.append(int((radii > 0).sum()))
+            assert 0 < dropout.keep.sum() < len(radii)
+    assert seen(capsys.readouterr().out) == counts
 
 
 def test_the_script_sees_what_python_would_show_it(repository, capsys):
@@ -285,6 +305,8 @@ def test_without_cuda_the_stand_in_comes_first(repository, capsys, monkeypatch):
         (["-m", "nowhere.train"], "there is no module nowhere.train"),
         (["--patience", "-1", "SCRIPT"], "--patience must be at least 0"),
         (["--cpu", "--outputs", "5", "SCRIPT"], "invalid choice"),
+        (["--regularizer", "dropout(1.5)", "SCRIPT"], r"p must be in \[0, 1\)"),
+        (["--regularizer", "nowhere:Mine", "SCRIPT"], "the regularizer nowhere:Mine cannot be had"),
         (["--dropout", "1.5", "SCRIPT"], r"p must be in \[0, 1\)"),
         (["--noise", "-1", "SCRIPT"], "sigma must be finite and at least 0"),
         (["--dropout", "0.2", "--ramp", "0", "SCRIPT"], "end_step must come after start_step"),

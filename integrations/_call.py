@@ -1,0 +1,115 @@
+"""One call of a rasterizer: its Gaussians as `Params`, and what a regularizer made of them back among its arguments."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+from torch import Tensor, nn
+
+from ca_reg import Chain, Params
+
+__all__ = ["Call", "chain_of"]
+
+_OF_CALL = ("view_matrix", "step")  # fields that no argument with a row for each Gaussian holds
+
+
+def chain_of(regularizer: nn.Module) -> Chain:
+    """Return a chain of what a user gave.
+
+    Raises:
+        TypeError: if it is no module.
+        ValueError: if it learns numbers per Gaussian.
+    """
+    chain = Chain(regularizer)
+    if chain.learns:
+        raise ValueError(
+            f"{_who(chain, 'learns', *chain.learns)} learns {', '.join(chain.learns)} for each Gaussian, which only "
+            "the bundled trainer (ca-reg train) can keep with the Gaussians: train there, or leave it out."
+        )
+    return chain
+
+
+class Call:
+    """A call whose arguments may be changed before it is made.
+
+    Args:
+        function: what does the work.
+        bound: its arguments.
+
+    Attributes:
+        arguments: by name.
+        names: of the arguments, by field of :class:`~ca_reg.Params`, where the two names differ.
+        instead: what takes their place in some calls, for messages.
+    """
+
+    names: ClassVar[Mapping[str, str]] = {}
+    instead: ClassVar[str] = ""
+
+    def __init__(self, function: Callable[..., Any], bound: inspect.BoundArguments) -> None:
+        self.function = function
+        self.arguments = bound.arguments
+        self._bound = bound
+
+    def __call__(self) -> Any:
+        """Rasterize."""
+        return self.function(*self._bound.args, **self._bound.kwargs)
+
+    @classmethod
+    def check(cls, chain: Chain, signature: inspect.Signature) -> None:
+        """Raise a ValueError if a regularizer asks for what no call with this signature can supply."""
+        for name in chain.needs:
+            if name not in Params._fields or cls.names.get(name, name) not in (*signature.parameters, *_OF_CALL):
+                raise ValueError(
+                    f"{_who(chain, 'needs', name)} needs {name}, which this rasterizer does not take; it takes "
+                    f"{', '.join(signature.parameters)}."
+                )
+
+    def get(self, field: str) -> Tensor | None:
+        """Return a field as the rasterizer takes it; None if this call is without."""
+        value: Tensor | None = self.arguments.get(self.names.get(field, field))
+        return value
+
+    def put(self, field: str, value: Tensor) -> None:
+        """Replace a field."""
+        if field in _OF_CALL:
+            raise ValueError(
+                f"a regularizer changed {field}, which belongs to the call and is no field of the Gaussians."
+            )
+        name = self.names.get(field, field)
+        self.arguments[name] = value.reshape(self.arguments[name].shape)
+
+    def params(self, chain: Chain, step: int) -> Params:
+        """Return the opacities (N,) and what else the regularizers need, batches as one set of Gaussians.
+
+        Raises:
+            ValueError: if this call has not all that is needed.
+        """
+        opacities = self.arguments["opacities"].reshape(-1)
+        found: dict[str, Any] = {}
+        for name in chain.needs:
+            if name in ("opacities", "step"):
+                continue
+            value = self.get(name)
+            if value is not None and name != "view_matrix":
+                value = value.flatten(0, -3 if name == "sh" else -2)
+            if value is None or (name != "view_matrix" and len(value) != len(opacities)):
+                raise ValueError(
+                    f"{_who(chain, 'needs', name)} needs {name}, which this call of the rasterizer does not have for "
+                    f"every Gaussian: {self.instead}."
+                )
+            found[name] = value
+        return Params(opacities, step=step, **found)
+
+    def replace(self, before: Params, after: Params) -> bool:
+        """Hand what has changed to the rasterizer; return whether anything has."""
+        changed = [name for name in Params._fields if getattr(after, name) is not getattr(before, name)]
+        for name in changed:
+            self.put(name, getattr(after, name))
+        return bool(changed)
+
+
+def _who(chain: Chain, attribute: str, *names: str) -> str:
+    """Return the types of the members that need, or learn, something."""
+    return ", ".join(type(member).__name__ for member in chain if set(names) & set(getattr(member, attribute)))
