@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.camera import Camera
-from reference_trainer.neighbors import nearest_neighbors
 from reference_trainer.scenes.colmap import read_colmap
 from reference_trainer.scenes.scene import PointCloud
 
