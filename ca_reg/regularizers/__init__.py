@@ -3,9 +3,17 @@
 from ca_reg.chain import Chain
 from ca_reg.registry import Registry
 from ca_reg.regularizer import Regularizer
+from ca_reg.regularizers.clustered import ClusteredDropout
+from ca_reg.regularizers.d2gs import D2GSDropout
+from ca_reg.regularizers.density import DensityDropout
+from ca_reg.regularizers.depth import DepthDropout
+from ca_reg.regularizers.drop_anchors import AnchorDropout
+from ca_reg.regularizers.drop_sh import SHDropout
 from ca_reg.regularizers.dropout import GaussianDropout
+from ca_reg.regularizers.geometry import GeometryDropout
 from ca_reg.regularizers.independent import IndependentDropout
 from ca_reg.regularizers.noise import OpacityNoise
+from ca_reg.regularizers.position_noise import PositionNoise
 from ca_reg.schedules import LinearRamp, StartStop
 
 __all__ = ["REGULARIZERS", "GaussianDropout", "IndependentDropout", "OpacityNoise", "parse"]
@@ -13,8 +21,20 @@ __all__ = ["REGULARIZERS", "GaussianDropout", "IndependentDropout", "OpacityNois
 REGULARIZERS: Registry[Regularizer] = Registry("regularizer", Regularizer, {"ramp": LinearRamp, "between": StartStop})
 """What can be asked for by name; ``REGULARIZERS.register("name")`` adds a class."""
 
-REGULARIZERS.register("dropout")(GaussianDropout)
-REGULARIZERS.register("noise")(OpacityNoise)
+_TABLE: dict[str, type[Regularizer]] = {
+    "dropout": GaussianDropout,
+    "noise": OpacityNoise,
+    "clustered": ClusteredDropout,
+    "d2gs": D2GSDropout,
+    "density": DensityDropout,
+    "depth": DepthDropout,
+    "drop_anchors": AnchorDropout,
+    "drop_sh": SHDropout,
+    "geometry": GeometryDropout,
+    "position_noise": PositionNoise,
+}
+for _name, _class in _TABLE.items():
+    REGULARIZERS.register(_name)(_class)
 
 
 def parse(text: str, *, imports: bool = True) -> Chain:

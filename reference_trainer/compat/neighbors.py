@@ -7,7 +7,7 @@ from types import ModuleType
 
 from torch import Tensor
 
-from reference_trainer.neighbors import nearest_neighbors
+from ca_reg.neighbors import nearest_neighbors
 
 __all__ = ["neighbor_modules"]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ca_reg.neighbors import mean_neighbor_distance
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.neighbors import mean_neighbor_distance
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.config import TrainConfig
 

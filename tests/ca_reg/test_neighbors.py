@@ -1,11 +1,13 @@
-"""Nearest neighbours against the full matrix of distances in float64."""
+"""Nearest neighbors against the full matrix of distances in float64."""
+
+import sys
 
 import numpy as np
 import pytest
 import torch
 
-from reference_trainer import neighbors
-from reference_trainer.neighbors import mean_neighbor_distance, nearest_neighbors
+from ca_reg import neighbors
+from ca_reg.neighbors import mean_neighbor_distance, nearest_neighbors
 
 
 def _points(kind: str, n: int) -> torch.Tensor:
@@ -17,25 +19,58 @@ def _points(kind: str, n: int) -> torch.Tensor:
         points[0] = torch.tensor([1e3, -2e3, 5e2])
     if kind == "duplicates":
         points = points.repeat_interleave(2, dim=0)[:n]
+    if kind == "one place":
+        points[:] = points[0]
     if kind == "line":
         points[:, 1:] = 0
     return points
 
 
-@pytest.mark.parametrize("chunk", [4_000_000, 1800, 1])
-@pytest.mark.parametrize(("n", "count"), [(4, 3), (5, 3), (601, 3), (50, 7), (50, 1), (2, 1)])
-@pytest.mark.parametrize("kind", ["spread", "clustered", "outlier", "duplicates", "line"])
-def test_equal_to_the_full_matrix(monkeypatch, kind, n, count, chunk):
-    monkeypatch.setattr(neighbors, "CHUNK_ELEMENTS", chunk)  # the last is one point at a time, as from 2 million on
-    points = _points(kind, n)
+CASES = pytest.mark.parametrize(
+    ("kind", "n", "count"),
+    [
+        (kind, *size)
+        for kind in ("spread", "clustered", "outlier", "duplicates", "one place", "line")
+        for size in ((4, 3), (5, 3), (601, 3), (50, 7), (50, 1), (2, 1))
+    ],
+)
+
+
+def _check(found, numbers, points, count):
     squares = (points.double()[:, None] - points.double()).square().sum(-1)
     squares.fill_diagonal_(torch.inf)
     expected = squares.sort(dim=1).values[:, :count]
-    found, numbers = nearest_neighbors(points, count)
     torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-12)
-    # Ties may be told apart either way: the neighbours' distances count, not their numbers.
+    # Ties may be told apart either way: the neighbors' distances count, not their numbers.
     torch.testing.assert_close(squares.gather(1, numbers), expected, rtol=1e-5, atol=1e-12)
     assert all(len(set(row)) == count for row in numbers.tolist())
+    assert found.dtype == points.dtype
+
+
+@CASES
+def test_by_scipy_equal_to_the_full_matrix(monkeypatch, kind, n, count):
+    pytest.importorskip("scipy")
+    monkeypatch.setattr(neighbors, "_along_an_axis", None)
+    monkeypatch.setattr(neighbors, "TREE_FROM", 0)
+    points = _points(kind, n)
+    _check(*nearest_neighbors(points, count), points, count)
+
+
+@pytest.mark.parametrize("chunk", [4_000_000, 1800, 1])
+@CASES
+def test_without_scipy_equal_to_the_full_matrix(monkeypatch, kind, n, count, chunk):
+    monkeypatch.setattr(neighbors, "TREE_FROM", 0)
+    monkeypatch.setitem(sys.modules, "scipy.spatial", None)
+    monkeypatch.setattr(neighbors, "CHUNK_ELEMENTS", chunk)  # the last is one point at a time, as from 2 million on
+    points = _points(kind, n)
+    _check(*nearest_neighbors(points, count), points, count)
+
+
+def test_on_any_device(device):
+    points = _points("clustered", 601)
+    found, numbers = nearest_neighbors(points.to(device), 7)
+    assert found.device.type == numbers.device.type == device.type
+    _check(found.cpu(), numbers.cpu(), points, 7)
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (9, 2), (9,)])

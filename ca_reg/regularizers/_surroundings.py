@@ -1,0 +1,189 @@
+"""What rules for the rates look at: neighbors, ranks and depths, and when they look again."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from ca_reg import functional
+from ca_reg._check import Rate, check_count, check_rate, is_zero
+from ca_reg.neighbors import nearest_neighbors
+from ca_reg.params import Params
+from ca_reg.regularizers.independent import IndependentDropout
+from ca_reg.schedules import Schedule
+
+__all__ = [
+    "RankedDropout",
+    "Refreshed",
+    "SurroundingsDropout",
+    "camera_depths",
+    "mean_distances",
+    "neighbors_of",
+    "relative_ranks",
+]
+
+
+class Refreshed(nn.Module):
+    """A tensor of one row per Gaussian that is computed anew every so many steps, and when their number changes.
+
+    Without a step between two calls it is computed anew unless the very same means come again, unchanged: one object
+    may score several models. ``state_dict`` holds the tensor and its step, so that a resumed run goes on with them; a
+    checkpoint without them starts afresh. Not noticed is a pruning of as many Gaussians as were added, until the next
+    time.
+
+    Args:
+        every: steps from one computation to the next, at least 1.
+    """
+
+    value: Tensor | None
+    _seen: tuple[weakref.ref[Tensor], int] | None = None
+
+    def __init__(self, every: int) -> None:
+        check_count(every, "every", minimum=1)
+        super().__init__()
+        self.every = every
+        self.since = 0
+        self.register_buffer("value", None, persistent=False)
+
+    def forward(self, x: Params, compute: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return ``compute(means)``, of now or of a former step."""
+        assert x.means is not None
+        means = x.means.detach()
+        if self.value is None or not self.holds(x):
+            with torch.inference_mode(False):  # what is found in a test may serve in training
+                self.value, self.since = compute(means), x.step
+            self._seen = weakref.ref(x.means), _version(x.means)
+        return self.value.to(means.device)
+
+    def holds(self, x: Params) -> bool:
+        """Whether the present value still serves."""
+        assert x.means is not None
+        assert self.value is not None
+        if len(self.value) != len(x.means):
+            return False
+        same = self._seen is not None and self._seen[0]() is x.means and self._seen[1] == _version(x.means)
+        return same or 0 < x.step - self.since < self.every
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_seen"}
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        if self.value is not None and self.every > 1:
+            destination[prefix + "value"] = self.value
+            destination[prefix + "since"] = torch.tensor(self.since)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        self.value, self._seen = state_dict.pop(prefix + "value", None), None
+        self.since = int(state_dict.pop(prefix + "since", 0))
+
+
+class SurroundingsDropout(IndependentDropout):
+    """Drop independently, at rates that follow from what is around each Gaussian; a subclass says from what and how.
+
+    In training that is computed every so many steps (:class:`Refreshed`), at test time from the model that is rendered.
+
+    Args:
+        schedule: a rate that follows the step.
+        every: steps from one look at the neighbors to the next; a change of their number is another occasion.
+        compensate: scale the survivors in training.
+        scale: scale the opacities in evaluation.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ("means",)
+
+    def __init__(
+        self, schedule: Schedule | None = None, *, every: int, compensate: bool = False, scale: bool = True
+    ) -> None:
+        super().__init__(schedule, compensate=compensate, scale=scale)
+        self.trained, self.tested = Refreshed(every), Refreshed(1)
+
+    def measure(self, means: Tensor) -> Tensor:
+        """Return what the rates follow from, one row per Gaussian."""
+        raise NotImplementedError
+
+    def rates_from(self, x: Params, look: Callable[[], Tensor]) -> Rate:
+        """Return the rates; ``look()`` returns what was measured, and is not to be called where there is no rate."""
+        raise NotImplementedError
+
+    def rates(self, x: Params) -> Rate:
+        """Return the rates by the neighbors of some former step."""
+        return self.rates_from(x, lambda: self.trained(x, self.measure))
+
+    def expected(self, x: Params) -> Params:
+        """Scale by ``1 - p``, or not; the rates are those of ``x``, whatever the steps before."""
+        if self.compensate or not self.scale:
+            return x
+        rates = self.rates_from(x, lambda: self.tested(x, self.measure))
+        return x if is_zero(rates) else x._replace(opacities=functional.scale_opacity(x.opacities, rates))
+
+
+class RankedDropout(SurroundingsDropout):
+    """Rates between two bounds, by the rank of something that is measured: the base of density and geometry."""
+
+    def __init__(self, low: float, high: float, k: int, *, every: int, compensate: bool, scale: bool) -> None:
+        check_rate(low, "low")
+        check_rate(high, "high")
+        check_count(k, "k", minimum=1)
+        super().__init__(every=every, compensate=compensate, scale=scale)
+        self.low, self.high, self.k = low, high, k
+
+    def rates_from(self, x: Params, look: Callable[[], Tensor]) -> Rate:
+        """Return ``low + (high - low) rank``."""
+        return self.low if self.low == self.high else self.low + (self.high - self.low) * look()
+
+    def extra_repr(self) -> str:
+        """Return the arguments, for ``print``."""
+        return f"low={self.low}, high={self.high}, k={self.k}, scale={self.scale}"
+
+
+def _version(x: Tensor) -> int:
+    """Return how often a tensor was changed in place, as far as PyTorch counts that."""
+    return 0 if x.is_inference() else x._version
+
+
+def neighbors_of(means: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Return distances and numbers of the k nearest others, (N, k) each; of all others, if these are fewer."""
+    count = min(k, len(means) - 1)
+    if count < 1:
+        return means.new_zeros(len(means), 0), torch.zeros(len(means), 0, dtype=torch.int64, device=means.device)
+    squares, numbers = nearest_neighbors(means, count)
+    return squares.sqrt_(), numbers
+
+
+def mean_distances(means: Tensor, k: int) -> Tensor:
+    """Return the mean distance to the k nearest others, (N,); 0 if there are none."""
+    distances, _ = neighbors_of(means, k)
+    return distances.sum(1) / max(distances.shape[1], 1)
+
+
+def relative_ranks(values: Tensor) -> Tensor:
+    """Return ranks from 0, the smallest, to 1, (N,); equal values share the mean of their ranks, so it is always 1/2.
+
+    One outlier moves the others by 1 / (N - 1), where it would decide the result of ``(x - min) / (max - min)``.
+
+    Example:
+        >>> relative_ranks(torch.tensor([5.0, 1.0, 5.0, 1e9, 0.0]))
+        tensor([0.6250, 0.2500, 0.6250, 1.0000, 0.0000])
+    """
+    if len(values) < 2:
+        return torch.full_like(values, 0.5)
+    ordered, order = values.sort()
+    _, places, counts = ordered.unique_consecutive(return_inverse=True, return_counts=True)  # type: ignore[no-untyped-call]
+    ranks = torch.empty_like(values)
+    ranks[order] = ((2 * counts.cumsum(0) - counts - 1).to(values.dtype) / (2 * len(values) - 2))[places]
+    return ranks
+
+
+def camera_depths(x: Params) -> Tensor:
+    """Return the depths of the centers along the camera's axis, (N,), negative behind the camera.
+
+    Convention: the view matrix is world to camera, for column vectors: its third row is the viewing direction.
+    """
+    assert x.means is not None
+    assert x.view_matrix is not None
+    row = x.view_matrix.detach()[2].to(x.means)
+    return x.means.detach() @ row[:3] + row[3]

@@ -1,0 +1,135 @@
+"""The dropout of D2GS: the near and the dense more often."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ca_reg._check import Rate, check_count, check_finite, is_zero
+from ca_reg.params import Params
+from ca_reg.regularizers._surroundings import (
+    Refreshed,
+    SurroundingsDropout,
+    camera_depths,
+    mean_distances,
+    relative_ranks,
+)
+from ca_reg.schedules import LinearRamp, Schedule, as_schedule
+
+__all__ = ["D2GSDropout"]
+
+RATE = LinearRamp(0.05, 0.3, 0, 10_000)
+TIERS = (1.0, 0.7, 0.3)  # factors of the rate: near, middle, far
+QUANTILES = (0.33, 0.67)  # of the depths, between the tiers
+
+
+class D2GSDropout(SurroundingsDropout):
+    """Drop by depth and density (Song et al., "D2GS", ICLR 2026; code Insta360-Research-Team/DDGS).
+
+    ``p = rate(step) tier (depth_weight nearness + density_weight density)``. Nearness is 1 less the rank of the depth,
+    density the rank of minus the mean distance to the k nearest neighbors, both in [0, 1]. The tier is 1 up to the
+    33rd percentile of the depths, 0.7 up to the 67th, then 0.3. ``train()``: ``opacity * keep``; ``eval()``: nothing,
+    as there. As the weights add up to 1, about a third of ``rate`` is dropped.
+
+    With ``literal`` it does what the published code does (read at commit d665f22 of a fork that has its history):
+
+    - the depth is the *column* of the view matrix times the center, right for cameras without rotation only;
+    - both scores are ``(value - min) / (max - min)``, so that one outlier pushes all others together;
+    - densities are computed at step 1 and every ``every`` steps alone: with more Gaussians than then all count as 0.5,
+      with fewer the first numbers are taken, whosever they are.
+
+    That it counts each point among its own neighbors changes nothing but a factor, which cancels.
+
+    Convention: the view matrix is world to camera; depth is along its third axis.
+
+    Args:
+        rate: the largest rate, or a schedule of it. Theirs rises from 0.05 to 0.3 over 10,000 steps.
+        depth_weight: of nearness, at least 0. Theirs is 0.3, and 0.15 to 0.7 in the script for single scenes.
+        density_weight: of density, at least 0. Theirs is 0.7, and 0.3 to 0.85 for single scenes.
+        k: number of neighbors. Theirs is 6 with the point itself.
+        every: steps between two looks at the neighbors, as theirs.
+        literal: do what their code does.
+        scale: scale the opacities in evaluation; they do not.
+
+    Raises:
+        ValueError: if a weight is negative, or ``k`` or ``every`` below 1.
+
+    Example:
+        >>> from ca_reg import Params
+        >>> means = torch.tensor([[0.0, 0, 1], [0.0, 0, 2], [0.0, 0, 4]])
+        >>> x = Params(torch.ones(3), means=means, view_matrix=torch.eye(4), step=10_000)
+        >>> D2GSDropout(k=1).rates(x)
+        tensor([0.2475, 0.1417, 0.0000])
+    """
+
+    needs = ("means", "view_matrix")
+
+    def __init__(
+        self,
+        rate: float | Schedule = RATE,
+        depth_weight: float = 0.3,
+        density_weight: float = 0.7,
+        k: int = 5,
+        *,
+        every: int = 500,
+        literal: bool = False,
+        scale: bool = False,
+    ) -> None:
+        check_finite(depth_weight, "depth_weight", minimum=0.0)
+        check_finite(density_weight, "density_weight", minimum=0.0)
+        check_count(k, "k", minimum=1)
+        super().__init__(as_schedule(rate), every=every, scale=scale)
+        self.weights = (depth_weight, density_weight)
+        self.k = k
+        self.literal = literal
+        if literal:
+            self.trained = _ByStepsAlone(every)
+
+    def measure(self, means: Tensor) -> Tensor:
+        """Return the density, (N,): a rank, or minus the mean distance to the neighbors."""
+        density = -mean_distances(means, self.k)
+        return density if self.literal else relative_ranks(density)
+
+    def rates_from(self, x: Params, look: Callable[[], Tensor]) -> Rate:
+        """Return the rates; 0 while the schedule is."""
+        rate = self._rate_at(x.step)
+        if is_zero(rate) or not len(x.opacities):
+            return 0.0
+        if self.literal:
+            assert x.view_matrix is not None
+            depths = camera_depths(x._replace(view_matrix=x.view_matrix.mT))
+            nearness, density = 1 - _min_max(depths), _first(look(), len(depths))
+        else:
+            depths = camera_depths(x)
+            nearness, density = 1 - relative_ranks(depths), look()
+        ordered = depths.sort().values
+        near, far = (ordered[int(len(depths) * quantile)] for quantile in QUANTILES)
+        tier = (
+            torch.full_like(depths, TIERS[2]).masked_fill(depths <= far, TIERS[1]).masked_fill(depths <= near, TIERS[0])
+        )
+        return rate * tier * (self.weights[0] * nearness + self.weights[1] * density)
+
+    def extra_repr(self) -> str:
+        """Return the arguments, for ``print``."""
+        return (
+            f"rate={self._rate_repr()}, weights={self.weights}, k={self.k}, literal={self.literal}, scale={self.scale}"
+        )
+
+
+class _ByStepsAlone(Refreshed):
+    """Computes at step 1 and the multiples of ``every``, however many Gaussians there are by then."""
+
+    def holds(self, x: Params) -> bool:
+        return x.step != 1 and x.step % self.every != 0
+
+
+def _min_max(values: Tensor) -> Tensor:
+    low, high = values.aminmax()
+    return (values - low) / (high - low + 1e-6)
+
+
+def _first(density: Tensor, count: int) -> Tensor:
+    """Return the first of the stored densities, scaled, or 1/2 for all if they are too few."""
+    return density.new_full((count,), 0.5) if len(density) < count else _min_max(density[:count])

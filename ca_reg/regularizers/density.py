@@ -1,0 +1,53 @@
+"""The paper's density-based dropout: the denser the surroundings, the more often a Gaussian is dropped."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ca_reg.regularizers._surroundings import RankedDropout, mean_distances, relative_ranks
+
+__all__ = ["DensityDropout"]
+
+
+class DensityDropout(RankedDropout):
+    """Drop at rates from ``low``, the sparsest, to ``high``, the densest (paper, appendix, density-based dropout).
+
+    ``p = low + (high - low) rank``, with the rank in [0, 1] of the density, which falls with the mean distance to the k
+    nearest neighbors. ``train()`` and ``eval()`` are those of dropout: ``opacity * keep`` and ``opacity * (1 - p)``.
+    The paper gives the rates and that they are mapped linearly, but not ``k``, nor the density itself; by ranks neither
+    an outlier nor two Gaussians at one place decide all rates, and their mean is always ``(low + high) / 2``.
+
+    Args:
+        low: rate of the sparsest, in [0, 1). The paper uses 0.2.
+        high: rate of the densest, in [0, 1). The paper uses 0.5.
+        k: number of neighbors; 3 are those from which 3DGS takes its first scales.
+        every: steps between two looks at the neighbors; those between 3DGS's own density controls.
+        compensate: scale the survivors in training rather than all opacities in evaluation.
+        scale: scale the opacities in evaluation, as the paper does.
+
+    Raises:
+        ValueError: if a rate is outside [0, 1), or ``k`` or ``every`` below 1.
+
+    Example:
+        >>> import torch
+        >>> from ca_reg import Params
+        >>> means = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0], [9.0, 0, 0], [99.0, 0, 0]])
+        >>> DensityDropout(k=1).rates(Params(torch.ones(5), means=means))
+        tensor([0.4250, 0.4250, 0.4250, 0.2750, 0.2000])
+    """
+
+    def __init__(
+        self,
+        low: float = 0.2,
+        high: float = 0.5,
+        k: int = 3,
+        *,
+        every: int = 100,
+        compensate: bool = False,
+        scale: bool = True,
+    ) -> None:
+        super().__init__(low, high, k, every=every, compensate=compensate, scale=scale)
+
+    def measure(self, means: Tensor) -> Tensor:
+        """Return the rank of the density, (N,)."""
+        return relative_ranks(-mean_distances(means, self.k))

@@ -1,0 +1,78 @@
+"""DropAnSH-GS, second half: some Gaussians show only their low degrees of color."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+
+import torch
+
+from ca_reg import functional
+from ca_reg._check import check_count, check_rate, is_zero
+from ca_reg.params import Draw, Params
+from ca_reg.regularizer import Regularizer
+from ca_reg.schedules import Schedule, as_schedule
+
+__all__ = ["SHDropout"]
+
+
+class SHDropout(Regularizer):
+    """Take from random Gaussians the spherical harmonics above a degree that rises (Fang et al., "DropAnSH-GS").
+
+    A share ``p`` keeps only the degrees up to ``l``, where ``l`` is 0 before the first of ``until``, 1 before the
+    second and so on; after the last nothing is dropped. ``eval()``: nothing. After arXiv 2602.20933 (CVPR 2026), as no
+    code was published; with :class:`~ca_reg.regularizers.drop_anchors.AnchorDropout` it is the whole scheme:
+    ``drop_anchors + drop_sh``. Only colors change, so there is no multiplier, and density control counts
+    every Gaussian.
+
+    Args:
+        p: rate in [0, 1), or a schedule of it. Theirs is 0.2.
+        until: the steps at which the degree rises. Theirs are 2,000, 4,000 and 6,000.
+
+    Raises:
+        ValueError: if ``p`` is outside [0, 1), or ``until`` does not rise.
+
+    Example:
+        >>> x = Params(torch.ones(1000), sh=torch.ones(1000, 16, 3), step=2500)
+        >>> colors = SHDropout().regularize(x).sh
+        >>> bool((colors[:, :4] == 1).all()), 0.1 < float((colors[:, 4:] == 0).float().mean()) < 0.3
+        (True, True)
+    """
+
+    needs = ("sh",)
+    drops = False
+
+    def __init__(self, p: float | Schedule = 0.2, until: Sequence[int] = (2_000, 4_000, 6_000)) -> None:
+        if not callable(p):
+            check_rate(p)
+        for step in until:
+            check_count(step, "until", minimum=0)
+        if list(until) != sorted(until):
+            raise ValueError(f"until must be steps in rising order, got {tuple(until)}.")
+        super().__init__(as_schedule(p))
+        self.until = tuple(until)
+
+    def _check_rate(self, rate: float, step: int) -> None:
+        check_rate(rate, f"p at step {step}")
+
+    def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
+        """Draw who shows all degrees, (N,) bool, beside the number of bands that the others show."""
+        assert x.sh is not None
+        rate, degree = self._rate_at(x.step), bisect_right(self.until, x.step)
+        bands = (degree + 1) ** 2
+        if is_zero(rate) or degree == len(self.until) or bands >= x.sh.shape[1]:
+            return Draw()
+        return Draw((functional.draw_keep_mask(len(x.sh), rate, generator=generator, device=x.sh.device), bands))
+
+    def replay(self, x: Params, draw: Draw) -> Params:
+        """Set the higher bands of the drawn to 0."""
+        if draw.value is None:
+            return x
+        assert x.sh is not None
+        whole, bands = draw.value
+        low, high = x.sh[:, :bands], x.sh[:, bands:]
+        return x._replace(sh=torch.cat([low, high.masked_fill(~whole[:, None, None], 0.0)], dim=1))
+
+    def extra_repr(self) -> str:
+        """Return the arguments, for ``print``."""
+        return f"p={self._rate_repr()}, until={self.until}"

@@ -1,0 +1,79 @@
+"""The paper's geometry-aware dropout: the more the surroundings vary, the more often a Gaussian is dropped."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ca_reg.regularizers._surroundings import RankedDropout, neighbors_of, relative_ranks
+
+__all__ = ["GeometryDropout", "surface_variation"]
+
+
+class GeometryDropout(RankedDropout):
+    """Drop at rates from ``low``, on planes, to ``high``, in scattered volumes (paper, geometry-aware dropout).
+
+    ``p = low + (high - low) rank``, with the rank in [0, 1] of :func:`surface_variation`. ``train()`` and ``eval()``
+    are those of dropout: ``opacity * keep`` and ``opacity * (1 - p)``.
+
+    The paper has one sentence about it, "estimate local geometric complexity by computing structural variation among
+    each Gaussian's nearest neighbors", and calls it infeasible at O(N^3). Its measure, direction, rates and ``k`` are
+    not given: here the measure is the standard one of a point's surroundings, and the rates are those of the paper's
+    density-based dropout. With neighbors from a tree it takes O(N log N).
+
+    Args:
+        low: rate where the surroundings vary least, in [0, 1).
+        high: rate where they vary most, in [0, 1).
+        k: number of neighbors.
+        every: steps between two looks at the neighbors; those between 3DGS's own density controls.
+        compensate: scale the survivors in training rather than all opacities in evaluation.
+        scale: scale the opacities in evaluation, as the paper does.
+
+    Raises:
+        ValueError: if a rate is outside [0, 1), or ``k`` or ``every`` below 1.
+
+    Example:
+        >>> from ca_reg import Params
+        >>> plane = torch.rand(100, 3) * torch.tensor([1.0, 1.0, 0.0])
+        >>> cloud = torch.rand(100, 3) + 9.0
+        >>> rates = GeometryDropout().rates(Params(torch.ones(200), means=torch.cat([plane, cloud])))
+        >>> bool(rates[:100].max() < rates[100:].min())
+        True
+    """
+
+    def __init__(
+        self,
+        low: float = 0.2,
+        high: float = 0.5,
+        k: int = 10,
+        *,
+        every: int = 100,
+        compensate: bool = False,
+        scale: bool = True,
+    ) -> None:
+        super().__init__(low, high, k, every=every, compensate=compensate, scale=scale)
+
+    def measure(self, means: Tensor) -> Tensor:
+        """Return the rank of the surface variation, (N,)."""
+        return relative_ranks(surface_variation(means, self.k))
+
+
+def surface_variation(means: Tensor, k: int) -> Tensor:
+    """Return the share of the smallest eigenvalue in the covariance of each point and its k nearest neighbors.
+
+    The definition is that of Pauly, Gross and Kobbelt, "Efficient simplification of point-sampled surfaces" (2002).
+
+    Args:
+        means: shape (N, 3).
+        k: number of neighbors.
+
+    Returns:
+        In [0, 1/3], shape (N,): 0 on a plane or a line, 1/3 where all directions are alike; 0 if all points coincide.
+    """
+    _, numbers = neighbors_of(means, k)
+    offsets = torch.cat([torch.zeros_like(means)[:, None], means[numbers] - means[:, None]], dim=1)
+    offsets = offsets - offsets.mean(1, keepdim=True)
+    # Relative to the largest offset, so that squares neither vanish nor overflow.
+    offsets = offsets / offsets.abs().amax((1, 2), keepdim=True).clamp_min(torch.finfo(means.dtype).tiny)
+    variances: Tensor = torch.linalg.eigvalsh(offsets.mT @ offsets)
+    return variances[:, 0].clamp_min(0) / variances.sum(1).clamp_min(torch.finfo(means.dtype).eps)
