@@ -82,7 +82,7 @@ def render_expectation(
         splats.projection.means.retain_grad()
 
     def moments_fn(opacity: Tensor, view: Splats, multiplier: Multiplier, behind: Any) -> MomentImages:
-        return render_moments(view, multiplier, background=background, alpha=False)
+        return render_moments(view, multiplier, background=background)
 
     ca_penalty = CAPenalty(moments_fn, multiplier, weight=config.ca_weight)
     image, variance, penalty = ca_penalty(opacities, splats)

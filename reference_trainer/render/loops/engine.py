@@ -11,7 +11,7 @@ from reference_trainer.render.loops.binning import bin_gaussians
 from reference_trainer.render.loops.drawing import composite
 from reference_trainer.render.loops.moments import moments, shares
 from reference_trainer.render.loops.projection import project, visible
-from reference_trainer.render.splats import Projection, Splats
+from reference_trainer.render.splats import MomentImages, Projection, Splats
 
 __all__ = ["LoopEngine"]
 
@@ -54,9 +54,9 @@ class LoopEngine:
         red = torch.nn.functional.pad(splats.projection.depths[:, None], (0, 2))
         return image, 1 - light, composite(splats._replace(colors=red), torch.zeros_like(background))[0][0]
 
-    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
+    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Composite mean and variance back to front."""
-        return moments(splats, multiplier, behind, alpha=alpha)
+        return moments(splats, multiplier, behind)
 
     def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
         """Sum the summands of the variance over the pixels."""

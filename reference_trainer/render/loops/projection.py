@@ -14,7 +14,6 @@ from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALP
 from reference_trainer.render.loops.compiling import inlined, kernel
 from reference_trainer.render.loops.harmonics import basis, basis_gradient
 from reference_trainer.render.loops.threads import in_threads
-from reference_trainer.render.precision import without_autocast
 
 __all__ = ["Projected", "project", "visible"]
 
@@ -298,7 +297,6 @@ class _Project(torch.autograd.Function):
         return (*outputs, finite)
 
     @staticmethod
-    @without_autocast
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
         (colors,) = ctx.saved_tensors
         to_centers, to_factors, _, to_depths, to_colors, _ = gradients
