@@ -165,12 +165,10 @@ def pad_entries(rows: Tensor) -> Tensor:
 def untile(tiles: Tensor, lists: TileLists) -> Tensor:
     """Reorder per-tile pixels of shape (tiles, C, 64) into an image of shape (C, H, W)."""
     grid = tiles.view(lists.rows, lists.columns, -1, TILE, TILE)
-    image = grid.permute(2, 0, 3, 1, 4).reshape(-1, lists.rows * TILE, lists.columns * TILE)
-    return image[:, : lists.height, : lists.width]
+    return lists.cut(grid.permute(2, 0, 3, 1, 4).reshape(-1, lists.rows * TILE, lists.columns * TILE))
 
 
 def tile(image: Tensor, lists: TileLists) -> Tensor:
     """Reorder an image of shape (C, H, W) into per-tile pixels of shape (tiles, C, 64), zero outside the image."""
-    padding = (0, lists.columns * TILE - lists.width, 0, lists.rows * TILE - lists.height)
-    grid = torch.nn.functional.pad(image, padding).view(-1, lists.rows, TILE, lists.columns, TILE)
+    grid = lists.padded(image).view(-1, lists.rows, TILE, lists.columns, TILE)
     return grid.permute(1, 3, 0, 2, 4).reshape(lists.rows * lists.columns, -1, PIXELS)

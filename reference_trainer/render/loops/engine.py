@@ -11,7 +11,7 @@ from reference_trainer.render.loops.binning import bin_gaussians
 from reference_trainer.render.loops.drawing import composite
 from reference_trainer.render.loops.moments import moments, shares
 from reference_trainer.render.loops.projection import project, visible
-from reference_trainer.render.splats import MomentImages, Projection, Splats
+from reference_trainer.render.splats import MomentImages, Splats
 
 __all__ = ["LoopEngine"]
 
@@ -26,21 +26,15 @@ class LoopEngine:
         means, opacities = inputs["means"], inputs["opacities"]
         colors = inputs["sh"] if "sh" in inputs else inputs["colors"][:, None]
         indices, finite = visible(means.detach(), opacities.detach(), camera)
-        result = project(
-            means,
-            inputs["quaternions"],
-            inputs["scales"],
-            colors,
-            indices,
-            camera,
-            degree if "sh" in inputs else -1,
+        degree = degree if "sh" in inputs else -1
+        projection, colors, drawable = project(
+            means, inputs["quaternions"], inputs["scales"], colors, indices, camera, degree
         )
-        projection = Projection(result.means, result.factors, result.covariances, result.depths)
-        check_projection(finite and result.finite, projection, result.colors, inputs, camera)
+        check_projection(finite and drawable, projection, colors, inputs, camera)
         if indices.shape[0] < opacities.shape[0]:
             opacities = opacities.index_select(0, indices)
         lists = bin_gaussians(projection, opacities, camera.width, camera.height)
-        return Splats(indices, projection, opacities, result.colors, lists, self)
+        return Splats(indices, projection, opacities, colors, lists, self)
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
         """Keep the lists: the loops pass over those that are too faint."""

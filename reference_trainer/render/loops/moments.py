@@ -282,5 +282,6 @@ def shares(splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) 
     lists = splats.lists
     rows = torch.empty(lists.gaussians.shape[0], 1, dtype=torch.float64)
     table = make_table(splats, multiplier)
+    assert lists.slots is not None
     over_tiles(_shares, lists, lists.slots, table, lists.padded(behind), lists.padded(weights[None]), rows)
     return sum_rows(rows, lists)[:, 0]

@@ -80,7 +80,7 @@ def sum_rows(rows: Tensor, lists: TileLists) -> Tensor:
     """Add up the rows of every Gaussian's entries, (P, C), always in the same order; shape (M, C)."""
     assert lists.offsets is not None
     sums = rows.new_empty(lists.offsets.shape[0] - 1, rows.shape[1])
-    in_threads(_sum_rows, sums.shape[0], lists.offsets.numpy(), rows.numpy(), sums.numpy())
+    in_threads(_sum_rows, sums.shape[0], lists.offsets.numpy(), rows.numpy(), sums.numpy(), least=4096)
     return sums
 
 
