@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.splats import Splats
+from reference_trainer.render.splats import MomentImages, Splats
 
 __all__ = ["ENGINES", "Engine", "chosen_engine", "describe_engine", "engine_for", "use_engine"]
 
@@ -50,14 +50,13 @@ class Engine(Protocol):
     def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draw splats front to back over a background (3,): image (3, H, W), alpha (H, W), depth (H, W) if asked."""
 
-    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
-        """Return mean and variance of red, green, blue, and accumulated alpha if asked, (3 or more, H, W) each.
+    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
+        """Return mean and variance of every pixel under random factors on the alphas.
 
         Args:
             splats: of the full model.
             multiplier: mean and variance of every splat's factor, shape (M, 2).
             behind: colours behind everything, shape (3, H, W).
-            alpha: whether the fourth channel is needed.
         """
 
     def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:

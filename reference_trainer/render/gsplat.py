@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
@@ -19,27 +20,7 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, NEAR_PLANE
 
-__all__ = ["DrawnLists", "Ellipses", "GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
-
-
-class Ellipses(NamedTuple):
-    """Projected Gaussians, as much of `Projection` as density control reads.
-
-    Args:
-        means: pixel coordinates, shape (M, 2); keeps its gradient.
-    """
-
-    means: Tensor
-
-
-class DrawnLists(NamedTuple):
-    """As much of `TileLists` as density control reads.
-
-    Args:
-        touched: whether a Gaussian is in any list, shape (M,) bool.
-    """
-
-    touched: Tensor
+__all__ = ["GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
 
 
 class GsplatSplats(NamedTuple):
@@ -47,13 +28,13 @@ class GsplatSplats(NamedTuple):
 
     Args:
         indices: which of the N Gaussians lie in view, shape (M,).
-        projection: their ellipses.
-        lists: which of them were drawn.
+        projection: has ``means``, pixel coordinates, shape (M, 2), which keep their gradient.
+        lists: has ``touched``, whether a Gaussian was drawn, shape (M,) bool.
     """
 
     indices: Tensor
-    projection: Ellipses
-    lists: DrawnLists
+    projection: SimpleNamespace
+    lists: SimpleNamespace
 
 
 class GsplatRendering(NamedTuple):
@@ -162,7 +143,7 @@ def render_by(
     image = images[0].permute(2, 0, 1)
     splats = GsplatSplats(
         indices=info["gaussian_ids"].long(),
-        projection=Ellipses(info["means2d"]),
-        lists=DrawnLists(info["tiles_per_gauss"] > 0),
+        projection=SimpleNamespace(means=info["means2d"]),
+        lists=SimpleNamespace(touched=info["tiles_per_gauss"] > 0),
     )
     return GsplatRendering(image[:3], alphas[0, ..., 0], image[3] if depth else None, splats)

@@ -12,9 +12,7 @@ from reference_trainer.render.splats import MomentImages, Splats
 __all__ = ["render_moments", "variance_shares"]
 
 
-def render_moments(
-    splats: Splats, multiplier: Multiplier, *, background: Tensor | None = None, alpha: bool = True
-) -> MomentImages:
+def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor | None = None) -> MomentImages:
     """Render the exact mean and variance of a view under random factors on the alphas; differentiable.
 
     The factors are independent per splat. There is no early stop: splats behind an opaque surface shine through its
@@ -24,10 +22,9 @@ def render_moments(
         splats: of the full model, with its plain opacities.
         multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,), one value each.
         background: fixed colour behind everything, shape (3,), or one for each pixel, (3, H, W); black by default.
-        alpha: whether to give the moments of the accumulated alpha too.
 
     Returns:
-        The moments of colours and accumulated alpha.
+        The moments of the colours, and the expected accumulated alpha.
 
     Raises:
         ValueError: if the background has another shape, or is not finite.
@@ -43,12 +40,7 @@ def render_moments(
         (0.4, 0.16)
     """
     with torch.autocast(splats.colors.device.type, enabled=False):
-        mean, variance = splats.engine.moments(
-            splats, _factors(multiplier, splats), _behind(background, splats), alpha=alpha
-        )
-    if not alpha:
-        return MomentImages(mean[:3], variance[:3], None, None)
-    return MomentImages(mean[:3], variance[:3], mean[3], variance[3])
+        return splats.engine.moments(splats, _factors(multiplier, splats), _behind(background, splats))
 
 
 @torch.no_grad()

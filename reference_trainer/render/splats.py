@@ -91,6 +91,15 @@ class TileLists:
         """List length of each tile, shape (tiles,)."""
         return self.starts.diff()
 
+    def padded(self, image: Tensor) -> Tensor:
+        """Return an image (..., H, W) with zeros up to the borders of the tiles."""
+        missing = (0, TILE * self.columns - self.width, 0, TILE * self.rows - self.height)
+        return torch.nn.functional.pad(image, missing)
+
+    def cut(self, image: Tensor) -> Tensor:
+        """Return the part (..., H, W) of an image of whole tiles."""
+        return image[..., : self.height, : self.width]
+
     def only(self, kept: Tensor) -> TileLists:
         """Return the lists without some Gaussians; without the numbers that the loops need.
 
@@ -151,11 +160,9 @@ class MomentImages(NamedTuple):
     Args:
         mean: expected colours over the background, shape (3, H, W).
         variance: variances of the colours, shape (3, H, W), at least 0.
-        alpha_mean: expected accumulated alpha, shape (H, W); None if it was not asked for.
-        alpha_variance: its variance, shape (H, W); likewise.
+        alpha_mean: expected accumulated alpha, shape (H, W).
     """
 
     mean: Tensor
     variance: Tensor
-    alpha_mean: Tensor | None
-    alpha_variance: Tensor | None
+    alpha_mean: Tensor

@@ -64,6 +64,5 @@ def _use_everything() -> None:
     opacities = model.gaussians.opacities.detach().requires_grad_()
     splats, multiplier = model.splats(opacities, view), Multiplier.dropout(0.5)
     moments = render_moments(splats, multiplier)
-    assert moments.alpha_variance is not None
-    (moments.variance.sum() + moments.alpha_variance.sum()).backward()  # type: ignore[no-untyped-call]
+    (moments.variance.sum() + moments.alpha_mean.sum()).backward()  # type: ignore[no-untyped-call]
     variance_shares(splats, multiplier, torch.ones(splats.lists.height, splats.lists.width))

@@ -13,7 +13,7 @@ from reference_trainer.render.eager.binning import bin_gaussians
 from reference_trainer.render.eager.projection import project
 from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
 from reference_trainer.render.eager.walk import blocks, geometry_rows, pad_entries, tile, walk
-from reference_trainer.render.splats import Splats
+from reference_trainer.render.splats import MomentImages, Splats
 
 __all__ = ["TorchEngine"]
 
@@ -58,14 +58,11 @@ class TorchEngine:
         sums = walk(formulas.composite, rows, behind, splats.lists, extra=1)
         return sums[:3], sums[-1], sums[3] if depth else None
 
-    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
+    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Composite mean and variance back to front."""
         rows = torch.cat([geometry_rows(splats), multiplier.T, splats.colors.T])
-        if alpha:  # one more colour, white over black
-            rows = torch.cat([rows, torch.ones_like(rows[:1])])
-            behind = torch.cat([behind, torch.zeros_like(behind[:1])])
-        images = walk(formulas.moments, rows, behind, splats.lists, extra=behind.shape[0])
-        return images[: behind.shape[0]], images[behind.shape[0] :]
+        images = walk(formulas.moments, rows, behind, splats.lists, extra=4)
+        return MomentImages(images[:3], images[3:6], images[6])
 
     def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
         """Sum the summands of the variance over the pixels."""

@@ -14,7 +14,6 @@ from torch import Tensor
 from ca_reg.functional import color_variance
 from reference_trainer.render.constants import MAX_ALPHA, MIN_TRANSMITTANCE
 from reference_trainer.render.eager.walk import Block
-from reference_trainer.render.precision import without_autocast
 
 __all__ = ["blend_weights", "color_variances", "composite", "first_order", "moments", "over", "summands"]
 
@@ -55,7 +54,6 @@ class _BlendWeights(torch.autograd.Function):
         return weights
 
     @staticmethod
-    @without_autocast
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         passed, transmittance, weights = ctx.saved_tensors
         # A splat adds its own light, and dims by 1 / (1 - alpha) all behind it; the clamp lets gradients pass.
@@ -107,7 +105,7 @@ def _random(block: Block, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
-    """Return mean and variance of C values under random factors on the alphas, (T, 2 C, 64).
+    """Return mean and variance of C values under random factors, and the expected alpha, (T, 2 C + 1, 64).
 
     The recursion of `ca_reg.functional.pixel_moments`, back to front: with d the contrast of a splat with the mean of
     what is behind it, the mean grows by m alpha d, and the variance V becomes ((1 - m alpha)^2 + v alpha^2) V
@@ -126,7 +124,7 @@ def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
         contrast = value - mean
         variance = kept * variance + s * contrast.square()
         mean = mean + e * contrast
-    return torch.cat([mean, variance], dim=1)
+    return torch.cat([mean, variance, 1 - (1 - expected).prod(0)], dim=1)
 
 
 def summands(block: Block, rows: Tensor, behind: Tensor) -> Tensor:

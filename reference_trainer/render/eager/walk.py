@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from reference_trainer.render.constants import BLOCK_PAIRS_CPU, BLOCK_PAIRS_CUDA, MIN_ALPHA, TILE
-from reference_trainer.render.precision import without_autocast
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = ["PIXELS", "Block", "blocks", "geometry_rows", "pad_entries", "pixel_offsets", "tile", "untile", "walk"]
@@ -140,7 +139,6 @@ class _Walk(torch.autograd.Function):
         return untile(result, lists)
 
     @staticmethod
-    @without_autocast
     def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, Tensor, None, None]:
         rows, behind = ctx.saved_tensors
         lists: TileLists = ctx.lists
@@ -148,9 +146,10 @@ class _Walk(torch.autograd.Function):
         to_entries, to_tiles = torch.zeros_like(entries), upstream[:, : behind.shape[0]].clone()
         for block in ctx.blocks:
             inputs = [x.detach().requires_grad_() for x in (entries[:, block.gaussians], tiles[block.tiles])]
-            with torch.enable_grad():
+            # Whoever calls backward() within torch.autocast would have its products computed in 16 bits.
+            with torch.enable_grad(), torch.autocast(rows.device.type, enabled=False):
                 result = ctx.formula(block, *inputs)
-            of_block, of_tiles = torch.autograd.grad(result, inputs, upstream[block.tiles], materialize_grads=True)
+                of_block, of_tiles = torch.autograd.grad(result, inputs, upstream[block.tiles], materialize_grads=True)
             to_entries.index_add_(1, block.gaussians.flatten(), of_block.flatten(1))
             to_tiles[block.tiles] = of_tiles
         return None, to_entries[:, :-1], untile(to_tiles, lists), None, None
@@ -166,12 +165,10 @@ def pad_entries(rows: Tensor) -> Tensor:
 def untile(tiles: Tensor, lists: TileLists) -> Tensor:
     """Reorder per-tile pixels of shape (tiles, C, 64) into an image of shape (C, H, W)."""
     grid = tiles.view(lists.rows, lists.columns, -1, TILE, TILE)
-    image = grid.permute(2, 0, 3, 1, 4).reshape(-1, lists.rows * TILE, lists.columns * TILE)
-    return image[:, : lists.height, : lists.width]
+    return lists.cut(grid.permute(2, 0, 3, 1, 4).reshape(-1, lists.rows * TILE, lists.columns * TILE))
 
 
 def tile(image: Tensor, lists: TileLists) -> Tensor:
     """Reorder an image of shape (C, H, W) into per-tile pixels of shape (tiles, C, 64), zero outside the image."""
-    padding = (0, lists.columns * TILE - lists.width, 0, lists.rows * TILE - lists.height)
-    grid = torch.nn.functional.pad(image, padding).view(-1, lists.rows, TILE, lists.columns, TILE)
+    grid = lists.padded(image).view(-1, lists.rows, TILE, lists.columns, TILE)
     return grid.permute(1, 3, 0, 2, 4).reshape(lists.rows * lists.columns, -1, PIXELS)

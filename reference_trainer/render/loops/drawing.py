@@ -12,178 +12,107 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE
-from reference_trainer.render.loops.arithmetic import PIXELS, X, Y, exp2
+from reference_trainer.render.constants import MIN_TRANSMITTANCE
 from reference_trainer.render.loops.compiling import inlined, kernel
-from reference_trainer.render.loops.threads import in_threads
-from reference_trainer.render.precision import without_autocast
-from reference_trainer.render.splats import Splats, TileLists
+from reference_trainer.render.loops.tiles import (
+    CHUNK,
+    PIXELS,
+    alpha_at,
+    clamped,
+    footprint,
+    footprint_gradient,
+    geometry_gradients,
+    get_pixels,
+    is_faint,
+    make_table,
+    over_tiles,
+    put_pixels,
+    read_entries,
+    sum_rows,
+    whole_tiles,
+)
+from reference_trainer.render.splats import Splats
 
-__all__ = [
-    "alpha_at",
-    "composite",
-    "footprint",
-    "footprint_gradient",
-    "geometry_gradients",
-    "is_faint",
-    "make_table",
-    "over_tiles",
-    "sum_rows",
-]
+__all__ = ["composite"]
 
 Array = Any
 f4 = np.float32
-_ZERO, _ONE, _TWO = f4(0), f4(1), f4(2)
-_HALF = f4(0.5 * np.log2(np.e))  # exp(-x / 2) = 2^(-_HALF x)
-_MIN, _MAX, _LEAST_LIGHT = f4(MIN_ALPHA), f4(MAX_ALPHA), f4(MIN_TRANSMITTANCE)
-_FAINT = f4(np.log2(MIN_ALPHA))
-_CHECK = 16  # entries between two looks at whether all pixels have ended
+_ZERO, _ONE, _LEAST_LIGHT = f4(0), f4(1), f4(MIN_TRANSMITTANCE)
 
-
-def make_table(splats: Splats) -> Tensor:
-    """Return x, y, l11, l21, l22, log2 of the opacity, red, green and blue of M splats, shape (M, 9)."""
-    projection, logarithms = splats.projection, torch.log2(splats.opacities)[:, None]
-    return torch.cat([projection.means, projection.factors, logarithms, splats.colors], dim=1).detach()
-
-
-def over_tiles(kernel: Any, lists: TileLists, *arguments: Any) -> None:
-    """Call a kernel with the lists of all tiles, and with more tensors, of which it fills some that are contiguous."""
-    arrays = (x.detach().contiguous().numpy() if isinstance(x, Tensor) else x for x in (lists.gaussians, *arguments))
-    in_threads(kernel, lists.columns * lists.rows, lists.starts.numpy(), *arrays, least=4)
-
-
-def sum_rows(rows: Tensor, lists: TileLists) -> Tensor:
-    """Add up the rows of every Gaussian's entries, (P, C), always in the same order; shape (M, C)."""
-    assert lists.offsets is not None
-    sums = rows.new_empty(lists.offsets.shape[0] - 1, rows.shape[1])
-    in_threads(_sum_rows, sums.shape[0], lists.offsets.numpy(), rows.numpy(), sums.numpy())
-    return sums
+# Places in a tile's state: what is kept of every pixel stands in one array, so that the compiler sees that nothing
+# overlaps. With an array for each it would give up and not use vector instructions: four times slower.
+_LIGHT, _RED, _GREEN, _BLUE, _BEHIND, _SLOPE = (i * PIXELS for i in range(6))
 
 
 @inlined
-def is_faint(table: Any, i: Any) -> Any:
-    """Whether a Gaussian cannot be seen anywhere, as one that a mask has dropped."""
-    return table[i, 5] < _FAINT
+def _pass(alpha: Any, light: Any) -> Any:
+    """Return the weight of a splat, and what light is left behind it."""
+    rest = light * (_ONE - alpha)
+    goes_on = rest >= _LEAST_LIGHT
+    return alpha * light if goes_on else _ZERO, rest if goes_on else -abs(light)
 
 
 @inlined
-def footprint(table: Any, i: Any, tile_x: Any, tile_y: Any) -> Any:
-    """Expand log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2 around the centre of a tile."""
-    l11, l21, l22 = table[i, 2], table[i, 3], table[i, 4]
-    dx, dy = table[i, 0] - tile_x, table[i, 1] - tile_y
-    # Squaring w1 and w2, which are small wherever alpha is not, avoids the cancellation of a dx^2 + 2 b dx dy + c dy^2.
-    w1, w2 = l11 * dx + l21 * dy, l22 * dy
-    return (
-        table[i, 5] - _HALF * (w1 * w1 + w2 * w2),
-        _TWO * _HALF * l11 * w1,
-        _TWO * _HALF * (l21 * w1 + l22 * w2),
-        -_HALF * l11 * l11,
-        -_TWO * _HALF * l11 * l21,
-        -_HALF * (l21 * l21 + l22 * l22),
-    )
-
-
-@inlined
-def alpha_at(polynomial: Any, x: Any, y: Any) -> Any:
-    """Return a splat's alpha at a pixel of the tile before the clamp; 0 below `MIN_ALPHA`."""
-    c, cx, cy, cxx, cxy, cyy = polynomial
-    raw = exp2(c + x * (cx + cxx * x + cxy * y) + y * (cy + cyy * y))
-    return raw if raw > _MIN else _ZERO
-
-
-@inlined
-def footprint_gradient(table: Any, i: Any, tile_x: Any, tile_y: Any, sums: Any, row: Any) -> None:
-    """Carry the gradient from a splat's ln alpha to its geometry.
-
-    Args:
-        table: of the Gaussians.
-        i: the Gaussian.
-        tile_x: centre of the tile.
-        tile_y: likewise.
-        sums: gradient of ln alpha times each monomial 1, x, y, x^2, x y, y^2, summed over the tile's pixels.
-        row: receives the gradients of x, y, l11, l21, l22 and ln o.
-    """
-    l11, l21, l22 = table[i, 2], table[i, 3], table[i, 4]
-    dx, dy = table[i, 0] - tile_x, table[i, 1] - tile_y
-    w1, w2 = l11 * dx + l21 * dy, l22 * dy
-    s, sx, sy, sxx, sxy, syy = sums
-    to_w1, to_w2 = l11 * sx + l21 * sy - w1 * s, l22 * sy - w2 * s
-    row[0] = l11 * to_w1
-    row[1] = l21 * to_w1 + l22 * to_w2
-    row[2] = w1 * sx - l11 * sxx - l21 * sxy + dx * to_w1
-    row[3] = w1 * sy - l11 * sxy - l21 * syy + dy * to_w1
-    row[4] = w2 * sy - l22 * syy + dy * to_w2
-    row[5] = s
+def _have_ended(state: Any) -> Any:
+    most = state[_LIGHT]
+    for p in range(PIXELS):
+        most = state[_LIGHT + p] if state[_LIGHT + p] > most else most
+    return most < _ZERO
 
 
 @kernel
 def _forward(
-    first: int, last: int, starts: Array, gaussians: Array, table: Array, background: Array, image: Array, light: Array
-) -> None:
-    height, width = light.shape
-    columns = (width + TILE - 1) // TILE
-    t, red, green, blue = np.empty(PIXELS, f4), np.empty(PIXELS, f4), np.empty(PIXELS, f4), np.empty(PIXELS, f4)
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array,
+    image: Array, light: Array,
+) -> None:  # fmt: skip
+    s, entries = np.empty(4 * PIXELS, f4), np.empty((CHUNK + 1, 9), f4)
     for tile in range(first, last):
-        top, left = tile // columns * TILE, tile % columns * TILE
-        tile_x, tile_y = f4(left + TILE // 2), f4(top + TILE // 2)
-        for p in range(PIXELS):
-            inside = top + p // TILE < height and left + p % TILE < width
-            t[p] = _ONE if inside else -_ONE
-            red[p], green[p], blue[p] = _ZERO, _ZERO, _ZERO
-        for e in range(starts[tile], starts[tile + 1]):
-            i = gaussians[e]
-            if is_faint(table, i):
-                continue
-            polynomial = footprint(table, i, tile_x, tile_y)
-            r, g, b = table[i, 6], table[i, 7], table[i, 8]
-            for p in range(PIXELS):
-                alpha = alpha_at(polynomial, X[p], Y[p])
-                alpha = alpha if alpha < _MAX else _MAX
-                now = t[p]
-                rest = now * (_ONE - alpha)
-                goes_on = rest >= _LEAST_LIGHT
-                weight = alpha * now if goes_on else _ZERO
-                red[p] += weight * r
-                green[p] += weight * g
-                blue[p] += weight * b
-                t[p] = rest if goes_on else -abs(now)
-            if e % _CHECK == 0:
-                most = t[0]
+        s[:] = _ZERO
+        s[_LIGHT : _LIGHT + PIXELS] = _ONE
+        for begin in range(starts[tile], starts[tile + 1], CHUNK):
+            end = min(begin + CHUNK, starts[tile + 1])
+            count = read_entries(gaussians, begin, end, 1, table, tile, columns, entries)
+            for k in range(0, count, 2):
+                a, b = entries[k], entries[k + 1]
+                shape_a, shape_b = (a[0], a[1], a[2], a[3], a[4], a[5]), (b[0], b[1], b[2], b[3], b[4], b[5])
+                red_a, green_a, blue_a, red_b, green_b, blue_b = a[6], a[7], a[8], b[6], b[7], b[8]
                 for p in range(PIXELS):
-                    most = t[p] if t[p] > most else most
-                if most < _ZERO:
-                    break
+                    weight_a, between = _pass(clamped(alpha_at(shape_a, p)), s[_LIGHT + p])
+                    weight_b, rest = _pass(clamped(alpha_at(shape_b, p)), between)
+                    s[_RED + p] += weight_a * red_a + weight_b * red_b
+                    s[_GREEN + p] += weight_a * green_a + weight_b * green_b
+                    s[_BLUE + p] += weight_a * blue_a + weight_b * blue_b
+                    s[_LIGHT + p] = rest
+            if _have_ended(s):
+                break
         for p in range(PIXELS):
-            y, x = top + p // TILE, left + p % TILE
-            if y < height and x < width:
-                through = abs(t[p])
-                light[y, x] = through
-                image[0, y, x] = red[p] + through * background[0]
-                image[1, y, x] = green[p] + through * background[1]
-                image[2, y, x] = blue[p] + through * background[2]
+            through = abs(s[_LIGHT + p])
+            s[_LIGHT + p] = through
+            s[_RED + p] += through * background[0]
+            s[_GREEN + p] += through * background[1]
+            s[_BLUE + p] += through * background[2]
+        put_pixels(s, _LIGHT, light[0], tile, columns)
+        for c in range(3):
+            put_pixels(s, _RED + c * PIXELS, image[c], tile, columns)
 
 
 @kernel
 def _backward(
-    first: int, last: int, starts: Array, gaussians: Array, slots: Array, table: Array, image: Array, light: Array,
-    to_image: Array, to_light: Array, rows: Array,
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array, image: Array,
+    light: Array, to_image: Array, to_light: Array, rows: Array,
 ) -> None:  # fmt: skip
-    height, width = light.shape
-    columns = (width + TILE - 1) // TILE
-    t, behind = np.empty(PIXELS, f4), np.empty(PIXELS, f4)
-    to_red, to_green, to_blue = np.empty(PIXELS, f4), np.empty(PIXELS, f4), np.empty(PIXELS, f4)
+    s, drawn = np.empty(6 * PIXELS, f4), np.empty(4 * PIXELS, f4)
     for tile in range(first, last):
-        top, left = tile // columns * TILE, tile % columns * TILE
-        tile_x, tile_y = f4(left + TILE // 2), f4(top + TILE // 2)
+        get_pixels(to_light[0], tile, columns, s, _LIGHT)
+        get_pixels(light[0], tile, columns, drawn, _LIGHT)
+        for c in range(3):
+            get_pixels(to_image[c], tile, columns, s, _RED + c * PIXELS)
+            get_pixels(image[c], tile, columns, drawn, _RED + c * PIXELS)
         for p in range(PIXELS):
-            y, x = top + p // TILE, left + p % TILE
-            t[p] = -_ONE
-            to_red[p], to_green[p], to_blue[p], behind[p] = _ZERO, _ZERO, _ZERO, _ZERO
-            if y < height and x < width:
-                t[p] = _ONE
-                to_red[p], to_green[p], to_blue[p] = to_image[0, y, x], to_image[1, y, x], to_image[2, y, x]
-                of_colors = to_red[p] * image[0, y, x] + to_green[p] * image[1, y, x] + to_blue[p] * image[2, y, x]
-                behind[p] = of_colors + to_light[y, x] * light[y, x]
+            of_colors = s[_RED + p] * drawn[_RED + p] + s[_GREEN + p] * drawn[_GREEN + p]
+            of_colors += s[_BLUE + p] * drawn[_BLUE + p]
+            s[_BEHIND + p] = of_colors + s[_LIGHT + p] * drawn[_LIGHT + p]
+            s[_LIGHT + p] = _ONE
         ended = False
         for e in range(starts[tile], starts[tile + 1]):
             i = gaussians[e]
@@ -191,66 +120,40 @@ def _backward(
             if ended or is_faint(table, i):
                 row[:] = _ZERO
                 continue
-            polynomial = footprint(table, i, tile_x, tile_y)
+            polynomial = footprint(table, i, tile, columns)
             r, g, b = table[i, 6], table[i, 7], table[i, 8]
-            s, sx, sy, sxx, sxy, syy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
             to_r, to_g, to_b = _ZERO, _ZERO, _ZERO
             for p in range(PIXELS):
-                x, y = X[p], Y[p]
-                raw = alpha_at(polynomial, x, y)
-                alpha = raw if raw < _MAX else _MAX
-                now, passed = t[p], _ONE - alpha
-                rest = now * passed
-                goes_on = rest >= _LEAST_LIGHT
-                weight = alpha * now if goes_on else _ZERO
-                along = to_red[p] * r + to_green[p] * g + to_blue[p] * b
-                beyond = behind[p] - weight * along
-                behind[p] = beyond
-                t[p] = rest if goes_on else -abs(now)
+                raw, now = alpha_at(polynomial, p), s[_LIGHT + p]
+                alpha = clamped(raw)
+                weight, rest = _pass(alpha, now)
+                along = s[_RED + p] * r + s[_GREEN + p] * g + s[_BLUE + p] * b
+                beyond = s[_BEHIND + p] - weight * along
+                s[_BEHIND + p], s[_LIGHT + p] = beyond, rest
                 # A splat adds T c itself, and dims by 1 / (1 - alpha) all behind it; the clamp lets gradients pass.
-                d = raw * (now * along - beyond / passed) if goes_on else _ZERO
-                s += d
-                sx += d * x
-                sy += d * y
-                sxx += d * x * x
-                sxy += d * x * y
-                syy += d * y * y
-                to_r += weight * to_red[p]
-                to_g += weight * to_green[p]
-                to_b += weight * to_blue[p]
-            footprint_gradient(table, i, tile_x, tile_y, (s, sx, sy, sxx, sxy, syy), row)
+                s[_SLOPE + p] = raw * (now * along - beyond / (_ONE - alpha)) if rest > _ZERO else _ZERO
+                to_r += weight * s[_RED + p]
+                to_g += weight * s[_GREEN + p]
+                to_b += weight * s[_BLUE + p]
+            footprint_gradient(table, i, tile, columns, s[_SLOPE:], row)
             row[6], row[7], row[8] = to_r, to_g, to_b
-            if e % _CHECK == 0:
-                most = t[0]
-                for p in range(PIXELS):
-                    most = t[p] if t[p] > most else most
-                ended = most < _ZERO
-
-
-@kernel
-def _sum_rows(first: int, last: int, offsets: Array, rows: Array, sums: Array) -> None:
-    for i in range(first, last):
-        for column in range(rows.shape[1]):
-            sums[i, column] = 0
-        for row in range(offsets[i], offsets[i + 1]):
-            for column in range(rows.shape[1]):
-                sums[i, column] += rows[row, column]
+            if e % CHUNK == 0:
+                ended = _have_ended(s)
 
 
 class _Composite(torch.autograd.Function):
-    """Of a table of splats: their image over the background (3, H, W), and what light is left (H, W)."""
+    """Of a table of splats: their image over the background, and what light is left, (3 and 1, whole tiles)."""
 
     @staticmethod
     def forward(ctx: Any, splats: Splats, background: Tensor, *_differentiable: Tensor) -> tuple[Tensor, Tensor]:
         table, lists = make_table(splats), splats.lists
-        image, light = table.new_empty(3, lists.height, lists.width), table.new_empty(lists.height, lists.width)
+        image, light = whole_tiles(lists, 3), whole_tiles(lists, 1)
         over_tiles(_forward, lists, table, background, image, light)
         ctx.lists = lists
         ctx.save_for_backward(table, image, light)
         return image, light
 
     @staticmethod
-    @without_autocast
     def backward(ctx: Any, to_image: Tensor, to_light: Tensor) -> tuple[Tensor | None, ...]:
         table, image, light = ctx.saved_tensors
         rows = table.new_empty(ctx.lists.gaussians.shape[0], 9)
@@ -259,16 +162,10 @@ class _Composite(torch.autograd.Function):
         return None, to_background, *geometry_gradients(table, sum_rows(rows, ctx.lists))
 
 
-def geometry_gradients(table: Tensor, sums: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the gradients of means, factors, opacities and colours, given those of a table's rows (M, 9 or more)."""
-    # A splat that a mask has dropped has no logarithm, and a gradient of 0.
-    return sums[:, :2], sums[:, 2:5], sums[:, 5] / table[:, 5].exp2().clamp_min(MIN_ALPHA), sums[:, 6:9]
-
-
 def composite(splats: Splats, background: Tensor) -> tuple[Tensor, Tensor]:
     """Draw splats over a background (3,): image (3, H, W), and the light left at every pixel, 1 - alpha, (H, W)."""
     p = splats.projection
-    result: tuple[Tensor, Tensor] = _Composite.apply(  # type: ignore[no-untyped-call]
+    image, light = _Composite.apply(  # type: ignore[no-untyped-call]
         splats, background, p.means, p.factors, splats.opacities, splats.colors
     )
-    return result
+    return splats.lists.cut(image), splats.lists.cut(light)[0]

@@ -11,7 +11,7 @@ from reference_trainer.render.loops.binning import bin_gaussians
 from reference_trainer.render.loops.drawing import composite
 from reference_trainer.render.loops.moments import moments, shares
 from reference_trainer.render.loops.projection import project, visible
-from reference_trainer.render.splats import Projection, Splats
+from reference_trainer.render.splats import MomentImages, Splats
 
 __all__ = ["LoopEngine"]
 
@@ -26,21 +26,15 @@ class LoopEngine:
         means, opacities = inputs["means"], inputs["opacities"]
         colors = inputs["sh"] if "sh" in inputs else inputs["colors"][:, None]
         indices, finite = visible(means.detach(), opacities.detach(), camera)
-        result = project(
-            means,
-            inputs["quaternions"],
-            inputs["scales"],
-            colors,
-            indices,
-            camera,
-            degree if "sh" in inputs else -1,
+        degree = degree if "sh" in inputs else -1
+        projection, colors, drawable = project(
+            means, inputs["quaternions"], inputs["scales"], colors, indices, camera, degree
         )
-        projection = Projection(result.means, result.factors, result.covariances, result.depths)
-        check_projection(finite and result.finite, projection, result.colors, inputs, camera)
+        check_projection(finite and drawable, projection, colors, inputs, camera)
         if indices.shape[0] < opacities.shape[0]:
             opacities = opacities.index_select(0, indices)
         lists = bin_gaussians(projection, opacities, camera.width, camera.height)
-        return Splats(indices, projection, opacities, result.colors, lists, self)
+        return Splats(indices, projection, opacities, colors, lists, self)
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
         """Keep the lists: the loops pass over those that are too faint."""
@@ -54,9 +48,9 @@ class LoopEngine:
         red = torch.nn.functional.pad(splats.projection.depths[:, None], (0, 2))
         return image, 1 - light, composite(splats._replace(colors=red), torch.zeros_like(background))[0][0]
 
-    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
+    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Composite mean and variance back to front."""
-        return moments(splats, multiplier, behind, alpha=alpha)
+        return moments(splats, multiplier, behind)
 
     def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
         """Sum the summands of the variance over the pixels."""

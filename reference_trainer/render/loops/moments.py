@@ -5,7 +5,7 @@ Back to front, with ``d_i = c_i - mu_{i+1}`` the contrast of a splat with the me
     mu_i = mu_{i+1} + m alpha_i d_i        V = sum_i spread_i S_i d_i^2        S_i = prod_{j<i} shrink_j
 
 where ``spread = v alpha^2`` and ``shrink = (1 - m alpha)^2 + spread``. Every term of V is a square times a non-negative
-weight: nothing cancels. The accumulated alpha is a fourth colour, 1 over 0; what it lacks of 1 is ``light``.
+weight: nothing cancels. What the expected accumulated alpha lacks of 1 is ``light``.
 """
 
 from __future__ import annotations
@@ -16,94 +16,93 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.render.constants import MAX_ALPHA, TILE
-from reference_trainer.render.loops.arithmetic import PIXELS, X, Y
-from reference_trainer.render.loops.compiling import kernel
-from reference_trainer.render.loops.drawing import (
+from reference_trainer.render.loops.compiling import inlined, kernel
+from reference_trainer.render.loops.tiles import (
+    CHUNK,
+    PIXELS,
     alpha_at,
+    clamped,
     footprint,
     footprint_gradient,
     geometry_gradients,
+    get_pixels,
     is_faint,
+    longest_list,
     make_table,
     over_tiles,
+    put_pixels,
+    read_entries,
     sum_rows,
+    whole_tiles,
 )
-from reference_trainer.render.precision import without_autocast
-from reference_trainer.render.splats import Splats
+from reference_trainer.render.splats import MomentImages, Splats
 
 __all__ = ["moments", "shares"]
 
 Array = Any
 f4 = np.float32
-_ZERO, _ONE, _TWO, _MAX, _THIRD = f4(0), f4(1), f4(2), f4(MAX_ALPHA), f4(1 / 3)
+_ZERO, _ONE, _TWO, _THIRD = f4(0), f4(1), f4(2), f4(1 / 3)
 
-# Places in a tile's state: what is kept of every pixel stands in one array, so that the compiler sees that nothing
-# overlaps. With an array for each it would give up and not use vector instructions: four times slower.
-_MEAN, _MEAN_1, _MEAN_2, _LIGHT, _HIDDEN, _FRONT = (i * PIXELS for i in range(6))
-_TO_MEAN, _TO_MEAN_1, _TO_MEAN_2, _TO_MEAN_3 = (i * PIXELS for i in range(6, 10))
-_VARIANCE, _VARIANCE_1, _VARIANCE_2, _VARIANCE_3 = (i * PIXELS for i in range(4, 8))
-_TO_VARIANCE, _TO_VARIANCE_1, _TO_VARIANCE_2, _TO_VARIANCE_3 = (i * PIXELS for i in range(10, 14))
+# Places in a tile's state, see drawing.py.
+_MEAN, _MEAN_1, _MEAN_2, _LIGHT = (i * PIXELS for i in range(4))
+_VARIANCE, _VARIANCE_1, _VARIANCE_2 = (i * PIXELS for i in range(4, 7))
+_TO_MEAN, _TO_MEAN_1, _TO_MEAN_2, _TO_LIGHT = (i * PIXELS for i in range(7, 11))
+_HIDDEN, _FRONT, _SLOPE, _SIZE = (i * PIXELS for i in range(11, 15))
+# Places in what is kept of an entry.
+_RAW, _D0, _D1, _D2, _BEYOND, _D3 = (i * PIXELS for i in range(6))
+
+
+@inlined
+def _random(alpha: Any, factor: Any, varies: Any) -> Any:
+    """Return m alpha, spread, 1 - m alpha and shrink."""
+    expected, spread = factor * alpha, varies * alpha * alpha
+    passed = _ONE - expected
+    return expected, spread, passed, passed * passed + spread
 
 
 @kernel
 def _forward(
-    first: int, last: int, starts: Array, gaussians: Array, table: Array, factors: Array, behind: Array, mean: Array,
-    variance: Array,
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, behind: Array, mean: Array,
+    variance: Array, alpha: Array,
 ) -> None:  # fmt: skip
-    _, height, width = behind.shape
-    columns = (width + TILE - 1) // TILE
-    s = np.empty(8 * PIXELS, f4)
+    s, entries = np.empty(7 * PIXELS, f4), np.empty((CHUNK + 1, 11), f4)
     for tile in range(first, last):
-        top, left = tile // columns * TILE, tile % columns * TILE
-        tile_x, tile_y = f4(left + TILE // 2), f4(top + TILE // 2)
+        s[_LIGHT : _LIGHT + PIXELS] = _ONE
+        s[_VARIANCE:] = _ZERO
+        for c in range(3):
+            get_pixels(behind[c], tile, columns, s, _MEAN + c * PIXELS)
+        for begin in range(starts[tile + 1] - 1, starts[tile] - 1, -CHUNK):
+            end = max(begin - CHUNK, starts[tile] - 1)
+            count = read_entries(gaussians, begin, end, -1, table, tile, columns, entries)
+            for k in range(0, count, 2):
+                a, b = entries[k], entries[k + 1]
+                shape_a, shape_b = (a[0], a[1], a[2], a[3], a[4], a[5]), (b[0], b[1], b[2], b[3], b[4], b[5])
+                a0, a1, a2, factor_a, varies_a = a[6], a[7], a[8], a[9], a[10]
+                b0, b1, b2, factor_b, varies_b = b[6], b[7], b[8], b[9], b[10]
+                for p in range(PIXELS):
+                    expected, spread, passed, shrink = _random(clamped(alpha_at(shape_a, p)), factor_a, varies_a)
+                    m0, m1, m2 = s[_MEAN + p], s[_MEAN_1 + p], s[_MEAN_2 + p]
+                    d0, d1, d2 = a0 - m0, a1 - m1, a2 - m2
+                    v0 = s[_VARIANCE + p] * shrink + spread * d0 * d0
+                    v1 = s[_VARIANCE_1 + p] * shrink + spread * d1 * d1
+                    v2 = s[_VARIANCE_2 + p] * shrink + spread * d2 * d2
+                    m0, m1, m2 = m0 + expected * d0, m1 + expected * d1, m2 + expected * d2
+                    light = passed * s[_LIGHT + p]
+                    expected, spread, passed, shrink = _random(clamped(alpha_at(shape_b, p)), factor_b, varies_b)
+                    d0, d1, d2 = b0 - m0, b1 - m1, b2 - m2
+                    s[_VARIANCE + p] = v0 * shrink + spread * d0 * d0
+                    s[_VARIANCE_1 + p] = v1 * shrink + spread * d1 * d1
+                    s[_VARIANCE_2 + p] = v2 * shrink + spread * d2 * d2
+                    s[_MEAN + p] = m0 + expected * d0
+                    s[_MEAN_1 + p] = m1 + expected * d1
+                    s[_MEAN_2 + p] = m2 + expected * d2
+                    s[_LIGHT + p] = passed * light
         for p in range(PIXELS):
-            y, x = top + p // TILE, left + p % TILE
-            inside = y < height and x < width
-            for c in range(3):
-                s[_MEAN + c * PIXELS + p] = behind[c, y, x] if inside else _ZERO
-            s[_LIGHT + p] = _ONE
-            for c in range(4):
-                s[_VARIANCE + c * PIXELS + p] = _ZERO
-        for e in range(starts[tile + 1] - 1, starts[tile] - 1, -1):
-            i = gaussians[e]
-            if is_faint(table, i):
-                continue
-            polynomial = footprint(table, i, tile_x, tile_y)
-            r, g, b = table[i, 6], table[i, 7], table[i, 8]
-            factor, varies = factors[i, 0], factors[i, 1]
-            for p in range(PIXELS):
-                alpha = alpha_at(polynomial, X[p], Y[p])
-                alpha = alpha if alpha < _MAX else _MAX
-                expected, spread = factor * alpha, varies * alpha * alpha
-                passed = _ONE - expected
-                shrink = passed * passed + spread
-                m0, m1, m2, light = s[_MEAN + p], s[_MEAN_1 + p], s[_MEAN_2 + p], s[_LIGHT + p]
-                d0, d1, d2 = r - m0, g - m1, b - m2
-                s[_VARIANCE + p] = s[_VARIANCE + p] * shrink + spread * d0 * d0
-                s[_VARIANCE_1 + p] = s[_VARIANCE_1 + p] * shrink + spread * d1 * d1
-                s[_VARIANCE_2 + p] = s[_VARIANCE_2 + p] * shrink + spread * d2 * d2
-                s[_VARIANCE_3 + p] = s[_VARIANCE_3 + p] * shrink + spread * light * light
-                s[_MEAN + p] = m0 + expected * d0
-                s[_MEAN_1 + p] = m1 + expected * d1
-                s[_MEAN_2 + p] = m2 + expected * d2
-                s[_LIGHT + p] = passed * light
-        for p in range(PIXELS):
-            y, x = top + p // TILE, left + p % TILE
-            if y < height and x < width:
-                for c in range(3):
-                    mean[c, y, x] = s[_MEAN + c * PIXELS + p]
-                mean[3, y, x] = _ONE - s[_LIGHT + p]
-                for c in range(4):
-                    variance[c, y, x] = s[_VARIANCE + c * PIXELS + p]
-
-
-@kernel
-def _longest(first: int, last: int, starts: Array) -> int:
-    longest = 0
-    for tile in range(first, last):
-        longest = max(longest, starts[tile + 1] - starts[tile])
-    return longest
+            s[_LIGHT + p] = _ONE - s[_LIGHT + p]
+        put_pixels(s, _LIGHT, alpha[0], tile, columns)
+        for c in range(3):
+            put_pixels(s, _MEAN + c * PIXELS, mean[c], tile, columns)
+            put_pixels(s, _VARIANCE + c * PIXELS, variance[c], tile, columns)
 
 
 def _make_backward(complete: bool) -> Any:
@@ -112,112 +111,89 @@ def _make_backward(complete: bool) -> Any:
     Args:
         complete: with those of the accumulated alpha, and of the moments of the factors: a quarter slower.
     """
+    size = 6 if complete else 5
 
     @kernel
     def _backward(
-        first: int, last: int, starts: Array, gaussians: Array, slots: Array, table: Array, factors: Array,
-        behind: Array, to_mean: Array, to_variance: Array, rows: Array, to_behind: Array,
+        first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array,
+        behind: Array, to_mean: Array, to_variance: Array, to_alpha: Array, rows: Array, to_behind: Array,
     ) -> None:  # fmt: skip
         """Carry gradients back: to what is in front of a splat by what is behind it, then to the splat itself.
 
         With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
         hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}: walked back to front, as division would fail at 0.
         """
-        _, height, width = behind.shape
-        columns = (width + TILE - 1) // TILE
-        longest = _longest(first, last, starts)
-        kept = np.empty(longest * 6 * PIXELS, f4)  # of every entry raw alpha, four contrasts, hidden
-        s = np.empty(14 * PIXELS, f4)
+        kept = np.empty(longest_list(first, last, starts) * size * PIXELS, f4)
+        s = np.empty(_SIZE, f4)  # in which _VARIANCE is its gradient
         for tile in range(first, last):
-            top, left = tile // columns * TILE, tile % columns * TILE
-            tile_x, tile_y = f4(left + TILE // 2), f4(top + TILE // 2)
-            for p in range(PIXELS):
-                y, x = top + p // TILE, left + p % TILE
-                inside = y < height and x < width
-                for c in range(3):
-                    s[_MEAN + c * PIXELS + p] = behind[c, y, x] if inside else _ZERO
-                for c in range(4):
-                    s[_TO_MEAN + c * PIXELS + p] = to_mean[c, y, x] if inside else _ZERO
-                    s[_TO_VARIANCE + c * PIXELS + p] = to_variance[c, y, x] if inside else _ZERO
-                s[_LIGHT + p], s[_HIDDEN + p], s[_FRONT + p] = _ONE, _ZERO, _ONE
+            s[_LIGHT : _LIGHT + PIXELS] = _ONE
+            s[_HIDDEN : _HIDDEN + PIXELS] = _ZERO
+            s[_FRONT : _FRONT + PIXELS] = _ONE
+            for c in range(3):
+                get_pixels(behind[c], tile, columns, s, _MEAN + c * PIXELS)
+                get_pixels(to_mean[c], tile, columns, s, _TO_MEAN + c * PIXELS)
+                get_pixels(to_variance[c], tile, columns, s, _VARIANCE + c * PIXELS)
+            if complete:
+                get_pixels(to_alpha[0], tile, columns, s, _TO_LIGHT)
             begin = starts[tile]
             for k in range(starts[tile + 1] - begin - 1, -1, -1):
                 i = gaussians[begin + k]
                 if is_faint(table, i):
                     continue
-                polynomial = footprint(table, i, tile_x, tile_y)
-                r, g, b = table[i, 6], table[i, 7], table[i, 8]
-                factor, varies = factors[i, 0], factors[i, 1]
-                of_entry = kept[k * 6 * PIXELS : (k + 1) * 6 * PIXELS]
+                polynomial = footprint(table, i, tile, columns)
+                r, g, b, factor, varies = table[i, 6], table[i, 7], table[i, 8], table[i, 9], table[i, 10]
+                of_entry = kept[k * size * PIXELS : (k + 1) * size * PIXELS]
                 for p in range(PIXELS):
-                    raw = alpha_at(polynomial, X[p], Y[p])
-                    alpha = raw if raw < _MAX else _MAX
-                    expected, spread = factor * alpha, varies * alpha * alpha
-                    passed = _ONE - expected
+                    raw = alpha_at(polynomial, p)
+                    expected, spread, passed, shrink = _random(clamped(raw), factor, varies)
                     d0, d1, d2, d3 = r - s[_MEAN + p], g - s[_MEAN_1 + p], b - s[_MEAN_2 + p], s[_LIGHT + p]
                     hidden = s[_HIDDEN + p]
-                    of_entry[p], of_entry[PIXELS + p], of_entry[2 * PIXELS + p] = raw, d0, d1
-                    of_entry[3 * PIXELS + p], of_entry[4 * PIXELS + p], of_entry[5 * PIXELS + p] = d2, d3, hidden
-                    weight = s[_TO_VARIANCE + p] * d0 * d0 + s[_TO_VARIANCE_1 + p] * d1 * d1
-                    weight += s[_TO_VARIANCE_2 + p] * d2 * d2
+                    of_entry[_RAW + p], of_entry[_D0 + p], of_entry[_D1 + p] = raw, d0, d1
+                    of_entry[_D2 + p], of_entry[_BEYOND + p] = d2, hidden
                     if complete:
-                        weight += s[_TO_VARIANCE_3 + p] * d3 * d3
-                    s[_HIDDEN + p] = hidden * (passed * passed + spread) + weight * spread
+                        of_entry[_D3 + p] = d3
+                        s[_LIGHT + p] = passed * d3
+                    weight = s[_VARIANCE + p] * d0 * d0 + s[_VARIANCE_1 + p] * d1 * d1
+                    weight += s[_VARIANCE_2 + p] * d2 * d2
+                    s[_HIDDEN + p] = hidden * shrink + weight * spread
                     s[_MEAN + p] += expected * d0
                     s[_MEAN_1 + p] += expected * d1
                     s[_MEAN_2 + p] += expected * d2
-                    s[_LIGHT + p] = passed * d3
             for k in range(starts[tile + 1] - begin):
                 i = gaussians[begin + k]
                 row = rows[slots[begin + k]]
                 if is_faint(table, i):
                     row[:] = _ZERO
                     continue
-                factor, varies = factors[i, 0], factors[i, 1]
-                g0, gx, gy, gxx, gxy, gyy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+                factor, varies = table[i, 9], table[i, 10]
                 to_r, to_g, to_b, to_factor, to_varies = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
-                of_entry = kept[k * 6 * PIXELS : (k + 1) * 6 * PIXELS]
+                of_entry = kept[k * size * PIXELS : (k + 1) * size * PIXELS]
                 for p in range(PIXELS):
-                    x, y = X[p], Y[p]
-                    raw, d0, d1 = of_entry[p], of_entry[PIXELS + p], of_entry[2 * PIXELS + p]
-                    d2, d3, hidden = of_entry[3 * PIXELS + p], of_entry[4 * PIXELS + p], of_entry[5 * PIXELS + p]
+                    raw, d0, d1, d2 = of_entry[_RAW + p], of_entry[_D0 + p], of_entry[_D1 + p], of_entry[_D2 + p]
                     u0, u1, u2 = s[_TO_MEAN + p], s[_TO_MEAN_1 + p], s[_TO_MEAN_2 + p]
-                    u3 = s[_TO_MEAN_3 + p] if complete else _ZERO
-                    w0, w1 = s[_TO_VARIANCE + p] * d0, s[_TO_VARIANCE_1 + p] * d1
-                    w2, w3 = s[_TO_VARIANCE_2 + p] * d2, s[_TO_VARIANCE_3 + p] * d3 if complete else _ZERO
-                    alpha = raw if raw < _MAX else _MAX
-                    expected, spread = factor * alpha, varies * alpha * alpha
-                    passed, front = _ONE - expected, s[_FRONT + p]
-                    to_shrink = hidden * front
-                    to_spread = (w0 * d0 + w1 * d1 + w2 * d2 + w3 * d3) * front + to_shrink
-                    to_expected = u0 * d0 + u1 * d1 + u2 * d2 + u3 * d3 - _TWO * passed * to_shrink
+                    w0, w1, w2 = s[_VARIANCE + p] * d0, s[_VARIANCE_1 + p] * d1, s[_VARIANCE_2 + p] * d2
+                    alpha, front = clamped(raw), s[_FRONT + p]
+                    expected, spread, passed, shrink = _random(alpha, factor, varies)
+                    to_shrink = of_entry[_BEYOND + p] * front
+                    to_spread = (w0 * d0 + w1 * d1 + w2 * d2) * front + to_shrink
+                    to_expected = u0 * d0 + u1 * d1 + u2 * d2 - _TWO * passed * to_shrink
                     twice = _TWO * front * spread
                     t0, t1, t2 = u0 * expected + w0 * twice, u1 * expected + w1 * twice, u2 * expected + w2 * twice
-                    s[_TO_MEAN + p] = u0 - t0
-                    s[_TO_MEAN_1 + p] = u1 - t1
-                    s[_TO_MEAN_2 + p] = u2 - t2
-                    s[_FRONT + p] = front * (passed * passed + spread)
+                    s[_TO_MEAN + p], s[_TO_MEAN_1 + p], s[_TO_MEAN_2 + p] = u0 - t0, u1 - t1, u2 - t2
+                    s[_FRONT + p] = front * shrink
                     to_r += t0
                     to_g += t1
                     to_b += t2
                     if complete:
-                        s[_TO_MEAN_3 + p] = u3 - u3 * expected - w3 * twice
+                        to_expected += s[_TO_LIGHT + p] * of_entry[_D3 + p]
+                        s[_TO_LIGHT + p] *= passed
                         to_factor += to_expected * alpha
                         to_varies += to_spread * alpha * alpha
-                    d = raw * (_TWO * varies * to_spread * alpha + to_expected * factor)
-                    g0 += d
-                    gx += d * x
-                    gy += d * y
-                    gxx += d * x * x
-                    gxy += d * x * y
-                    gyy += d * y * y
-                footprint_gradient(table, i, tile_x, tile_y, (g0, gx, gy, gxx, gxy, gyy), row)
+                    s[_SLOPE + p] = raw * (_TWO * varies * to_spread * alpha + to_expected * factor)
+                footprint_gradient(table, i, tile, columns, s[_SLOPE:], row)
                 row[6], row[7], row[8], row[9], row[10] = to_r, to_g, to_b, to_factor, to_varies
-            for p in range(PIXELS):
-                y, x = top + p // TILE, left + p % TILE
-                if y < height and x < width:
-                    for c in range(3):
-                        to_behind[c, y, x] = s[_TO_MEAN + c * PIXELS + p]
+            for c in range(3):
+                put_pixels(s, _TO_MEAN + c * PIXELS, to_behind[c], tile, columns)
 
     return _backward
 
@@ -227,34 +203,26 @@ _backward, _complete_backward = _make_backward(False), _make_backward(True)
 
 @kernel
 def _shares(
-    first: int, last: int, starts: Array, gaussians: Array, slots: Array, table: Array, factors: Array, behind: Array,
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array, behind: Array,
     weights: Array, rows: Array,
 ) -> None:  # fmt: skip
     """Sum the summands of the variance, mean over the colours, over the pixels of every tile."""
-    _, height, width = behind.shape
-    columns = (width + TILE - 1) // TILE
-    kept = np.empty(_longest(first, last, starts) * 2 * PIXELS, f4)  # of every entry alpha, squared contrast
-    s = np.empty(6 * PIXELS, f4)
+    kept = np.empty(longest_list(first, last, starts) * 2 * PIXELS, f4)  # of every entry alpha, squared contrast
+    s = np.empty(_SIZE, f4)
     for tile in range(first, last):
-        top, left = tile // columns * TILE, tile % columns * TILE
-        tile_x, tile_y = f4(left + TILE // 2), f4(top + TILE // 2)
-        for p in range(PIXELS):
-            y, x = top + p // TILE, left + p % TILE
-            inside = y < height and x < width
-            for c in range(3):
-                s[_MEAN + c * PIXELS + p] = behind[c, y, x] if inside else _ZERO
-            s[_FRONT + p] = weights[y, x] * _THIRD if inside else _ZERO
+        get_pixels(weights[0], tile, columns, s, _FRONT)
+        for c in range(3):
+            get_pixels(behind[c], tile, columns, s, _MEAN + c * PIXELS)
         begin = starts[tile]
         for k in range(starts[tile + 1] - begin - 1, -1, -1):
             i = gaussians[begin + k]
             if is_faint(table, i):
                 continue
-            polynomial = footprint(table, i, tile_x, tile_y)
-            r, g, b, factor = table[i, 6], table[i, 7], table[i, 8], factors[i, 0]
+            polynomial = footprint(table, i, tile, columns)
+            r, g, b, factor = table[i, 6], table[i, 7], table[i, 8], table[i, 9]
             of_entry = kept[k * 2 * PIXELS : (k + 1) * 2 * PIXELS]
             for p in range(PIXELS):
-                alpha = alpha_at(polynomial, X[p], Y[p])
-                alpha = alpha if alpha < _MAX else _MAX
+                alpha = clamped(alpha_at(polynomial, p))
                 d0, d1, d2 = r - s[_MEAN + p], g - s[_MEAN_1 + p], b - s[_MEAN_2 + p]
                 of_entry[p], of_entry[PIXELS + p] = alpha, d0 * d0 + d1 * d1 + d2 * d2
                 s[_MEAN + p] += factor * alpha * d0
@@ -264,54 +232,56 @@ def _shares(
             i = gaussians[begin + k]
             total = 0.0
             if not is_faint(table, i):
-                factor, varies = factors[i, 0], factors[i, 1]
+                factor, varies = table[i, 9], table[i, 10]
                 of_entry = kept[k * 2 * PIXELS : (k + 1) * 2 * PIXELS]
                 for p in range(PIXELS):
-                    alpha, front = of_entry[p], s[_FRONT + p]
-                    passed, spread = _ONE - factor * alpha, varies * alpha * alpha
+                    _, spread, _, shrink = _random(of_entry[p], factor, varies)
+                    front = s[_FRONT + p]
                     total += np.float64(front * spread * of_entry[PIXELS + p])
-                    s[_FRONT + p] = front * (passed * passed + spread)
-            rows[slots[begin + k], 0] = total
+                    s[_FRONT + p] = front * shrink
+            rows[slots[begin + k], 0] = total * _THIRD
 
 
 class _Moments(torch.autograd.Function):
-    """Mean and variance of red, green, blue and accumulated alpha, (4, H, W) each."""
+    """Mean and variance of the colours, and the expected accumulated alpha, (3, 3 and 1, whole tiles)."""
 
     @staticmethod
-    def forward(
-        ctx: Any, splats: Splats, alpha: bool, multiplier: Tensor, behind: Tensor, *_differentiable: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        table = make_table(splats)
-        mean, variance = (table.new_empty(4, *behind.shape[1:]) for _ in range(2))
-        over_tiles(_forward, splats.lists, table, multiplier, behind, mean, variance)
-        ctx.lists, ctx.alpha = splats.lists, alpha
-        ctx.save_for_backward(table, multiplier, behind)
-        return mean, variance
+    def forward(ctx: Any, splats: Splats, multiplier: Tensor, behind: Tensor, *_differentiable: Tensor) -> Any:
+        ctx.set_materialize_grads(False)
+        table, lists = make_table(splats, multiplier), splats.lists
+        mean, variance, alpha = (whole_tiles(lists, channels) for channels in (3, 3, 1))
+        over_tiles(_forward, lists, table, behind, mean, variance, alpha)
+        ctx.lists = lists
+        ctx.save_for_backward(table, behind)
+        return mean, variance, alpha
 
     @staticmethod
-    @without_autocast
-    def backward(ctx: Any, to_mean: Tensor, to_variance: Tensor) -> tuple[Tensor | None, ...]:
-        table, multiplier, behind = ctx.saved_tensors
-        backward = _complete_backward if ctx.alpha or ctx.needs_input_grad[2] else _backward
-        rows, to_behind = table.new_empty(ctx.lists.gaussians.shape[0], 11), torch.empty_like(to_mean[:3])
-        fixed = (ctx.lists.slots, table, multiplier, behind, to_mean, to_variance)
-        over_tiles(backward, ctx.lists, *fixed, rows, to_behind)
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        table, behind = ctx.saved_tensors
+        complete = gradients[2] is not None or ctx.needs_input_grad[1]
+        rows, to_behind = table.new_empty(ctx.lists.gaussians.shape[0], 11), torch.empty_like(behind)
+        upstream = (torch.zeros_like(behind) if x is None else x for x in gradients)
+        kernel = _complete_backward if complete else _backward
+        over_tiles(kernel, ctx.lists, ctx.lists.slots, table, behind, *upstream, rows, to_behind)
         sums = sum_rows(rows, ctx.lists)
-        return None, None, sums[:, 9:], to_behind, *geometry_gradients(table, sums)
+        return None, sums[:, 9:], to_behind, *geometry_gradients(table, sums)
 
 
-def moments(splats: Splats, multiplier: Tensor, behind: Tensor, *, alpha: bool) -> tuple[Tensor, Tensor]:
-    """Return mean and variance of every pixel under random factors, (4, H, W) each, see `Engine.moments`."""
-    p = splats.projection
-    result: tuple[Tensor, Tensor] = _Moments.apply(  # type: ignore[no-untyped-call]
-        splats, alpha, multiplier, behind, p.means, p.factors, splats.opacities, splats.colors
+def moments(splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
+    """Composite mean and variance back to front, see `Engine.moments`."""
+    p, lists = splats.projection, splats.lists
+    images = _Moments.apply(  # type: ignore[no-untyped-call]
+        splats, multiplier, lists.padded(behind), p.means, p.factors, splats.opacities, splats.colors
     )
-    return result
+    mean, variance, alpha = (lists.cut(image) for image in images)
+    return MomentImages(mean, variance, alpha[0])
 
 
 def shares(splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
     """Return every splat's share of the weighted variance of the pixels, (M,), float64, see `Engine.shares`."""
     lists = splats.lists
     rows = torch.empty(lists.gaussians.shape[0], 1, dtype=torch.float64)
-    over_tiles(_shares, lists, lists.slots, make_table(splats), multiplier, behind, weights, rows)
+    table = make_table(splats, multiplier)
+    assert lists.slots is not None
+    over_tiles(_shares, lists, lists.slots, table, lists.padded(behind), lists.padded(weights[None]), rows)
     return sum_rows(rows, lists)[:, 0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,9 +14,9 @@ from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALP
 from reference_trainer.render.loops.compiling import inlined, kernel
 from reference_trainer.render.loops.harmonics import basis, basis_gradient
 from reference_trainer.render.loops.threads import in_threads
-from reference_trainer.render.precision import without_autocast
+from reference_trainer.render.splats import Projection
 
-__all__ = ["Projected", "project", "visible"]
+__all__ = ["project", "visible"]
 
 Array = Any
 f4 = np.float32
@@ -52,7 +52,7 @@ def visible(means: Tensor, opacities: Tensor, camera: Camera) -> tuple[Tensor, b
         camera.world_to_camera.contiguous().numpy(),
         seen,
     )
-    finite = all(in_threads(_visible, means.shape[0], *arguments, least=4096))
+    finite = all(in_threads(_visible, means.shape[0], *arguments, least=32768))
     return torch.from_numpy(np.flatnonzero(seen)), finite
 
 
@@ -136,6 +136,22 @@ def _towards(means: Array, i: int, position: Array) -> Any:
     return (x * inverse, y * inverse, z * inverse), inverse
 
 
+@inlined
+def _ellipse(means: Array, quaternions: Array, scales: Array, i: int, view: Array, lens: Array) -> Any:
+    """Project a Gaussian; return all that its gradient needs, the results last."""
+    x, y, z = _in_camera(means, i, view)
+    row_x, row_y = _rows(x / z, y / z, z, view, lens)
+    matrix, unit, scale = _rotation(quaternions, i)
+    ux, uy = _axes(matrix, row_x, scales[i]), _axes(matrix, row_y, scales[i])
+    xx, xy, yy = _dot(ux, ux) + _DILATION, _dot(ux, uy), _dot(uy, uy) + _DILATION
+    l22 = _ONE / math.sqrt(yy)
+    w, spread = _times(l22, uy), _DILATION * (xx + yy - _DILATION)
+    cross = _cross(ux, w)
+    l11 = _ONE / math.sqrt(_dot(cross, cross) + spread * (l22 * l22))
+    slopes, rotation, factor = (x / z, y / z, z), (matrix, unit, scale), (l11, l22)
+    return slopes, rotation, (row_x, row_y), (ux, uy), (w, spread, cross), (xx, xy, yy), factor
+
+
 @kernel
 def _forward(
     first: int, last: int, indices: Array, means: Array, quaternions: Array, scales: Array, sh: Array, degree: int,
@@ -147,15 +163,10 @@ def _forward(
     values = np.empty(16, f4)
     for k in range(first, last):
         i = indices[k]
-        x, y, z = _in_camera(means, i, view)
-        row_x, row_y = _rows(x / z, y / z, z, view, lens)
-        matrix, _, _ = _rotation(quaternions, i)
-        ux, uy = _axes(matrix, row_x, scales[i]), _axes(matrix, row_y, scales[i])
-        xx, xy, yy = _dot(ux, ux) + _DILATION, _dot(ux, uy), _dot(uy, uy) + _DILATION
-        l22 = _ONE / math.sqrt(yy)
-        cross = _cross(ux, _times(l22, uy))
-        l11 = _ONE / math.sqrt(_dot(cross, cross) + _DILATION * (xx + yy - _DILATION) * (l22 * l22))
-        centers[k, 0], centers[k, 1] = lens[0] * (x / z) + lens[2], lens[1] * (y / z) + lens[3]
+        (slope_x, slope_y, z), _, _, _, _, (xx, xy, yy), (l11, l22) = _ellipse(
+            means, quaternions, scales, i, view, lens
+        )
+        centers[k, 0], centers[k, 1] = lens[0] * slope_x + lens[2], lens[1] * slope_y + lens[3]
         factors[k, 0], factors[k, 1], factors[k, 2] = l11, -xy * (l22 * l22) * l11, l22
         covariances[k, 0], covariances[k, 1], covariances[k, 2] = xx, xy, yy
         depths[k] = z
@@ -185,18 +196,11 @@ def _backward(
     values = np.empty(16, f4)
     for k in range(first, last):
         i = indices[k]
-        x, y, z = _in_camera(means, i, view)
-        slope_x, slope_y = x / z, y / z
-        row_x, row_y = _rows(slope_x, slope_y, z, view, lens)
-        matrix, (qw, qx, qy, qz), scale = _rotation(quaternions, i)
+        (slope_x, slope_y, z), rotation, (row_x, row_y), (ux, uy), (w, spread, cross), (_, xy, _), (l11, l22) = (
+            _ellipse(means, quaternions, scales, i, view, lens)
+        )
+        matrix, (qw, qx, qy, qz), scale = rotation
         s = scales[i]
-        ux, uy = _axes(matrix, row_x, s), _axes(matrix, row_y, s)
-        xx, xy, yy = _dot(ux, ux) + _DILATION, _dot(ux, uy), _dot(uy, uy) + _DILATION
-        l22 = _ONE / math.sqrt(yy)
-        w = _times(l22, uy)
-        cross = _cross(ux, w)
-        spread = _DILATION * (xx + yy - _DILATION)
-        l11 = _ONE / math.sqrt(_dot(cross, cross) + spread * (l22 * l22))
         # l21 = -xy l22^2 l11, l11 = (cross^2 + spread l22^2)^(-1/2), l22 = yy^(-1/2)
         to_l11 = to_factors[k, 0] - to_factors[k, 1] * xy * l22 * l22
         to_xy = -to_factors[k, 1] * l22 * l22 * l11
@@ -268,17 +272,6 @@ def _backward(
         to_means[i, 2] += inverse * (tz - along * dz)
 
 
-class Projected(NamedTuple):
-    """M Gaussians that a camera may see; see `Projection`, and `Splats` for the colours."""
-
-    means: Tensor
-    factors: Tensor
-    covariances: Tensor
-    depths: Tensor
-    colors: Tensor
-    finite: bool
-
-
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -292,27 +285,26 @@ class _Project(torch.autograd.Function):
         view = (x.contiguous().numpy() for x in (camera.world_to_camera, camera.position))
         ctx.arguments = (*arrays, degree, next(view), np.array(lens, f4), next(view))
         outputs = [means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,))]
-        finite = all(in_threads(_forward, count, *ctx.arguments, *(x.numpy() for x in outputs), least=1024))
+        finite = all(in_threads(_forward, count, *ctx.arguments, *(x.numpy() for x in outputs), least=4096))
         ctx.save_for_backward(outputs[-1])
         ctx.mark_non_differentiable(outputs[2])
         return (*outputs, finite)
 
     @staticmethod
-    @without_autocast
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
         (colors,) = ctx.saved_tensors
         to_centers, to_factors, _, to_depths, to_colors, _ = gradients
         upstream = tuple(x.contiguous().numpy() for x in (colors, to_centers, to_factors, to_depths, to_colors))
         inputs = [torch.zeros(x.shape) for x in ctx.arguments[1:5]]
         outputs = tuple(x.numpy() for x in inputs)
-        in_threads(_backward, colors.shape[0], *ctx.arguments, *upstream, *outputs, least=1024)
+        in_threads(_backward, colors.shape[0], *ctx.arguments, *upstream, *outputs, least=4096)
         return (*inputs, None, None, None)
 
 
 def project(
     means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, indices: Tensor, camera: Camera, degree: int
-) -> Projected:
-    """Project some of N Gaussians and evaluate their colours.
+) -> tuple[Projection, Tensor, bool]:
+    """Project some of N Gaussians; return also their colours (M, 3), and whether all numbers are finite.
 
     Args:
         means: world coordinates, shape (N, 3).
@@ -323,4 +315,7 @@ def project(
         camera: the view.
         degree: highest band of ``sh``; -1 if these are colours.
     """
-    return Projected(*_Project.apply(means, quaternions, scales, sh, indices, camera, degree))  # type: ignore[no-untyped-call]
+    *projection, colors, finite = _Project.apply(  # type: ignore[no-untyped-call]
+        means, quaternions, scales, sh, indices, camera, degree
+    )
+    return Projection(*projection), colors, finite

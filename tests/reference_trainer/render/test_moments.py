@@ -32,7 +32,7 @@ def dense_moments(splats, multiplier, background, width, height):
     colors = splats.colors[order].expand(*alpha.shape, 3)
     background = background if background.ndim == 1 else background.permute(1, 2, 0)
     mean, variance = pixel_moments(alpha, colors, multiplier, background=background)
-    return (mean.permute(2, 0, 1), variance.permute(2, 0, 1), *alpha_moments(alpha, multiplier))
+    return (mean.permute(2, 0, 1), variance.permute(2, 0, 1), alpha_moments(alpha, multiplier)[0])
 
 
 def per_gaussian(n):
@@ -62,17 +62,12 @@ def test_moments_equal_the_closed_form_per_pixel(name, per_pixel, case):
     for mine, other in zip(ours, exact, strict=True):
         case.agrees(mine, other)
     assert (ours.variance >= 0).all()
-    without = render_moments(splats, MULTIPLIERS[name], background=background, alpha=False)
-    assert torch.equal(without.mean, ours.mean)
-    assert torch.equal(without.variance, ours.variance)
-    assert without.alpha_mean is None
-    assert without.alpha_variance is None
 
 
 @pytest.mark.parametrize("behind", [BACKGROUND, backdrop(13, 19)], ids=["one colour", "per pixel"])
 def test_gradients_equal_autograd_through_the_closed_form(behind, case):
     scene = random_scene(40, 19, 13, seed=7)
-    weights = torch.randn(8, 13, 19, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = torch.randn(7, 13, 19, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     gradients = []
     for dtype, route in ((case.dtype, render_moments), (torch.float64, None)):
         s, each = scene.to(dtype), per_gaussian(40)
@@ -93,7 +88,7 @@ def test_gradients_equal_autograd_through_the_closed_form(behind, case):
 def test_gradients_in_a_colour_or_a_variance_alone(case):
     """Upstream gradients that are absent, or are zero but for one image."""
     scene = random_scene(30, 19, 13, seed=8, size=0.2)
-    for pick in ("mean", "variance", "alpha_mean", "alpha_variance"):
+    for pick in ("mean", "variance", "alpha_mean"):
         gradients = []
         for dtype, route in ((case.dtype, render_moments), (torch.float64, dense_moments)):
             s = scene.to(dtype)
@@ -102,7 +97,7 @@ def test_gradients_in_a_colour_or_a_variance_alone(case):
             if route is render_moments:
                 image = getattr(route(splats, Multiplier.dropout(0.3)), pick)
             else:
-                names = ("mean", "variance", "alpha_mean", "alpha_variance")
+                names = ("mean", "variance", "alpha_mean")
                 black = torch.zeros(3, dtype=torch.float64)
                 image = dict(zip(names, route(splats, Multiplier.dropout(0.3), black, 19, 13), strict=True))[pick]
             image.square().sum().backward()
@@ -127,7 +122,7 @@ def test_moments_are_those_of_all_masks(case):
     splats = splat(*s[:4], s.camera, colors=s.colors)
     ours = render_moments(splats, Multiplier.dropout(p), background=BACKGROUND.to(case.dtype))
     case.agrees(torch.cat([ours.mean, ours.alpha_mean[None]]), mean)
-    case.agrees(torch.cat([ours.variance, ours.alpha_variance[None]]), square - mean**2)
+    case.agrees(ours.variance, (square - mean**2)[:3])
 
 
 def test_without_randomness_the_mean_is_the_render_and_the_variance_exactly_zero(case):

@@ -62,7 +62,7 @@ def results(scene, engine, dtype, weights, mask, random):
     splats = splat(*leaves[:4], s.camera, colors=leaves[4])
     if random:
         out = render_moments(splats, Multiplier(leaves[5], leaves[6]), background=leaves[7])
-        images = torch.cat([out.mean, out.variance, out.alpha_mean[None], out.alpha_variance[None]])
+        images = torch.cat([out.mean, out.variance, out.alpha_mean[None]])
     else:
         out = draw(splats, background=torch.tensor([0.2, 0.9, 0.5]), depth=True)
         images = torch.cat([out.image, out.alpha[None], out.depth[None]])

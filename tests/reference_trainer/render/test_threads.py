@@ -34,7 +34,7 @@ def everything(scene):
     out = draw(splats, depth=True)
     kept = draw(masked(splats, leaves[3] * (torch.arange(len(sh)) % 2)))
     moments = render_moments(splats, Multiplier.dropout(0.4))
-    images = (out.image, out.alpha, out.depth, kept.image, moments.mean, moments.variance, moments.alpha_variance)
+    images = (out.image, out.alpha, out.depth, kept.image, moments.mean, moments.variance, moments.alpha_mean)
     sum((x * torch.linspace(-1, 1, x.numel()).view(x.shape)).sum() for x in images).backward()
     shares = variance_shares(splats, Multiplier.dropout(0.4), torch.ones_like(out.alpha))
     lists = splats.lists

@@ -1,0 +1,258 @@
+"""What the kernels that walk over tiles share: a tile's pixels, the alphas of its list at them, and their gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from torch import Tensor
+
+from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
+from reference_trainer.render.loops.compiling import inlined, kernel
+from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.render.splats import Splats, TileLists
+
+__all__ = [
+    "CHUNK",
+    "PIXELS",
+    "X",
+    "Y",
+    "alpha_at",
+    "clamped",
+    "footprint",
+    "footprint_gradient",
+    "geometry_gradients",
+    "get_pixels",
+    "is_faint",
+    "longest_list",
+    "make_table",
+    "over_tiles",
+    "put_pixels",
+    "read_entries",
+    "sum_rows",
+    "whole_tiles",
+]
+
+Array = Any
+f4 = np.float32
+
+PIXELS = TILE * TILE
+CHUNK = 16
+"""Entries of a list that are read at once."""
+
+X = np.tile(np.arange(TILE, dtype=f4) - f4((TILE - 1) / 2), TILE)
+"""x of every pixel of a tile from its centre, row by row."""
+Y = np.repeat(np.arange(TILE, dtype=f4) - f4((TILE - 1) / 2), TILE)
+"""y likewise."""
+
+_ZERO, _ONE, _TWO, _MAX = f4(0), f4(1), f4(2), f4(MAX_ALPHA)
+_HALF = f4(0.5 * np.log2(np.e))  # exp(-x / 2) = 2^(-_HALF x)
+_FAINT = f4(np.log2(MIN_ALPHA))
+_ABSENT = f4(-1e4)  # binary logarithm of an opacity that is 0 everywhere
+
+# The polynomial of degree 5 with the least relative error (7.5e-8) of 2^x on [-1/2, 1/2].
+_P0, _P1, _P2 = f4(1.00000007165467), f4(0.69314696706436), f4(0.24022119723882)
+_P3, _P4, _P5 = f4(0.05550713274154), f4(0.00967554133273), f4(0.00132764717803)
+
+
+def make_table(splats: Splats, *more: Tensor) -> Tensor:
+    """Return x, y, l11, l21, l22, log2 of the opacity, red, green, blue, and more of M splats, shape (M, 9 or more)."""
+    projection, logarithms = splats.projection, torch.log2(splats.opacities)[:, None]
+    return torch.cat([projection.means, projection.factors, logarithms, splats.colors, *more], dim=1).detach()
+
+
+def whole_tiles(lists: TileLists, channels: int) -> Tensor:
+    """Return an empty image of whole tiles, (channels, 8 rows, 8 columns): kernels need not look at borders."""
+    return torch.empty(channels, TILE * lists.rows, TILE * lists.columns)
+
+
+def over_tiles(kernel: Any, lists: TileLists, *arguments: Tensor) -> None:
+    """Call a kernel for all tiles, with their lists and more tensors, of which it fills some that are contiguous."""
+    arrays = (x.detach().contiguous().numpy() for x in (lists.starts, lists.gaussians, *arguments))
+    in_threads(kernel, lists.columns * lists.rows, lists.columns, *arrays, least=16)
+
+
+def sum_rows(rows: Tensor, lists: TileLists) -> Tensor:
+    """Add up the rows of every Gaussian's entries, (P, C), always in the same order; shape (M, C)."""
+    assert lists.offsets is not None
+    sums = rows.new_empty(lists.offsets.shape[0] - 1, rows.shape[1])
+    in_threads(_sum_rows, sums.shape[0], lists.offsets.numpy(), rows.numpy(), sums.numpy(), least=4096)
+    return sums
+
+
+@kernel
+def _sum_rows(first: int, last: int, offsets: Array, rows: Array, sums: Array) -> None:
+    for i in range(first, last):
+        for column in range(rows.shape[1]):
+            sums[i, column] = 0
+        for row in range(offsets[i], offsets[i + 1]):
+            for column in range(rows.shape[1]):
+                sums[i, column] += rows[row, column]
+
+
+def geometry_gradients(table: Tensor, sums: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the gradients of means, factors, opacities and colours, given those of a table's rows (M, 9 or more)."""
+    # A splat that a mask has dropped has no logarithm, and a gradient of 0.
+    return sums[:, :2], sums[:, 2:5], sums[:, 5] / table[:, 5].exp2().clamp_min(MIN_ALPHA), sums[:, 6:9]
+
+
+@inlined
+def longest_list(first: Any, last: Any, starts: Any) -> Any:
+    """Return the length of the longest list of some tiles."""
+    longest = 0
+    for tile in range(first, last):
+        longest = max(longest, starts[tile + 1] - starts[tile])
+    return longest
+
+
+@inlined
+def get_pixels(image: Any, tile: Any, columns: Any, state: Any, place: Any) -> None:
+    """Copy a tile of an image (H, W) to a place of its state."""
+    top, left = tile // columns * TILE, tile % columns * TILE
+    for p in range(PIXELS):
+        state[place + p] = image[top + p // TILE, left + p % TILE]
+
+
+@inlined
+def put_pixels(state: Any, place: Any, image: Any, tile: Any, columns: Any) -> None:
+    """Copy them back."""
+    top, left = tile // columns * TILE, tile % columns * TILE
+    for p in range(PIXELS):
+        image[top + p // TILE, left + p % TILE] = state[place + p]
+
+
+@inlined
+def is_faint(table: Any, i: Any) -> Any:
+    """Whether a Gaussian cannot be seen anywhere, as one that a mask has dropped."""
+    return table[i, 5] < _FAINT
+
+
+@inlined
+def read_entries(
+    gaussians: Any, first: Any, last: Any, step: Any, table: Any, tile: Any, columns: Any, entries: Any
+) -> Any:
+    """Collect what pixels need of a part of a list, leaving out who cannot be seen.
+
+    Args:
+        gaussians: of all lists.
+        first: of them.
+        last: as of `range`.
+        step: 1 for nearest first, -1 for farthest first.
+        table: of the Gaussians.
+        tile: whose list it is.
+        columns: of tiles in the image.
+        entries: receives footprint, colour, and what else is in the table.
+
+    Returns:
+        How many there are; one more that is nowhere seen follows, so that they can be taken in pairs.
+    """
+    count = 0
+    for e in range(first, last, step):
+        i = gaussians[e]
+        if is_faint(table, i):
+            continue
+        entry = entries[count]
+        entry[0], entry[1], entry[2], entry[3], entry[4], entry[5] = footprint(table, i, tile, columns)
+        for column in range(6, table.shape[1]):
+            entry[column] = table[i, column]
+        count += 1
+    entries[count] = _ZERO
+    entries[count, 0] = _ABSENT
+    return count
+
+
+@inlined
+def _from_center(table: Any, i: Any, tile: Any, columns: Any) -> Any:
+    """Return the factor of a splat, its mean seen from the centre of a tile, and the product of both."""
+    l11, l21, l22 = table[i, 2], table[i, 3], table[i, 4]
+    dx = table[i, 0] - f4(tile % columns * TILE + TILE // 2)
+    dy = table[i, 1] - f4(tile // columns * TILE + TILE // 2)
+    return l11, l21, l22, dx, dy, l11 * dx + l21 * dy, l22 * dy
+
+
+@inlined
+def footprint(table: Any, i: Any, tile: Any, columns: Any) -> Any:
+    """Expand log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2 in 1, x, y, x^2, x y, y^2 around a tile's centre."""
+    # Squaring w1 and w2, which are small wherever alpha is not, avoids the cancellation of a dx^2 + 2 b dx dy + c dy^2.
+    l11, l21, l22, _, _, w1, w2 = _from_center(table, i, tile, columns)
+    return (
+        table[i, 5] - _HALF * (w1 * w1 + w2 * w2),
+        _TWO * _HALF * l11 * w1,
+        _TWO * _HALF * (l21 * w1 + l22 * w2),
+        -_HALF * l11 * l11,
+        -_TWO * _HALF * l11 * l21,
+        -_HALF * (l21 * l21 + l22 * l22),
+    )
+
+
+@inlined
+def alpha_at(polynomial: Any, p: Any) -> Any:
+    """Return a splat's alpha at a pixel of the tile before the clamp; 0 below `MIN_ALPHA`."""
+    c, cx, cy, cxx, cxy, cyy = polynomial
+    x, y = X[p], Y[p]
+    exponent = c + x * (cx + cxx * x + cxy * y) + y * (cy + cyy * y)
+    part, power = _split(exponent)
+    raw = power * (_P0 + part * (_P1 + part * (_P2 + part * (_P3 + part * (_P4 + part * _P5)))))
+    return raw if exponent > _FAINT else _ZERO
+
+
+@inlined
+def clamped(raw: Any) -> Any:
+    """Return an alpha that is at most `MAX_ALPHA`."""
+    return raw if raw < _MAX else _MAX
+
+
+@intrinsic
+def _split(_context: Any, _exponent: Any) -> Any:
+    """Return x less the nearest integer n, and 2^n (nothing of use below -126, where every alpha is cut off).
+
+    `math.exp2` is a call for every number; this is a few instructions for eight or sixteen of them.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        single, whole = ir.FloatType(), ir.IntType(32)
+        nearest = builder.call(builder.module.declare_intrinsic("llvm.rint", [single]), arguments)
+        biased = builder.add(builder.fptosi(nearest, whole), ir.Constant(whole, 127))
+        power = builder.bitcast(builder.shl(biased, ir.Constant(whole, 23)), single)
+        return context.make_tuple(builder, signature.return_type, [builder.fsub(arguments[0], nearest), power])
+
+    return types.UniTuple(types.float32, 2)(types.float32), generate
+
+
+@inlined
+def footprint_gradient(table: Any, i: Any, tile: Any, columns: Any, slopes: Any, row: Any) -> None:
+    """Carry the gradient from a splat's ln alpha to its geometry.
+
+    Args:
+        table: of the Gaussians.
+        i: the Gaussian.
+        tile: where.
+        columns: of tiles in the image.
+        slopes: gradient of ln alpha at every pixel of the tile.
+        row: receives the gradients of x, y, l11, l21, l22 and ln o.
+    """
+    s, sx, sy, sxx, sxy, syy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+    for q in range(TILE):  # column by column: x is factored out
+        d, dy, dyy = _ZERO, _ZERO, _ZERO
+        for p in range(0, PIXELS, TILE):
+            d += slopes[p + q]
+            dy += slopes[p + q] * Y[p]
+            dyy += slopes[p + q] * (Y[p] * Y[p])
+        s += d
+        sx += d * X[q]
+        sxx += d * (X[q] * X[q])
+        sy += dy
+        sxy += dy * X[q]
+        syy += dyy
+    l11, l21, l22, dx, dy, w1, w2 = _from_center(table, i, tile, columns)
+    to_w1, to_w2 = l11 * sx + l21 * sy - w1 * s, l22 * sy - w2 * s
+    row[0] = l11 * to_w1
+    row[1] = l21 * to_w1 + l22 * to_w2
+    row[2] = w1 * sx - l11 * sxx - l21 * sxy + dx * to_w1
+    row[3] = w1 * sy - l11 * sxy - l21 * syy + dy * to_w1
+    row[4] = w2 * sy - l22 * syy + dy * to_w2
+    row[5] = s
