@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -19,14 +21,15 @@ def cuda_on_cpu() -> Iterator[None]:
     """Let torch functions of this thread take the CPU wherever they are told to take a CUDA device.
 
     With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
-    ``.cuda()`` of tensors and modules mean the CPU, and ``torch.cuda.Event``, ``synchronize``, ``set_device``,
-    ``current_device`` and ``reset_peak_memory_stats`` are harmless; everything is restored at the end.
+    ``.cuda()`` of tensors and modules, and ``torch.load(map_location="cuda")`` mean the CPU, and ``torch.cuda.Event``,
+    ``synchronize``, ``set_device``, ``current_device`` and ``reset_peak_memory_stats`` are harmless; everything is
+    restored at the end.
     ``torch.cuda.is_available()`` stays False.
 
     A tensor that is moved to "cuda" is the same tensor, as on a real device if it were there already: what is written
     into one of them in place is written into the other.
 
-    Not covered: ``torch.load(map_location="cuda")``, ``torch.Generator("cuda")``, CUDA streams, and other threads.
+    Not covered: ``torch.Generator("cuda")``, CUDA streams, and other threads.
 
     Example:
         >>> with cuda_on_cpu():
@@ -36,15 +39,9 @@ def cuda_on_cpu() -> Iterator[None]:
     if torch.cuda.is_available():
         yield
         return
-    originals = {name: getattr(torch.cuda, name) for name in _STAND_INS}
-    try:
-        for name, value in _STAND_INS.items():
-            setattr(torch.cuda, name, value)
-        with _CudaMeansCpu():
-            yield
-    finally:
-        for name, value in originals.items():
-            setattr(torch.cuda, name, value)
+    load = _load_on_cpu(torch.load)
+    with patch.multiple(torch.cuda, **_STAND_INS), patch.object(torch, "load", load), _CudaMeansCpu():
+        yield
 
 
 class _CudaMeansCpu(TorchFunctionMode):
@@ -60,6 +57,16 @@ class _CudaMeansCpu(TorchFunctionMode):
         if func is Tensor.cuda:
             return args[0]
         return func(*map(_on_cpu, args), **{name: _on_cpu(value) for name, value in (kwargs or {}).items()})
+
+
+def _load_on_cpu(load: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `torch.load`, which is no function of tensors, for a machine without CUDA."""
+
+    @functools.wraps(load)
+    def load_on_cpu(f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
+        return load(f, _on_cpu(map_location), *args, **kwargs)
+
+    return load_on_cpu
 
 
 def _on_cpu(value: Any) -> Any:

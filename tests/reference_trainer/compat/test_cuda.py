@@ -93,3 +93,13 @@ def test_with_a_device_nothing_changes():
     with cuda_on_cpu():
         assert torch.cuda.Event is before
         assert torch.zeros(1, device="cuda").is_cuda
+
+
+@without_cuda
+def test_a_file_of_a_card_is_loaded(tmp_path):
+    load = torch.load
+    torch.save({"x": torch.ones(2)}, tmp_path / "x.pt")
+    with cuda_on_cpu():
+        for place in ("cuda:0", CUDA, None):
+            assert torch.load(tmp_path / "x.pt", map_location=place, weights_only=True)["x"].device.type == "cpu"
+    assert torch.load is load
