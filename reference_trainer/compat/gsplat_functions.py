@@ -8,6 +8,7 @@ import inspect
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from types import ModuleType
 from typing import Any, NoReturn
 from unittest.mock import patch
 
@@ -28,25 +29,27 @@ def gsplat_functions() -> Iterator[None]:
     Raises:
         ImportError: if gsplat is missing.
     """
-    try:
-        gsplat = importlib.import_module("gsplat")
-    except ModuleNotFoundError as error:
-        raise ImportError("the stand-in for gsplat's kernels needs the rest of gsplat: pip install gsplat.") from error
-    rendering = importlib.import_module("gsplat.rendering")
-    distributed = importlib.import_module("gsplat.distributed")
-    original = rendering.rasterization
-    stand_ins = {
-        original: make_rasterization(original, per_axis=_per_axis(gsplat.__version__)),
-        rendering.rasterization_2dgs: _refusing(rendering.rasterization_2dgs),
-        importlib.import_module("gsplat.relocation").compute_relocation: compute_relocation,
-        gsplat.quat_scale_to_covar_preci: quat_scale_to_covar_preci,
-        distributed.cli: _run_once,
-    }
     with ExitStack() as undo:
-        # What gsplat finds in the place of its compiled code, when it first looks for it.
-        undo.enter_context(patch.object(gsplat, "csrc", _NoKernels(), create=True))
-        sys.modules.pop("gsplat.cuda._backend", None)
-        undo.callback(sys.modules.pop, "gsplat.cuda._backend", None)
+        for name, module in {"gsplat.csrc": _no_kernels(), "gsplat.cuda._backend": None}.items():
+            undo.callback(_put_module, name, sys.modules.get(name))
+            _put_module(name, module)
+        try:
+            gsplat = importlib.import_module("gsplat")
+        except ModuleNotFoundError as error:
+            raise ImportError(
+                "the stand-in for gsplat's kernels needs the rest of gsplat: pip install gsplat."
+            ) from error
+        rendering, relocation, distributed = (
+            importlib.import_module(f"gsplat.{name}") for name in ("rendering", "relocation", "distributed")
+        )
+        original = rendering.rasterization
+        stand_ins = {
+            original: make_rasterization(original, per_axis=_per_axis(gsplat.__version__)),
+            rendering.rasterization_2dgs: _refusing(rendering.rasterization_2dgs),
+            relocation.compute_relocation: compute_relocation,
+            gsplat.quat_scale_to_covar_preci: quat_scale_to_covar_preci,
+            distributed.cli: _run_once,
+        }
         for name, module in list(sys.modules.items()):
             if name.partition(".")[0] == "gsplat":
                 for attribute, value in list(vars(module).items()):
@@ -55,11 +58,23 @@ def gsplat_functions() -> Iterator[None]:
         yield
 
 
-class _NoKernels:
-    """Compiled code that is not there."""
+def _put_module(name: str, module: ModuleType | None) -> None:
+    """Let a module be found by its name, or not; where gsplat holds its compiled code, or looks for it."""
+    if module is None:
+        sys.modules.pop(name, None)
+    else:
+        sys.modules[name] = module
 
-    def __getattr__(self, name: str) -> NoReturn:
-        raise _without_cuda(name)
+
+def _no_kernels() -> ModuleType:
+    """Make a module for compiled code that is not there."""
+
+    def refuse(name: str) -> NoReturn:
+        raise AttributeError(name) if name.startswith("__") else _without_cuda(name)
+
+    module = ModuleType("gsplat.csrc")
+    module.__getattr__ = refuse  # type: ignore[method-assign]
+    return module
 
 
 def _refusing(function: Callable[..., Any]) -> Callable[..., Any]:

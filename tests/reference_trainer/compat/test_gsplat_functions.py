@@ -23,7 +23,7 @@ def train(strategy, steps=12):
     optimizers = {k: torch.optim.Adam([{"params": x, "lr": 0.02, "name": k}]) for k, x in params.items()}
     strategy.check_sanity(params, optimizers)
     state, losses = strategy.initialize_state(), []
-    for step in range(steps):
+    for step in range(1, steps + 1):  # older versions reset the opacities at step 0
         image, _, info = gsplat.rasterization(
             params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid(),
             params["colors"].sigmoid(), scene.camera.world_to_camera[None], intrinsics(scene.camera)[None].float(),
@@ -78,16 +78,15 @@ def test_everything_is_replaced_everywhere_and_restored():
     finally:
         uninstall()
     assert functions() == before
-    assert not hasattr(gsplat, "csrc")
-    assert {"fused_ssim", "gsplat.cuda._backend"}.isdisjoint(sys.modules)
+    assert {"fused_ssim", "gsplat.csrc"}.isdisjoint(sys.modules)
 
 
 def test_what_needs_cuda_says_so_by_its_name():
     with stand_in():
         with pytest.raises(RuntimeError, match="gsplat's rasterization_2dgs needs CUDA"):
             gsplat.rasterization_2dgs()
-        with pytest.raises(RuntimeError, match="gsplat's intersect_tile needs CUDA"):
-            gsplat.isect_tiles(torch.zeros(1, 1, 2), torch.ones(1, 1, 2, dtype=torch.int32), torch.ones(1, 1), 16, 1, 1)
+        with pytest.raises(RuntimeError, match=r"gsplat's \w+_fwd needs CUDA"):
+            gsplat.spherical_harmonics(0, torch.ones(1, 3), torch.ones(1, 1, 3))
 
 
 def test_without_gsplat_its_name_is_in_the_message(monkeypatch):
