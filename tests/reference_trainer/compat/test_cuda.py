@@ -1,5 +1,7 @@
 """Code that says "cuda", on a machine without."""
 
+import threading
+
 import pytest
 import torch
 
@@ -103,3 +105,14 @@ def test_a_file_of_a_card_is_loaded(tmp_path):
         for place in ("cuda:0", CUDA, None):
             assert torch.load(tmp_path / "x.pt", map_location=place, weights_only=True)["x"].device.type == "cpu"
     assert torch.load is load
+
+
+@without_cuda
+def test_threads_that_are_started_within_the_block_are_covered():
+    start, found = threading.Thread.start, []
+    with cuda_on_cpu():
+        thread = threading.Thread(target=lambda: found.append(torch.zeros(2, device="cuda").device.type))
+        thread.start()
+        thread.join()
+    assert found == ["cpu"]
+    assert threading.Thread.start is start
