@@ -22,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from ._call import Call, chain_of
+from ._tally import Tally
 from ._watch import Watch
 
 __all__ = ["Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized"]
@@ -221,6 +222,17 @@ class Installation:
         """Number of calls, of all functions, that were regularized as training."""
         return sum(function.trained for function in self.functions.values())
 
+    @property
+    def tally(self) -> Tally:
+        """What was done, in the launcher's terms."""
+        evaluated = {id(function): function.evaluated for function in self.functions.values()}
+        return Tally(regularized=self.trained, scaled=sum(evaluated.values()))
+
+    def problem(self) -> str | None:
+        """Say that the training was not regularized, and the way out; None if it was, or if patience is 0."""
+        shortfall = self._watch.patience and self.tally.shortfall(self._watch.steps)
+        return f"{shortfall} {_explain()}" if shortfall else None
+
     def uninstall(self) -> None:
         """Put back what was there; a second call does nothing."""
         self._watch.stop()
@@ -240,8 +252,8 @@ class Installation:
             RuntimeError: if Gaussians were trained, and no call was regularized.
         """
         self.uninstall()
-        if error is None and self._watch.patience and self._watch.steps and not self.trained:
-            raise RuntimeError(f"The training was not regularized. {_explain()}")
+        if error is None and self._watch.steps and (problem := self.problem()):
+            raise RuntimeError(problem)
 
 
 def install(regularizer: nn.Module, *, generator: torch.Generator | None = None, patience: int = 100) -> Installation:

@@ -1,10 +1,12 @@
-"""Regularize a training script of the INRIA family without editing it: `python -m ca_reg.integrations.run`.
+"""Regularize a training script without editing it: `python -m ca_reg.integrations.run`.
 
     python -m ca_reg.integrations.run --dropout 0.2 train.py -s scene -m output --iterations 10000
+    python -m ca_reg.integrations.run --dropout 0.2 simple_trainer.py default --data_dir scene
 
-runs ``train.py`` as Python itself would, with a :class:`~ca_reg.integrations.inria.RasterizerHook` in force, and says
-at the end, however that comes about, what was regularized. The options of this launcher stand before the script, all
-that follows belongs to the script; ``-m module arguments...`` runs a module instead.
+runs the script as Python itself would, with a :class:`~ca_reg.integrations.inria.RasterizerHook` in force, or, if it
+imports gsplat, with :func:`~ca_reg.integrations.gsplat.install`, and says at the end, however that comes about, what
+was regularized. The options of this launcher stand before the script, all that follows belongs to the script; ``-m
+module arguments...`` runs a module instead.
 
 The exit code is that of the script, and not 0 if the script succeeded but was not regularized; a training of which this
 shows earlier is ended.
@@ -25,10 +27,14 @@ from ca_reg import Chain, GaussianDropout, OpacityNoise
 from ca_reg.regularizers import parse
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
-from ._script import run_script, set_command_line
+from ._gsplat_hook import GsplatHook
+from ._rasterizer import MODULES
+from ._script import imported_packages, run_script, set_command_line
 from .inria import RasterizerHook, Scope, Steps
 
 __all__ = ["main"]
+
+_OF_INRIA = ("scope", "outputs", "steps", "viewer", "allow_zeros")  # options that mean nothing to a script of gsplat's
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -38,21 +44,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: of the launcher, the script and the arguments of the script; those of the process by default.
     """
     options = _parse(arguments)
-    hook: RasterizerHook | None = options.hook
+    hook: RasterizerHook | GsplatHook | None = options.hook
     set_command_line(options.script, options.arguments)
     with _reported(options, hook), ExitStack() as undo:
         if options.cpu:
             from reference_trainer.compat import stand_in
 
             root = options.script.resolve().parent if isinstance(options.script, Path) else Path.cwd()
-            undo.enter_context(stand_in(root, outputs=options.outputs))
+            undo.enter_context(stand_in() if options.gsplat else stand_in(root, outputs=options.outputs))
         if hook is not None:
             hook.install()
             undo.callback(_uninstall, hook)
         run_script(options.script)
 
 
-def _uninstall(hook: RasterizerHook) -> None:
+def _uninstall(hook: RasterizerHook | GsplatHook) -> None:
     """Uninstall a hook unless the script has wrapped the class once more."""
     with suppress(RuntimeError):
         hook.uninstall()
@@ -62,7 +68,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Read and check the options before anything runs; `hook` is what they ask for."""
     parser = argparse.ArgumentParser(
         prog="python -m ca_reg.integrations.run",
-        description="Run a training or render script of the INRIA 3DGS family, regularized, with no edit.",
+        description="Run a training or render script of the INRIA 3DGS family or of gsplat, regularized, with no edit.",
         usage="%(prog)s [options] {script.py | -m module} [arguments of the script]",
         allow_abbrev=False,
     )
@@ -76,7 +82,11 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--scope", choices=get_args(Scope), default="main", help="first training render of an iteration, or all")
     add("--seed", type=int, default=0, help="of masks and noise (default: 0); the script's random numbers are its own")
     add("--report", type=Path, metavar="FILE", help="write what was done as JSON, too")
-    add("--cpu", action="store_true", help="run without CUDA: a stand-in for the rasterizer of the code base")
+    add(
+        "--cpu",
+        action="store_true",
+        help="run without CUDA: a stand-in for the rasterizer of the code base, or gsplat's",
+    )
     add(
         "--outputs",
         type=lambda text: int(text) if text.isdigit() else text,
@@ -102,6 +112,13 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
             parser.error(f"there is no module {options.script}")
     elif options.script is None or not options.script.is_file():
         parser.error(f"there is no script {options.script or ''}".rstrip())
+    packages = imported_packages(options.script)
+    options.gsplat = "gsplat" in packages and packages.isdisjoint(MODULES)
+    meaningless = [name for name in _OF_INRIA if getattr(options, name) != parser.get_default(name)]
+    if options.gsplat and meaningless:
+        parser.error(
+            f"{options.script} renders with gsplat, for which there is no --{meaningless[0].replace('_', '-')}"
+        )
     if options.patience < 0:
         parser.error("--patience must be at least 0")
     if options.report is not None:
@@ -117,7 +134,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def _hook(options: argparse.Namespace) -> RasterizerHook | None:
+def _hook(options: argparse.Namespace) -> RasterizerHook | GsplatHook | None:
     """Make the hook that the options ask for; None if they ask for no regularizer."""
 
     def scheduled(rate: float) -> Schedule:
@@ -132,6 +149,8 @@ def _hook(options: argparse.Namespace) -> RasterizerHook | None:
             members.append(kind(scheduled(rate)))
     if not members:
         return None
+    if options.gsplat:
+        return GsplatHook(Chain(*members), seed=options.seed, patience=options.patience)
     return RasterizerHook(
         Chain(*members),
         scope=options.scope,
@@ -144,7 +163,7 @@ def _hook(options: argparse.Namespace) -> RasterizerHook | None:
 
 
 @contextmanager
-def _reported(options: argparse.Namespace, hook: RasterizerHook | None) -> Iterator[None]:
+def _reported(options: argparse.Namespace, hook: RasterizerHook | GsplatHook | None) -> Iterator[None]:
     """Say at the end, whatever it is, what was done; exit with 1 if that is not what was asked for."""
     ended, problem = "finished", None
     try:

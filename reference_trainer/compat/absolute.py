@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from reference_trainer.render import Splats
+from reference_trainer.render import Rendering, Splats
 from reference_trainer.render.eager.formulas import blend_weights, over
 from reference_trainer.render.eager.walk import blocks, geometry_rows, pad_entries, pixel_offsets, tile
 
@@ -26,18 +26,19 @@ def splat_weights(splats: Splats) -> Tensor:
     return sums[:-1]
 
 
-def absolute_gradients(splats: Splats, gradient: Tensor, background: Tensor) -> Tensor:
+def absolute_gradients(splats: Splats, values: Tensor, gradient: Tensor, background: Tensor) -> Tensor:
     """Sum the absolute values of the gradients that the pixels give to a splat's position (AbsGS).
 
     Args:
         splats: of a rendering, without gradients.
-        gradient: of the loss with respect to the image, shape (3, H, W).
-        background: colour behind everything, shape (3,).
+        values: of the splats that were drawn, shape (M, C).
+        gradient: of the loss with respect to their picture and the accumulated alpha, shape (C + 1, H, W).
+        background: values behind everything, shape (C,).
 
     Returns:
         Sums of absolute values in x and y, loss per pixel of displacement, shape (M, 2).
     """
-    rows = pad_entries(torch.cat([geometry_rows(splats), splats.colors.T]))
+    rows = pad_entries(torch.cat([geometry_rows(splats), values.T]))
     upstream = tile(gradient, splats.lists)
     behind = background.to(gradient)[:, None]
     sums = rows.new_zeros(2, rows.shape[1])
@@ -46,8 +47,8 @@ def absolute_gradients(splats: Splats, gradient: Tensor, background: Tensor) -> 
         entries = rows[:, block.gaussians]
         raw = block.alphas(entries[:6]).requires_grad_()
         with torch.enable_grad():
-            image = over(blend_weights(raw), entries[6:], behind)[:, :3]
-        (to_raw,) = torch.autograd.grad(image, raw, upstream[block.tiles])
+            drawn = over(blend_weights(raw), entries[6:], behind)
+        (to_raw,) = torch.autograd.grad(drawn, raw, upstream[block.tiles])
         # ln alpha falls by half the square of (l11 dx + l21 dy, l22 dy); its gradient in the position is that of alpha
         # divided by alpha.
         x, y, l11, l21, l22 = entries[:5, :, None]
@@ -59,31 +60,40 @@ def absolute_gradients(splats: Splats, gradient: Tensor, background: Tensor) -> 
 
 
 class _AbsoluteGradients(torch.autograd.Function):
-    """The image unchanged; on the way back the sums of absolute gradients go to an input of their own."""
+    """The picture unchanged; on the way back the sums of absolute gradients go to an input of their own."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, sink: Tensor, splats: Splats, background: Tensor) -> Tensor:
-        ctx.splats, ctx.background = splats, background
-        return image.view_as(image)
+    def forward(ctx: Any, drawn: Tensor, sink: Tensor, *rest: Any) -> Tensor:
+        ctx.rest = rest
+        return drawn.view_as(drawn)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
-        return gradients[0], absolute_gradients(ctx.splats, gradients[0], ctx.background), None, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        splats, values, background = ctx.rest
+        return gradients[0], absolute_gradients(splats, values, gradients[0], background), None, None, None
 
 
-def with_absolute_gradients(image: Tensor, sink: Tensor, splats: Splats, background: Tensor) -> Tensor:
-    """Return the image, whose backward pass also delivers `absolute_gradients`.
+def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tensor | None = None) -> Rendering:
+    """Return the rendering, whose backward pass also delivers `absolute_gradients`.
 
     Args:
-        image: rendered from the splats, shape (3, H, W).
+        rendering: of some splats.
         sink: receives them as its gradient; its values do not matter, shape (M, 2).
-        splats: of the image.
-        background: of the image, shape (3,).
+        background: of the image, shape (3,); black by default.
     """
+    splats = rendering.splats
     detached = splats._replace(
         projection=type(splats.projection)(*(x.detach() for x in splats.projection)),
         opacities=splats.opacities.detach(),
         colors=splats.colors.detach(),
     )
-    result: Tensor = _AbsoluteGradients.apply(image, sink, detached, background)  # type: ignore[no-untyped-call]
-    return result
+    planes, values = [*rendering.image], [detached.colors]
+    behind = splats.colors.new_zeros(3) if background is None else background.detach()
+    if rendering.depth is not None:
+        planes.append(rendering.depth)
+        values.append(detached.projection.depths[:, None])
+        behind = torch.cat([behind, behind.new_zeros(1)])
+    drawn = torch.stack([*planes, rendering.alpha])
+    drawn = _AbsoluteGradients.apply(drawn, sink, detached, torch.cat(values, 1), behind)  # type: ignore[no-untyped-call]
+    depth = None if rendering.depth is None else drawn[3]
+    return rendering._replace(image=drawn[:3], alpha=drawn[-1], depth=depth)

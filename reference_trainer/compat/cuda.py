@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -16,17 +19,20 @@ __all__ = ["cuda_on_cpu"]
 
 @contextmanager
 def cuda_on_cpu() -> Iterator[None]:
-    """Let torch functions of this thread take the CPU wherever they are told to take a CUDA device.
+    """Let torch functions take the CPU wherever they are told to take a CUDA device.
 
     With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
-    ``.cuda()`` of tensors and modules mean the CPU, and ``torch.cuda.Event``, ``synchronize``, ``set_device``,
-    ``current_device`` and ``reset_peak_memory_stats`` are harmless; everything is restored at the end.
+    ``.cuda()`` of tensors and modules, and ``torch.load(map_location="cuda")`` mean the CPU, and ``torch.cuda.Event``,
+    ``synchronize``, ``set_device``, ``current_device`` and ``reset_peak_memory_stats`` are harmless; everything is
+    restored at the end.
     ``torch.cuda.is_available()`` stays False.
 
     A tensor that is moved to "cuda" is the same tensor, as on a real device if it were there already: what is written
     into one of them in place is written into the other.
 
-    Not covered: ``torch.load(map_location="cuda")``, ``torch.Generator("cuda")``, CUDA streams, and other threads.
+    It holds for this thread and for those that are started within the block, such as a viewer's.
+
+    Not covered: ``torch.Generator("cuda")`` and CUDA streams.
 
     Example:
         >>> with cuda_on_cpu():
@@ -36,15 +42,12 @@ def cuda_on_cpu() -> Iterator[None]:
     if torch.cuda.is_available():
         yield
         return
-    originals = {name: getattr(torch.cuda, name) for name in _STAND_INS}
-    try:
-        for name, value in _STAND_INS.items():
-            setattr(torch.cuda, name, value)
-        with _CudaMeansCpu():
-            yield
-    finally:
-        for name, value in originals.items():
-            setattr(torch.cuda, name, value)
+    with ExitStack() as undo:
+        undo.enter_context(patch.multiple(torch.cuda, **_STAND_INS))
+        undo.enter_context(patch.object(torch, "load", _load_on_cpu(torch.load)))
+        undo.enter_context(patch.object(threading.Thread, "start", _start_on_cpu(threading.Thread.start)))
+        undo.enter_context(_CudaMeansCpu())
+        yield
 
 
 class _CudaMeansCpu(TorchFunctionMode):
@@ -60,6 +63,33 @@ class _CudaMeansCpu(TorchFunctionMode):
         if func is Tensor.cuda:
             return args[0]
         return func(*map(_on_cpu, args), **{name: _on_cpu(value) for name, value in (kwargs or {}).items()})
+
+
+def _load_on_cpu(load: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `torch.load`, which is no function of tensors, for a machine without CUDA."""
+
+    @functools.wraps(load)
+    def load_on_cpu(f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
+        return load(f, _on_cpu(map_location), *args, **kwargs)
+
+    return load_on_cpu
+
+
+def _start_on_cpu(start: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
+    """Return `threading.Thread.start` for threads without CUDA: a mode of torch functions ends at its thread."""
+
+    @functools.wraps(start)
+    def start_on_cpu(thread: threading.Thread) -> None:
+        run = thread.run
+
+        def run_on_cpu() -> None:
+            with _CudaMeansCpu():
+                run()
+
+        thread.run = run_on_cpu  # type: ignore[method-assign]
+        start(thread)
+
+    return start_on_cpu
 
 
 def _on_cpu(value: Any) -> Any:

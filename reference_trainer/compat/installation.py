@@ -1,38 +1,31 @@
-"""Put the stand-ins in the place of the CUDA extensions that a foreign repository imports."""
+"""Put the stand-ins in the place of the CUDA extensions that a foreign repository imports, or of gsplat's functions."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
 
 from reference_trainer.compat.cuda import cuda_on_cpu
+from reference_trainer.compat.gsplat_functions import gsplat_functions
 from reference_trainer.compat.neighbors import neighbor_modules
 from reference_trainer.compat.rasterizer import rasterizer_module
 from reference_trainer.compat.repository import Interface, Outputs, read_interface
+from reference_trainer.compat.similarity import similarity_module
 
 __all__ = ["install", "install_in_worker", "stand_in", "uninstall"]
 
 _active = ExitStack()
 
 
-def install(repository: str | Path, outputs: Outputs | None = None) -> tuple[str, ...]:
-    """Let a repository's imports of its CUDA extensions find the stand-ins, until `uninstall`.
-
-    Args:
-        repository: its root; its source tells which variants it expects.
-        outputs: what its rasterizer returns, if its source does not tell: 2 (colour, radii), 4 (colour, radii, depth,
-            alpha), or three, the third of which is a "depth" or an "inverse-depth".
+def install(repository: str | Path | None = None, outputs: Outputs | None = None) -> tuple[str, ...]:
+    """Do what `stand_in` does, until `uninstall`; same arguments and exceptions.
 
     Returns:
         The names of the modules.
-
-    Raises:
-        RuntimeError: if the extensions, or stand-ins for them, are imported already.
-        ValueError: if the variant cannot be told.
     """
     names = _active.enter_context(stand_in(repository, outputs))
     return names
@@ -44,32 +37,37 @@ def uninstall() -> None:
 
 
 @contextmanager
-def stand_in(repository: str | Path, outputs: Outputs | None = None) -> Iterator[tuple[str, ...]]:
-    """Let a repository run without CUDA: `install` within a block, with "cuda" mapped to the CPU.
+def stand_in(repository: str | Path | None = None, outputs: Outputs | None = None) -> Iterator[tuple[str, ...]]:
+    """Let a repository of the INRIA family, or scripts that call gsplat, run without CUDA within a block.
 
-    The extensions are ``diff_gaussian_rasterization`` (or ``diff_gaussian_rasterization_abs``) and ``simple_knn``. If
-    there is a CUDA device, only they are replaced and "cuda" stays what it is. Modules of the repository that were
-    imported within the block keep the stand-ins. Worker processes that start afresh, as those of data loaders do on
-    macOS, find them as well: by a temporary folder at the end of the search path, which such processes inherit.
+    The extensions of the INRIA family are ``diff_gaussian_rasterization`` (or ``diff_gaussian_rasterization_abs``) and
+    ``simple_knn``. For gsplat its functions are replaced (`gsplat_functions`), and ``fused_ssim``, which its trainer
+    imports. "cuda" is mapped to the CPU; if there is a CUDA device, it stays what it is. Modules that were imported
+    within the block keep the stand-ins. Worker processes that start afresh, as those of data loaders do on macOS, find
+    the extensions as well: by a temporary folder at the end of the search path, which such processes inherit.
 
     Args:
-        repository: as for `install`.
-        outputs: as for `install`.
+        repository: its root; its source tells which variants of the extensions it expects. None for gsplat.
+        outputs: what its rasterizer returns, if its source does not tell: 2 (colour, radii), 4 (colour, radii, depth,
+            alpha), or three, the third of which is a "depth" or an "inverse-depth".
 
     Yields:
         The names of the modules.
 
     Raises:
-        RuntimeError: as `install`.
-        ValueError: as `install`.
+        RuntimeError: if the extensions, or stand-ins for them, are imported already.
+        ValueError: if the variant cannot be told.
+        ImportError: if gsplat is missing, for which this is to be done.
 
     Example:
         >>> with stand_in("a/repository", outputs=2) as modules:
         ...     from diff_gaussian_rasterization import GaussianRasterizer
         >>> modules
         ('diff_gaussian_rasterization', 'simple_knn', 'simple_knn._C')
+        >>> with stand_in():  # doctest: +SKIP
+        ...     import simple_trainer  # gsplat's
     """
-    interface = read_interface(Path(repository), outputs)
+    interface = None if repository is None else read_interface(Path(repository), outputs)
     modules = _modules(interface)
     present = [name for name in modules if name in sys.modules]
     if present:
@@ -77,7 +75,7 @@ def stand_in(repository: str | Path, outputs: Outputs | None = None) -> Iterator
             f"{', '.join(present)} {'is' if len(present) == 1 else 'are'} imported already: start a new process, and "
             "install the stand-in before the repository is imported; or uninstall() an earlier one."
         )
-    with cuda_on_cpu(), _importable(interface):
+    with cuda_on_cpu(), _importable(modules, interface), nullcontext() if interface else gsplat_functions():
         sys.modules.update(modules)
         try:
             yield tuple(modules)
@@ -86,20 +84,20 @@ def stand_in(repository: str | Path, outputs: Outputs | None = None) -> Iterator
                 sys.modules.pop(name, None)
 
 
-def install_in_worker(rasterizer: str, members: tuple[str, ...], neighbor_indices: bool) -> None:
+def install_in_worker(interface: tuple[str, tuple[str, ...], bool] | None) -> None:
     """Install the stand-ins in a worker process, for as long as it lives.
 
     Args:
-        rasterizer: see `reference_trainer.compat.repository.Interface`.
-        members: likewise.
-        neighbor_indices: likewise.
+        interface: the fields of `reference_trainer.compat.repository.Interface`; None for gsplat.
     """
     _active.enter_context(cuda_on_cpu())
-    sys.modules.update(_modules(Interface(rasterizer, members, neighbor_indices)))
+    sys.modules.update(_modules(interface and Interface(*interface)))
 
 
-def _modules(interface: Interface) -> dict[str, ModuleType]:
-    """Make the modules that a repository imports, by name."""
+def _modules(interface: Interface | None) -> dict[str, ModuleType]:
+    """Make the modules that are imported, by name."""
+    if interface is None:
+        return {"fused_ssim": similarity_module()}
     return {
         interface.rasterizer: rasterizer_module(interface.rasterizer, interface.members),
         **neighbor_modules(indices=interface.neighbor_indices),
@@ -107,13 +105,14 @@ def _modules(interface: Interface) -> dict[str, ModuleType]:
 
 
 @contextmanager
-def _importable(interface: Interface) -> Iterator[None]:
+def _importable(modules: Iterable[str], interface: Interface | None) -> Iterator[None]:
     """Let processes that inherit the search path import the stand-ins, but not their parent's objects."""
     with TemporaryDirectory(prefix="ca_reg_stand_in_") as folder:
-        for name in (interface.rasterizer, "simple_knn"):
-            # The import system hands out what stands in sys.modules once the file has run.
-            text = f"from {__name__} import install_in_worker\n\ninstall_in_worker{tuple(interface)!r}\n"
-            (Path(folder) / f"{name}.py").write_text(text, encoding="utf-8")
+        # The import system hands out what stands in sys.modules once the file has run.
+        text = f"from {__name__} import install_in_worker\n\ninstall_in_worker({interface and tuple(interface)!r})\n"
+        for name in modules:
+            if "." not in name:
+                (Path(folder) / f"{name}.py").write_text(text, encoding="utf-8")
         sys.path.append(folder)
         try:
             yield

@@ -86,7 +86,7 @@ def rasterize(
     radii = visible_radii(means, quaternions, scales, camera)
     if columns == 4:
         weights = means.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
-        return with_absolute_gradients(rendering.image, sink[:, 2:], splats, settings.bg), radii, weights
+        return with_absolute_gradients(rendering, sink[:, 2:], settings.bg).image, radii, weights
     found = {"alpha": rendering.alpha, "depth": rendering.depth, "inverse_depth": rendering.depth}
     return (rendering.image, radii, *(found[member][None] for member in planes))  # type: ignore[index]
 

@@ -15,6 +15,7 @@ import torch
 from stand_ins.inria import Model, make_rasterizer, make_render
 
 from ca_reg import Chain
+from ca_reg.integrations._script import imported_packages
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.integrations.run import main
 
@@ -294,6 +295,70 @@ def test_without_cuda_the_stand_in_comes_first(repository, capsys, monkeypatch):
     assert launch("--cpu", "--outputs", 2, "--dropout", 0.5, repository / "train.py", 1) == 0
     assert asked == [(repository, 2)]
     assert "1 renders regularized" in capsys.readouterr().err
+
+
+OF_GSPLAT = """
+import sys
+
+import torch
+from gsplat.distributed import cli
+from gsplat.rendering import rasterization
+from oracles import random_scene
+from stand_ins.gsplat import intrinsics
+
+def main(local_rank, world_rank, world_size, steps):
+    scene = random_scene(40, 20, 16, seed=1).to(torch.float32)
+    means, logits = scene.means.to(f"cuda:{local_rank}").requires_grad_(), torch.zeros(40, requires_grad=True)
+    optimizer = torch.optim.SGD([{"params": [logits], "name": "opacities"}], lr=0.1)
+
+    def render():
+        camera = scene.camera.world_to_camera[None], intrinsics(scene.camera)[None], 20, 16
+        return rasterization(means, scene.quaternions, scene.scales, logits.sigmoid(), scene.colors, *camera)
+
+    for step in range(steps):
+        image, _, info = render()
+        image.sum().backward()
+        optimizer.step()
+        print("seen", len(info["gaussian_ids"]), torch.rand(1).item())
+    with torch.no_grad():
+        render()
+
+torch.manual_seed(0)
+cli(main, int(sys.argv[1]))
+"""
+
+
+def test_a_script_that_calls_gsplat_is_told_from_the_others(tmp_path, capsys, repository):
+    pytest.importorskip("gsplat")
+    script, report = tmp_path / "trainer.py", tmp_path / "report.json"
+    script.write_text(OF_GSPLAT)
+    main(["--cpu", str(script), "3"])
+    plain = capsys.readouterr().out
+    main(["--cpu", "--dropout", "0.5", "--report", str(report), str(script), "3"])
+    regularized = capsys.readouterr()
+    assert json.loads(report.read_text())["renders"] | {"skipped": {}} == {
+        "regularized": 3,
+        "scaled": 1,
+        "skipped": {},
+        "first_step": None,
+        "last_step": None,
+        "lost": 0,
+    }
+    assert all(a < 0.8 * b for a, b in zip(seen(regularized.out), seen(plain), strict=True))
+    assert draws(plain) == draws(regularized.out)
+    assert launch("--scope", "all", "--dropout", 0.5, script) == 2
+    assert "renders with gsplat, for which there is no --scope" in capsys.readouterr().err
+
+
+def test_what_a_script_imports_is_read_also_through_the_files_beside_it(repository):
+    (repository / "scene" / "views.py").write_text("from .. import gsplat\nfrom . import others, views\n")
+    (repository / "scene" / "others.py").write_text("def late():\n    import far.away as near\n")
+    (repository / "broken.py").write_text("import (\n")
+    (repository / "other.py").write_text("import numpy.linalg, broken\nfrom scene import views\n")
+    expected = {"numpy", "broken", "scene", "stand_ins", "far"}
+    assert imported_packages(repository / "other.py") == expected
+    assert "diff_gaussian_rasterization" in imported_packages(repository / "train.py")
+    assert imported_packages("nowhere.train") == set()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Code that says "cuda", on a machine without."""
 
+import threading
+
 import pytest
 import torch
 
@@ -93,3 +95,24 @@ def test_with_a_device_nothing_changes():
     with cuda_on_cpu():
         assert torch.cuda.Event is before
         assert torch.zeros(1, device="cuda").is_cuda
+
+
+@without_cuda
+def test_a_file_of_a_card_is_loaded(tmp_path):
+    load = torch.load
+    torch.save({"x": torch.ones(2)}, tmp_path / "x.pt")
+    with cuda_on_cpu():
+        for place in ("cuda:0", CUDA, None):
+            assert torch.load(tmp_path / "x.pt", map_location=place, weights_only=True)["x"].device.type == "cpu"
+    assert torch.load is load
+
+
+@without_cuda
+def test_threads_that_are_started_within_the_block_are_covered():
+    start, found = threading.Thread.start, []
+    with cuda_on_cpu():
+        thread = threading.Thread(target=lambda: found.append(torch.zeros(2, device="cuda").device.type))
+        thread.start()
+        thread.join()
+    assert found == ["cpu"]
+    assert threading.Thread.start is start

@@ -1,0 +1,226 @@
+"""``gsplat.rasterization`` on top of the reference renderer."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.compat.absolute import with_absolute_gradients
+from reference_trainer.render import Splats, draw, splat
+from reference_trainer.render.constants import DILATION, MIN_ALPHA, NEAR_PLANE
+from reference_trainer.render.eager.projection import project
+
+__all__ = ["make_rasterization"]
+
+MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+READ = {
+    "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane", "far_plane",
+    "radius_clip", "sh_degree", "packed", "backgrounds", "render_mode", "absgrad", "rasterize_mode",
+}  # fmt: skip
+WITHOUT_EFFECT = {"tile_size", "channel_chunk", "segmented", "sparse_grad", "ut_params", "renderer_config"}
+NEAREST = 1e-6  # a nearer near plane is taken for this one
+EXTENT = 3.33  # standard deviations at which an opaque splat has faded to `MIN_ALPHA`
+SMALLEST_SPREAD = 0.1  # px^2, of gsplat 1.4: half the difference of the variances is taken for no less
+
+Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
+
+
+def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterization:
+    """Make a function with the arguments and results of ``gsplat.rasterization``, for any device.
+
+    Drawn are the Gaussians that gsplat 1.5 draws, with its near plane, far plane and radii; all arguments that do not
+    say how fast are obeyed or refused. Differences: alpha is clamped at 0.99, as in gsplat 1.6 (0.999 before), and
+    gradients pass the clamp; the projection is linearised within a margin around the middle of the picture, not around
+    the principal point; with gsplat 1.4, too, Gaussians fainter than 1/255 have no radius.
+
+    ``info`` holds ``means2d`` (pixels, part of the graph: `retain_grad` it; ``absgrad`` appears on it at the backward
+    pass if it was asked for), ``radii``, ``depths``, ``opacities``, the numbers ``batch_ids``, ``camera_ids`` and
+    ``gaussian_ids`` in packed mode, and ``width``, ``height``, ``n_batches`` and ``n_cameras``.
+
+    Args:
+        original: the function of the gsplat that is installed, whose signature is taken over; it is not called.
+        per_axis: whether radii are those of gsplat since 1.5, by axis, [C, N, 2], or packed [nnz, 2]; else those of
+            1.4, [C, N] or [nnz].
+
+    Returns:
+        The function. It raises ValueError, by name, for arguments that the renderer has not: cameras other than
+        pinholes, another ``eps2d``, covariances, batches of scenes, features that are no colours, ``distributed``,
+        the unscented transform, and gradients of the poses.
+
+    Example:
+        >>> def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane=0.01,
+        ...                   far_plane=1e10, radius_clip=0.0, sh_degree=None, packed=True, backgrounds=None,
+        ...                   render_mode="RGB", absgrad=False, rasterize_mode="classic"): ...
+        >>> draw_on_any_device = make_rasterization(rasterization, per_axis=True)
+        >>> one, pose = torch.ones(1, 3), torch.eye(4)[None]
+        >>> lens = torch.tensor([[[50.0, 0, 16], [0, 50, 16], [0, 0, 1]]])
+        >>> image, alpha, info = draw_on_any_device(
+        ...     one * pose[0, 2, :3], pose[0, :1], 0.1 * one, one[0, :1], one, pose, lens, 32, 32)
+        >>> image.shape, alpha.shape, info["radii"].tolist()
+        (torch.Size([1, 32, 32, 3]), torch.Size([1, 32, 32, 1]), [[17, 17]])
+    """
+    signature = inspect.signature(original)
+
+    @functools.wraps(original)
+    def rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        bound = signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        for name, value in bound.arguments.items():
+            default = signature.parameters[name].default
+            if name not in READ | WITHOUT_EFFECT and (isinstance(value, Tensor) or value != default):
+                _refuse(name, f"got {_describe(value)}: leave it at {default!r}")
+        given = SimpleNamespace(**bound.arguments)
+        _check(given)
+        return _rasterize(given, per_axis)
+
+    return rasterization
+
+
+class _View(NamedTuple):
+    """What one camera sees.
+
+    Args:
+        splats: M of the N Gaussians.
+        radii: gsplat's, 0 for what it does not draw, shape (M, 2).
+        listed: numbers of those with a radius, among the M.
+    """
+
+    splats: Splats
+    radii: Tensor
+    listed: Tensor
+
+
+def _rasterize(given: SimpleNamespace, per_axis: bool) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Draw all cameras."""
+    # The renderer's near plane is fixed. In other units of length it is any: the picture does not change.
+    unit = NEAR_PLANE / max(given.near_plane, NEAREST)
+    means, scales = given.means * unit, given.scales * unit
+    views = [_look(given, number, means, scales, unit, per_axis) for number in range(len(given.viewmats))]
+    counts = [len(view.listed) for view in views]
+
+    def tabulate(values: list[Tensor]) -> Tensor:
+        """Arrange what M Gaussians of every camera have: [nnz, ...], or [C, N, ...] with zeros for the others."""
+        if given.packed:
+            return torch.cat([x[view.listed] for x, view in zip(values, views, strict=True)])
+        tables = [x.new_zeros(len(means), *x.shape[1:]) for x in values]
+        pairs = zip(tables, values, views, strict=True)
+        return torch.stack([table.index_copy(0, view.splats.indices, x) for table, x, view in pairs])
+
+    def rows(table: Tensor, number: int, others: Tensor) -> Tensor:
+        """Return what a table has for the M Gaussians of a camera; those that it does not list keep what they had."""
+        if given.packed:
+            return others.index_copy(0, views[number].listed, torch.split(table, counts)[number])
+        return table[number].index_select(0, views[number].splats.indices)
+
+    means2d = tabulate([view.splats.projection.means for view in views])
+    sink = None
+    if given.absgrad and means2d.requires_grad:
+        sink = torch.zeros_like(means2d).requires_grad_()
+        sink.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient))  # type: ignore[no-untyped-call]
+    images, alphas = [], []
+    for number, view in enumerate(views):
+        projection = view.splats.projection
+        moved = projection._replace(means=rows(means2d, number, projection.means))
+        background = None if given.backgrounds is None or "RGB" not in given.render_mode else given.backgrounds[number]
+        rendering = draw(view.splats._replace(projection=moved), background=background, depth="D" in given.render_mode)
+        if sink is not None:
+            nothing = torch.zeros_like(projection.means)
+            rendering = with_absolute_gradients(rendering, rows(sink, number, nothing), background)
+        planes = [*rendering.image] if "RGB" in given.render_mode else []
+        if rendering.depth is not None:
+            weight = rendering.alpha.clamp_min(1e-10) if "ED" in given.render_mode else 1.0
+            planes.append(rendering.depth / (unit * weight))
+        images.append(torch.stack(planes, dim=-1))
+        alphas.append(rendering.alpha[..., None])
+    radii = tabulate([view.radii for view in views])
+    cameras = torch.arange(len(views), device=means.device).repeat_interleave(torch.tensor(counts, device=means.device))
+    info = {
+        "batch_ids": torch.zeros_like(cameras) if given.packed else None,
+        "camera_ids": cameras if given.packed else None,
+        "gaussian_ids": torch.cat([v.splats.indices[v.listed] for v in views]) if given.packed else None,
+        "radii": radii if per_axis else radii.amax(-1),
+        "means2d": means2d,
+        "depths": tabulate([view.splats.projection.depths / unit for view in views]),
+        "opacities": tabulate([view.splats.opacities for view in views]),
+        "width": given.width,
+        "height": given.height,
+        "n_batches": 1,
+        "n_cameras": len(views),
+    }
+    return torch.stack(images), torch.stack(alphas), info
+
+
+def _look(given: SimpleNamespace, number: int, means: Tensor, scales: Tensor, unit: float, per_axis: bool) -> _View:
+    """Project the Gaussians of a camera, and leave out those that gsplat leaves out."""
+    pose = given.viewmats[number].detach().clone()
+    pose[:3, 3] *= unit
+    (fx, _, cx), (_, fy, cy), _ = given.Ks[number].tolist()
+    camera = Camera(pose, fx, fy, cx, cy, given.width, given.height)
+    splats = splat(means, given.quats, scales, given.opacities, camera, **_colors(given, number))
+    if given.rasterize_mode == "antialiased":
+        seen, quats, lengths = (x.index_select(0, splats.indices) for x in (means, given.quats, scales))
+        ellipses = project(seen, quats, lengths, camera.to(means.device, means.dtype))
+        compensation = _compensation(*ellipses.covariances.unbind(-1))
+        splats = splats.engine.masked(splats, splats.opacities * compensation)
+    projection = splats.projection
+    centers, extents = projection.means.detach(), _extents(splats, per_axis)
+    size = centers.new_tensor([given.width, given.height])
+    inside = ((centers + extents > 0) & (centers - extents < size)).all(1)
+    shown = inside & (extents > given.radius_clip).any(1) & (projection.depths.detach() <= given.far_plane * unit)
+    if bool((splats.lists.touched & ~shown).any()):
+        splats = splats.engine.masked(splats, splats.opacities * shown)
+    return _View(splats, (extents * shown[:, None]).int(), shown.nonzero()[:, 0])
+
+
+def _colors(given: SimpleNamespace, number: int) -> dict[str, Any]:
+    """Return the colours of a camera as arguments of `splat`."""
+    if "RGB" not in given.render_mode:
+        return {"colors": torch.zeros_like(given.means)}
+    shared = given.colors.ndim == (2 if given.sh_degree is None else 3)
+    colors = given.colors if shared else given.colors[number]
+    return {"colors": colors} if given.sh_degree is None else {"sh": colors, "sh_degree": given.sh_degree}
+
+
+def _compensation(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
+    """Return the root of the share of its area that a splat had before `DILATION` (Mip-Splatting, equation 9)."""
+    dilated = xx * yy - xy * xy
+    before = (xx - DILATION) * (yy - DILATION) - xy * xy
+    return (before / dilated).clamp_min(1e-10).sqrt()  # above 0: the root has a slope
+
+
+@torch.no_grad()
+def _extents(splats: Splats, per_axis: bool) -> Tensor:
+    """Return half the sides of the rectangles that gsplat draws splats in, whole pixels, shape (M, 2)."""
+    xx, xy, yy = splats.projection.covariances.unbind(-1)
+    if per_axis:
+        extent = (2 * (splats.opacities / MIN_ALPHA).clamp_min(1).log()).sqrt().clamp_max(EXTENT)
+        return (extent[:, None] * torch.stack([xx, yy], dim=1).sqrt()).ceil()
+    spread = torch.hypot(0.5 * (xx - yy), xy).clamp_min(SMALLEST_SPREAD)
+    return (3 * (0.5 * (xx + yy) + spread).sqrt()).ceil()[:, None].expand(-1, 2)
+
+
+def _check(given: SimpleNamespace) -> None:
+    """Raise ValueError for what the renderer has not."""
+    if given.means.ndim != 2:
+        _refuse("means", f"must have shape (N, 3), a single scene, got {tuple(given.means.shape)}")
+    if given.render_mode not in MODES:
+        _refuse("render_mode", f"must be one of {', '.join(MODES)}, got {given.render_mode!r}")
+    if "RGB" in given.render_mode and given.colors.shape[-1] != 3:
+        _refuse("colors", f"must have three channels, got shape {tuple(given.colors.shape)}")
+    if torch.is_grad_enabled() and given.viewmats.requires_grad:
+        _refuse("viewmats", "requires a gradient, as poses that are optimized do: switch that off (pose_opt)")
+
+
+def _refuse(name: str, problem: str) -> None:
+    raise ValueError(f"{name} of the stand-in for gsplat.rasterization, which runs without CUDA: {problem}.")
+
+
+def _describe(value: Any) -> str:
+    return f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)

@@ -1,0 +1,66 @@
+"""What gsplat's MCMC strategy computes on the GPU: relocated Gaussians, and covariances."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from reference_trainer.render.eager.projection import rotation_matrices
+
+__all__ = ["compute_relocation", "quat_scale_to_covar_preci"]
+
+
+@torch.no_grad()
+def compute_relocation(
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Return opacity and scales of Gaussians that, n at one place, look as one does (3DGS-MCMC, equation 9).
+
+    Args:
+        opacities: of the one, shape (N,).
+        scales: of the one, shape (N, 3).
+        ratios: n, which is taken for at most the size of the table, shape (N,).
+        binoms: row n, column k holds n over k; shape (n_max, n_max).
+        min_opacity: the opacities are no lower, and that is what the scales are for (gsplat 1.6).
+
+    Returns:
+        Opacities (N,) and scales (N, 3) of each of the n.
+
+    Example:
+        >>> table = torch.tensor([[1.0, 0.0], [1.0, 1.0]])
+        >>> opacity, scales = compute_relocation(torch.tensor([0.75]), torch.ones(1, 3), torch.tensor([2]), table)
+        >>> opacity.item(), round(scales[0, 0].item(), 4)  # 0.75 / (2 x 0.5 - 0.5^2 / sqrt(2))
+        (0.5, 0.9111)
+    """
+    n = ratios.long().clamp(1, len(binoms))
+    opacity = (1 - (1 - opacities.double()) ** (1 / n.double())).clamp_min(min_opacity)
+    k = torch.arange(len(binoms), dtype=torch.float64, device=binoms.device)
+    # Terms of alternating signs: in single precision they would cancel.
+    terms = binoms.double().cumsum(0) * (-1) ** k / (k + 1).sqrt()
+    shrink = opacities.double() / (terms[n - 1] * opacity[:, None] ** (k + 1)).sum(1)
+    return opacity.to(opacities), scales * shrink[:, None].to(scales)
+
+
+def quat_scale_to_covar_preci(
+    quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
+) -> tuple[Tensor | None, Tensor | None]:
+    """Return covariances and their inverses, None for what was not asked for.
+
+    Args:
+        quats: orientation, wxyz, shape (N, 4).
+        scales: standard deviations, shape (N, 3).
+        compute_covar: whether the covariances are needed.
+        compute_preci: whether their inverses are.
+        triu: whether to return the entries xx, xy, xz, yy, yz, zz, shape (N, 6), in place of matrices (N, 3, 3).
+
+    Example:
+        >>> quat_scale_to_covar_preci(torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[1.0, 2, 3]]), triu=True)[0]
+        tensor([[1., 0., 0., 4., 0., 9.]])
+    """
+    axes = rotation_matrices(quats)
+
+    def product(lengths: Tensor) -> Tensor:
+        matrix = (axes * lengths[:, None]) @ (axes * lengths[:, None]).mT
+        return matrix.flatten(1)[:, [0, 1, 2, 4, 5, 8]] if triu else matrix
+
+    return product(scales) if compute_covar else None, product(1 / scales) if compute_preci else None

@@ -1,0 +1,29 @@
+"""The stand-in for `fused_ssim` against kornia."""
+
+import pytest
+import torch
+from kornia.metrics import ssim
+from torch.nn.functional import pad
+
+from reference_trainer.compat.similarity import similarity_module
+
+fused_ssim = similarity_module().fused_ssim
+
+
+@pytest.mark.parametrize("padding", ["same", "valid"])
+def test_values_and_gradients_are_kornias(padding):
+    generator = torch.Generator().manual_seed(0)
+    image, target = (torch.rand(2, 3, 17, 21, generator=generator).double() for _ in range(2))
+    leaves = [image.clone().requires_grad_() for _ in range(2)]
+    border = 5 if padding == "same" else 0
+    padded = (pad(x, (border,) * 4) for x in (leaves[1], target))
+    values = [fused_ssim(leaves[0], target, padding=padding), ssim(*padded, 11, eps=0.0, padding="valid").mean()]
+    torch.testing.assert_close(*values, rtol=1e-9, atol=1e-9)
+    for value in values:
+        value.backward()
+    torch.testing.assert_close(leaves[0].grad, leaves[1].grad, rtol=1e-7, atol=1e-9)
+
+
+def test_another_padding_is_refused():
+    with pytest.raises(ValueError, match="padding must be 'same' or 'valid', got 'reflect'"):
+        fused_ssim(torch.rand(1, 3, 16, 16), torch.rand(1, 3, 16, 16), padding="reflect")
