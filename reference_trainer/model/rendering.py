@@ -63,7 +63,6 @@ def render_moments_of(
     background: Tensor,
     *,
     sh_degree: int | None = None,
-    alpha: bool = True,
 ) -> tuple[MomentImages, Splats]:
     """Render the exact moments of a model under random factors on its alphas.
 
@@ -73,7 +72,6 @@ def render_moments_of(
         camera: the view.
         background: colour behind it, shape (3,), or one for each pixel, (3, H, W).
         sh_degree: highest band of spherical harmonics to use; all by default.
-        alpha: whether to give the moments of the accumulated alpha too.
 
     Returns:
         The moments, and what was drawn; its projected centres keep their gradient.
@@ -81,7 +79,7 @@ def render_moments_of(
     splats = splat_gaussians(model, camera, sh_degree=sh_degree)
     if splats.projection.means.requires_grad:
         splats.projection.means.retain_grad()
-    return render_moments(splats, multiplier, background=background, alpha=alpha), splats
+    return render_moments(splats, multiplier, background=background), splats
 
 
 def _arguments(model: Gaussians | Params, opacities: Tensor | None) -> dict[str, Any]:

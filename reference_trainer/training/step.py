@@ -123,9 +123,7 @@ class Step:
             observed: as of `render`.
         """
         params = self.params if params is None else params
-        moments, splats = render_moments_of(
-            params, multiplier, camera, self.background, sh_degree=self.sh_degree, alpha=False
-        )
+        moments, splats = render_moments_of(params, multiplier, camera, self.background, sh_degree=self.sh_degree)
         if observed:
             self.observed.append((splats, camera))
         return moments
