@@ -11,7 +11,6 @@ import tyro
 __all__ = [
     "Attribution",
     "ErrorRuntime",
-    "GradientNoise",
     "Pruning",
     "Ranking",
     "Stability",
@@ -36,15 +35,12 @@ class ErrorRuntime:
 
     def __call__(self) -> None:
         """Run the study."""
-        from reference_trainer.studies.error_runtime_study import study_error_runtime
+        from reference_trainer.studies.error_runtime import error_runtime_study
+        from reference_trainer.studies.study import run_study
 
-        study_error_runtime(
-            self.sources,
+        run_study(
+            error_runtime_study(self.sources, max_samples=self.max_samples, seeds=self.seeds, device=self.device),
             self.out,
-            max_samples=self.max_samples,
-            seeds=self.seeds,
-            device=self.device,
-            say=print,
         )
 
 
@@ -65,9 +61,10 @@ class Ranking:
 
     def __call__(self) -> None:
         """Run the study."""
-        from reference_trainer.studies.ranking import study_ranking
+        from reference_trainer.studies.ranking import ranking_study
+        from reference_trainer.studies.study import run_study
 
-        study_ranking(self.runs, self.out, split=self.split, views=self.views, device=self.device, say=print)
+        run_study(ranking_study(self.runs, split=self.split, views=self.views, device=self.device), self.out)
 
 
 @dataclass(frozen=True)
@@ -87,9 +84,9 @@ class Attribution:
 
     def __call__(self) -> None:
         """Run the study."""
-        from reference_trainer.studies.attribution import study_attribution
+        from reference_trainer.studies.gaussian_shares import study_attribution
 
-        study_attribution(self.run, self.out, split=self.split, drop_rate=self.drop_rate, device=self.device, say=print)
+        study_attribution(self.run, self.out, split=self.split, drop_rate=self.drop_rate, device=self.device)
 
 
 @dataclass(frozen=True)
@@ -109,31 +106,10 @@ class Pruning:
 
     def __call__(self) -> None:
         """Run the study."""
-        from reference_trainer.studies.pruning import study_pruning
+        from reference_trainer.studies.pruning import pruning_study
+        from reference_trainer.studies.study import run_study
 
-        study_pruning(self.runs, self.out, fractions=self.fractions, refine=self.refine, device=self.device, say=print)
-
-
-@dataclass(frozen=True)
-class GradientNoise:
-    """What sampling masks costs the gradient of a training step, against the analytic gradient."""
-
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs."""
-    out: Path = Path("runs/gradient_noise")
-    """Folder for the JSON, the tables and the figure; what is in it is not measured again."""
-    draws: int = 64
-    """Masks at every training view, a power of two."""
-    dropout: float = 0.2
-    """Rate of the masks."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
-
-    def __call__(self) -> None:
-        """Run the study."""
-        from reference_trainer.studies.gradient_noise import study_gradient_noise
-
-        study_gradient_noise(self.runs, self.out, draws=self.draws, dropout=self.dropout, device=self.device, say=print)
+        run_study(pruning_study(self.runs, fractions=self.fractions, refine=self.refine, device=self.device), self.out)
 
 
 @dataclass(frozen=True)
@@ -154,7 +130,7 @@ class Stability:
 class Study:
     """Measure something about the method itself; see the subcommands."""
 
-    what: ErrorRuntime | Ranking | Attribution | Pruning | GradientNoise | Stability
+    what: ErrorRuntime | Ranking | Attribution | Pruning | Stability
 
     def __call__(self) -> None:
         """Run the study that was chosen."""

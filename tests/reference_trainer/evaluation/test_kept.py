@@ -41,7 +41,7 @@ def test_records_come_back_as_they_were(tmp_path):
     again = KeptRecords(file, "as before", said.append)
     assert {key: again.get(key) for key in records} == records
     assert math.isnan(again.get("three")["x"])
-    assert said == [f"3 measured before the interruption, kept: {file}"]
+    assert said == [f"3 measured before, kept: {file}"]
 
 
 def test_a_record_whose_picture_is_gone_is_not_used(tmp_path):
@@ -205,7 +205,7 @@ def test_an_interrupted_orbit_measures_the_rest(model, tiny_scene, tmp_path, mon
     found = evaluate_cameras(model, views, samples=2, pictures=pictures, keep=file, say=said.append)
     assert repr(found) == repr(whole)  # to the last digit
     assert drawn == ["002"]
-    assert said == [f"2 measured before the interruption, kept: {file}"]
+    assert said == [f"2 measured before, kept: {file}"]
     for path in (tmp_path / "whole").iterdir():
         assert path.read_bytes() == (pictures / path.name).read_bytes()
     turned = [dataclasses.replace(views[0], fx=views[0].fx * 1.01), *views[1:]]
