@@ -121,9 +121,9 @@ class Stability:
 
     def __call__(self) -> None:
         """Run the study."""
-        from reference_trainer.studies.stability.study import study_stability
+        from reference_trainer.studies.stability.stability_study import study_stability
 
-        study_stability(self.out, say=print)
+        study_stability(self.out)
 
 
 @dataclass(frozen=True)

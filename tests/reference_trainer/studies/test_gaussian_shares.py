@@ -17,8 +17,8 @@ from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies import attribution as attribution_module
-from reference_trainer.studies.attribution import (
+from reference_trainer.studies import gaussian_shares as shares_module
+from reference_trainer.studies.gaussian_shares import (
     blend_weights,
     colored_by,
     concentration,
@@ -116,7 +116,7 @@ def test_every_view_has_a_picture_of_four_panels(run, study):
 def test_views_of_the_same_name_in_two_folders_keep_their_pictures(run, tmp_path, monkeypatch):
     model, scene, _ = of_run(run)
     views = tuple(dataclasses.replace(v, name=n) for v, n in zip(scene.test, ("a/r.png", "b/r.png"), strict=False))
-    monkeypatch.setattr(attribution_module, "of_run", lambda *a: (model, dataclasses.replace(scene, test=views), run))
+    monkeypatch.setattr(shares_module, "of_run", lambda *a: (model, dataclasses.replace(scene, test=views), run))
     study_attribution(run, tmp_path, say=lambda text: None)
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["a_r.png", "b_r.png"]
 
