@@ -39,7 +39,7 @@ class Study:
             in another process finds it.
         cases: the settings by the name of the case: strings, numbers, paths of files, None, and lists of them.
         report: returns the tables of all records in Markdown.
-        draw: draws all records into an empty figure.
+        draw: draws all records into an empty figure; None for no figure.
         check: whether the study checks the program itself: once it is finished, the next call measures all again.
     """
 
@@ -47,7 +47,7 @@ class Study:
     measure: Callable[..., Record]
     cases: Mapping[str, Mapping[str, Any]]
     report: Callable[[Records], str]
-    draw: Callable[[Records, Figure], None]
+    draw: Callable[[Records, Figure], None] | None = None
     check: bool = False
 
 
@@ -68,7 +68,7 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
 
     Raises:
         ValueError: if there is no case, or what ``study.measure`` raises.
-        RuntimeError: if cases failed on the engine; the same call tries them again.
+        RuntimeError: if cases failed on the engine, after the others are written; the same call tries them again.
     """
     if not study.cases:
         raise ValueError(f"expected at least 1 case of {study.name}, got none.")
@@ -82,19 +82,21 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
             failed[name] = outcome.error
         else:
             kept.add(keys[name], json.loads(json.dumps(outcome)))  # now what it will be when it is read
+    records = {name: record for name, key in keys.items() if (record := kept.get(key)) is not None}
+    write_json(out / f"{study.name}.json", {"study": study.name, "machine": here, "cases": records, "failed": failed})
+    if records:
+        text = study.report(records)
+        write_text(out / f"{study.name}.md", text)
+        say(text)
+        if study.draw is not None:
+            with new_figure(out / f"{study.name}.png") as figure:
+                study.draw(records, figure)
+        say(f"numbers, tables and figures: {study.name}.* in {out}")
     if failed:
         reasons = "".join(f"\n  {name}: {error}" for name, error in failed.items())
-        raise RuntimeError(f"{len(failed)} of {len(missing)} cases FAILED; the same command tries them again:{reasons}")
-    records = {name: kept.get(key) or {} for name, key in keys.items()}
-    write_json(out / f"{study.name}.json", {"study": study.name, "machine": here, "cases": records})
-    text = study.report(records)
-    write_text(out / f"{study.name}.md", text)
-    with new_figure(out / f"{study.name}.png") as figure:
-        study.draw(records, figure)
+        raise RuntimeError(f"{len(failed)} of {len(keys)} cases FAILED; the same command tries them again:{reasons}")
     if study.check:
         partial_file.unlink(missing_ok=True)
-    say(text)
-    say(f"numbers, tables and figure: {study.name}.json, .md and .png in {out}")
     return records
 
 

@@ -24,6 +24,7 @@ from reference_trainer.evaluation.report import write_json
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.runs.folder import CHECKPOINT
 from reference_trainer.runs.folder import CONFIG as RUN_CONFIG
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
@@ -312,18 +313,21 @@ def test_settings_out_of_range_are_refused(scene, change, draws, message):
         gradient_noise(gaussians, BACKGROUND, config, views, sh_degree=1, draws=draws)
 
 
+OPTIONS = SceneOptions("synthetic", views=2, downscale=8)
+
+
 @pytest.fixture(scope="module")
-def trainer(options) -> Trainer:
+def trainer() -> Trainer:
     """Two views, and noise and inverted dropout, which the study leaves out."""
     config = TrainConfig(dropout=0.4, compensate=True, noise=0.3, seed=5)
-    return Trainer(dataclasses.replace(options, views=2).load(seed=5), config)
+    return Trainer(OPTIONS.load(seed=5), config)
 
 
 @pytest.fixture(scope="module")
-def run(options, trainer, tmp_path_factory):
+def run(trainer, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "mixed" / "seed_0"
     trainer.save(folder / CHECKPOINT)
-    scene = dataclasses.asdict(dataclasses.replace(options, views=2))
+    scene = dataclasses.asdict(OPTIONS)
     write_json(folder / RUN_CONFIG, {"scene": scene, "config": dataclasses.asdict(trainer.config)})
     return folder
 
