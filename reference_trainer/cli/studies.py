@@ -25,7 +25,7 @@ class ErrorRuntime:
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs, or 3DGS PLY files (seen from an orbit camera)."""
     out: Path = Path("runs/error_runtime")
-    """Folder for the JSON, the table and the figure; what is in it is not measured again."""
+    """Folder for the JSON, the table and the figure; what was measured is not measured again."""
     max_samples: int = 1024
     """Largest number of renders."""
     seeds: int = 3
@@ -51,7 +51,7 @@ class Ranking:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs; those of one scene are compared with each other."""
     out: Path = Path("runs/ranking")
-    """Folder for the JSON, the tables and the figure; what is in it is not measured again."""
+    """Folder for the JSON, the tables and the figure; what was measured is not measured again."""
     split: Literal["test", "train"] = "test"
     """Which views."""
     views: int | None = None
@@ -96,7 +96,7 @@ class Pruning:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs that differ only in their seed."""
     out: Path = Path("runs/pruning")
-    """Folder for the JSON, the table and the figure; what is in it is not measured again."""
+    """Folder for the JSON, the table and the figure; what was measured is not measured again."""
     fractions: tuple[float, ...] = (0.1, 0.2, 0.4)
     """Parts of the Gaussians to remove."""
     refine: int = 300

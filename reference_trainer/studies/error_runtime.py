@@ -75,8 +75,10 @@ def error_runtime_study(
 
 def _measure(source: Path, max_samples: int, seeds: int, device: str) -> Record:
     """Measure one checkpoint of a run, or PLY."""
-    model, view = _of_ply(source, device) if source.suffix == ".ply" else _of_run(source.parent, device)
-    return error_runtime(model, view, max_samples=max_samples, seeds=seeds)
+    if source.suffix == ".ply":
+        return error_runtime(*_of_ply(source, device), max_samples=max_samples, seeds=seeds)
+    model, scene, _ = of_run(source.parent, device)
+    return error_runtime(model, (*scene.test, *scene.train)[0].to(device), max_samples=max_samples, seeds=seeds)
 
 
 @torch.no_grad()
@@ -306,19 +308,15 @@ def _panel(axes: Any, record: Record) -> None:
     axes.axvline(precise, color="C2", linestyle=":", label=f"{DOUBLE} (reference)")
     axes.set(xscale="log", yscale="log", xlabel="wall-clock time, s")
     axes.grid(alpha=0.3)
+    axes.tick_params(which="minor", labelbottom=False)
     render = statistics.median(record["render_seconds"])
     top = axes.secondary_xaxis("top", functions=(lambda s: s / render, lambda n: n * render))
     top.set_xlabel("wall-clock time, plain renders")
+    top.tick_params(which="minor", labeltop=False)
     sampled = entries_of(record, MONTE_CARLO)
     for m in (sampled[0], sampled[-1]):
         place = (statistics.median(m["seconds"]), rms(m, "map"))
         axes.annotate(f"K = {m['K']}", place, (0, 9), textcoords="offset points", ha="center", fontsize="small")
-
-
-def _of_run(run: Path, device: str) -> tuple[Model, View]:
-    """Return a run's model and its first test view."""
-    model, scene, _ = of_run(run, device)
-    return model, (*scene.test, *scene.train)[0].to(device)
 
 
 def _of_ply(ply: Path, device: str) -> tuple[Model, View]:
