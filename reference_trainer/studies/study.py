@@ -37,7 +37,8 @@ class Study:
         name: of its files, ``NAME.json``, ``NAME.md`` and ``NAME.png``.
         measure: measures one case, given its settings as keyword arguments. A function of a module, so that a worker
             in another process finds it.
-        cases: the settings by the name of the case: strings, numbers, paths of files, None, and lists of them.
+        cases: the settings by the name of the case: strings, numbers, None, paths of files that are there and count
+            with their size and time, and lists and dataclasses of these. A place to write to is a string.
         report: returns the tables of all records in Markdown.
         draw: draws all records into an empty figure; None for no figure.
         check: whether the study checks the program itself: once it is finished, the next call measures all again.
@@ -54,7 +55,7 @@ class Study:
 def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say = print) -> Records:
     """Measure the cases that are not measured yet; write all records, the tables and the figure, and print the tables.
 
-    Every record is on the disk, in ``NAME.partial.json``, before the next case begins. It is kept for later calls as
+    Every record is on the disk, in ``NAME.records.json``, before the next case begins. It is kept for later calls as
     long as the settings, the files among them and what `machine` says are the same; other cases may come and go.
 
     Args:
@@ -72,8 +73,8 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
     """
     if not study.cases:
         raise ValueError(f"expected at least 1 case of {study.name}, got none.")
-    here, partial_file = machine(), out / f"{study.name}.partial.json"
-    kept = KeptRecords(partial_file, study.name, say)
+    here, file = machine(), out / f"{study.name}.records.json"
+    kept = KeptRecords(file, study.name, say)
     keys = {name: f"{name} {fingerprint([here, _decisive(dict(case))])}" for name, case in study.cases.items()}
     missing = [name for name, key in keys.items() if kept.get(key) is None]
     failed = {}
@@ -96,7 +97,7 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
         reasons = "".join(f"\n  {name}: {error}" for name, error in failed.items())
         raise RuntimeError(f"{len(failed)} of {len(keys)} cases FAILED; the same command tries them again:{reasons}")
     if study.check:
-        partial_file.unlink(missing_ok=True)
+        file.unlink(missing_ok=True)
     return records
 
 

@@ -96,7 +96,7 @@ def test_an_interrupted_study_continues_and_writes_nothing_of_all(tmp_path):
         with pytest.raises(ValueError, match="no -1 times"):
             run_study(study(**cases), tmp_path, say=quiet)
     assert measured == ["x"]
-    assert [path.name for path in tmp_path.iterdir()] == ["letters.partial.json"]
+    assert [path.name for path in tmp_path.iterdir()] == ["letters.records.json"]
 
 
 def test_a_check_continues_where_it_was_interrupted_and_begins_anew_when_it_is_finished(tmp_path):
