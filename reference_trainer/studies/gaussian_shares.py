@@ -219,9 +219,9 @@ def study_attribution(
         "color_scales": scales,
         "machine": machine(),
     }
-    arrays = {"shares": shares, "total_effects": effects, "blend_weights": weights}
+    a, b, c = (x.cpu().numpy() for x in (shares, effects, weights))
     with replacing(out / "shares.npz") as place, place.open("wb") as file:
-        np.savez(file, **{name: x.cpu().numpy() for name, x in arrays.items()})
+        np.savez(file, shares=a, total_effects=b, blend_weights=c)
     colored = {
         "attribution": colored_by(model.gaussians, shares, *scales["share"]),
         "attribution_per_weight": colored_by(
