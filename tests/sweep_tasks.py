@@ -52,7 +52,7 @@ def note_the_interruption(folder):
         raise
 
 
-def note_the_interruption_here(*arguments):
+def note_the_interruption_here(*arguments, **settings):
     """The same in the working folder, in place of any task."""
     note_the_interruption(".")
 

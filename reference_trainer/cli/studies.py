@@ -11,7 +11,6 @@ import tyro
 __all__ = [
     "Attribution",
     "ErrorRuntime",
-    "GradientNoise",
     "Pruning",
     "Ranking",
     "Stability",
@@ -26,7 +25,7 @@ class ErrorRuntime:
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs, or 3DGS PLY files (seen from an orbit camera)."""
     out: Path = Path("runs/error_runtime")
-    """Folder for the JSON, the table and the figure; what is in it is not measured again."""
+    """Folder for the JSON, the table and the figure; what was measured is not measured again."""
     max_samples: int = 1024
     """Largest number of renders."""
     seeds: int = 3
@@ -36,15 +35,12 @@ class ErrorRuntime:
 
     def __call__(self) -> None:
         """Run the study."""
-        from reference_trainer.studies.error_runtime_study import study_error_runtime
+        from reference_trainer.studies.error_runtime import error_runtime_study
+        from reference_trainer.studies.study import run_study
 
-        study_error_runtime(
-            self.sources,
+        run_study(
+            error_runtime_study(self.sources, max_samples=self.max_samples, seeds=self.seeds, device=self.device),
             self.out,
-            max_samples=self.max_samples,
-            seeds=self.seeds,
-            device=self.device,
-            say=print,
         )
 
 
@@ -55,7 +51,7 @@ class Ranking:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs; those of one scene are compared with each other."""
     out: Path = Path("runs/ranking")
-    """Folder for the JSON, the tables and the figure; what is in it is not measured again."""
+    """Folder for the JSON, the tables and the figure; what was measured is not measured again."""
     split: Literal["test", "train"] = "test"
     """Which views."""
     views: int | None = None
@@ -65,9 +61,10 @@ class Ranking:
 
     def __call__(self) -> None:
         """Run the study."""
-        from reference_trainer.studies.ranking import study_ranking
+        from reference_trainer.studies.ranking import ranking_study
+        from reference_trainer.studies.study import run_study
 
-        study_ranking(self.runs, self.out, split=self.split, views=self.views, device=self.device, say=print)
+        run_study(ranking_study(self.runs, split=self.split, views=self.views, device=self.device), self.out)
 
 
 @dataclass(frozen=True)
@@ -87,9 +84,9 @@ class Attribution:
 
     def __call__(self) -> None:
         """Run the study."""
-        from reference_trainer.studies.attribution import study_attribution
+        from reference_trainer.studies.gaussian_shares import study_attribution
 
-        study_attribution(self.run, self.out, split=self.split, drop_rate=self.drop_rate, device=self.device, say=print)
+        study_attribution(self.run, self.out, split=self.split, drop_rate=self.drop_rate, device=self.device)
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ class Pruning:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs that differ only in their seed."""
     out: Path = Path("runs/pruning")
-    """Folder for the JSON, the table and the figure; what is in it is not measured again."""
+    """Folder for the JSON, the table and the figure; what was measured is not measured again."""
     fractions: tuple[float, ...] = (0.1, 0.2, 0.4)
     """Parts of the Gaussians to remove."""
     refine: int = 300
@@ -109,31 +106,10 @@ class Pruning:
 
     def __call__(self) -> None:
         """Run the study."""
-        from reference_trainer.studies.pruning import study_pruning
+        from reference_trainer.studies.pruning import pruning_study
+        from reference_trainer.studies.study import run_study
 
-        study_pruning(self.runs, self.out, fractions=self.fractions, refine=self.refine, device=self.device, say=print)
-
-
-@dataclass(frozen=True)
-class GradientNoise:
-    """What sampling masks costs the gradient of a training step, against the analytic gradient."""
-
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs."""
-    out: Path = Path("runs/gradient_noise")
-    """Folder for the JSON, the tables and the figure; what is in it is not measured again."""
-    draws: int = 64
-    """Masks at every training view, a power of two."""
-    dropout: float = 0.2
-    """Rate of the masks."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
-
-    def __call__(self) -> None:
-        """Run the study."""
-        from reference_trainer.studies.gradient_noise import study_gradient_noise
-
-        study_gradient_noise(self.runs, self.out, draws=self.draws, dropout=self.dropout, device=self.device, say=print)
+        run_study(pruning_study(self.runs, fractions=self.fractions, refine=self.refine, device=self.device), self.out)
 
 
 @dataclass(frozen=True)
@@ -145,16 +121,16 @@ class Stability:
 
     def __call__(self) -> None:
         """Run the study."""
-        from reference_trainer.studies.stability.study import study_stability
+        from reference_trainer.studies.stability.stability_study import study_stability
 
-        study_stability(self.out, say=print)
+        study_stability(self.out)
 
 
 @dataclass(frozen=True)
 class Study:
     """Measure something about the method itself; see the subcommands."""
 
-    what: ErrorRuntime | Ranking | Attribution | Pruning | GradientNoise | Stability
+    what: ErrorRuntime | Ranking | Attribution | Pruning | Stability
 
     def __call__(self) -> None:
         """Run the study that was chosen."""

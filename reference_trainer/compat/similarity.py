@@ -7,7 +7,7 @@ from types import ModuleType
 
 from torch import Tensor
 
-from reference_trainer.training.losses import ssim_map
+from reference_trainer.losses.photometric import ssim_map
 
 __all__ = ["similarity_module"]
 

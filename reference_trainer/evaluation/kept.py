@@ -41,7 +41,7 @@ class KeptRecords:
         ...     file = Path(folder, "scores.partial.json")
         ...     KeptRecords(file, {"seed": 1}, print).add("view 0", {"psnr": 20.5})
         ...     KeptRecords(file, {"seed": 1}, print).get("view 0")
-        1 measured before the interruption, kept: ...scores.partial.json
+        1 measured before, kept: ...scores.partial.json
         {'psnr': 20.5}
     """
 
@@ -61,7 +61,7 @@ class KeptRecords:
         else:
             if depends_on == self._depends_on:
                 self._records = records
-                say(f"{len(records)} measured before the interruption, kept: {file}")
+                say(f"{len(records)} measured before, kept: {file}")
                 return
             reason = "they belong to another model, scene, setting or machine"
         # At once: the first picture of the new measurement must not be found beside an old record.

@@ -1,9 +1,11 @@
-"""Figures of a comparison: dynamics, and the same test view under every strategy."""
+"""Figures: an empty one; of a comparison, dynamics, and the same test view under every strategy."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from torch.nn.functional import pad
 
@@ -12,7 +14,23 @@ from reference_trainer.evaluation.pictures import PANEL, save_png, side_by_side
 from reference_trainer.files import replacing
 from reference_trainer.scenes.images import read_image
 
-__all__ = ["comparison_figure", "dynamics_figure"]
+if TYPE_CHECKING:  # an extra
+    from matplotlib.figure import Figure
+
+__all__ = ["comparison_figure", "dynamics_figure", "new_figure"]
+
+
+@contextmanager
+def new_figure(path: Path) -> Iterator[Figure]:
+    """Give an empty figure to draw into, which becomes a PNG at ``path``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(layout="constrained")
+    FigureCanvasAgg(figure)
+    yield figure
+    with replacing(path) as place:
+        figure.savefig(place, dpi=110, format="png")
 
 
 def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
@@ -22,14 +40,9 @@ def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
         runs: folder of each run by label.
         path: the PNG to write.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 5), layout="constrained")
-    FigureCanvasAgg(figure)
-    plot_dynamics(dict(runs), ax=figure.add_subplot())
-    with replacing(path) as place:
-        figure.savefig(place, dpi=110, format="png")
+    with new_figure(path) as figure:
+        figure.set_size_inches(9, 5)
+        plot_dynamics(dict(runs), ax=figure.add_subplot())
 
 
 def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split: str = "test") -> None:

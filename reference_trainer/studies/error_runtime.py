@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
-from statistics import fmean
-from typing import Any, Literal
+import statistics
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,154 +16,73 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
+from reference_trainer.evaluation.results import format_mean_std, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.model.ply import load_ply
 from reference_trainer.render import first_order_map
+from reference_trainer.runs.measure import of_run
+from reference_trainer.scenes.orbit import orbit_views
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies.engines import drawn_by, engines_on
-from reference_trainer.studies.timing import in_turns, now
+from reference_trainer.studies.both_engines import drawn_by, engines_on
+from reference_trainer.studies.clocks import in_turns, now
+from reference_trainer.studies.study import Record, Records, Study, checkpoints
 
-__all__ = [
-    "DOUBLE",
-    "ERRORS",
-    "FIRST_ORDER",
-    "LOOPS",
-    "MONTE_CARLO",
-    "TORCH",
-    "Error",
-    "ErrorRuntime",
-    "Measurement",
-    "error_runtime",
-]
+__all__ = ["entries_of", "error_runtime", "error_runtime_study", "rms", "samples_to_match", "single", "slope"]
 
-MONTE_CARLO = "Monte Carlo"
-FIRST_ORDER = "first order"
-LOOPS = "exact, loops"
-TORCH = "exact, torch"
-DOUBLE = "exact float64"
-
-Error = Literal["score", "map"]
-ERRORS: tuple[Error, ...] = ("score", "map")
+MONTE_CARLO, FIRST_ORDER, DOUBLE = "Monte Carlo", "first order", "exact float64"
+LOOPS, TORCH = "exact, loops", "exact, torch"
+ERRORS = ("score", "map")
 
 DROP_RATE = 0.5
 THRESHOLD = 0.8  # of the expected alpha
 ROUNDS = 7  # how often everything but Monte Carlo is timed
 FIT_FROM = 8  # smallest K of the fitted lines: at smaller ones the error is not yet a power of K
+PICTURE = 256  # side of the picture of a PLY, pixels
 
 
-@dataclass(frozen=True)
-class Measurement:
-    """One estimator at one price.
+def error_runtime_study(
+    sources: Sequence[Path], *, max_samples: int = 1024, seeds: int = 3, device: str = "cpu"
+) -> Study:
+    """Declare the study of runs of this program and anyone's PLY files.
 
-    Args:
-        estimator: its name.
-        samples: number of renders K of a Monte Carlo estimate, else None.
-        seconds: wall-clock times, one per seed or repetition.
-        scores: estimated scores, one per seed; one if there is nothing random.
-        score_errors: of each, ``|score - reference| / reference``.
-        map_errors: root mean square of the error of the variance map, divided by the mean of the reference.
-    """
-
-    estimator: str
-    samples: int | None
-    seconds: list[float]
-    scores: list[float]
-    score_errors: list[float]
-    map_errors: list[float]
-
-    def rms(self, error: Error) -> float:
-        """Return the root mean square of an error over the seeds."""
-        return math.sqrt(fmean(x * x for x in self.errors(error)))
-
-    def errors(self, error: Error) -> list[float]:
-        """Return an error of every seed."""
-        return self.score_errors if error == "score" else self.map_errors
-
-
-@dataclass(frozen=True)
-class ErrorRuntime:
-    """Error against time for one model and view. The reference is the exact float64 result.
+    A run is measured at its first test view, or training view if there is none; a PLY at the first camera of an orbit,
+    over black. Both with the plain opacities: the test-time scaling is no part of co-adaptation.
 
     Args:
-        view: name of the view.
-        width: of the picture, pixels.
-        height: of the picture, pixels.
-        gaussians: number of them.
-        covered: share of the pixels in the region, in which the expected alpha exceeds 0.8.
-        drop_rate: of the masks.
-        score: the reference: the exact variance, mean over RGB and over the region.
-        render_seconds: times of a plain render in float32, one per repetition.
-        measurements: of all estimators.
+        sources: folders of runs, and ``.ply`` files.
+        max_samples: largest K, a power of two, at least 16.
+        seeds: number of Monte Carlo runs, at least 1.
+        device: where to render.
+
+    Raises:
+        FileNotFoundError: if a source is missing, or is no run.
+        ValueError: if there is no source, two have the same name, or a number is out of range.
     """
+    if max_samples < 2 * FIT_FROM or max_samples & (max_samples - 1) or seeds < 1:
+        raise ValueError(
+            f"expected max_samples, a power of two of at least {2 * FIT_FROM}, and at least 1 seed, got {max_samples} "
+            f"and {seeds}."
+        )
+    plys = [source for source in sources if source.suffix == ".ply"]
+    runs = [source for source in sources if source.suffix != ".ply"]
+    named = {**(checkpoints(runs) if runs or not plys else {}), **{ply.stem: ply for ply in plys}}
+    if len(named) < len({*sources}) or len({*plys}) < len(plys):
+        raise ValueError(f"sources must have different names, got {[str(source) for source in sources]}.")
+    settings = {"max_samples": max_samples, "seeds": seeds, "device": device}
+    cases = {name: {"source": source, **settings} for name, source in named.items()}
+    return Study("error_runtime", _measure, cases, _report, _draw)
 
-    view: str
-    width: int
-    height: int
-    gaussians: int
-    covered: float
-    drop_rate: float
-    score: float
-    render_seconds: list[float]
-    measurements: list[Measurement]
 
-    def slope(self, error: Error) -> float:
-        """Return the slope of ln error against ln K, fitted to Monte Carlo from K = 8 on; expected is -1/2.
-
-        The error at one K is the root mean square over the seeds. A map has the errors of many pixels, the score one
-        error per seed: the slope of the latter scatters, with a deviation of 0.14 for 3 seeds and K up to 1024.
-        """
-        ks, errors = self._convergence(error)
-        return float(np.polyfit(np.log(ks), np.log(errors), 1)[0])
-
-    def samples_to_match(self, error: Error) -> float | None:
-        """Return the K at which Monte Carlo would have the error of the first exact float32 estimate.
-
-        Extrapolated from the measured errors by the law K^(-1/2) and not by the fitted slope, whose uncertainty would
-        be multiplied by many decades. The renders' own rounding and early stop may keep the average from getting
-        there. None if the exact estimate has no error at all.
-        """
-        ks, errors = self._convergence(error)
-        target = self.single.rms(error)
-        return float(np.exp(np.mean(np.log(ks * errors**2)))) / target**2 if target > 0 else None
-
-    def _convergence(self, error: Error) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return K and the error of Monte Carlo at each."""
-        points = [(m.samples, m.rms(error)) for m in self.measurements if m.samples and m.samples >= FIT_FROM]
-        ks, errors = np.array(points, dtype=np.float64).T
-        return ks, errors
-
-    @property
-    def single(self) -> Measurement:
-        """The exact float32 estimate of the loops, or of torch where there are none."""
-        return next(m for m in self.measurements if m.estimator in (LOOPS, TORCH))
-
-    def of(self, estimator: str) -> Measurement:
-        """Return the first measurement of an estimator."""
-        return next(m for m in self.measurements if m.estimator == estimator)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return everything as plain data, with the fitted slopes, for JSON."""
-        fits = {
-            error: {"slope": self.slope(error), "samples_to_match_exact_float32": self.samples_to_match(error)}
-            for error in ERRORS
-        }
-        return {**asdict(self), "fits": fits}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> ErrorRuntime:
-        """Return what `as_dict` wrote; unknown entries are ignored."""
-        known = {name: data[name] for name in cls.__dataclass_fields__}
-        return cls(**{**known, "measurements": [Measurement(**m) for m in data["measurements"]]})
+def _measure(source: Path, max_samples: int, seeds: int, device: str) -> Record:
+    """Measure one checkpoint of a run, or PLY."""
+    if source.suffix == ".ply":
+        return error_runtime(*_of_ply(source, device), max_samples=max_samples, seeds=seeds)
+    model, scene, _ = of_run(source.parent, device)
+    return error_runtime(model, (*scene.test, *scene.train)[0].to(device), max_samples=max_samples, seeds=seeds)
 
 
 @torch.no_grad()
-def error_runtime(
-    model: TrainedModel,
-    view: View,
-    *,
-    max_samples: int = 1024,
-    seeds: int = 3,
-    progress: Callable[[str], None] | None = None,
-) -> ErrorRuntime:
+def error_runtime(model: TrainedModel, view: View, *, max_samples: int = 1024, seeds: int = 3) -> Record:
     """Measure error and wall-clock time of all estimators of the co-adaptation of one view at a drop rate of 1/2.
 
     - Monte Carlo with K = 2, 4, 8, ... renders: the unbiased variance (ddof = 1), accumulated in float64 in one running
@@ -177,22 +97,18 @@ def error_runtime(
     Args:
         model: what to measure, float32; its dropout rate does not matter.
         view: what to render; only its name and camera matter.
-        max_samples: largest K, a power of two, at least 16.
-        seeds: number of Monte Carlo runs, at least 1; their masks come from the seeds 0, 1, 2, ...
-        progress: receives a line before each part.
+        max_samples: largest K.
+        seeds: number of Monte Carlo runs; their masks come from the seeds 0, 1, 2, ...
 
     Returns:
-        All measurements; errors are relative to the exact float64 result, whose own are 0 by definition.
+        The exact float64 ``score``, the mean over RGB and the region, which covers the share ``covered`` of the pixels;
+        ``render_seconds`` of a plain render; under ``estimators`` one entry for each and each K: ``seconds``,
+        ``scores``, ``score`` and ``map``, with a value for each seed or repetition. ``score`` is the relative error of
+        the score, ``map`` the root mean square error of the variance map, divided by the mean of the reference.
 
     Raises:
-        ValueError: if an argument is out of range, no pixel is covered, or nothing in the region varies.
+        ValueError: if no pixel is covered, or nothing in the region varies.
     """
-    if max_samples < 2 * FIT_FROM or max_samples & (max_samples - 1) or seeds < 1:
-        raise ValueError(
-            f"expected max_samples, a power of two of at least {2 * FIT_FROM}, and at least 1 seed, got {max_samples} "
-            f"and {seeds}."
-        )
-    tell = progress or (lambda text: None)
     double = replace(model, gaussians=model.gaussians.map(Tensor.double), background=model.background.double())
     multiplier = Multiplier.dropout(DROP_RATE)
     opacities, precise = model.gaussians.opacities, double.gaussians.opacities
@@ -214,8 +130,7 @@ def error_runtime(
     def errors(variance: Tensor) -> tuple[float, float, float]:
         estimate = variance.double().mean(0)[region]
         found = estimate.mean().item()
-        rms = (estimate - reference).square().mean().sqrt().item()
-        return found, abs(found - score) / score, rms / score
+        return found, abs(found - score) / score, (estimate - reference).square().mean().sqrt().item() / score
 
     def moments(engine: str) -> Tensor:
         with drawn_by(engine):
@@ -228,29 +143,33 @@ def error_runtime(
         **exact_calls,
         DOUBLE: lambda: double.moments(precise, view, multiplier).variance,
     }
-    tell(f"render, {', '.join(list(calls)[1:])}")
     maps = {name: call() for name, call in calls.items()}
     seconds = in_turns(calls, ROUNDS, functools.partial(now, device))
-    runs = []
-    for seed in range(seeds):
-        tell(f"{MONTE_CARLO}, {max_samples} renders, seed {seed}")
-        runs.append([(k, spent, *errors(v)) for k, spent, v in _monte_carlo(model, view, max_samples, seed)])
-    sampled = []
-    for of_k in zip(*runs, strict=True):
-        ks, *columns = (list(column) for column in zip(*of_k, strict=True))
-        sampled.append(Measurement(MONTE_CARLO, ks[0], *columns))
-    single = [Measurement(name, None, seconds[name], *([x] for x in errors(maps[name]))) for name in list(calls)[1:]]
-    return ErrorRuntime(
-        view=view.name,
-        width=view.camera.width,
-        height=view.camera.height,
-        gaussians=len(model.gaussians),
-        covered=region.double().mean().item(),
-        drop_rate=DROP_RATE,
-        score=score,
-        render_seconds=seconds["render"],
-        measurements=[*sampled, *single],
-    )
+    of_seeds = [
+        [(k, spent, *errors(variance)) for k, spent, variance in _monte_carlo(model, view, max_samples, seed)]
+        for seed in range(seeds)
+    ]
+
+    def entry(name: str, k: int | None, spent: list[float], measured: Sequence[tuple[float, ...]]) -> Record:
+        scores, score_errors, map_errors = ([*column] for column in zip(*measured, strict=True))
+        return {"name": name, "K": k, "seconds": spent, "scores": scores, "score": score_errors, "map": map_errors}
+
+    sampled = [
+        entry(MONTE_CARLO, at_k[0][0], [x[1] for x in at_k], [x[2:] for x in at_k])
+        for at_k in zip(*of_seeds, strict=True)
+    ]
+    others = [entry(name, None, seconds[name], [errors(maps[name])]) for name in list(calls)[1:]]
+    return {
+        "view": view.name,
+        "width": view.camera.width,
+        "height": view.camera.height,
+        "gaussians": len(model.gaussians),
+        "covered": region.double().mean().item(),
+        "drop_rate": DROP_RATE,
+        "score": score,
+        "render_seconds": seconds["render"],
+        "estimators": [*sampled, *others],
+    }
 
 
 def _monte_carlo(model: TrainedModel, view: View, max_samples: int, seed: int) -> Iterator[tuple[int, float, Tensor]]:
@@ -272,3 +191,141 @@ def _monte_carlo(model: TrainedModel, view: View, max_samples: int, seed: int) -
         spent += now(device) - start
         yield count, spent, scatter / (count - 1)
         target *= 2
+
+
+def rms(estimate: Record, error: str) -> float:
+    """Return the root mean square of an error (of `ERRORS`) of an estimate over the seeds."""
+    return math.sqrt(statistics.fmean(x * x for x in estimate[error]))
+
+
+def entries_of(record: Record, name: str) -> list[Record]:
+    """Return the entries of an estimator, by K."""
+    return [estimate for estimate in record["estimators"] if estimate["name"] == name]
+
+
+def single(record: Record) -> Record:
+    """Return the exact float32 estimate of the loops, or of torch where there are none."""
+    return (entries_of(record, LOOPS) or entries_of(record, TORCH))[0]
+
+
+def slope(record: Record, error: str) -> float:
+    """Return the slope of ln error against ln K, fitted to Monte Carlo from K = 8 on; expected is -1/2.
+
+    The error at one K is the root mean square over the seeds. A map has the errors of many pixels, the score one error
+    per seed: the slope of the latter scatters, with a deviation of 0.14 for 3 seeds and K up to 1024.
+    """
+    ks, errors = _convergence(record, error)
+    return float(np.polyfit(np.log(ks), np.log(errors), 1)[0])
+
+
+def samples_to_match(record: Record, error: str) -> float | None:
+    """Return the K at which Monte Carlo would have the error of the first exact float32 estimate.
+
+    Extrapolated from the measured errors by the law K^(-1/2) and not by the fitted slope, whose uncertainty would be
+    multiplied by many decades. The renders' own rounding and early stop may keep the average from getting there. None
+    if the exact estimate has no error at all.
+    """
+    ks, errors = _convergence(record, error)
+    target = rms(single(record), error)
+    return float(np.exp(np.mean(np.log(ks * errors**2)))) / target**2 if target > 0 else None
+
+
+def _convergence(record: Record, error: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return K and the error of Monte Carlo at each."""
+    points = [(m["K"], rms(m, error)) for m in entries_of(record, MONTE_CARLO) if m["K"] >= FIT_FROM]
+    ks, errors = np.array(points, dtype=np.float64).T
+    return ks, errors
+
+
+def _report(records: Records) -> str:
+    """Return one row per estimator, and what follows; times are medians, errors root mean squares over the seeds."""
+    return "\n".join(f"## {name}\n\n{_table(record)}" for name, record in records.items())
+
+
+def _table(record: Record) -> str:
+    """Return the table of one model."""
+    render = statistics.median(record["render_seconds"])
+    rows: list[dict[str, object]] = []
+    for m in record["estimators"]:
+        seconds = statistics.median(m["seconds"])
+        row = {"estimator": m["name"], "K": m["K"] or "", "seconds": seconds, "renders": f"{seconds / render:.3g}"}
+        row["score x1e-3"] = format_mean_std(m["scores"], unit=1e-3)
+        rows.append(row | {f"{error} error": f"{rms(m, error):.2g}" for error in ERRORS})
+    return (
+        f"{markdown_table(rows, list(rows[0]))}\n"
+        f"View {record['view']}, {record['width']}x{record['height']}, {record['gaussians']} Gaussians; the region "
+        f"covers {record['covered']:.0%} of the pixels. Drop rate {record['drop_rate']:g}. One plain render takes "
+        f"{render:.3g} s; errors are relative to exact float64.\n\n"
+        + "".join(f"- {_conclusion(record, error)}\n" for error in ERRORS)
+    )
+
+
+def _conclusion(record: Record, error: str) -> str:
+    """Say how the Monte Carlo error falls, and when it would be that of the exact estimate."""
+    needed, name, last = samples_to_match(record, error), single(record)["name"], entries_of(record, MONTE_CARLO)[-1]
+    text = f"{error}: the error of {MONTE_CARLO} falls as K^{slope(record, error):.2f}"
+    if needed is None:
+        return f"{text}; {name} has none."
+    hours = needed / last["K"] * statistics.median(last["seconds"]) / 3600
+    return f"{text}; continued as K^-0.5 it equals that of {name} at K = {needed:.1e}, after {hours:.1e} hours."
+
+
+def _draw(records: Records, figure: Any) -> None:
+    """Draw error against time, one panel per model; bars reach from the smallest to the largest error of a seed."""
+    figure.set_size_inches(5.2 * len(records), 5.2)
+    panels = figure.subplots(1, len(records), squeeze=False, sharey=True)[0]
+    for axes, (name, record) in zip(panels, records.items(), strict=True):
+        _panel(axes, record)
+        axes.set_title(name, fontsize="medium")
+    panels[0].set_ylabel("relative error")
+    lines = dict(zip(*reversed(panels[-1].get_legend_handles_labels()), strict=True))
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize="small")
+
+
+def _panel(axes: Any, record: Record) -> None:
+    """Draw one model: filled markers for the score, hollow ones for the map."""
+    styles = {MONTE_CARLO: ("o", "C0"), FIRST_ORDER: ("s", "C1"), LOOPS: ("D", "C2"), TORCH: ("^", "C3")}
+    for error in ERRORS:
+        for name, (marker, color) in styles.items():
+            measured = [m for m in entries_of(record, name) if rms(m, error) > 0]
+            if measured:
+                centers = [rms(m, error) for m in measured]
+                pairs = list(zip(centers, measured, strict=True))
+                axes.errorbar(
+                    [statistics.median(m["seconds"]) for m in measured],
+                    centers,
+                    yerr=[[y - min(m[error]) for y, m in pairs], [max(m[error]) - y for y, m in pairs]],
+                    label=f"{name}, {error}",
+                    marker=marker,
+                    markerfacecolor=color if error == "score" else "white",
+                    color=color,
+                    linestyle="-" if error == "score" else "--",
+                    markersize=5,
+                    linewidth=1,
+                    capsize=2,
+                )
+    precise = statistics.median(entries_of(record, DOUBLE)[0]["seconds"])
+    axes.axvline(precise, color="C2", linestyle=":", label=f"{DOUBLE} (reference)")
+    axes.set(xscale="log", yscale="log", xlabel="wall-clock time, s")
+    axes.grid(alpha=0.3)
+    axes.tick_params(which="minor", labelbottom=False)
+    render = statistics.median(record["render_seconds"])
+    top = axes.secondary_xaxis("top", functions=(lambda s: s / render, lambda n: n * render))
+    top.set_xlabel("wall-clock time, plain renders")
+    top.tick_params(which="minor", labeltop=False)
+    sampled = entries_of(record, MONTE_CARLO)
+    for m in (sampled[0], sampled[-1]):
+        place = (statistics.median(m["seconds"]), rms(m, "map"))
+        axes.annotate(f"K = {m['K']}", place, (0, 9), textcoords="offset points", ha="center", fontsize="small")
+
+
+def _of_ply(ply: Path, device: str) -> tuple[TrainedModel, View]:
+    """Return the model of a PLY over black, and a view from an orbit; it has a camera but no photograph."""
+    loaded = load_ply(ply)
+    if loaded.opacity_scale != 1 or loaded.for_rendering:
+        by = "the mean of their noise" if loaded.for_rendering else f"{loaded.opacity_scale:g}"
+        raise ValueError(f"the opacities of {ply} are scaled by {by} for viewers: give the PLY with plain ones.")
+    gaussians = loaded.gaussians.to(device)
+    camera = orbit_views(gaussians.means, gaussians.opacities, count=1, width=PICTURE, height=PICTURE)[0]
+    nothing = torch.zeros(3, device=device)
+    return TrainedModel(gaussians, nothing), View("orbit", camera, nothing[:, None, None].expand(3, PICTURE, PICTURE))

@@ -1,5 +1,5 @@
 """Measurements for those who change this package: not installed, not timed by any test.
 
-From the root of the checkout: ``PYTHONPATH=tests python -m benchmarks.speed --help``, likewise ``growth`` and
-``plan``.
+From the root of the checkout: ``PYTHONPATH=tests python -m benchmarks.speed --help``, likewise ``growth``, ``plan`` and
+``gradient_noise``.
 """

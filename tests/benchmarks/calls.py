@@ -11,7 +11,7 @@ from benchmarks.workloads import Workload
 from reference_trainer.camera import Camera
 from reference_trainer.render import render
 from reference_trainer.render.gsplat import load_gsplat_render
-from reference_trainer.studies.engines import drawn_by, engines_on
+from reference_trainer.studies.both_engines import drawn_by, engines_on
 from reference_trainer.studies.stability.baseline import render_simply
 
 __all__ = ["BASELINE", "PASSES", "Draw", "draw_of", "gradients", "image", "others_on"]

@@ -25,8 +25,8 @@ from benchmarks.workloads import WorkloadSpec
 from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
-from reference_trainer.studies.engines import engines_on
-from reference_trainer.studies.timing import in_turns, now
+from reference_trainer.studies.both_engines import engines_on
+from reference_trainer.studies.clocks import in_turns, now
 
 __all__ = ["extrapolated", "growth", "measure_growth"]
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.calls import PASSES
 from reference_trainer.evaluation.results import markdown_table
-from reference_trainer.files import replacing
+from reference_trainer.runs.figures import new_figure
 
 __all__ = ["Fit", "fit_exponent", "fits", "growth_figure", "growth_tables"]
 
@@ -159,12 +159,13 @@ def growth_figure(report: Mapping[str, Any], path: Path) -> None:
         report: what `measure_growth` returns.
         path: the PNG to write.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    with new_figure(path) as figure:
+        _draw(report["axes"], figure)
 
-    axes = report["axes"]
-    figure = Figure(figsize=(4.2 * len(axes), 7.5), layout="constrained")
-    FigureCanvasAgg(figure)
+
+def _draw(axes: Mapping[str, Any], figure: Any) -> None:
+    """Draw all axes."""
+    figure.set_size_inches(4.2 * len(axes), 7.5)
     panels = figure.subplots(2, len(axes), squeeze=False, sharex="col")
     for column, axis in enumerate(axes.values()):
         for i, curve in enumerate(_curves(axis["points"])):
@@ -185,5 +186,3 @@ def growth_figure(report: Mapping[str, Any], path: Path) -> None:
                 panel.legend(fontsize="x-small")
     panels[0, 0].set_ylabel("seconds")
     panels[1, 0].set_ylabel("peak memory above the inputs, MiB")
-    with replacing(path) as place:
-        figure.savefig(place, dpi=110, format="png")

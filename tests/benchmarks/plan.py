@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,19 +17,16 @@ import tyro
 
 from benchmarks.plan_parts import parts_of_a_step
 from reference_trainer.evaluation.evaluate import evaluate
-from reference_trainer.evaluation.results import format_mean_std, machine, markdown_table, write_json
-from reference_trainer.files import write_text
-from reference_trainer.json_files import read_json
-from reference_trainer.runs.engines.engine import Failure, Task
+from reference_trainer.evaluation.results import format_mean_std, markdown_table
 from reference_trainer.runs.engines.processes import Processes
-from reference_trainer.runs.engines.run_all import run_all
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies.study import Study, run_study
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import Plan, make_plan
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["ALTERNATIVES", "plan", "plan_table", "shortened", "study_plan", "variants"]
+__all__ = ["ALTERNATIVES", "plan", "plan_study", "plan_table", "shortened", "variants"]
 
 AS_ASKED = "as asked"
 WHOLE_PLAN = "the whole plan"
@@ -70,7 +67,9 @@ def plan(
             "initial size 1/4", "no densification", "no opacity reset".
         device: "cpu" or "cuda".
     """
-    study_plan(scene, out, config=config, iterations=steps, seeds=seeds, alternatives=alternatives, device=device)
+    study = plan_study(scene, config=config, iterations=steps, seeds=seeds, alternatives=alternatives, device=device)
+    # Every training has a fresh process, one after the other, because time and peak memory are measured.
+    run_study(study, out, engine=Processes(1))
 
 
 def shortened(config: TrainConfig, iterations: int) -> TrainConfig:
@@ -117,79 +116,41 @@ def variants(plan: Plan, config: TrainConfig, alternatives: Sequence[str] = ()) 
     return chosen | {name: of for name, of in found.items() if of not in chosen.values()}
 
 
-def study_plan(
+def plan_study(
     options: SceneOptions,
-    out: Path,
     *,
     config: TrainConfig,
     iterations: int = 1_000,
     seeds: int = 3,
     alternatives: Sequence[str] = (),
     device: str = "cpu",
-    say: Callable[[str], None] = print,
-) -> list[dict[str, Any]]:
-    """Train a scene with every item of its plan on and off and write ``plan_study.json`` and ``plan_study.md``.
-
-    Every training has a fresh process, one after the other, because time and peak memory are measured; what is in the
-    folder is not trained again. A worker that dies is replaced, a training that fails does not stop the others.
+) -> Study:
+    """Declare the study: a scene is trained with every item of its plan on and off.
 
     Args:
         options: the scene.
-        out: folder of the study.
         config: what is asked for, in the length that the plan is made for.
         iterations: steps of each training; the schedule is shortened alike.
         seeds: number of seeds.
         alternatives: keys of `ALTERNATIVES` to try besides.
         device: where to train.
-        say: receives a line about every training and every worker that died, and the table.
-
-    Returns:
-        One record per training.
-
-    Raises:
-        ValueError: if the folder holds a training with other settings.
-        RuntimeError: if a training failed; everything about the others has been written.
     """
     plan = make_plan(options.load(seed=config.seed), config)
     chosen = {name: shortened(of, iterations) for name, of in variants(plan, config, alternatives).items()}
-    trainings = {
-        out / name.replace("/", "_").replace(" ", "_") / f"seed_{seed}.json": (name, dataclasses.replace(of, seed=seed))
+    shared = {"options": options, "device": device, "threads": torch.get_num_threads()}
+    cases = {
+        f"{name}, seed {seed}": {"variant": name, "config": dataclasses.replace(of, seed=seed), **shared}
         for seed in range(seeds)
         for name, of in chosen.items()
     }
-    threads = torch.get_num_threads()
-    tasks: dict[Path, Task] = {}
-    for file, (name, settings) in trainings.items():
-        if file.exists():
-            say(_line(_read(file, settings)))
-        else:
-            tasks[file] = Task(f"{name}, seed {settings.seed}", _train, (options, name, settings, device, threads))
-    failures = _train_all(tasks, say)
-    records = [_read(file, settings) for file, (_, settings) in trainings.items() if file.exists()]
-    study = {
-        "plan": plan.as_dict(),
-        "trainings": records,
-        "failures": {label: dataclasses.asdict(why) for label, why in failures.items()},
-        "machine": machine(),
-    }
-    write_json(out / "plan_study.json", study)
-    if records:
-        table = plan_table(records)
-        write_text(out / "plan_study.md", table)
-        say(table)
-    if failures:
-        raise RuntimeError(
-            f"{len(failures)} of {len(trainings)} trainings failed ({', '.join(failures)}): "
-            f"{out / 'plan_study.json'} has the tracebacks; the same command tries them again."
-        )
-    return records
+    return Study("plan_study", _train, cases, lambda records: plan_table([*records.values()]))
 
 
 def plan_table(records: Sequence[Mapping[str, Any]]) -> str:
     """Return the table of the study: per variant mean and deviation over the seeds, differences within a seed.
 
     Args:
-        records: what `study_plan` returns.
+        records: of the trainings.
     """
     base = {record["config"]["seed"]: record for record in records if record["variant"] == AS_ASKED}
     columns = {
@@ -204,11 +165,11 @@ def plan_table(records: Sequence[Mapping[str, Any]]) -> str:
     for name in dict.fromkeys(record["variant"] for record in records):
         of = [record for record in records if record["variant"] == name]
         pairs = [(record, base.get(record["config"]["seed"])) for record in of]
-        gains = [_known(x, "psnr") - _known(y, "psnr") if y else math.nan for x, y in pairs]
+        gains = [x["psnr"] - y["psnr"] if y else math.nan for x, y in pairs]
         known = ["n/a" if math.isnan(gain) else f"{gain:+.2f}" for gain in gains]
         difference = "" if name == AS_ASKED else ", ".join(known)
         measured = {
-            column: format_mean_std([_known(record, key) for record in of], unit=unit)
+            column: format_mean_std([record[key] for record in of], unit=unit)
             for column, (key, unit) in columns.items()
         }
         rows.append({"variant": name, "seeds": len(of), "PSNR, difference in each seed": difference, **measured})
@@ -221,39 +182,6 @@ def plan_table(records: Sequence[Mapping[str, Any]]) -> str:
     return table + "\n" + markdown_table(left, ["part", "ms", "% of a step"])
 
 
-def _train_all(tasks: Mapping[Path, Task], say: Callable[[str], None]) -> dict[str, Failure]:
-    """Do trainings, each in a process of its own, and write their records to files; return those that failed."""
-    failures: dict[str, Failure] = {}
-    places, queue = list(tasks), list(tasks.values())
-    for index, outcome in run_all(Processes(1), queue, say=say):
-        if isinstance(outcome, Failure):
-            failures[queue[index].label] = outcome
-            say(f"{queue[index].label}: FAILED, {outcome.error}")
-        else:
-            write_json(places[index], outcome.value)
-            say(_line(outcome.value))
-    return failures
-
-
-def _read(file: Path, settings: TrainConfig) -> dict[str, Any]:
-    """Return the record of a training, which must be that of these settings."""
-    record: dict[str, Any] = read_json(file)
-    if record["config"] != dataclasses.asdict(settings):
-        raise ValueError(f"{file} holds a training with other settings: give another folder, or delete it.")
-    return record
-
-
-def _line(record: Mapping[str, Any]) -> str:
-    """Return a training in a few words."""
-    seconds = f"{record['cpu_seconds']:.0f} s of processors"
-    return f"{record['variant']}, seed {record['config']['seed']}: {_known(record, 'psnr'):.2f} dB, {seconds}"
-
-
-def _known(record: Mapping[str, Any], key: str) -> float:
-    """Return a number of a record; JSON has null for one that does not exist."""
-    return math.nan if record[key] is None else float(record[key])
-
-
 def _train(options: SceneOptions, variant: str, config: TrainConfig, device: str, threads: int) -> dict[str, Any]:
     """Do one training in a process of its own."""
     torch.set_num_threads(threads)
@@ -262,7 +190,7 @@ def _train(options: SceneOptions, variant: str, config: TrainConfig, device: str
     start = time.process_time()
     trainer.train()
     seconds, peak = time.process_time() - start, _peak_bytes()
-    found = evaluate(model_of(trainer), {"test": scene.test} if scene.test else {"train": scene.train})
+    found = evaluate(model_of(trainer), dataclasses.replace(scene, train=() if scene.test else scene.train))
     split = "test" if scene.test else "train"
     return {
         "variant": variant,

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from benchmarks.workloads import Workload
 from reference_trainer.render import splat
-from reference_trainer.studies.engines import drawn_by
-from reference_trainer.studies.timing import Clock
+from reference_trainer.studies.both_engines import drawn_by
+from reference_trainer.studies.clocks import Clock
 
 __all__ = ["STAGES", "Staged", "staged"]
 

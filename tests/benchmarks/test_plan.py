@@ -1,5 +1,4 @@
-import dataclasses
-import json
+import math
 import os
 import signal
 import subprocess
@@ -12,12 +11,13 @@ from stand_ins.engine import Here
 from waiting import PATIENCE, until
 
 from benchmarks import plan as plan_module
-from benchmarks.plan import ALTERNATIVES, plan_table, shortened, study_plan, variants
+from benchmarks.plan import ALTERNATIVES, plan_study, plan_table, shortened, variants
 from benchmarks.plan_parts import parts_of_a_step
 from reference_trainer.runs.engines.engine import Task
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import Plan, PlanItem
 from reference_trainer.training.trainer import Trainer
@@ -46,17 +46,6 @@ def short():
     )
 
 
-@pytest.fixture(scope="module")
-def studied(tmp_path_factory, options, short):
-    out, said = tmp_path_factory.mktemp("plan"), []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan_module, "Processes", Here)
-        records = study_plan(
-            options, out, config=short, iterations=4, seeds=2, alternatives=["no densification"], say=said.append
-        )
-    return out, records, said
-
-
 def test_every_changing_item_is_tried_alone_and_with_the_others():
     tried = variants(TWO, TrainConfig(), ["initial size 1/2", "SH degree 1"])
     assert list(tried) == ["as asked", "bands", "size", "the whole plan", "SH degree 1"]  # 1/2 is there as "size"
@@ -80,8 +69,9 @@ def test_a_shortened_schedule_keeps_its_proportions():
 
 
 @pytest.mark.slow
-def test_the_study_trains_what_it_says(studied):
-    out, records, said = studied
+def test_the_study_trains_what_it_says(tmp_path, options, short):
+    study = plan_study(options, config=short, iterations=4, seeds=2, alternatives=["no densification"])
+    records = [*run_study(study, tmp_path, engine=Here(), say=lambda text: None).values()]
     assert [(record["variant"], record["config"]["seed"]) for record in records] == [
         (name, seed) for seed in (0, 1) for name in ("as asked", "SH bands", "no densification")
     ]
@@ -89,26 +79,12 @@ def test_the_study_trains_what_it_says(studied):
     assert [record["config"]["densify_every"] for record in records] == [4, 4, 0] * 2
     assert all(record["cpu_seconds"] > 0 and record["peak_bytes"] > 2**20 for record in records)
     assert [record["parts"] is not None for record in records] == [True] + [False] * 5
-    assert records == json.loads((out / "plan_study.json").read_text())["trainings"]
-    assert (out / "plan_study.md").read_text() == said[-1] == plan_table(records)
-
-
-@pytest.mark.slow
-def test_a_second_call_trains_nothing(studied, options, short, monkeypatch):
-    out, records, _ = studied
-    monkeypatch.setattr(plan_module, "Processes", Here)
-    monkeypatch.setattr(Here, "start", lambda *a: pytest.fail("trained again"))
-    again = study_plan(
-        options, out, config=short, iterations=4, seeds=2, alternatives=["no densification"], say=lambda text: None
-    )
-    assert again == records
-    with pytest.raises(ValueError, match="other settings"):
-        study_plan(options, out, config=dataclasses.replace(short, noise=0.1), iterations=4, say=lambda text: None)
+    assert (tmp_path / "plan_study.md").read_text() == plan_table(records)
 
 
 def record(variant: str, seed: int, psnr: float) -> dict:
     """What the table needs of a training."""
-    rest = dict.fromkeys(("ssim", "gaussians", "cpu_seconds", "peak_bytes"), 0.0) | {"ca": None}
+    rest = dict.fromkeys(("ssim", "gaussians", "cpu_seconds", "peak_bytes"), 0.0) | {"ca": math.nan}
     return {"variant": variant, "config": {"seed": seed}, "psnr": psnr, **rest}
 
 
@@ -119,33 +95,19 @@ def test_a_training_that_fails_is_reported_and_the_others_go_on(options, short, 
     def train(options, variant, config, device, threads):
         if f"{variant}, seed {config.seed}" in failing:
             raise MemoryError("no room")
-        return record(variant, config.seed, 20.0) | {"config": dataclasses.asdict(config)}
+        return record(variant, config.seed, 20.0)
 
-    def study():
-        said = []
-        return study_plan(options, tmp_path, config=short, iterations=4, seeds=2, say=said.append), said
+    def trained():
+        study = plan_study(options, config=short, iterations=4, seeds=2)
+        run_study(study, tmp_path, engine=Here(), say=lambda text: None)
 
-    monkeypatch.setattr(plan_module, "Processes", Here)
     monkeypatch.setattr(plan_module, "_train", train)
-    with pytest.raises(RuntimeError, match=r"1 of 4 trainings failed \(as asked, seed 1\): .* tries them again"):
-        study()
-    stored = json.loads((tmp_path / "plan_study.json").read_text())
-    assert [(r["variant"], r["config"]["seed"]) for r in stored["trainings"]] == [
-        ("as asked", 0), ("SH bands", 0), ("SH bands", 1)
-    ]  # fmt: skip
-    assert stored["failures"]["as asked, seed 1"]["error"] == "MemoryError: no room"
-    assert "in train" in stored["failures"]["as asked, seed 1"]["traceback"]
+    with pytest.raises(RuntimeError, match=r"1 of 4 cases FAILED; .*\n  as asked, seed 1: MemoryError: no room"):
+        trained()
     assert "+0.00, n/a" in (tmp_path / "plan_study.md").read_text()
-
-    before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("seed_*.json")}
     failing.clear()
-    records, said = study()
-    assert [(r["variant"], r["config"]["seed"]) for r in records] == [
-        (name, seed) for seed in (0, 1) for name in ("as asked", "SH bands")
-    ]
-    assert {file: file.stat().st_mtime_ns for file in before} == before
-    assert "+0.00, +0.00" in said[-1]
-    assert json.loads((tmp_path / "plan_study.json").read_text())["failures"] == {}
+    trained()
+    assert "+0.00, +0.00" in (tmp_path / "plan_study.md").read_text()
 
 
 STUDY = """
@@ -153,9 +115,12 @@ from pathlib import Path
 import sweep_tasks
 from reference_trainer.scenes.options import SceneOptions
 from benchmarks import plan
+from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
 plan._train = sweep_tasks.note_the_interruption_here
-plan.study_plan(SceneOptions("synthetic", downscale=8.0), Path("out"), config=TrainConfig(iterations=1), seeds=1)
+study = plan.plan_study(SceneOptions("synthetic", downscale=8.0), config=TrainConfig(iterations=1), seeds=1)
+run_study(study, Path("out"), engine=Processes(1))
 """
 
 

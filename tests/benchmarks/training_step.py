@@ -14,8 +14,8 @@ from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.studies.engines import drawn_by
-from reference_trainer.studies.timing import Clock, in_turns
+from reference_trainer.studies.both_engines import drawn_by
+from reference_trainer.studies.clocks import Clock, in_turns
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 

@@ -2,6 +2,7 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -17,8 +18,11 @@ from reference_trainer.runs.engines import choice as choice_module
 from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
-from reference_trainer.studies import attribution as attribution_module
+from reference_trainer.studies import error_runtime as error_runtime_module
+from reference_trainer.studies import gaussian_shares as shares_module
 from reference_trainer.studies import pruning as pruning_module
+from reference_trainer.studies import ranking as ranking_module
+from reference_trainer.studies import study as study_module
 from reference_trainer.training.config import PRESETS
 
 SMALL = ["--downscale", "8", "--iterations", "3", "--monitor-every", "2"]
@@ -339,23 +343,39 @@ def test_several_scenes_and_how_they_are_run(monkeypatch, tmp_path):
         (["attribution", "r"], ("r", None, {"split": "test", "drop_rate": 0.5})),
         (["attribution", "r", "--out", "o", "--split", "train", "--drop-rate", "0.3"],
          ("r", "o", {"split": "train", "drop_rate": 0.3})),
-        (["pruning", "r", "s", "--out", "o"], (["r", "s"], "o", {"fractions": (0.1, 0.2, 0.4), "refine": 300})),
-        (["pruning", "r", "--fractions", "0.2", "0.5", "--refine", "0", "--out", "o"],
-         (["r"], "o", {"fractions": (0.2, 0.5), "refine": 0})),
     ],
 )  # fmt: skip
-def test_studies_of_the_shares(arguments, expected, monkeypatch):
+def test_attribution(arguments, expected, monkeypatch):
     asked = []
 
-    def fake(source, out, **keywords):
-        source = [str(path) for path in source] if isinstance(source, tuple) else str(source)
-        asked.append((source, out and str(out), keywords))
+    def fake(run, out, **keywords):
+        asked.append((str(run), out and str(out), keywords))
 
-    monkeypatch.setattr(attribution_module, "study_attribution", fake)
-    monkeypatch.setattr(pruning_module, "study_pruning", fake)
+    monkeypatch.setattr(shares_module, "study_attribution", fake)
     main(["study", *arguments])
     source, out, keywords = expected
-    assert asked == [(source, out, {**keywords, "device": "cpu", "say": print})]
+    assert asked == [(source, out, {**keywords, "device": "cpu"})]
+
+
+@pytest.mark.parametrize(
+    ("command", "module", "arguments", "expected"),
+    [
+        ("pruning", pruning_module, ["--out", "o"], {"fractions": (0.1, 0.2, 0.4), "refine": 300}),
+        ("pruning", pruning_module, ["--fractions", "0.2", "0.5", "--refine", "0", "--out", "o"],
+         {"fractions": (0.2, 0.5), "refine": 0}),
+        ("ranking", ranking_module, ["--split", "train", "--out", "o"], {"split": "train", "views": None}),
+        ("error-runtime", error_runtime_module, ["--seeds", "2", "--out", "o"], {"max_samples": 1024, "seeds": 2}),
+    ],
+)  # fmt: skip
+def test_studies(command, module, arguments, expected, monkeypatch):
+    declared, ran = [], []
+    monkeypatch.setattr(
+        module, f"{command.replace('-', '_')}_study", lambda runs, **keywords: declared.append((runs, keywords))
+    )
+    monkeypatch.setattr(study_module, "run_study", lambda study, out: ran.append(out))
+    main(["study", command, "r", "s", *arguments])
+    assert declared == [((Path("r"), Path("s")), {**expected, "device": "cpu"})]
+    assert ran == [Path("o")]
 
 
 # Mistakes end with one line that says what to do, and exit code 2

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from reference_trainer.studies.stability.case import Case
+from reference_trainer.studies.study import Record
 
-__all__ = ["GRADIENT_TOLERANCE", "VALUE_TOLERANCE", "Point", "Status", "Verdict", "judge", "relative_error"]
-
-Status = Literal["ok", "inexact", "not finite", "refused", "crash"]
+__all__ = ["GRADIENT_TOLERANCE", "VALUE_TOLERANCE", "judge", "relative_error"]
 
 VALUE_TOLERANCE = 1e-3
 """Largest error of an image, a moment or a score that counts as right: a quarter of an 8-bit step."""
@@ -23,79 +19,49 @@ GRADIENT_TOLERANCE = 1e-2
 """Largest error of a gradient that counts as right: a hundredth of a training step."""
 
 _HALVINGS = 5  # of the decade in which a case starts to fail: the onset is then known to 7 %
-_ALLOWED: dict[str, set[Status]] = {
+_ALLOWED = {
     "refused": {"ok", "refused"},
     "limit": {"ok", "refused", "inexact"},
     "overflow": {"ok", "refused", "inexact", "not finite"},
 }
 
 
-@dataclass(frozen=True)
-class Point:
-    """A case at one magnitude.
-
-    Args:
-        magnitude: of the case.
-        status: what happened.
-        errors: relative error of every quantity; infinite where it is not finite although it should be.
-        message: of the exception, if there was one.
-    """
-
-    magnitude: float
-    status: Status
-    errors: Mapping[str, float] = field(default_factory=dict)
-    message: str = ""
-
-    @property
-    def failing(self) -> list[str]:
-        """The quantities that are not right."""
-        return [name for name, error in self.errors.items() if not error <= _tolerance(name)]
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """How a case ends.
-
-    Args:
-        case: what was judged.
-        points: at the magnitudes of the case, and at those of the search for the onset, increasing.
-        onset: the smallest magnitude that failed; None if none did.
-        ending: "ok"; "refused" or "limit" as the case foresees it; "defect" for everything else.
-    """
-
-    case: Case
-    points: list[Point]
-    onset: float | None
-    ending: Literal["ok", "refused", "limit", "defect"]
-
-    @property
-    def failure(self) -> Point | None:
-        """The first point that failed."""
-        return next((point for point in self.points if point.status != "ok"), None)
-
-
-def judge(case: Case) -> Verdict:
+def judge(case: Case) -> Record:
     """Run a case at all its magnitudes, and search for the one at which it starts to fail.
 
     Args:
         case: what to judge.
+
+    Returns:
+        What the case is; under "ending" how it ends: "ok"; "refused" or "limit" as it foresees; "defect" for all else;
+        under "onset" the smallest magnitude that failed, None if none did; under "points" for every magnitude, those of
+        the search included, the "status" ("ok", "inexact", "not finite", "refused" or "crash"), the relative "errors"
+        of the quantities, which of them are "wrong", and the "message" of an exception.
     """
     points = [_point(case, magnitude) for magnitude in case.magnitudes]
-    failed = next((i for i, point in enumerate(points) if point.status != "ok"), None)
-    if failed is None:
-        return Verdict(case, points, None, "ok")
-    onset = points[failed].magnitude
-    if failed > 0:
-        good = points[failed - 1].magnitude
-        for _ in range(_HALVINGS):
-            middle = math.sqrt(good * onset)
-            point = _point(case, middle)
-            points.append(point)
-            good, onset = (middle, onset) if point.status == "ok" else (good, middle)
-        points.sort(key=lambda point: point.magnitude)
-    if onset <= case.until or any(point.status not in _ALLOWED[case.beyond] for point in points):
-        return Verdict(case, points, onset, "defect")
-    return Verdict(case, points, onset, "refused" if case.beyond == "refused" else "limit")
+    failed = next((i for i, point in enumerate(points) if point["status"] != "ok"), None)
+    onset, ending = None, "ok"
+    if failed is not None:
+        onset = points[failed]["magnitude"]
+        if failed > 0:
+            good = points[failed - 1]["magnitude"]
+            for _ in range(_HALVINGS):
+                points.append(_point(case, math.sqrt(good * onset)))
+                middle = points[-1]["magnitude"]
+                good, onset = (middle, onset) if points[-1]["status"] == "ok" else (good, middle)
+            points.sort(key=lambda point: point["magnitude"])
+        foreseen = onset > case.until and all(point["status"] in _ALLOWED[case.beyond] for point in points)
+        ending = ("refused" if case.beyond == "refused" else "limit") if foreseen else "defect"
+    return {
+        "family": case.family,
+        "name": case.name,
+        "magnitudes": [case.magnitudes[0], case.magnitudes[-1]] if len(case.magnitudes) > 1 else None,
+        "ending": ending,
+        "onset": onset,
+        "must_hold_until": case.until if math.isfinite(case.until) else None,
+        "note": case.note,
+        "points": points,
+    }
 
 
 def relative_error(measured: Tensor, reference: Tensor) -> float:
@@ -123,21 +89,24 @@ def relative_error(measured: Tensor, reference: Tensor) -> float:
     return float(torch.linalg.vector_norm(measured - reference).item() / (size or 1.0))
 
 
-def _tolerance(quantity: str) -> float:
-    """Return the largest error of a quantity that counts as right."""
-    return GRADIENT_TOLERANCE if quantity.startswith("d ") else VALUE_TOLERANCE
-
-
-def _point(case: Case, magnitude: float) -> Point:
+def _point(case: Case, magnitude: float) -> Record:
     """Run a case at a magnitude."""
-    probe = case.probe(magnitude)
+    probe, status, errors, wrong, message = case.probe(magnitude), "ok", {}, [], ""
     try:
         measured = probe.measured()
     except (ValueError, TypeError) as error:
-        return Point(magnitude, "refused", message=f"{type(error).__name__}: {error}")
+        status, message = "refused", f"{type(error).__name__}: {error}"
     except (RuntimeError, ArithmeticError, LookupError, AssertionError, MemoryError) as error:
-        return Point(magnitude, "crash", message=f"{type(error).__name__}: {error}")
-    reference = probe.reference()
-    errors = {name: relative_error(x, reference[name]) for name, x in measured.items()}
-    wrong = [error for name, error in errors.items() if not error <= _tolerance(name)]
-    return Point(magnitude, "ok" if not wrong else "not finite" if math.inf in wrong else "inexact", errors)
+        status, message = "crash", f"{type(error).__name__}: {error}"
+    else:
+        reference = probe.reference()
+        errors = {name: relative_error(x, reference[name]) for name, x in measured.items()}
+        wrong = [name for name, error in errors.items() if not error <= _tolerance(name)]
+        if wrong:
+            status = "not finite" if math.inf in map(errors.get, wrong) else "inexact"
+    return {"magnitude": magnitude, "status": status, "errors": errors, "wrong": wrong, "message": message}
+
+
+def _tolerance(quantity: str) -> float:
+    """Return the largest error of a quantity that counts as right."""
+    return GRADIENT_TOLERANCE if quantity.startswith("d ") else VALUE_TOLERANCE

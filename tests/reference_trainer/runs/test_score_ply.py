@@ -148,9 +148,7 @@ def test_an_interrupted_measurement_continues_to_the_same_files(tmp_path, option
     monkeypatch.setattr(evaluate_module, "_measure", original)
     assert not (tmp_path / "cut" / "evaluation.json").exists()
     (tmp_path / "cut" / "views" / ".001.png.1.part").touch()  # as kill -9 leaves it
-    assert f"1 measured before the interruption, kept: {tmp_path}/cut/evaluation.partial.json" in measure(
-        tmp_path / "cut"
-    )
+    assert f"1 measured before, kept: {tmp_path}/cut/evaluation.partial.json" in measure(tmp_path / "cut")
     files = [
         {str(path.relative_to(tmp_path / out)): path.read_bytes() for path in (tmp_path / out).rglob("*.*")}
         for out in ("whole", "cut")

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from PIL import Image
+from matplotlib.figure import Figure
 
 from ca_reg import attribute
 from reference_trainer.evaluation.evaluate import evaluate
@@ -12,8 +12,9 @@ from reference_trainer.evaluation.results import write_json
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import model_of
 from reference_trainer.studies import pruning as pruning_module
-from reference_trainer.studies.attribution import blend_weights
-from reference_trainer.studies.pruning import CRITERIA, Pruned, prune_lowest, pruning_order, study_pruning, train_on
+from reference_trainer.studies.gaussian_shares import blend_weights
+from reference_trainer.studies.pruning import CRITERIA, prune_lowest, pruning_order, pruning_study, train_on
+from reference_trainer.studies.study import run_study
 from reference_trainer.training import trainer as trainer_module
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
@@ -57,7 +58,7 @@ def test_exactly_the_lowest_go_and_the_others_are_untouched(trained, criterion, 
         for moment in ("exp_avg", "exp_avg_sq"):
             assert torch.equal(new["moments"][name][moment], moments[moment][kept])
         assert new["moments"][name]["step"] == moments["step"]
-    assert trainer.statistics.steps.shape == (len(kept),)
+    assert trainer.density.statistics.steps.shape == (len(kept),)
     trainer.train_step()  # config and statistics fit the smaller set
 
 
@@ -117,71 +118,59 @@ def runs(tmp_path_factory, options, tiny_scene, busy):
 
 
 @pytest.mark.slow
-def test_a_study_is_resumed(runs, tmp_path, monkeypatch):
+def test_what_was_pruned_is_measured_before_and_after_further_steps(runs, tmp_path, monkeypatch):
     (folder, evaluation), scene = next(iter(runs[0].items())), runs[1]
-    score, calls = pruning_module._score, []
-
-    def counted(*args):
-        calls.append(args)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return score(*args)
-
-    def load(folder, device):
-        return Trainer.load(folder / CHECKPOINT, scene, device)
-
-    monkeypatch.setattr(pruning_module, "_score", counted)
-    monkeypatch.setattr(pruning_module, "_figure", lambda found, path: None)
-    monkeypatch.setattr(pruning_module, "load_run", load)
-    with pytest.raises(KeyboardInterrupt):
-        study_pruning([folder], tmp_path, fractions=[0.25], refine=1, say=silent)
-    (measured,) = study_pruning([folder], tmp_path, fractions=[0.25], refine=1, say=silent).values()
-    count = 2 * (1 + len(CRITERIA))
-    assert len(calls) == 1 + count  # only the interrupted one was measured twice
-    assert [each.steps for each in measured] == [0, 1] * (count // 2)
-    whole, refined = measured[:2]
-    assert (whole.psnr, whole.gaussians) == (evaluation.mean("test", "psnr"), evaluation.gaussians)
-    assert whole.ca_protocol == evaluation.mean("test", "ca_half")
-    assert refined.psnr != whole.psnr
-    assert {each.gaussians for each in measured[2:]} == {evaluation.gaussians - round(0.25 * evaluation.gaussians)}
-    assert [each.criterion for each in measured[2::2]] == list(CRITERIA)
-    saved = json.loads((tmp_path / "pruning.json").read_text())["runs"][str(folder.resolve())]
-    assert [each["psnr"] for each in saved] == [each.psnr for each in measured]
-    study_pruning([folder], tmp_path, fractions=[0.25, 0.5], refine=0, say=silent)
-    assert len(calls) == 1 + count + len(CRITERIA)
+    monkeypatch.setattr(
+        pruning_module, "load_run", lambda folder, device: Trainer.load(folder / CHECKPOINT, scene, device)
+    )
+    study = pruning_study([folder], fractions=[0.25], refine=1)
+    whole, refined, *pruned = run_study(study, tmp_path, say=silent).values()
+    assert (whole["steps"], refined["steps"]) == (0, 1)
+    assert (whole["psnr"], whole["gaussians"]) == (evaluation.mean("test", "psnr"), evaluation.gaussians)
+    assert whole["ca_protocol"] == evaluation.mean("test", "ca_half")
+    assert refined["psnr"] != whole["psnr"]
+    left = evaluation.gaussians - round(0.25 * evaluation.gaussians)
+    done = [(name, 0.25, steps, left) for name in CRITERIA for steps in (0, 1)]
+    assert [(x["criterion"], x["fraction"], x["steps"], x["gaussians"]) for x in pruned] == done
+    more = pruning_study([folder], fractions=[0.25, 0.5], refine=0).cases
+    assert {name: case for name, case in study.cases.items() if case["steps"] == 0}.items() <= more.items()
 
 
-def test_the_report_is_of_mean_and_spread_over_runs(tmp_path):
-    def record(run: float, criterion: str, fraction: float, steps: int) -> Pruned:
-        return Pruned(criterion, fraction, steps, 90, 20 + run - fraction, math.nan, 0.5, (2 + run + steps) * 1e-3)
+def test_the_report_is_of_mean_and_spread_over_runs():
+    def record(run: float, criterion: str, fraction: float, steps: int) -> dict:
+        what = {"criterion": criterion, "fraction": fraction, "steps": steps, "gaussians": 90}
+        scores = {"psnr": 20 + run - fraction, "ca_exact": math.nan, "covered": 0.5}
+        return what | scores | {"ca_protocol": (2 + run + steps) * 1e-3}
 
     plan = [("nothing removed", 0.0), *((name, part) for part in (0.1, 0.4) for name in CRITERIA)]
-    found = {str(run): [record(run, *each, steps) for each in plan for steps in (0, 7)] for run in (0.0, 0.4, 0.8)}
+    found = {str((run, *each, n)): record(run, *each, n) for run in (0.0, 0.4, 0.8) for each in plan for n in (0, 7)}
     text = pruning_module._report(found)
+    assert text.startswith("# Pruning at equal count, 3 runs\n")
     as_pruned, refined = text.split("## After 7 further steps")
     for part, protocol in ((as_pruned, "2.40 ± 0.40"), (refined, "9.40 ± 0.40")):
         rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in part.splitlines() if "%" in line]
         assert len(rows) == 1 + len(plan)  # with the header
         assert rows[-1] == ["random", "40%", "90", "20.00 ± 0.40", "n/a", "50 ± 0", protocol]
-    pruning_module._figure(found, tmp_path / "pruning.png")
-    with Image.open(tmp_path / "pruning.png") as picture:
-        assert picture.size == (1100, 836)
+    figure = Figure()
+    pruning_module._draw(found, figure)
+    lines = figure.axes[0].get_legend_handles_labels()[0]
+    assert (len(figure.axes), len(lines)) == (4, len(CRITERIA))
+    x, y = lines[0].lines[0].get_data()
+    assert [*x] == [0, 10, 40]
+    assert [*y] == pytest.approx([20.4, 20.3, 20.0])
 
 
 def test_mistakes(runs, tmp_path):
     run = next(iter(runs[0]))
     for fractions in ([], [0.0], [0.2, 1.0]):
         with pytest.raises(ValueError, match=r"each in \(0, 1\), got"):
-            study_pruning([run], tmp_path, fractions=fractions)
+            pruning_study([run], fractions=fractions)
     with pytest.raises(ValueError, match="refine must not be negative, got -1"):
-        study_pruning([run], tmp_path, refine=-1)
-    with pytest.raises(ValueError, match="at least 1 run, got none"):
-        study_pruning([], tmp_path)
+        pruning_study([run], refine=-1)
     with pytest.raises(FileNotFoundError, match="holds no run"):
-        study_pruning([tmp_path], tmp_path)
+        pruning_study([tmp_path])
     with pytest.raises(ValueError, match=r"fraction to remove must be in \[0, 1\), got 1"):
         prune_lowest(None, torch.zeros(3), 1.0)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_runs_of_two_kinds_have_no_mean(runs, tmp_path):
@@ -193,4 +182,4 @@ def test_runs_of_two_kinds_have_no_mean(runs, tmp_path):
     config["config"]["dropout"] = 0.5
     write_json(other / CONFIG, config)
     with pytest.raises(ValueError, match="differ in dropout; runs whose mean is taken may differ in their seed only"):
-        study_pruning([run, other], tmp_path / "out")
+        pruning_study([run, other])

@@ -1,11 +1,11 @@
 import dataclasses
 import itertools
 import math
-import os
 import statistics
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 from reference_trainer.camera import Camera
@@ -16,15 +16,9 @@ from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies import ranking as ranking_module
-from reference_trainer.studies.ranking import rank_runs, study_ranking
-from reference_trainer.studies.ranking_report import (
-    correlations,
-    disagreements,
-    group_labels,
-    ranking_figure,
-    ranking_report,
-)
-from reference_trainer.studies.ranking_scores import VARIANTS, Ranking, RunScores, score_view
+from reference_trainer.studies.ranking import correlations, disagreements, group_labels, mean_of, ranking_study
+from reference_trainer.studies.score_variants import VARIANTS, score_view
+from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
@@ -97,9 +91,10 @@ def test_five_renders_without_a_hole_know_the_variance_given_no_hole(walls, name
         assert math.isfinite(row["limit_conditioned"]) == seen
 
 
-def scores_of(rows: list[dict], strategy: str = "baseline", seed: int = 0, **settings) -> RunScores:
+def scores_of(rows: list[dict], strategy: str = "baseline", seed: int = 0, **settings) -> dict:
     views = [{"name": str(i), **row} for i, row in enumerate(rows)]
-    return RunScores(f"runs/{strategy}/{seed}", "wall", strategy, 3, seed, settings, 3, views)
+    of = {"scene": "wall", "split": "test", "strategy": strategy, "training_views": 3, "seed": seed, "gaussians": 3}
+    return of | {"settings": settings, "views": views}
 
 
 def test_conditioning_on_visibility_turns_an_order_around(walls):
@@ -166,74 +161,42 @@ def trained(tmp_path_factory, options, short):
     return [folder / "both" / "seed_0", folder / "plain" / "seed_4"], results
 
 
-def test_scores_are_those_of_the_evaluation(trained, tmp_path):
+def test_scores_are_those_of_the_evaluation(trained):
     folders, results = trained
-    (run,) = rank_runs(folders[:1], tmp_path, say=silent).runs
-    assert (run.strategy, run.training_views, run.seed) == ("dropout 0.2 + noise 0.3", 3, 0)
-    assert run.scene == "synthetic (1/8)"
-    assert run.gaussians == results["gaussians"]
+    ((name, case),) = ranking_study(folders[:1]).cases.items()
+    run = ranking_module._measure(**case)
+    assert name.endswith("both/seed_0")
+    assert (run["strategy"], run["training_views"], run["seed"]) == ("dropout 0.2 + noise 0.3", 3, 0)
+    assert run["scene"] == "synthetic (1/8)"
+    assert run["gaussians"] == results["gaussians"]
     mean = results["mean"]["test"]
     for ours, theirs in (("psnr", "psnr"), ("protocol", "ca"), ("protocol_half", "ca_half"), ("exact", "ca_exact"),
                          ("visible protocol", "visible")):  # fmt: skip
-        assert run.mean(ours) == pytest.approx(mean[theirs]), ours
-    assert run.mean("protocol") != run.mean("protocol_half")
-    (plain,) = rank_runs(folders[1:], tmp_path, views=1, say=silent).runs
-    assert plain.strategy == "baseline"
-    assert plain.views[0]["protocol"] == plain.views[0]["protocol_half"]
-
-
-def test_what_was_measured_is_not_measured_again(trained, tmp_path, monkeypatch):
-    folders, _ = trained
-    original, measured = ranking_module.score_run, []
-
-    def score_run(folder, **keywords):
-        measured.append(folder)
-        if len(measured) == 2:
-            raise KeyboardInterrupt
-        return original(folder, **keywords)
-
-    monkeypatch.setattr(ranking_module, "score_run", score_run)
-    asked = {"views": 1, "say": silent}
-    with pytest.raises(KeyboardInterrupt):
-        rank_runs(folders, tmp_path, **asked)
-    first = rank_runs(folders, tmp_path, **asked)
-    assert measured == [folders[0], folders[1], folders[1]]  # the interrupted one again, the finished one not
-    assert rank_runs(folders[::-1], tmp_path, **asked) == first
-    assert len(measured) == 3
-    rank_runs(folders[:1], tmp_path, split="train", **asked)
-    assert len(measured) == 4
-    checkpoint = folders[0] / CHECKPOINT
-    later = checkpoint.stat().st_mtime_ns + 1_000_000_000
-    os.utime(checkpoint, ns=(later, later))  # trained further
-    rank_runs(folders, tmp_path, **asked)
-    assert measured[4:] == [folders[0]]
+        assert mean_of(run, ours) == pytest.approx(mean[theirs]), ours
+    assert mean_of(run, "protocol") != mean_of(run, "protocol_half")
 
 
 def test_a_study_leaves_numbers_tables_and_a_figure(trained, tmp_path):
-    folders, _ = trained
-    said: list[str] = []
-    ranking = study_ranking(folders, tmp_path, views=1, say=said.append)
-    assert [len(run.views) for run in ranking.runs] == [1, 1]
+    records = run_study(ranking_study(trained[0], views=1), tmp_path, say=silent)
+    plain = records["/".join(trained[0][1].parts[-3:])]
+    assert plain["strategy"] == "baseline"
+    assert plain["views"][0]["protocol"] == plain["views"][0]["protocol_half"]
+    assert [len(run["views"]) for run in records.values()] == [1, 1]
     text = (tmp_path / "ranking.md").read_text()
-    assert text in said
+    assert "(test views)" in text
     assert "## synthetic (1/8): 2 runs, 1 views" in text
-    assert (tmp_path / "ranking.json").exists()
     with Image.open(tmp_path / "ranking.png") as picture:
         assert len(picture.convert("RGB").getcolors(1 << 24)) > 50
 
 
 @pytest.mark.parametrize(("keywords", "message"), [({"split": "val"}, "split must be 'train' or 'test', got 'val'"),
                                                     ({"views": 0}, "views must be at least 1")])  # fmt: skip
-def test_refusals(trained, tmp_path, keywords, message):
+def test_refusals(trained, keywords, message):
     with pytest.raises(ValueError, match=message):
-        rank_runs(trained[0], tmp_path, **keywords)
-    with pytest.raises(ValueError, match="at least 1 run"):
-        rank_runs([], tmp_path)
-    with pytest.raises(FileNotFoundError, match="holds no run"):
-        rank_runs([tmp_path], tmp_path)
+        ranking_study(trained[0], **keywords)
 
 
-def made(strategy: str, seed: int, exact: float, protocol: float = 1.0, psnr: float = 20.0, **settings) -> RunScores:
+def made(strategy: str, seed: int, exact: float, protocol: float = 1.0, psnr: float = 20.0, **settings) -> dict:
     row = dict.fromkeys(VARIANTS, exact) | {"protocol": protocol, "psnr": psnr}
     row |= {f"visible {name}": 0.5 for name in ("protocol", "protocol_half", "exact_half")}
     return scores_of([row], strategy, seed, **settings)
@@ -270,10 +233,11 @@ def test_runs_with_other_settings_are_no_seeds_of_one_strategy():
 
 
 def test_a_run_without_a_value_is_shown_as_such(tmp_path):
-    half = scores_of([made("b", 0, 0.004).views[0], made("b", 0, math.nan).views[0]], "b")
-    ranking = Ranking("test", (half, made("a", 0, math.nan)))
-    lines = [line for line in ranking_report(ranking).splitlines() if line.startswith(("| b", "| a"))]
+    half = scores_of([made("b", 0, 0.004)["views"][0], made("b", 0, math.nan)["views"][0]], "b")
+    records = {"a": made("a", 0, math.nan), "b": half}  # what has no value comes last
+    lines = [line for line in ranking_module._report(records).splitlines() if line.startswith(("| b", "| a"))]
     assert "| 4 (1/2) |" in lines[0]
     assert lines[1].count("n/a") == len(VARIANTS) - 1
-    ranking_figure(ranking, tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").exists()
+    figure = Figure()
+    ranking_module._draw(records, figure)
+    figure.savefig(tmp_path / "figure.png")

@@ -1,4 +1,4 @@
-"""The clocks of the studies."""
+"""Clocks, and timing in turns."""
 
 from __future__ import annotations
 

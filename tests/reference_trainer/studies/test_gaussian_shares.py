@@ -11,14 +11,14 @@ from PIL import Image
 
 from ca_reg import Reason
 from reference_trainer.evaluation.results import write_json
-from reference_trainer.evaluation.trained_model import TrainedModel, Treatment
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies import attribution as attribution_module
-from reference_trainer.studies.attribution import (
+from reference_trainer.studies import gaussian_shares as shares_module
+from reference_trainer.studies.gaussian_shares import (
     blend_weights,
     colored_by,
     concentration,
@@ -116,7 +116,7 @@ def test_every_view_has_a_picture_of_four_panels(run, study):
 def test_views_of_the_same_name_in_two_folders_keep_their_pictures(run, tmp_path, monkeypatch):
     model, scene, _ = of_run(run)
     views = tuple(dataclasses.replace(v, name=n) for v, n in zip(scene.test, ("a/r.png", "b/r.png"), strict=False))
-    monkeypatch.setattr(attribution_module, "of_run", lambda *a: (model, dataclasses.replace(scene, test=views), run))
+    monkeypatch.setattr(shares_module, "of_run", lambda *a: (model, dataclasses.replace(scene, test=views), run))
     study_attribution(run, tmp_path, say=lambda text: None)
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["a_r.png", "b_r.png"]
 
@@ -156,7 +156,7 @@ def test_blend_weights_are_those_of_brute_force():
         torch.zeros(n, 1, 3, dtype=torch.float64),
         torch.zeros(n, 0, 3, dtype=torch.float64),
     )
-    model = TrainedModel(gaussians, torch.ones(3, dtype=torch.float64), treatment=Treatment(scale=scale))
+    model = TrainedModel(gaussians, torch.ones(3, dtype=torch.float64), f"dropout({1 - scale})")
     views = [View(str(i), camera, torch.zeros(3, 18, 24)) for i, camera in enumerate(cameras)]
     identity = torch.eye(n, dtype=torch.float64)
     expected = sum(

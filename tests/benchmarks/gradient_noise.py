@@ -1,26 +1,20 @@
-"""What sampling costs the gradient: one training step with random masks against the step in expectation."""
+"""What sampling costs the gradient: one training step with random masks against the step in expectation.
+
+``PYTHONPATH=tests python -m benchmarks.gradient_noise RUN ...``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import torch
+import tyro
 from torch import Tensor
 
-from ca_reg.functional import apply_dropout, draw_keep_mask, expected_squared_error
-from reference_trainer.evaluation.results import machine, write_json
-from reference_trainer.files import write_text
-from reference_trainer.json_files import read_json
-from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
-from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.runs.folder import CHECKPOINT
-from reference_trainer.runs.run import load_run
-from reference_trainer.scenes.scene import View
-from reference_trainer.studies.gradient_noise_moments import (
+from benchmarks.gradient_noise_moments import (
     ALL,
     LOSSES,
     DrawMoments,
@@ -30,92 +24,81 @@ from reference_trainer.studies.gradient_noise_moments import (
     StepNoise,
     dot,
 )
-from reference_trainer.studies.gradient_noise_report import gradient_noise_figure, gradient_noise_report
-from reference_trainer.studies.timing import now
+from benchmarks.gradient_noise_report import gradient_noise_figure, gradient_noise_report
+from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask, expected_squared_error
+from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.rendering import render_gaussians, render_moments_of
+from reference_trainer.runs.run import load_run
+from reference_trainer.scenes.scene import View
+from reference_trainer.studies.clocks import now
+from reference_trainer.studies.study import Record, Records, Study, checkpoints, run_study
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.expectation import render_expectation
 from reference_trainer.training.randomness import stream
 
-__all__ = ["gradient_noise", "study_gradient_noise"]
+__all__ = ["gradient_noise", "gradient_noise_study"]
 
 ROUNDS = 5  # how often each kind of step is timed at every view
 
-Say = Callable[[str], None]
 
-
-def study_gradient_noise(
-    runs: Sequence[Path], out: Path, *, draws: int = 64, dropout: float = 0.2, device: str = "cpu", say: Say = print
-) -> dict[str, GradientNoise]:
-    """Study trained runs, and write ``gradient_noise.json``, ``.md`` and ``.png``.
-
-    Every run is measured at the parameters of its checkpoint and its training views, under plain dropout (without
-    compensation and noise) whatever it was trained with. Each finished run is written at once; one that is in the JSON
-    file already, of the same checkpoint and with the same settings, is not measured again.
+def main(
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path = Path("runs/gradient_noise"),
+    draws: int = 64,
+    dropout: float = 0.2,
+    device: str = "cpu",
+) -> None:
+    """Measure what sampling masks costs the gradient of a training step, against the analytic gradient.
 
     Args:
         runs: folders of runs.
-        out: folder for the results.
+        out: folder for the JSON, the tables and the figure; what is in it is not measured again.
+        draws: masks at every training view, a power of two.
+        dropout: rate of the masks.
+        device: "cpu" or "cuda".
+    """
+    run_study(gradient_noise_study(runs, draws=draws, dropout=dropout, device=device), out)
+
+
+def gradient_noise_study(runs: Sequence[Path], *, draws: int = 64, dropout: float = 0.2, device: str = "cpu") -> Study:
+    """Declare the study of trained runs.
+
+    Every run is measured at the parameters of its checkpoint and its training views, under plain dropout (without
+    compensation and noise) whatever it was trained with.
+
+    Args:
+        runs: folders of runs.
         draws: number K of masks at every view, a power of two of at least 4.
         dropout: drop rate of the masks, in (0, 1).
         device: where to render.
-        say: receives the progress and the tables.
-
-    Returns:
-        The results by name: the last three parts of a run's path.
 
     Raises:
-        ValueError: if there is no run, two have the same name, a setting is out of range, or as `gradient_noise`.
+        ValueError: if there is no run, two have the same name, or a setting is out of range.
         FileNotFoundError: if a folder holds no run.
     """
-    if not runs:
-        raise ValueError("expected at least 1 run, got none: give the --out folders of ca-reg train.")
     _check(draws, dropout)
-    names = ["/".join(run.resolve().parts[-3:]) for run in runs]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"two runs are called {twice[0]}: rename one, or study them in different folders.")
-    for run in runs:
-        if not (run / CHECKPOINT).exists():
-            raise FileNotFoundError(f"{run} holds no run (no {CHECKPOINT}): give the --out folder of ca-reg train.")
-    file = out / "gradient_noise.json"
-    entries: dict[str, Any] = read_json(file) if file.exists() else {}
-    results: dict[str, GradientNoise] = {}
-    for name, run in zip(names, runs, strict=True):
-        settings = {
-            "run": str(run.resolve()),
-            "checkpoint": (run / CHECKPOINT).stat().st_mtime_ns,
-            "draws": draws,
-            "dropout": dropout,
-            "device": device,
-            "threads": torch.get_num_threads(),
-        }
-        if entries.get(name, {}).get("settings") == settings:
-            say(f"{name}: measured before, kept")
-        else:
-            say(name)
-            trainer = load_run(run, device)
-            result = gradient_noise(
-                trainer.gaussians,
-                trainer.background,
-                replace(trainer.config, dropout=dropout, compensate=False, noise=0.0),
-                trainer.views,
-                sh_degree=trainer.sh_degree,
-                draws=draws,
-                say=say,
-            )
-            entries[name] = {
-                "settings": settings,
-                "summary": result.summary(),
-                **asdict(result),
-                "machine": machine(),
-            }
-            write_json(file, entries)
-        results[name] = GradientNoise.from_dict(entries[name])
-    text = gradient_noise_report(results)
-    write_text(out / "gradient_noise.md", text)
-    gradient_noise_figure(results, out / "gradient_noise.png")
-    say(text)
-    say(f"Tables, numbers and figure are in {out}")
-    return results
+    settings = {"draws": draws, "dropout": dropout, "device": device}
+    cases = {name: {"checkpoint": file, **settings} for name, file in checkpoints(runs).items()}
+
+    def results(records: Records) -> dict[str, GradientNoise]:
+        return {name: GradientNoise.from_dict(record) for name, record in records.items()}
+
+    return Study(
+        "gradient_noise",
+        _measure,
+        cases,
+        lambda records: gradient_noise_report(results(records)),
+        lambda records, figure: gradient_noise_figure(results(records), figure),
+    )
+
+
+def _measure(checkpoint: Path, draws: int, dropout: float, device: str) -> Record:
+    """Measure a run."""
+    trainer = load_run(checkpoint.parent, device)
+    config = replace(trainer.config, dropout=dropout, noise=0.0, regularizer="")
+    model = (trainer.gaussians, trainer.background, config, trainer.views)
+    result = gradient_noise(*model, sh_degree=trainer.sh_degree, draws=draws)
+    return {"summary": result.summary(), **asdict(result)}
 
 
 def gradient_noise(
@@ -126,7 +109,6 @@ def gradient_noise(
     *,
     sh_degree: int,
     draws: int = 64,
-    say: Say = print,
 ) -> GradientNoise:
     """Measure what masks do to the gradient of a step at fixed parameters, and what is left without them.
 
@@ -137,7 +119,6 @@ def gradient_noise(
         views: to train on, with different names.
         sh_degree: highest band of spherical harmonics to use.
         draws: number K of masks at every view, a power of two of at least 4.
-        say: receives a line before each view.
 
     Returns:
         All measurements. The groups are the parameters, the two sets of spherical harmonics taken as one: at one view
@@ -147,15 +128,14 @@ def gradient_noise(
         ValueError: if ``draws`` is out of range, or the configuration is not one of plain dropout.
     """
     _check(draws, config.dropout)
-    if config.noise != 0 or config.compensate:
-        raise ValueError("expected plain dropout: leave out compensation and noise.")
+    if config.noise != 0 or config.regularizer:
+        raise ValueError("expected plain dropout: leave out noise and other regularizers.")
     model = gaussians.map(lambda x: x.detach().requires_grad_())
     found: dict[str, dict[str, dict[str, Moments]]] = {}
     sums: dict[str, list[Gradients]] = {loss: [{}, {}] for loss in LOSSES}  # of means of the draws, of analytic ones
     times: tuple[list[list[float]], list[list[float]]] = ([], [])
     repeats = True
     for index, view in enumerate(views):
-        say(f"view {view.name}: {draws} draws")
         step = _Step(model, background, config, sh_degree, view)
         generator = stream(config.seed, index, "gradient noise")
         analytic, again, control = step.analytic(), step.analytic(), step.control()
@@ -209,16 +189,16 @@ class _Step:
         """Return the gradients of both losses in expectation."""
         image, variance = self._expectation()
         squared = expected_squared_error(image, variance, self.view.image).mean()
-        photometric = expected_photometric_loss(image, variance, self.view.image, self.config.lambda_dssim)
+        photometric = expected_photometric_loss(image, variance, self.view.image)
         losses = {"photometric": photometric, "squared": squared}
         return {loss: self._gradient(losses[loss]) for loss in LOSSES}
 
     def seconds(self, generator: torch.Generator) -> tuple[list[float], list[float]]:
         """Time forward and backward of the photometric loss of a sampled and of an analytic step, in turns."""
-        weight, target = self.config.lambda_dssim, self.view.image
+        target = self.view.image
         calls: tuple[Callable[[], Tensor], Callable[[], Tensor]] = (
-            lambda: photometric_loss(self._draw(generator), target, weight),
-            lambda: expected_photometric_loss(*self._expectation(), target, weight),
+            lambda: photometric_loss(self._draw(generator), target),
+            lambda: expected_photometric_loss(*self._expectation(), target),
         )
         taken: tuple[list[float], list[float]] = ([], [])
         for _ in range(ROUNDS):
@@ -243,14 +223,13 @@ class _Step:
 
     def _expectation(self) -> tuple[Tensor, Tensor]:
         """Render mean and variance."""
-        out = render_expectation(
-            self.gaussians, self.view.camera, self.background, self.config, sh_degree=self.sh_degree
-        )
-        return out.image, out.variance
+        camera, multiplier = self.view.camera, Multiplier.dropout(self.config.dropout)
+        out, _ = render_moments_of(self.gaussians, multiplier, camera, self.background, sh_degree=self.sh_degree)
+        return out.mean, out.variance
 
     def _losses(self, image: Tensor) -> dict[str, Tensor]:
         """Return both losses of an image."""
-        photometric = photometric_loss(image, self.view.image, self.config.lambda_dssim)
+        photometric = photometric_loss(image, self.view.image)
         return {"photometric": photometric, "squared": (image - self.view.image).square().mean()}
 
     def _gradient(self, loss: Tensor) -> Gradients:
@@ -268,3 +247,7 @@ def _check(draws: int, dropout: float) -> None:
         raise ValueError(f"draws must be a power of two of at least 4, got {draws}.")
     if not 0 < dropout < 1:
         raise ValueError(f"dropout must lie between 0 and 1, got {dropout}: without masks there is nothing to sample.")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -2,10 +2,17 @@
 
 import pytest
 import torch
+from decimal_renderer import exact_images
 from oracles import brute_force
 
-from reference_trainer.studies.stability.exact import exact_images
-from reference_trainer.studies.stability.quantities import IMAGES, loss_weights
+from reference_trainer.studies.both_engines import drawn_by, engines_on
+from reference_trainer.studies.stability.judge import GRADIENT_TOLERANCE, VALUE_TOLERANCE, relative_error
+from reference_trainer.studies.stability.quantities import (
+    IMAGES,
+    independent_images,
+    loss_weights,
+    scene_quantities,
+)
 from reference_trainer.studies.stability.scenes import PARAMETERS, base_scene, camera_of
 
 
@@ -41,3 +48,28 @@ def test_opacities_that_are_clamped_or_end_a_pixel_are_refused(opacities):
     scene = base_scene(len(opacities)).with_(opacities=torch.tensor(opacities).double())
     with pytest.raises(ValueError, match="neither clamp an alpha nor end a pixel"):
         exact_images(scene)
+
+
+def needles(ratio):
+    """Three long needles in 16 pixels, with numbers that float32 holds."""
+    scene = base_scene(3, camera=camera_of(4, 4, focal=5.0))
+    scales = torch.tensor([[0.02 * ratio, 0.02, 0.02]], dtype=torch.float64).expand(3, 3)
+    return scene.with_(scales=scales).to(torch.float32, camera=torch.float64).to(torch.float64)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [2.0, 1e2, 1e4, 1e6, 1e8])
+def test_long_needles_are_drawn_right_where_float64_itself_is_in_doubt(ratio):
+    """The stability study compares needles with the renderer in float64: the reference of the other cases ends here."""
+    scene = needles(ratio)
+    exact = exact_images(scene)
+    drawn = {"float64": scene_quantities(scene, torch.float64)}
+    if ratio <= 1e6:  # then its covariances of 1e16 and 0.3 leave float64 nothing to invert
+        drawn["reference"] = independent_images(scene)
+    for engine in engines_on(torch.device("cpu")):
+        with drawn_by(engine):
+            drawn[engine] = scene_quantities(scene, torch.float32)
+    for by, quantities in drawn.items():
+        for name in IMAGES:
+            tolerance = GRADIENT_TOLERANCE if name.startswith("d ") else VALUE_TOLERANCE
+            assert relative_error(quantities[name], exact[name]) <= tolerance, (by, name)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
+from typing import Any
 
+from benchmarks.gradient_noise_moments import CANDIDATES, LOSSES, GradientNoise, Moments
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
-from reference_trainer.files import replacing
-from reference_trainer.studies.gradient_noise_moments import CANDIDATES, LOSSES, GradientNoise, Moments
 
 __all__ = ["gradient_noise_figure", "gradient_noise_report", "gradient_noise_table"]
 
@@ -94,18 +93,14 @@ def gradient_noise_table(result: GradientNoise) -> str:
     )
 
 
-def gradient_noise_figure(results: Mapping[str, GradientNoise], path: Path) -> None:
+def gradient_noise_figure(results: Mapping[str, GradientNoise], figure: Any) -> None:
     """Draw the relative noise of a sampled and of an analytic step for every group, one panel per run.
 
     Args:
         results: by the title of the panel.
-        path: the PNG to write.
+        figure: an empty one of matplotlib.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6 * len(results), 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure.set_size_inches(6 * len(results), 4.5)
     panels = figure.subplots(1, len(results), squeeze=False)[0]
     for axes, (name, result) in zip(panels, results.items(), strict=True):
         groups = result.groups()
@@ -121,5 +116,3 @@ def gradient_noise_figure(results: Mapping[str, GradientNoise], path: Path) -> N
         axes.grid(axis="y", alpha=0.3)
     lines = dict(zip(*reversed(panels[-1].get_legend_handles_labels()), strict=True))
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=3, frameon=False, fontsize="small")
-    with replacing(path) as place:
-        figure.savefig(place, dpi=110, format="png")

@@ -1,8 +1,8 @@
-"""The clocks of the studies."""
+"""Timing in turns."""
 
 import itertools
 
-from reference_trainer.studies.timing import in_turns
+from reference_trainer.studies.clocks import in_turns
 
 
 def test_calls_are_made_in_turns_and_the_first_round_is_not_timed():

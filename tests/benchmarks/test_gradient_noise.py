@@ -10,24 +10,26 @@ import torch
 from oracles import brute_force, random_scene
 from PIL import Image
 
-from ca_reg.functional import draw_keep_mask
-from reference_trainer.evaluation.results import write_json
-from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
-from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
-from reference_trainer.runs.folder import CHECKPOINT
-from reference_trainer.runs.folder import CONFIG as RUN_CONFIG
-from reference_trainer.scenes.scene import View
-from reference_trainer.studies import gradient_noise as study_module
-from reference_trainer.studies.gradient_noise import gradient_noise, study_gradient_noise
-from reference_trainer.studies.gradient_noise_moments import (
+from benchmarks import gradient_noise as study_module
+from benchmarks.gradient_noise import gradient_noise, gradient_noise_study
+from benchmarks.gradient_noise_moments import (
     LOSSES,
     DrawMoments,
     GradientNoise,
     Moments,
     StepNoise,
 )
+from ca_reg.functional import Multiplier, draw_keep_mask
+from reference_trainer.evaluation.results import write_json
+from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
+from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
+from reference_trainer.model.rendering import render_moments_of
+from reference_trainer.runs.folder import CHECKPOINT
+from reference_trainer.runs.folder import CONFIG as RUN_CONFIG
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import View
+from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.expectation import render_expectation
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 
@@ -62,7 +64,7 @@ def scene() -> tuple[Gaussians, list[View]]:
 def result(scene) -> GradientNoise:
     state = torch.get_rng_state()
     gaussians, views = scene
-    found = gradient_noise(gaussians, BACKGROUND, CONFIG, views, sh_degree=1, draws=DRAWS, say=lambda text: None)
+    found = gradient_noise(gaussians, BACKGROUND, CONFIG, views, sh_degree=1, draws=DRAWS)
     assert torch.equal(torch.get_rng_state(), state)
     assert not any(x.requires_grad for _, x in gaussians.named())
     return found
@@ -130,7 +132,9 @@ def test_both_gradients_of_the_photometric_loss_are_compared_with_the_draws(scen
     gaussians, views = scene
     for index, view in enumerate(views):
         leaves = gaussians.map(lambda x: x.clone().requires_grad_())
-        image, variance, *_ = render_expectation(leaves, view.camera, BACKGROUND, CONFIG, sh_degree=1)
+        (image, variance, *_), _ = render_moments_of(
+            leaves, Multiplier.dropout(RATE), view.camera, BACKGROUND, sh_degree=1
+        )
         loss = expected_photometric_loss(image, variance, view.image)
         analytic = torch.cat([x.flatten() for x in torch.autograd.grad(loss, [x for _, x in leaves.named()])])
         control = oracle(gaussians, view, torch.full((N,), 1 - RATE, dtype=torch.float64))["photometric"]
@@ -288,7 +292,7 @@ def test_a_result_survives_json(result):
 def test_masks_that_leave_nothing_have_a_gradient_of_zero(scene):
     gaussians, views = scene
     behind = dataclasses.replace(gaussians, means=gaussians.means - torch.tensor([0.0, 0.0, 99.0]))
-    found = gradient_noise(behind, BACKGROUND, CONFIG, views, sh_degree=1, draws=4, say=lambda text: None)
+    found = gradient_noise(behind, BACKGROUND, CONFIG, views, sh_degree=1, draws=4)
     m = found.views["a"]["photometric"]["all"]
     assert (m.variance, m.squared, m.analytic) == (0.0, 0.0, (0.0, 0.0))
     assert math.isnan(m.relative_noise)
@@ -301,7 +305,7 @@ def test_masks_that_leave_nothing_have_a_gradient_of_zero(scene):
         ({}, 12, "power of two of at least 4, got 12"),
         ({"dropout": 0.0}, 4, "dropout must lie between 0 and 1, got 0"),
         ({"noise": 0.1}, 4, "plain dropout"),
-        ({"compensate": True}, 4, "plain dropout"),
+        ({"regularizer": "noise(0.1)"}, 4, "plain dropout"),
     ],
 )
 def test_settings_out_of_range_are_refused(scene, change, draws, message):
@@ -311,77 +315,55 @@ def test_settings_out_of_range_are_refused(scene, change, draws, message):
         gradient_noise(gaussians, BACKGROUND, config, views, sh_degree=1, draws=draws)
 
 
+OPTIONS = SceneOptions("synthetic", views=2, downscale=8)
+
+
 @pytest.fixture(scope="module")
-def trainer(options) -> Trainer:
+def trainer() -> Trainer:
     """Two views, and noise and inverted dropout, which the study leaves out."""
-    config = TrainConfig(dropout=0.4, compensate=True, noise=0.3, seed=5)
-    return Trainer(dataclasses.replace(options, views=2).load(seed=5), config)
+    config = TrainConfig(regularizer="dropout(0.4, compensate=True)", noise=0.3, seed=5)
+    return Trainer(OPTIONS.load(seed=5), config)
 
 
 @pytest.fixture(scope="module")
-def run(options, trainer, tmp_path_factory):
+def run(trainer, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "mixed" / "seed_0"
     trainer.save(folder / CHECKPOINT)
-    scene = dataclasses.asdict(dataclasses.replace(options, views=2))
+    scene = dataclasses.asdict(OPTIONS)
     write_json(folder / RUN_CONFIG, {"scene": scene, "config": dataclasses.asdict(trainer.config)})
     return folder
 
 
 @pytest.mark.slow
-def test_a_study_measures_plain_dropout_at_the_training_views_of_a_run(trainer, run, tmp_path, monkeypatch):
+def test_a_study_measures_plain_dropout_at_the_training_views_of_a_run(trainer, run, monkeypatch):
     monkeypatch.setattr(study_module, "ROUNDS", 1)
-    monkeypatch.setattr(study_module, "gradient_noise_figure", lambda results, path: None)
-    said = []
-    found = study_gradient_noise([run], tmp_path, draws=4, dropout=0.2, say=said.append)
+    ((name, settings),) = gradient_noise_study([run], draws=4, dropout=0.2).cases.items()
+    result = GradientNoise.from_dict(json.loads(json.dumps(study_module._measure(**settings))))
     plain = TrainConfig(dropout=0.2, seed=5)
     step = trainer.gaussians, trainer.background, plain, trainer.views[:1]
-    alone = gradient_noise(*step, sh_degree=0, draws=4, say=said.append)
-    ((name, result),) = found.items()
+    alone = gradient_noise(*step, sh_degree=0, draws=4)
     assert name == "/".join(run.parts[-3:])
     first = trainer.views[0].name
     assert (result.views[first], list(result.views)) == (alone.views[first], [view.name for view in trainer.views])
 
 
-def test_a_study_writes_its_results_and_continues(run, result, tmp_path, monkeypatch):
-    asked = []
-
-    def measure(*args, draws, **kwargs):
-        asked.append(draws)
-        return result
-
-    monkeypatch.setattr(study_module, "gradient_noise", measure)
+def test_a_study_writes_its_results(run, result, tmp_path, monkeypatch):
+    monkeypatch.setattr(study_module, "gradient_noise", lambda *args, **keywords: result)
     said = []
-    first = study_gradient_noise([run], tmp_path, draws=4, say=said.append)
-    name = "/".join(run.parts[-3:])
-    assert first == {name: result}
-    entry = json.loads((tmp_path / "gradient_noise.json").read_text(encoding="utf-8"))[name]
-    assert (entry["settings"]["draws"], entry["settings"]["dropout"]) == (4, 0.2)
-    summary, pooled = entry["summary"]["squared"]["sh"], Moments.total(result.over_views("squared", "sh"))
+    (record,) = run_study(gradient_noise_study([run], draws=4), tmp_path, say=said.append).values()
+    assert GradientNoise.from_dict(record) == result
+    summary, pooled = record["summary"]["squared"]["sh"], Moments.total(result.over_views("squared", "sh"))
     assert (summary["relative_noise"], summary["worth_control"]) == (pooled.relative_noise, pooled.worth("control"))
     assert summary["share_of_masks"] == result.steps["squared"]["sh"].share_of_masks
-    assert entry["summary"]["seconds"]["ratio"] == result.seconds()[1] / result.seconds()[0]
-    assert entry["machine"]["torch"] == torch.__version__
+    assert record["summary"]["seconds"]["ratio"] == result.seconds()[1] / result.seconds()[0]
     text = (tmp_path / "gradient_noise.md").read_text(encoding="utf-8")
     assert text == said[-2]
     assert f"{result.steps['photometric']['opacity_logits'].share_of_masks:.1%} |" in text
     assert "agree bit by bit" in text
     with Image.open(tmp_path / "gradient_noise.png") as picture:
         assert picture.width > 300
-    monkeypatch.setattr(study_module, "gradient_noise_figure", lambda results, path: None)
-    assert study_gradient_noise([run], tmp_path, draws=4, say=said.append) == first
-    assert f"{name}: measured before, kept" in said
-    assert asked == [4]
-    for change in ({"draws": 8}, {"draws": 4, "dropout": 0.5}):
-        study_gradient_noise([run], tmp_path, say=said.append, **change)
-    assert asked == [4, 8, 4]
 
 
-def test_a_study_refuses_what_it_cannot_measure(run, tmp_path):
-    with pytest.raises(ValueError, match="at least 1 run"):
-        study_gradient_noise([], tmp_path)
-    with pytest.raises(ValueError, match="two runs are called"):
-        study_gradient_noise([run, run], tmp_path, draws=4, say=lambda text: None)
-    with pytest.raises(FileNotFoundError, match="holds no run"):
-        study_gradient_noise([tmp_path / "no"], tmp_path)
+def test_a_study_refuses_what_it_cannot_measure(run):
     with pytest.raises(ValueError, match="power of two"):
-        study_gradient_noise([run], tmp_path, draws=5)
+        gradient_noise_study([run], draws=5)

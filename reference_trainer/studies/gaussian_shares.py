@@ -48,11 +48,11 @@ _README = """\
 {table}
 - `shares.npz`: `shares`, `total_effects` and `blend_weights`, one float64 per Gaussian in the order of the model
   (`numpy.load`).
-- `attribution.ply`: the same Gaussians for any viewer, coloured by their share: black {low:.3g} (the mean share) or
-  less, pale yellow {high:.3g} (100 times the mean) or more.
-- `attribution_per_weight.ply`: coloured by their share per blend weight: black {low_per_weight:.3g} (a tenth of the
-  mean) or less, pale yellow {high_per_weight:.3g} (10 times the mean) or more. The mean is the score over the sum of
-  the weights. Here a Gaussian is bright that co-adapts much for what it contributes, small or large.
+- `attribution.ply`: the same Gaussians for any viewer, coloured by their share: black {share[0]:.3g} (the mean share)
+  or less, pale yellow {share[1]:.3g} (100 times the mean) or more.
+- `attribution_per_weight.ply`: coloured by their share per blend weight: black {share_per_weight[0]:.3g} (a tenth of
+  the mean) or less, pale yellow {share_per_weight[1]:.3g} (10 times the mean) or more. The mean is the score over the
+  sum of the weights. Here a Gaussian is bright that co-adapts much for what it contributes, small or large.
 - `views/`: render; CA map (black 0, pale yellow {ca_range:g} or more, grey: not covered by the score); the render with
   the colours of either PLY.
 
@@ -81,16 +81,7 @@ def mean_shares(model: TrainedModel, views: Sequence[View], *, drop_rate: float 
 
 
 def mean_effects(model: TrainedModel, views: Sequence[View], *, drop_rate: float = 0.5) -> Tensor:
-    """Return the total effects of the Gaussians, mean over the views that have a score, shape (N,), float64.
-
-    Args:
-        model: what to measure.
-        views: on the model's device.
-        drop_rate: of the score.
-
-    Raises:
-        ValueError: if no view has a score.
-    """
+    """Return the total effects of the Gaussians in the same way as `mean_shares` their shares."""
     score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
     return _mean_over_views(lambda view: total_effects(score, opacities, view), views)[0]
 
@@ -209,7 +200,11 @@ def study_attribution(
     effects = mean_effects(model, views, drop_rate=drop_rate)
     weights = blend_weights(model, views)
     values = [result.value for result in results if result.reason is Reason.OK]
-    means = {"share": shares.mean().item(), "share_per_weight": (shares.sum() / weights.sum()).item()}
+    per_weight = (shares.sum() / weights.sum()).item()
+    scales = {
+        "share": [end * shares.mean().item() for end in _SHARE_SCALE],
+        "share_per_weight": [end * per_weight for end in _PER_WEIGHT_SCALE],
+    }
     data: dict[str, Any] = {
         "scene": scene.name,
         "split": split,
@@ -221,13 +216,9 @@ def study_attribution(
         "sum_of_total_effects": effects.sum().item(),
         "held_by": concentration(shares),
         "spearman": _correlations(model, views, shares, weights),
-        "color_scales": {
-            "share": [end * means["share"] for end in _SHARE_SCALE],
-            "share_per_weight": [end * means["share_per_weight"] for end in _PER_WEIGHT_SCALE],
-        },
+        "color_scales": scales,
         "machine": machine(),
     }
-    scales = data["color_scales"]
     a, b, c = (x.cpu().numpy() for x in (shares, effects, weights))
     with replacing(out / "shares.npz") as place, place.open("wb") as file:
         np.savez(file, shares=a, total_effects=b, blend_weights=c)
@@ -243,9 +234,7 @@ def study_attribution(
         save_png(out / "views" / f"{name}.png", _picture(model, colored.values(), view, result))
     write_json(out / "attribution.json", data)
     table = _table(data)
-    ends = dict(zip(("low", "high"), scales["share"], strict=True))
-    ends |= dict(zip(("low_per_weight", "high_per_weight"), scales["share_per_weight"], strict=True))
-    write_text(out / "README.md", _README.format(table=table, ca_range=CA_PICTURE_RANGE, **ends))
+    write_text(out / "README.md", _README.format(table=table, ca_range=CA_PICTURE_RANGE, **scales))
     say(table)
     say(f"Shares, PLYs and pictures are in {out}; README.md there says what the colours mean")
     return data

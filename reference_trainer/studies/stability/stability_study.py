@@ -1,0 +1,235 @@
+"""The stability study: every case with every engine, where it ends and how; the command fails if nobody foresaw it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache, lru_cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+
+from reference_trainer.evaluation.results import machine, markdown_table
+from reference_trainer.studies.both_engines import drawn_by, engines_on
+from reference_trainer.studies.stability.blends import blend_cases
+from reference_trainer.studies.stability.case import Case, Probe
+from reference_trainer.studies.stability.geometry import geometry_cases
+from reference_trainer.studies.stability.judge import GRADIENT_TOLERANCE, VALUE_TOLERANCE, judge
+from reference_trainer.studies.stability.quantities import SCENE_QUANTITIES
+from reference_trainer.studies.study import Record, Records, Study, run_study
+
+__all__ = ["all_cases", "judge_with", "stability_study", "study_stability"]
+
+_GROUPS = {
+    "image, alpha": ("image", "alpha"),
+    "gradients": tuple(name for name in SCENE_QUANTITIES if name.startswith("d ") and name != "d variance"),
+    "mean, variance, CA": ("mean", "variance", "d variance", "CA"),
+    "dropout, noise": ("dropout", "noise"),
+}
+_FLOOR, _CEILING = 1e-9, 1.0
+
+
+@cache
+def all_cases() -> tuple[Case, ...]:
+    """Return all cases: shape, place and camera; opacities, masks, colours and precision."""
+    return (*geometry_cases(), *blend_cases())
+
+
+def study_stability(out: Path) -> Records:
+    """Push both engines of the renderer and the functions of `ca_reg` to extremes, and say where they end and how.
+
+    Args:
+        out: folder for the results.
+
+    Raises:
+        RuntimeError: if a case ends in another way than it should; lists them, after everything is written.
+    """
+    records = run_study(stability_study(), out)
+    if defects := [name for name, record in records.items() if record["ending"] == "defect"]:
+        raise RuntimeError("\n  ".join([f"{len(defects)} cases do not end as they should:", *defects]))
+    return records
+
+
+def stability_study() -> Study:
+    """Declare the study: every case once for each engine, or once if it draws nothing; no loops where numba is missing.
+
+    What was measured is not kept once it is finished: the next study checks the program as it is then.
+    """
+    cases = {}
+    for number, case in enumerate(all_cases()):
+        for engine in engines_on(torch.device("cpu")) if case.draws else [None]:
+            name = f"{case.family}: {case.name}" + (f" ({engine})" if engine else "")
+            cases[name] = {"number": number, "engine": engine}
+    return Study("stability", judge_with, cases, _report, _draw, check=True)
+
+
+def judge_with(number: int, engine: str | None) -> Record:
+    """Judge a case, by its number in `all_cases`, with an engine; None for one that draws nothing."""
+    start, case = perf_counter(), _with_one_reference(all_cases()[number])
+    if engine is None:
+        record = judge(case)
+    else:
+        with drawn_by(engine):
+            record = judge(case)
+    return {"engine": engine, "seconds": perf_counter() - start, **record}
+
+
+@lru_cache(maxsize=1)
+def _with_one_reference(case: Case) -> Case:
+    """Return the case with references that are computed once: they are in float64, whatever the engine."""
+
+    @cache
+    def probe(magnitude: float) -> Probe:
+        fresh = case.probe(magnitude)
+        return Probe(fresh.measured, cache(fresh.reference))
+
+    return replace(case, probe=probe)
+
+
+def _worst_errors(record: Record) -> dict[str, float]:
+    """Return the largest error of every quantity over the magnitudes at which all were right."""
+    worst: dict[str, float] = {}
+    for point in record["points"]:
+        if point["status"] == "ok":
+            for name, error in point["errors"].items():
+                worst[name] = max(error, worst.get(name, 0.0))
+    return worst
+
+
+def _engines(records: Records) -> list[str]:
+    return list(dict.fromkeys(record["engine"] for record in records.values() if record["engine"]))
+
+
+def _of_engine(records: Sequence[Record], engine: str) -> list[Record]:
+    """Return the records of an engine, and those that are of no engine."""
+    return [record for record in records if record["engine"] in (engine, None)]
+
+
+def _report(records: Records) -> str:
+    """Return counts, errors by case and quantity, and how what ends does so."""
+    cases, about = [*records.values()], machine()
+    rows = [_count_row(engine, _of_engine(cases, engine)) for engine in _engines(records)]
+    lines = [
+        f"{about['cpu']}, torch {about['torch']}: {sum(len(case['points']) for case in cases)} magnitudes in "
+        f"{sum(case['seconds'] for case in cases):.0f} s. Right is an error of at most {VALUE_TOLERANCE:g}, of "
+        f"gradients (d) {GRADIENT_TOLERANCE:g}: the norm of the difference over that of the reference. What draws "
+        "nothing in float32 is judged once and counted for every engine.",
+        "",
+        markdown_table(rows, ["engine", "cases", "ok", "refused", "limit", "defect"]),
+        "### Largest error over the magnitudes at which everything is right",
+    ]
+    for family in dict.fromkeys(case["family"] for case in cases):
+        measured = [case for case in cases if case["family"] == family and _worst_errors(case)]
+        if measured:
+            used = [name for name in SCENE_QUANTITIES if any(name in _worst_errors(case) for case in measured)]
+            rows = [_error_row(case) for case in measured]
+            lines += ["", f"**{family}**", "", markdown_table(rows, ["case", "engine", "up to", *used]).rstrip()]
+    rows = [_ending_row(case) for case in cases if case["ending"] != "ok"]
+    columns = ["case", "engine", "ends as", "from", "how", "what it says"]
+    lines += ["", "### Where and how the others end", "", markdown_table(rows, columns).rstrip()]
+    return "\n".join(lines) + "\n"
+
+
+def _count_row(engine: str, cases: Sequence[Record]) -> dict[str, object]:
+    """Return how many cases end in which way."""
+    counts = Counter(case["ending"] for case in cases)
+    endings = {name: counts[name] for name in ("ok", "refused", "limit", "defect")}
+    return {"engine": engine, "cases": len(cases), **endings}
+
+
+def _error_row(case: Record) -> dict[str, object]:
+    """Return the row of a case, its errors with one digit."""
+    right = [point["magnitude"] for point in case["points"] if point["status"] == "ok"]
+    up_to = f"{max(right):.2g}" if case["magnitudes"] else "one"
+    row: dict[str, object] = {"case": case["name"], "engine": case["engine"] or "", "up to": up_to}
+    return row | {name: f"{error:.0e}" if error else "0" for name, error in _worst_errors(case).items()}
+
+
+def _ending_row(case: Record) -> dict[str, object]:
+    """Return the row of a case that does not stay right: from where on, what goes wrong first, and what it says."""
+    first = next(point for point in case["points"] if point["status"] != "ok")
+    wrong = ", ".join(first["wrong"])
+    return {
+        "case": f"{case['family']}: {case['name']}",
+        "engine": case["engine"] or "",
+        "ends as": case["ending"],
+        "from": f"{case['onset']:.2g}" if case["magnitudes"] else "always",
+        "how": first["status"] + (f": {wrong}" if wrong else ""),
+        "what it says": first["message"].partition("\n")[0] or case["note"],
+    }
+
+
+def _draw(records: Records, figure: Any) -> None:
+    """Draw the errors as a heat map for each engine, and as lines for the cases that have an onset."""
+    cases = [case for case in records.values() if _worst_errors(case)]
+    sweeps = [case for case in cases if case["magnitudes"] and case["onset"] is not None]
+    engines = _engines(records) or [""]
+    rows = max(len(_of_engine(cases, engine)) for engine in engines)
+    figure.set_size_inches(6.5 * len(engines) + 7, max(4.0, 0.2 * rows + 2))
+    *left, right = figure.subfigures(1, len(engines) + 1)
+    for part, engine in zip(left, engines, strict=True):
+        _heat(part, engine, _of_engine(cases, engine))
+    if sweeps:
+        panels = right.subplots(math.ceil(len(sweeps) / 2), 2, squeeze=False).flat
+        for panel, case in zip(panels, sweeps, strict=False):
+            _lines(panel, case)
+        if len(sweeps) % 2:
+            right.axes[-1].set_visible(False)
+
+
+def _heat(figure: Any, engine: str, cases: Sequence[Record]) -> None:
+    """Draw the largest error of every quantity over the magnitudes at which all are right."""
+    table = np.full((len(cases), len(SCENE_QUANTITIES)), math.nan)
+    for i, case in enumerate(cases):
+        for name, error in _worst_errors(case).items():
+            table[i, SCENE_QUANTITIES.index(name)] = math.log10(max(error, _FLOOR))
+    axes = figure.subplots()
+    axes.set_facecolor("0.9")
+    picture = axes.imshow(table, cmap="viridis", vmin=math.log10(_FLOOR), vmax=-2, aspect="auto")
+    axes.set_xticks(range(len(SCENE_QUANTITIES)), SCENE_QUANTITIES, rotation=60, ha="right", fontsize=7)
+    axes.set_yticks(range(len(cases)), [_label(case) for case in cases], fontsize=6.5)
+    for i in range(1, len(cases)):
+        if cases[i]["family"] != cases[i - 1]["family"]:
+            axes.axhline(i - 0.5, color="white", linewidth=2)
+    axes.set_title(f"{engine}: largest error where all is right (grey: not part of the case)", fontsize=9)
+    bar = figure.colorbar(picture, ax=axes, shrink=0.4, aspect=30)
+    bar.set_label("log10 of the relative error", fontsize=7)
+
+
+def _label(case: Record) -> str:
+    """Return the name of a case, to where it was pushed, and from where on it ends."""
+    if not case["magnitudes"]:
+        return str(case["name"])
+    end = f"; ends at {case['onset']:.2g}" if case["onset"] is not None else f" (to {case['magnitudes'][1]:.0e})"
+    return f"{case['name']}{end}"
+
+
+def _lines(panel: Any, case: Record) -> None:
+    """Draw the errors of one case against the magnitude; a cross is an infinity, a grey area what is refused."""
+    for color, (label, names) in enumerate(_GROUPS.items()):
+        curve = {
+            point["magnitude"]: max(point["errors"][name] for name in names if name in point["errors"])
+            for point in case["points"]
+            if any(name in point["errors"] for name in names)
+        }
+        finite = {x: min(max(y, _FLOOR), _CEILING) for x, y in curve.items() if math.isfinite(y)}
+        if finite:
+            panel.plot(finite.keys(), finite.values(), ".-", color=f"C{color}", label=label, linewidth=1, markersize=4)
+        infinite = [x for x, y in curve.items() if not math.isfinite(y)]
+        panel.plot(infinite, [_CEILING] * len(infinite), "x", color=f"C{color}", markersize=5)
+    refused = [point["magnitude"] for point in case["points"] if point["status"] == "refused"]
+    if refused:
+        panel.axvspan(min(refused), max(refused), color="0.8")
+    panel.axvline(case["onset"], color="red", linewidth=0.8)
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    panel.set_ylim(_FLOOR / 2, _CEILING * 3)
+    panel.tick_params(labelsize=6)
+    panel.set_title(f"{case['name']}, {case['engine'] or 'any engine'} ({case['ending']})", fontsize=7)
+    panel.grid(alpha=0.3)
+    panel.legend(fontsize=5, loc="lower right")

@@ -1,0 +1,148 @@
+"""What a study is, a declaration, and the one function that runs every study."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from reference_trainer.evaluation.kept import KeptRecords, fingerprint
+from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.files import write_text
+from reference_trainer.runs.engines.engine import Engine, Failure, Task
+from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.figures import new_figure
+from reference_trainer.runs.folder import CHECKPOINT
+
+if TYPE_CHECKING:  # an extra
+    from matplotlib.figure import Figure
+
+__all__ = ["Record", "Records", "Study", "checkpoints", "run_study"]
+
+Say = Callable[[str], None]
+Record = dict[str, Any]
+"""What was measured of a case: strings, numbers, nan and infinity among them, None, lists and dictionaries."""
+Records = Mapping[str, Record]
+"""Records by the name of the case, in the order of the declaration."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """What to measure and what to show.
+
+    Args:
+        name: of its files, ``NAME.json``, ``NAME.md`` and ``NAME.png``.
+        measure: measures one case, given its settings as keyword arguments. A function of a module, so that a worker
+            in another process finds it.
+        cases: the settings by the name of the case: strings, numbers, None, paths of files that are there and count
+            with their size and time, and lists and dataclasses of these. A place to write to is a string.
+        report: returns the tables of all records in Markdown.
+        draw: draws all records into an empty figure; None for no figure.
+        check: whether the study checks the program itself: once it is finished, the next call measures all again.
+    """
+
+    name: str
+    measure: Callable[..., Record]
+    cases: Mapping[str, Mapping[str, Any]]
+    report: Callable[[Records], str]
+    draw: Callable[[Records, Figure], None] | None = None
+    check: bool = False
+
+
+def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say = print) -> Records:
+    """Measure the cases that are not measured yet; write all records, the tables and the figure, and print the tables.
+
+    Every record is on the disk, in ``NAME.records.json``, before the next case begins. It is kept for later calls as
+    long as the settings, the files among them and what `machine` says are the same; other cases may come and go.
+
+    Args:
+        study: the declaration.
+        out: folder for the results.
+        engine: where to measure, several cases at a time; None for here, one after the other.
+        say: receives the progress and the tables.
+
+    Returns:
+        The records.
+
+    Raises:
+        ValueError: if there is no case, or what ``study.measure`` raises.
+        RuntimeError: if cases failed on the engine, after the others are written; the same call tries them again.
+    """
+    if not study.cases:
+        raise ValueError(f"expected at least 1 case of {study.name}, got none.")
+    here, file = machine(), out / f"{study.name}.records.json"
+    kept = KeptRecords(file, study.name, say)
+    keys = {name: f"{name} {fingerprint([here, _decisive(dict(case))])}" for name, case in study.cases.items()}
+    missing = [name for name, key in keys.items() if kept.get(key) is None]
+    failed = {}
+    for name, outcome in _measured(study, missing, engine, say):
+        if isinstance(outcome, Failure):
+            failed[name] = outcome.error
+        else:
+            kept.add(keys[name], json.loads(json.dumps(outcome)))  # now what it will be when it is read
+    records = {name: record for name, key in keys.items() if (record := kept.get(key)) is not None}
+    write_json(out / f"{study.name}.json", {"study": study.name, "machine": here, "cases": records, "failed": failed})
+    if records:
+        text = study.report(records)
+        write_text(out / f"{study.name}.md", text)
+        say(text)
+        if study.draw is not None:
+            with new_figure(out / f"{study.name}.png") as figure:
+                study.draw(records, figure)
+        say(f"numbers, tables and figures: {study.name}.* in {out}")
+    if failed:
+        reasons = "".join(f"\n  {name}: {error}" for name, error in failed.items())
+        raise RuntimeError(f"{len(failed)} of {len(keys)} cases FAILED; the same command tries them again:{reasons}")
+    if study.check:
+        file.unlink(missing_ok=True)
+    return records
+
+
+def checkpoints(runs: Sequence[Path]) -> dict[str, Path]:
+    """Return the checkpoints of runs by name: the last three parts of the path, such as fern/dropout/seed_0.
+
+    Raises:
+        ValueError: if there is no run, or two have the same name.
+        FileNotFoundError: if a folder holds no run.
+    """
+    found: dict[str, Path] = {}
+    for run in dict.fromkeys(run.resolve() for run in runs):
+        name = "/".join(run.parts[-3:])
+        if not (run / CHECKPOINT).exists():
+            raise FileNotFoundError(f"{run} holds no run (no {CHECKPOINT}): give the --out folder of ca-reg train.")
+        if name in found:
+            raise ValueError(f"two runs are called {name}: rename one, or study them in different folders.")
+        found[name] = run / CHECKPOINT
+    if not found:
+        raise ValueError("expected at least 1 run, got none: give the --out folders of ca-reg train.")
+    return found
+
+
+def _measured(
+    study: Study, names: Sequence[str], engine: Engine | None, say: Say
+) -> Iterator[tuple[str, Record | Failure]]:
+    """Measure cases; yield each as it is finished. Here an error ends the study, on an engine the others go on."""
+    calls = {name: partial(study.measure, **study.cases[name]) for name in names}
+    if engine is None:
+        for number, (name, call) in enumerate(calls.items(), start=1):
+            say(f"[{number}/{len(names)}] {name}")
+            yield name, call()
+        return
+    tasks = [Task(name, call, ()) for name, call in calls.items()]
+    for number, (index, outcome) in enumerate(run_all(engine, tasks, say=say), start=1):
+        failed = isinstance(outcome, Failure)
+        say(f"[{number}/{len(names)}] {names[index]}{': FAILED' if failed else ''}")
+        yield names[index], outcome if isinstance(outcome, Failure) else outcome.value
+
+
+def _decisive(settings: Any) -> Any:
+    """Return settings as `fingerprint` takes them: a path is its file, of that size and from that time."""
+    if isinstance(settings, Path):
+        state = settings.stat()
+        return [str(settings.resolve()), state.st_size, state.st_mtime_ns]
+    if isinstance(settings, dict):
+        return {name: _decisive(value) for name, value in settings.items()}
+    return [_decisive(value) for value in settings] if isinstance(settings, list | tuple) else settings
