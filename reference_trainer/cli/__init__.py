@@ -14,6 +14,7 @@ from typing import Any
 import tyro
 
 from reference_trainer.cli.drawing import Warmup
+from reference_trainer.cli.names import Names
 from reference_trainer.cli.ply import Bake
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
@@ -58,6 +59,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "render": Render(run=Path("runs/train")),
         "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
         "study": Study(tyro.MISSING),
+        "names": Names(),
         "warmup": Warmup(),
     }
     # In the list of the commands the first paragraph of each; the command's own help has all of it.

@@ -31,7 +31,7 @@ class TrainConfig:
     """Standard deviation sigma of the multiplicative opacity noise; the paper uses up to 0.8."""
     regularizer: str = ""
     """Other regularizers: "d2gs", "dropout(0.2, compensate=True) + noise(0.8, scale=True)", "my_module:MyDropout(0.3)";
-    `ca-reg regularizers` lists them."""
+    `ca-reg names` lists them."""
     analytic: bool = False
     """Train on the expectation over the regularizers, computed exactly, instead of one random draw."""
     regularize_from: int = 0

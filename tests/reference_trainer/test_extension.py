@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from ca_reg.regularizers import parse
+from ca_reg.regularizers import REGULARIZERS, parse
 from reference_trainer.cli import main
 from reference_trainer.runs.run import load_run
 
@@ -120,3 +120,12 @@ def test_rates_of_a_user_follow_the_camera(toys):
     (near,) = parse(ADDED["regularizer"])
     rates = near.rates(Params(torch.ones(3), means=means, view_matrix=torch.eye(4)))
     torch.testing.assert_close(rates, torch.tensor([0.45, 0.18, 0.9]))
+
+
+def test_every_name_is_listed_with_its_arguments(capsys):
+    main(["names", "regularizer"])
+    out = capsys.readouterr().out
+    assert "--regularizer\n  dropout(p, *, compensate=False)\n      Drop a random subset" in out
+    assert "--loss" not in out
+    for name in REGULARIZERS:
+        assert f"\n  {name}(" in out

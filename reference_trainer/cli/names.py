@@ -1,0 +1,41 @@
+"""What can be asked for by name."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
+
+__all__ = ["Names"]
+
+
+@dataclass(frozen=True)
+class Names:
+    """List what --regularizer, --loss, --density and --renderer know by name, with arguments; trains nothing.
+
+    Classes of your own need no entry: write module:Class.
+    """
+
+    what: Annotated[Literal["all", "regularizer", "loss", "density", "renderer"], tyro.conf.Positional] = "all"
+    """Which option."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from ca_reg.regularizers import REGULARIZERS
+        from reference_trainer.density import DENSITY
+        from reference_trainer.losses import LOSSES
+        from reference_trainer.render.renderers import RENDERERS
+
+        known = {"regularizer": REGULARIZERS, "loss": LOSSES, "density": DENSITY, "renderer": RENDERERS}
+        for option, registry in known.items():
+            if self.what not in ("all", option):
+                continue
+            print(f"--{option}")
+            for name in registry:
+                made = registry[name]
+                about = (inspect.getdoc(made) or "").partition("\n")[0]
+                arguments = inspect.signature(made)
+                bare = [each.replace(annotation=each.empty) for each in arguments.parameters.values()]
+                print(f"  {name}{arguments.replace(parameters=bare, return_annotation=arguments.empty)}\n      {about}")
