@@ -40,7 +40,7 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
 
 def similarity_module() -> ModuleType:
     """Make the module ``fused_ssim``."""
-    module = ModuleType("fused_ssim", "A stand-in on top of reference_trainer.training.losses.")
+    module = ModuleType("fused_ssim", "A stand-in on top of reference_trainer.losses.photometric.")
     module.__spec__ = importlib.machinery.ModuleSpec("fused_ssim", loader=None)
     module.fused_ssim = fused_ssim  # type: ignore[attr-defined]
     return module

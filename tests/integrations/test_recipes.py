@@ -34,5 +34,5 @@ def test_the_launcher_takes_the_commands(command, tmp_path, monkeypatch):
     (tmp_path / script).touch()
     options = _parse(command)
     assert options.script.name == script
-    assert options.regularizers
+    assert options.hook
     assert options.arguments == command[command.index(script) + 1 :]
