@@ -170,9 +170,11 @@ def _forward(
         factors[k, 0], factors[k, 1], factors[k, 2] = l11, -xy * (l22 * l22) * l11, l22
         covariances[k, 0], covariances[k, 1], covariances[k, 2] = xx, xy, yy
         depths[k] = z
+        total = centers[k, 0] + centers[k, 1] + xx + xy + yy
         if degree < 0:
             for c in range(3):
                 colors[k, c] = sh[i, 0, c]
+                total += sh[i, 0, c]
         else:
             direction, _ = _towards(means, i, position)
             basis(direction[0], direction[1], direction[2], degree, values)
@@ -181,7 +183,7 @@ def _forward(
                 for j in range((degree + 1) * (degree + 1)):
                     color += values[j] * sh[i, j, c]
                 colors[k, c] = color if not color < _ZERO else _ZERO
-        total = centers[k, 0] + centers[k, 1] + xx + xy + yy + colors[k, 0] + colors[k, 1] + colors[k, 2]
+                total += color  # as it was: the clamp would make black of minus infinity
         finite = finite and abs(total) < _INFINITY
     return finite
 

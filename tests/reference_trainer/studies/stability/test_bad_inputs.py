@@ -38,7 +38,7 @@ def with_harmonics(bad):
     scene = SCENE.to(torch.float32)
     geometry = (scene.means, scene.quaternions, scene.scales, scene.opacities)
     sh = torch.zeros(24, 4, 3)
-    sh[5, 2, 1] = bad  # a colour of plus infinity; the loops clamp one of minus infinity to black
+    sh[5, 2, 1] = bad
     return render(*geometry, scene.camera, sh=sh)
 
 
@@ -52,6 +52,7 @@ RENDERER = {
     **{f"camera.{name}": lambda bad, name=name: with_camera(**{name: bad}) for name in ("fx", "fy", "cx", "cy")},
     "world_to_camera": lambda bad: with_camera(world_to_camera=spoiled(SCENE.camera.world_to_camera, bad)),
     "sh": with_harmonics,
+    "sh, a colour of minus infinity": lambda bad: with_harmonics(-bad),
     "background of the moments": moments_over,
 }
 
