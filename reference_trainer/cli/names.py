@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -28,7 +28,7 @@ class Names:
         from reference_trainer.losses import LOSSES
         from reference_trainer.render.renderers import RENDERERS
 
-        known = {"regularizer": REGULARIZERS, "loss": LOSSES, "density": DENSITY, "renderer": RENDERERS}
+        known: dict[str, Any] = {"regularizer": REGULARIZERS, "loss": LOSSES, "density": DENSITY, "renderer": RENDERERS}
         for option, registry in known.items():
             if self.what not in ("all", option):
                 continue

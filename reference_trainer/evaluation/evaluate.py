@@ -170,7 +170,7 @@ def _measure(
 ) -> ViewScores:
     """Measure one view, and write its picture and its panel if there are files for them."""
     opacities = model.gaussians.opacities
-    out = model.rendering(model.test_opacities, view)
+    out = model.test_rendering(view)
     image, photograph = out.image.clamp(0, 1), view.image if isinstance(view, View) else None
     protocol, at_half, *limits = scores
     ca, exact, neutral = (score(opacities, view, index=index) for score in (protocol, *limits))

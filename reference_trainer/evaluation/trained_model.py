@@ -65,18 +65,23 @@ class TrainedModel:
         return 1.0 - self.dropout if uniform else None
 
     @property
-    def tested(self) -> Params:
-        """What is rendered at test time; co-adaptation is measured on the plain opacities."""
-        return self.chain.expected(self._plain)
+    def depends_on_camera(self) -> bool:
+        """Whether the opacities at test time are others for every camera: no file of Gaussians can hold them."""
+        return any(member.renders_mean and "view_matrix" in member.needs for member in self.chain)
+
+    @property
+    def test_opacities(self) -> Tensor:
+        """The opacities to render with at test time, shape (N,), if they do not depend on the camera."""
+        return self.chain.expected(self._plain).opacities
 
     @property
     def _plain(self) -> Params:
         return self.gaussians.params(step=self.step)
 
-    @property
-    def test_opacities(self) -> Tensor:
-        """The opacities to render with at test time, shape (N,)."""
-        return self.tested.opacities
+    def test_rendering(self, view: Viewpoint) -> Rendering:
+        """Render a view as at test time; co-adaptation is measured on the plain opacities."""
+        tested = self.chain.expected(self.gaussians.params(view.camera, step=self.step))
+        return render_gaussians(tested, view.camera, self.background, sh_degree=self.sh_degree)
 
     def render(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
         """Render a view with given opacities (N,): the render callable of `CAScore`; image (3, H, W), alpha (H, W)."""

@@ -55,6 +55,8 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> s
     model, facts = of_ply(source, background=torch.zeros(3), regularizer=regularizer)
     if not facts.regularizer:
         raise ValueError(f"{source} does not say what it was trained with: give --regularizer, such as 'dropout(0.2)'.")
+    if model.depends_on_camera:
+        raise ValueError(f"what is rendered after {facts.regularizer} depends on the camera: no file can hold it.")
     if model.factor == 1:
         raise ValueError(f"a model trained with {facts.regularizer} is rendered as it is: there is nothing to bake.")
     save_for_viewers(model, target)

@@ -133,7 +133,7 @@ def render_run(
     images = []
     for name, view in zip(file_names([view.name for view in views]), views, strict=True):
         with threads_for(view.camera.width * view.camera.height):
-            image, _ = model.render(model.test_opacities, view.to(device))
+            image = model.test_rendering(view.to(device)).image
         images.append(image.clamp(0, 1).cpu())
         save_png(folder / f"{name}.png", images[-1])
     if what == "flight":

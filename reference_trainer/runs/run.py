@@ -239,7 +239,7 @@ def _train(
     views = {"train": trainer.views, "test": [view.to(trainer.device) for view in trainer.scene.test]}
 
     def quality(opacity: Tensor, view: View) -> float:  # the monitor's own scaling knows of dropout only
-        return psnr(render_now(model_of(trainer).test_opacities, view)[0].clamp(0, 1), view.image)
+        return psnr(model_of(trainer).test_rendering(view).image.clamp(0, 1), view.image)
 
     views = {name: group for name, group in views.items() if group}
     with CAMonitor(
@@ -263,7 +263,9 @@ def _measure(
     """Write the trained model, its pictures and its scores; return the results."""
     model = model_of(trainer)
     save_ply(model.gaussians, out / PLY, regularizer=model.regularizer, step=model.step)
-    if model.factor != 1:
+    if model.depends_on_camera:
+        say(f"{out}: what is rendered at test time depends on the camera, so that there is no {BAKED_PLY}")
+    elif model.factor != 1:
         save_for_viewers(model, out / BAKED_PLY)
     evaluation = evaluate(
         model,

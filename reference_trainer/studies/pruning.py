@@ -183,7 +183,7 @@ def _score(trainer: Trainer, scene: Scene) -> dict[str, float]:
     exact, protocol = model.exact_ca_score(drop_rate=_HALF), model.ca_score(drop_rate=_HALF)
     found: dict[str, list[float]] = {name: [] for name in _QUANTITIES}
     for index, view in enumerate(view.to(trainer.device) for view in scene.test):
-        image = model.rendering(model.test_opacities, view).image.clamp(0, 1)
+        image = model.test_rendering(view).image.clamp(0, 1)
         limit = exact(opacities, view)
         found["psnr"].append(psnr(image, view.image))
         found["ca_exact"].append(limit.value)

@@ -69,7 +69,7 @@ def score_view(model: TrainedModel, view: View, *, index: int) -> dict[str, floa
     values["unconditioned"] = _average(half.variance, exact_half.visible)
     values["limit_conditioned"] = _average(exact_half.variance, half.visible)
     values["weighted_half"] = _average(exact_half.variance, moments.alpha_mean)
-    image = model.rendering(model.test_opacities, view).image.clamp(0, 1)
+    image = model.test_rendering(view).image.clamp(0, 1)
     return {
         "psnr": psnr(image, view.image),
         **{name: values[name] for name in VARIANTS},

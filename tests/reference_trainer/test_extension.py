@@ -27,7 +27,7 @@ class DropNear(IndependentDropout):
     needs = ("means", "view_matrix")
 
     def __init__(self, p=0.5):
-        super().__init__(scale=False)
+        super().__init__()
         self.p = p
 
     def rates(self, x):

@@ -160,7 +160,7 @@ def main() -> None:
 def _quality(trainer: Trainer) -> float:
     """Mean PSNR over the training views, with the opacities of the test."""
     model = model_of(trainer)
-    images = [model.rendering(model.test_opacities, view).image.clamp(0, 1) for view in trainer.views]
+    images = [model.test_rendering(view).image.clamp(0, 1) for view in trainer.views]
     return sum(psnr(image, view.image) for image, view in zip(images, trainer.views, strict=True)) / len(images)
 
 

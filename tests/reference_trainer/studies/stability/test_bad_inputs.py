@@ -52,7 +52,7 @@ RENDERER = {
     **{f"camera.{name}": lambda bad, name=name: with_camera(**{name: bad}) for name in ("fx", "fy", "cx", "cy")},
     "world_to_camera": lambda bad: with_camera(world_to_camera=spoiled(SCENE.camera.world_to_camera, bad)),
     "sh": with_harmonics,
-    "sh, a colour of minus infinity": lambda bad: with_harmonics(-bad),
+    "sh of minus infinity": lambda bad: with_harmonics(-bad),
     "background of the moments": moments_over,
 }
 
