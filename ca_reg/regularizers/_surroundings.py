@@ -57,7 +57,8 @@ class Refreshed(nn.Module):
             with torch.inference_mode(False):  # what is found in a test may serve in training
                 self.value, self.since = compute(means), x.step
             self._seen = weakref.ref(x.means), _version(x.means)
-        return self.value.to(means.device)
+        self.value = self.value.to(means.device)
+        return self.value
 
     def holds(self, x: Params) -> bool:
         """Whether the present value still serves."""
