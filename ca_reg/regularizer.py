@@ -130,7 +130,8 @@ class Regularizer(Scheduled):
         if not self.training:
             if drawn is not None:
                 raise ValueError("a draw was given in eval(), where nothing is drawn; call train() or leave it out.")
-            self.check_needs(params)
+            if self.renders_mean:
+                self.check_needs(params)
             self.last, out = None, self.expected(params)
         elif drawn is not None:
             self.last, out = drawn, self.replay(params, drawn)

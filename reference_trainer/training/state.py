@@ -18,7 +18,7 @@ from reference_trainer.training.config import TrainConfig
 
 __all__ = ["TrainingState", "read_state"]
 
-_ENTRIES = ("config", "scene", "train_views", "step", "seconds", "statistics", "gaussians", "moments")
+_ENTRIES = ("config", "scene", "train_views", "step", "seconds", "statistics", "regularizer", "gaussians", "moments")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
@@ -30,6 +30,7 @@ class TrainingState(NamedTuple):
         step: number of steps taken.
         seconds: time that they took.
         statistics: of density control.
+        regularizer: what the regularizers found so far.
         optimizer: what `GaussianOptimizer.state_dict` returned.
     """
 
@@ -37,6 +38,7 @@ class TrainingState(NamedTuple):
     step: int
     seconds: float
     statistics: dict[str, Tensor]
+    regularizer: dict[str, Tensor]
     optimizer: dict[str, Any]
 
 
@@ -96,8 +98,11 @@ def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
         _check(x, tuple(expected[name].shape), f"{where}, {name}", least=0)
     # They are counted up in place, which a file can forbid: by a gradient, or by memory that is shared.
     statistics = {name: x.detach().clone() for name, x in state["statistics"].items()}
+    found = state["regularizer"]
+    if type(found) is not dict or not all(isinstance(x, Tensor) and bool(x.isfinite().all()) for x in found.values()):
+        raise ValueError(f"{where}, regularizer: expected finite tensors by name; the checkpoint is damaged.")
     plain = {name: {key: x.detach() for key, x in of.items()} for name, of in moments.items()}
-    return TrainingState(config, step, seconds, statistics, {"gaussians": tensors, "moments": plain})
+    return TrainingState(config, step, seconds, statistics, found, {"gaussians": tensors, "moments": plain})
 
 
 def _config(text: Any, where: Path) -> TrainConfig:

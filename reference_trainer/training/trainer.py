@@ -176,6 +176,7 @@ class Trainer:
             "step": self.step,
             "seconds": self.seconds,
             "statistics": self.density.state_dict(),
+            "regularizer": self.regularizer.state_dict(),
             **optimizer,
         }
         save_checkpoint(path, state)
@@ -203,6 +204,10 @@ class Trainer:
         trainer.optimizer.load_state_dict(state.optimizer)
         trainer.density.reset(len(trainer.gaussians))
         trainer.density.load_state_dict(state.statistics)
+        try:
+            trainer.regularizer.load_state_dict(state.regularizer)
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(f"{path}, regularizer: {error}") from error
         return trainer
 
     def _rates(self) -> LearningRates:

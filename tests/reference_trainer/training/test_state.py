@@ -12,7 +12,7 @@ from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
-KEYS = ["config", "scene", "train_views", "step", "seconds", "statistics", "gaussians", "moments"]
+KEYS = ["config", "scene", "train_views", "step", "seconds", "statistics", "regularizer", "gaussians", "moments"]
 Change = Callable[[dict[str, Any]], object]
 
 
@@ -45,6 +45,9 @@ def test_a_missing_entry(saved, tiny_scene, tmp_path, key):
         (lambda s: s["moments"].pop("means"), "it lacks 'means'"),
         (lambda s: s["moments"]["means"].pop("exp_avg"), "it lacks 'exp_avg'"),
         (lambda s: s["statistics"].pop("steps"), "statistics: it lacks 'steps'"),
+        (lambda s: s.update(regularizer=3), "regularizer: expected finite tensors by name"),
+        (lambda s: s["regularizer"].update(p=torch.tensor(math.nan)), "regularizer: expected finite tensors"),
+        (lambda s: s["regularizer"].update(p=torch.tensor(0.5)), "regularizer: .*Unexpected key"),
         (lambda s: s.update(step=2.0), "step must be a whole number from 0 to 5, got 2.0"),
         (lambda s: s.update(step=True), "step must be a whole number"),
         (lambda s: s.update(step=6), "step must be a whole number from 0 to 5, got 6"),
