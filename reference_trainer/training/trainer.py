@@ -176,7 +176,7 @@ class Trainer:
             "step": self.step,
             "seconds": self.seconds,
             "statistics": self.density.state_dict(),
-            "regularizer": self.regularizer.state_dict(),
+            "regularizer": dict(self.regularizer.state_dict()),
             **optimizer,
         }
         save_checkpoint(path, state)
