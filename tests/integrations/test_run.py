@@ -243,8 +243,35 @@ def test_a_module_runs_as_python_would_run_it(repository, capsys, monkeypatch):
     assert "[ca_reg] package.train: exit 0\n[ca_reg] 2 renders regularized" in captured.err
 
 
+SPAWNING = """
+import multiprocessing
+
+import torch
+
+{imports}
+
+def work(queue):
+    queue.put({call}.device.type)
+
+if __name__ == "__main__":
+    context = multiprocessing.get_context("spawn")
+    queue = context.SimpleQueue()
+    worker = context.Process(target=work, args=(queue,))
+    worker.start()
+    worker.join()
+    print(worker.exitcode, "nothing" if queue.empty() else queue.get())
+"""
+
+
 @pytest.mark.slow
-def test_workers_that_start_afresh_find_the_stand_ins(repository):
+@pytest.mark.parametrize(
+    ("imports", "call"),
+    [
+        ("import gaussian_renderer", "gaussian_renderer.distCUDA2(torch.rand(9, 3, device='cuda'))"),
+        ("import gsplat, fused_ssim", "fused_ssim.fused_ssim(*torch.rand(2, 1, 3, 12, 12, device='cuda'))"),
+    ],
+)
+def test_workers_that_start_afresh_find_the_stand_ins(repository, imports, call):
     """As those of data loaders do on macOS and Windows: nothing but the search path is handed on."""
     (repository / "diff_gaussian_rasterization.py").unlink()
     (repository / "gaussian_renderer" / "__init__.py").write_text(
@@ -254,18 +281,7 @@ def test_workers_that_start_afresh_find_the_stand_ins(repository):
         "    rasterizer = GaussianRasterizer(raster_settings=settings)\n"
         "    image, radii = rasterizer(means3D=x)\n"
     )
-    (repository / "train.py").write_text(
-        "import gaussian_renderer, multiprocessing, torch\n"
-        "def work(queue):\n"
-        "    queue.put(gaussian_renderer.distCUDA2(torch.rand(9, 3, device='cuda')).device.type)\n"
-        "if __name__ == '__main__':\n"
-        "    context = multiprocessing.get_context('spawn')\n"
-        "    queue = context.SimpleQueue()\n"
-        "    worker = context.Process(target=work, args=(queue,))\n"
-        "    worker.start()\n"
-        "    worker.join()\n"
-        "    print(worker.exitcode, 'nothing' if queue.empty() else queue.get())\n"
-    )
+    (repository / "train.py").write_text(SPAWNING.format(imports=imports, call=call))
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     command = [sys.executable, "-m", "ca_reg.integrations.run", "--cpu", "train.py"]
     done = subprocess.run(command, cwd=repository, env=environment, capture_output=True, text=True, check=False)
