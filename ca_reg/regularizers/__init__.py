@@ -3,9 +3,15 @@
 from ca_reg.chain import Chain
 from ca_reg.registry import Registry
 from ca_reg.regularizer import Regularizer
+from ca_reg.regularizers.concrete import ConcreteDropout
+from ca_reg.regularizers.drop_gaussian import DropGaussian
 from ca_reg.regularizers.dropout import GaussianDropout
 from ca_reg.regularizers.independent import IndependentDropout
 from ca_reg.regularizers.noise import OpacityNoise
+from ca_reg.regularizers.scale_noise import ScaleNoise
+from ca_reg.regularizers.segs import SEGSNoise
+from ca_reg.regularizers.sh_noise import SHNoise
+from ca_reg.regularizers.soft import SoftDropout
 from ca_reg.schedules import LinearRamp, StartStop
 
 __all__ = ["REGULARIZERS", "GaussianDropout", "IndependentDropout", "OpacityNoise", "parse"]
@@ -15,6 +21,12 @@ REGULARIZERS: Registry[Regularizer] = Registry("regularizer", Regularizer, {"ram
 
 REGULARIZERS.register("dropout")(GaussianDropout)
 REGULARIZERS.register("noise")(OpacityNoise)
+REGULARIZERS.register("scale_noise")(ScaleNoise)
+REGULARIZERS.register("sh_noise")(SHNoise)
+REGULARIZERS.register("concrete")(ConcreteDropout)
+REGULARIZERS.register("drop_gaussian")(DropGaussian)
+REGULARIZERS.register("soft")(SoftDropout)
+REGULARIZERS.register("segs")(SEGSNoise)
 
 
 def parse(text: str, *, imports: bool = True) -> Chain:
