@@ -33,6 +33,12 @@ class Consistency(LossTerm):
 
     Raises:
         ValueError: if one is out of range.
+
+    Example:
+        >>> from reference_trainer.losses import LOSSES
+        >>> _, term = LOSSES.make("photometric + consistency(0.3, 0.5, exact=True)")
+        >>> term.p, term.weight, term.exact
+        (0.3, 0.5, True)
     """
 
     analytic: ClassVar[bool] = True

@@ -36,7 +36,7 @@ def test_each_number_is_multiplied_by_one_plus_its_own_noise(kind, field, shape)
     assert drawn.shape == (5, *shape)
     below_zero = 0
     for index in np.ndindex(*before.shape):
-        literal = before[index] * (1 + float(drawn[index]))
+        literal = before[index] * (np.float32(1) + drawn[index])  # the draw is float32
         below_zero += literal < 0 < before[index]
         # A scale enters a covariance by its square alone.
         assert after[index] == pytest.approx(abs(literal) if field == "scales" else literal, rel=1e-12)
