@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from ca_reg._check import check_count, check_finite
 
-__all__ = ["Constant", "LinearRamp", "Schedule", "StartStop", "as_schedule"]
+__all__ = ["Constant", "ExponentialDecay", "LinearRamp", "Schedule", "StartStop", "as_schedule"]
 
 Schedule = Callable[[int], float]
 """Anything that maps a training step to a rate. The modules check the rate whenever they use it."""
@@ -110,6 +111,44 @@ class StartStop:
         """Return the rate at ``step``."""
         on = step >= self.start and (self.stop is None or step < self.stop)
         return self.value if on else 0.0
+
+
+@dataclass(frozen=True)
+class ExponentialDecay:
+    """A rate that goes from one value to another by a constant factor per step, and is 0 outside.
+
+    Args:
+        start_value: rate at ``start``, above 0.
+        end_value: rate that ``stop`` would have, above 0.
+        start: first step with a rate.
+        stop: first step without it again, greater than ``start``.
+
+    Raises:
+        ValueError: if a value is not finite and above 0, or ``stop`` does not come after ``start``.
+
+    Example:
+        >>> decay = ExponentialDecay(0.08, 0.02, 2_000, 9_500)
+        >>> decay(1_999), decay(2_000), round(decay(5_750), 6), decay(9_500)
+        (0.0, 0.08, 0.04, 0.0)
+    """
+
+    start_value: float
+    end_value: float
+    start: int
+    stop: int
+
+    def __post_init__(self) -> None:
+        StartStop(self.start_value, self.start, self.stop)  # checks
+        check_finite(self.end_value, "end_value")
+        if not (self.start_value > 0 and self.end_value > 0):
+            raise ValueError(f"both values must be above 0, got {self.start_value} and {self.end_value}.")
+
+    def __call__(self, step: int) -> float:
+        """Return the rate at ``step``."""
+        if not self.start <= step < self.stop:
+            return 0.0
+        done = (step - self.start) / (self.stop - self.start)
+        return self.start_value * math.pow(self.end_value / self.start_value, done)
 
 
 def as_schedule(rate: float | Schedule) -> Schedule:

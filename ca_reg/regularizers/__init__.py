@@ -4,34 +4,48 @@ from ca_reg.chain import Chain
 from ca_reg.registry import Registry
 from ca_reg.regularizer import Regularizer
 from ca_reg.regularizers.clustered import ClusteredDropout
+from ca_reg.regularizers.concrete import ConcreteDropout
 from ca_reg.regularizers.d2gs import D2GSDropout
 from ca_reg.regularizers.density import DensityDropout
 from ca_reg.regularizers.depth import DepthDropout
 from ca_reg.regularizers.drop_anchors import AnchorDropout
+from ca_reg.regularizers.drop_gaussian import DropGaussian
 from ca_reg.regularizers.drop_sh import SHDropout
 from ca_reg.regularizers.dropout import GaussianDropout
 from ca_reg.regularizers.geometry import GeometryDropout
 from ca_reg.regularizers.independent import IndependentDropout
 from ca_reg.regularizers.noise import OpacityNoise
 from ca_reg.regularizers.position_noise import PositionNoise
-from ca_reg.schedules import LinearRamp, StartStop
+from ca_reg.regularizers.scale_noise import ScaleNoise
+from ca_reg.regularizers.segs import SEGSNoise
+from ca_reg.regularizers.sh_noise import SHNoise
+from ca_reg.regularizers.soft import SoftDropout
+from ca_reg.schedules import ExponentialDecay, LinearRamp, StartStop
 
 __all__ = ["REGULARIZERS", "GaussianDropout", "IndependentDropout", "OpacityNoise", "parse"]
 
-REGULARIZERS: Registry[Regularizer] = Registry("regularizer", Regularizer, {"ramp": LinearRamp, "between": StartStop})
+REGULARIZERS: Registry[Regularizer] = Registry(
+    "regularizer", Regularizer, {"ramp": LinearRamp, "between": StartStop, "decay": ExponentialDecay}
+)
 """What can be asked for by name; ``REGULARIZERS.register("name")`` adds a class."""
 
 _TABLE: dict[str, type[Regularizer]] = {
     "dropout": GaussianDropout,
     "noise": OpacityNoise,
     "clustered": ClusteredDropout,
+    "concrete": ConcreteDropout,
     "d2gs": D2GSDropout,
     "density": DensityDropout,
     "depth": DepthDropout,
     "drop_anchors": AnchorDropout,
+    "drop_gaussian": DropGaussian,
     "drop_sh": SHDropout,
     "geometry": GeometryDropout,
     "position_noise": PositionNoise,
+    "scale_noise": ScaleNoise,
+    "segs": SEGSNoise,
+    "sh_noise": SHNoise,
+    "soft": SoftDropout,
 }
 for _name, _class in _TABLE.items():
     REGULARIZERS.register(_name)(_class)

@@ -6,16 +6,17 @@ import torch
 from torch import Tensor
 
 from ca_reg import functional
-from ca_reg._check import check_finite, is_zero
+from ca_reg._check import is_zero
 from ca_reg.functional import Multiplier
 from ca_reg.params import Draw, Params
-from ca_reg.regularizer import Given, Regularizer
-from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.regularizer import Given
+from ca_reg.regularizers.parameter_noise import ParameterNoise
+from ca_reg.schedules import Schedule
 
 __all__ = ["OpacityNoise"]
 
 
-class OpacityNoise(Regularizer):
+class OpacityNoise(ParameterNoise):
     """Multiply opacities by random factors in training, change nothing in evaluation (paper, opacity noise).
 
     ``train()``: ``clamp(opacity * (1 + noise), 0, 1)`` with ``noise ~ N(0, sigma^2)`` per Gaussian. ``eval()``: the
@@ -59,26 +60,11 @@ class OpacityNoise(Regularizer):
     """
 
     drops = False  # what its clamp leaves at 0 is still counted as seen, as in the paper's code
+    field = "opacities"
 
     def __init__(self, sigma: float | Schedule, *, clip: bool = False, scale: bool = False) -> None:
-        if not callable(sigma):
-            check_finite(sigma, "sigma", minimum=0.0)
-        super().__init__(as_schedule(sigma))
-        self.clip = clip
+        super().__init__(sigma, clip=clip)
         self.scale = self.renders_mean = scale
-
-    @property
-    def sigma(self) -> float:
-        """The standard deviation at the present step."""
-        return self._present_rate()
-
-    @property
-    def noise(self) -> Tensor | None:
-        """The last draw, (N,) float32; None if there was none."""
-        return None if self.last is None else self.last.value
-
-    def _check_rate(self, rate: float, step: int) -> None:
-        check_finite(rate, f"sigma at step {step}", minimum=0.0)
 
     def forward(  # type: ignore[override]
         self, opacity: Given, *, noise: Tensor | None = None, generator: torch.Generator | None = None
@@ -100,19 +86,9 @@ class OpacityNoise(Regularizer):
         """
         return super().forward(opacity, drawn=None if noise is None else Draw(noise), generator=generator)
 
-    def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw the relative noise."""
-        sigma = self._rate_at(x.step)
-        if is_zero(sigma):
-            return Draw()
-        count, device = x.opacities.shape[0], x.opacities.device
-        return Draw(functional.draw_opacity_noise(count, sigma, clip=self.clip, generator=generator, device=device))
-
-    def replay(self, x: Params, draw: Draw) -> Params:
+    def perturb(self, values: Tensor, noise: Tensor) -> Tensor:
         """Multiply and clamp."""
-        if draw.value is None:
-            return x
-        return x._replace(opacities=functional.apply_opacity_noise(x.opacities, draw.value))
+        return functional.apply_opacity_noise(values, noise)
 
     def expected(self, x: Params) -> Params:
         """With ``scale`` the mean over all draws."""
@@ -135,4 +111,4 @@ class OpacityNoise(Regularizer):
 
     def extra_repr(self) -> str:
         """Return the arguments, for ``print``."""
-        return f"sigma={self._rate_repr()}, clip={self.clip}, scale={self.scale}"
+        return f"{super().extra_repr()}, scale={self.scale}"

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
-from ca_reg import functional
-from ca_reg._check import check_finite, is_zero
 from ca_reg.params import Draw, Params
-from ca_reg.regularizer import Regularizer
 from ca_reg.regularizers._surroundings import Refreshed, mean_distances
-from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.regularizers.parameter_noise import ParameterNoise
+from ca_reg.schedules import Schedule
 
 __all__ = ["PositionNoise"]
 
 
-class PositionNoise(Regularizer):
+class PositionNoise(ParameterNoise):
     """Shift every center at random, in units of the distance to its nearest neighbor (paper, appendix, position noise).
 
     ``train()``: ``mean + sigma d n`` with ``n`` of three standard normal numbers and ``d`` the distance; ``eval()``:
@@ -36,32 +35,19 @@ class PositionNoise(Regularizer):
     """
 
     needs = ("means",)
-    drops = False
+    field = "means"
 
     def __init__(self, sigma: float | Schedule, *, every: int = 100) -> None:
-        if not callable(sigma):
-            check_finite(sigma, "sigma", minimum=0.0)
-        super().__init__(as_schedule(sigma))
+        super().__init__(sigma)
         self.distances = Refreshed(every)
-
-    def _check_rate(self, rate: float, step: int) -> None:
-        check_finite(rate, f"sigma at step {step}", minimum=0.0)
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw the shifts, world units, (N, 3)."""
-        assert x.means is not None
-        sigma = self._rate_at(x.step)
-        if is_zero(sigma):
+        noise = super().draw(x, generator).value
+        if noise is None:
             return Draw()
-        noise = functional.draw_opacity_noise(x.means.numel(), sigma, generator=generator, device=x.means.device)
-        distances = self.distances(x, lambda means: mean_distances(means, 1))
-        return Draw(distances[:, None] * noise.view(-1, 3).to(x.means.dtype))
+        return Draw(self.distances(x, lambda means: mean_distances(means, 1))[:, None] * noise)
 
-    def replay(self, x: Params, draw: Draw) -> Params:
+    def perturb(self, values: Tensor, noise: Tensor) -> Tensor:
         """Shift the centers."""
-        assert x.means is not None
-        return x if draw.value is None else x._replace(means=x.means + draw.value)
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"sigma={self._rate_repr()}"
+        return values + noise.to(values.dtype)

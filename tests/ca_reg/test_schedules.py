@@ -2,7 +2,7 @@
 
 import pytest
 
-from ca_reg.schedules import Constant, LinearRamp, StartStop, as_schedule
+from ca_reg.schedules import Constant, ExponentialDecay, LinearRamp, StartStop, as_schedule
 
 
 def test_constant_is_constant():
@@ -26,6 +26,12 @@ def test_start_stop_is_half_open():
     assert StartStop(0.2)(0) == StartStop(0.2)(10**9) == 0.2
 
 
+def test_a_decay_falls_by_a_constant_factor_and_is_half_open():
+    decay = ExponentialDecay(0.08, 0.02, 10, 14)
+    assert [decay(step) for step in (0, 9, 14, 100)] == [0.0] * 4
+    assert [decay(step) for step in (10, 11, 12, 13)] == pytest.approx([0.08 * 4 ** (-k / 4) for k in range(4)])
+
+
 def test_numbers_become_constants_and_callables_stay():
     assert as_schedule(0.2) == Constant(0.2)
     ramp = LinearRamp(0.0, 1.0, 0, 1)
@@ -37,6 +43,8 @@ def test_numbers_become_constants_and_callables_stay():
     [
         (lambda: Constant(float("nan")), "value must be finite"),
         (lambda: LinearRamp(0.0, 0.2, 10, 10), "must come after"),
+        (lambda: ExponentialDecay(0.2, 0.1, 10, 10), "must come after"),
+        (lambda: ExponentialDecay(0.2, 0.0, 0, 10), "above 0"),
         (lambda: LinearRamp(0.0, 0.2, -1, 10), "at least 0"),
         (lambda: StartStop(0.2, start=5, stop=5), "must come after"),
     ],

@@ -1,0 +1,126 @@
+"""Soft masks from the binary concrete distribution: the base class of every dropout that dims instead of dropping."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from ca_reg._check import Rate, check_draw
+from ca_reg.functional import Multiplier
+from ca_reg.params import Draw, Params
+from ca_reg.regularizer import Regularizer
+
+__all__ = ["BinaryConcrete", "concrete_moments"]
+
+
+class BinaryConcrete(Regularizer):
+    """Multiply each opacity by a soft mask ``1 - z`` of its own; a subclass says the logits of the drop rates.
+
+    With ``u ~ U(0, 1)`` and the rate ``p`` of the Gaussian,
+
+        z = sigmoid((logit p + logit u) / temperature)
+
+    is the binary concrete distribution (Maddison et al. 2017), which tends to a mask of dropout as the temperature
+    tends to 0. ``train()``: ``opacity * clamp(1 - z, floor, 1 - floor)``. ``eval()``: the opacity times the mean of
+    that factor, :func:`concrete_moments`. No opacity becomes 0, so that density control counts all Gaussians as seen.
+
+    Args:
+        temperature: above 0 and at most 1.
+        floor: least factor, in [0, 0.5); the largest is ``1 - floor``.
+
+    Raises:
+        ValueError: if one is out of range.
+
+    Example:
+        >>> class DimFaint(BinaryConcrete):
+        ...     def logits(self, x):
+        ...         return -torch.logit(x.opacities.detach())
+        >>> DimFaint(0.1).eval()(torch.tensor([0.2, 0.5, 0.8]))
+        tensor([0.0403, 0.2500, 0.6388])
+    """
+
+    drops: ClassVar[bool] = False
+    renders_mean = True
+
+    def __init__(self, temperature: float, *, floor: float = 0.0) -> None:
+        super().__init__()
+        if not 0 < temperature <= 1:
+            raise ValueError(f"the temperature must be above 0 and at most 1, got {temperature}: 0.1 is usual.")
+        if not 0 <= floor < 0.5:
+            raise ValueError(f"the least factor must be in [0, 0.5), got {floor}: the largest is 1 minus it.")
+        self.temperature = temperature
+        self.floor = floor
+
+    def logits(self, x: Params) -> Rate:
+        """Return ``log(p / (1 - p))`` of the drop rates at ``x``: a number, or one for each Gaussian, shape (N,)."""
+        raise NotImplementedError
+
+    def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
+        """Draw ``logit u`` of every Gaussian, float32."""
+        check_draw(generator)
+        device = x.opacities.device
+        u = torch.rand(len(x.opacities), generator=generator, device=device if generator is None else generator.device)
+        return Draw(u.to(device).logit())
+
+    def replay(self, x: Params, draw: Draw) -> Params:
+        """Multiply by the soft mask."""
+        factor = torch.sigmoid((self.logits(x) + draw.value.to(x.opacities.dtype)) / -self.temperature)
+        if self.floor:
+            factor = factor.clamp(self.floor, 1.0 - self.floor)
+        return x._replace(opacities=(x.opacities * factor).to(x.opacities.dtype))
+
+    def expected(self, x: Params) -> Params:
+        """Multiply by the mean of the soft mask."""
+        return x._replace(opacities=x.opacities * self.multiplied(x)[1].mean)
+
+    def multiplied(self, x: Params) -> tuple[Params, Multiplier]:
+        """Return ``x``, and the soft mask as its factor; exact but for the renderer's cut-off of faint alphas."""
+        return x, Multiplier(*concrete_moments(self.logits(x), self.temperature, self.floor))
+
+    def extra_repr(self) -> str:
+        """Return the arguments, for ``print``."""
+        return f"temperature={self.temperature}, floor={self.floor}"
+
+
+def concrete_moments(logits: Rate, temperature: float, floor: float = 0.0) -> tuple[Rate, Rate]:
+    """Return mean and variance of ``y = clamp(1 - z, floor, 1 - floor)``, z as in :class:`BinaryConcrete`.
+
+    ``y`` exceeds a level s between the two bounds if ``logit u < -temperature logit s - logit p``, that is with the
+    probability ``T(s) = sigmoid(-temperature logit s - logit p)``. Integrated over s from bound to bound,
+
+        E y = floor + integral T(s) ds,     E (y - floor)^2 = integral 2 (s - floor) T(s) ds
+
+    which the double-exponential rule does to rounding, the logarithms at 0 and 1 included. Rates above 1/2 are taken
+    thus and rates below mirrored, ``y -> 1 - y``, so that nothing cancels at either end.
+
+    Args:
+        logits: ``log(p / (1 - p))``, a number or any tensor.
+        temperature: above 0 and at most 1.
+        floor: in [0, 0.5).
+
+    Returns:
+        Mean and variance, as ``logits``, differentiable.
+
+    Example:
+        >>> mean, variance = concrete_moments(torch.tensor([-2.0, 0.0, 2.0]), 0.1)
+        >>> mean, variance  # of dropout at the same rates: 0.88, 0.5, 0.12 and 0.105, 0.25, 0.105
+        (tensor([0.8795, 0.5000, 0.1205]), tensor([0.0954, 0.2252, 0.0954]))
+    """
+    if not isinstance(logits, Tensor):
+        mean, variance = concrete_moments(torch.tensor(logits, dtype=torch.float64), temperature, floor)
+        return float(mean), float(variance)
+    t = torch.linspace(-3.25, 3.25, 53, dtype=torch.float64)  # up to where the weights reach rounding
+    y = math.pi * t.sinh()
+    s, complement = torch.sigmoid(y), torch.sigmoid(-y)
+    span = 1.0 - 2.0 * floor
+    weights = span * s * complement * math.pi * t.cosh() * (t[1] - t[0])
+    excess = span * s  # over the floor
+    level = y if floor == 0 else (floor + excess).logit()
+    weights, excess, level = (q.to(logits).view(-1, *[1] * logits.ndim) for q in (weights, excess, level))
+    above = torch.sigmoid(-temperature * level - logits.abs())
+    low = (weights * above).sum(0)
+    variance = (2.0 * weights * excess * above).sum(0) - low.square()
+    return torch.where(logits > 0, floor + low, 1.0 - floor - low), variance.clamp(min=0.0)

@@ -1,0 +1,93 @@
+"""Normal noise on a parameter of the Gaussians: the base class of all multiplicative noise."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from ca_reg import functional
+from ca_reg._check import check_finite, is_zero
+from ca_reg.params import Draw, Params
+from ca_reg.regularizer import Regularizer
+from ca_reg.schedules import Schedule, as_schedule
+
+__all__ = ["ParameterNoise"]
+
+
+class ParameterNoise(Regularizer):
+    """Multiply each number of a parameter by ``1 + noise`` in training, ``noise ~ N(0, sigma^2)``.
+
+    ``eval()`` changes nothing. A subclass says which parameter, and may say how the noise is applied: :meth:`perturb`.
+
+    Args:
+        sigma: standard deviation of the relative noise, at least 0, or a schedule of it.
+        clip: clip the noise to [-sigma, sigma], as the paper's released code does with that of the opacities.
+
+    Attributes:
+        field: of :class:`~ca_reg.Params` that the noise is on.
+        noise: the last draw, float32, the shape of the parameter; None if there was none.
+        sigma: the standard deviation at the present step.
+
+    Raises:
+        TypeError: if ``sigma`` is neither a number nor callable.
+        ValueError: if a constant ``sigma`` is negative or not finite; a schedule is checked at each use.
+
+    Example:
+        >>> class PositionShake(ParameterNoise):
+        ...     needs = ("means",)
+        ...     field = "means"
+        >>> means = torch.ones(2, 3)
+        >>> shake = PositionShake(0.1)
+        >>> torch.equal(shake(Params(torch.full((2,), 0.5), means)).means, means * (1 + shake.noise))
+        True
+    """
+
+    drops = False
+    field: ClassVar[str]
+
+    def __init__(self, sigma: float | Schedule, *, clip: bool = False) -> None:
+        if not callable(sigma):
+            check_finite(sigma, "sigma", minimum=0.0)
+        super().__init__(as_schedule(sigma))
+        self.clip = clip
+
+    @property
+    def sigma(self) -> float:
+        """The standard deviation at the present step."""
+        return self._present_rate()
+
+    @property
+    def noise(self) -> Tensor | None:
+        """The last draw, float32, the shape of the parameter; None if there was none."""
+        return None if self.last is None else self.last.value
+
+    def _check_rate(self, rate: float, step: int) -> None:
+        check_finite(rate, f"sigma at step {step}", minimum=0.0)
+
+    def perturb(self, values: Tensor, noise: Tensor) -> Tensor:
+        """Return the parameter with the noise, in its own dtype."""
+        return (values * (1.0 + noise)).to(values.dtype)
+
+    def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
+        """Draw the relative noise."""
+        sigma = self._rate_at(x.step)
+        if is_zero(sigma):
+            return Draw()
+        values: Tensor = getattr(x, self.field)
+        noise = functional.draw_opacity_noise(
+            values.numel(), sigma, clip=self.clip, generator=generator, device=values.device
+        )
+        return Draw(noise.view(values.shape))
+
+    def replay(self, x: Params, draw: Draw) -> Params:
+        """Apply the noise."""
+        if draw.value is None:
+            return x
+        changed: dict[str, Any] = {self.field: self.perturb(getattr(x, self.field), draw.value)}
+        return x._replace(**changed)
+
+    def extra_repr(self) -> str:
+        """Return the arguments, for ``print``."""
+        return f"sigma={self._rate_repr()}, clip={self.clip}"
