@@ -39,6 +39,7 @@ class TrainedModel:
             at test time, and the drop rate of the paper's CA protocol.
         step: of the training, which schedules follow.
         sh_degree: highest band of spherical harmonics to use; None for all.
+        for_rendering: whether the opacities are those of the test already, and the plain ones are not known.
     """
 
     gaussians: Gaussians
@@ -46,6 +47,7 @@ class TrainedModel:
     regularizer: str = ""
     step: int = 0
     sh_degree: int | None = None
+    for_rendering: bool = False
 
     @cached_property
     def chain(self) -> Chain:
@@ -72,15 +74,18 @@ class TrainedModel:
     @property
     def test_opacities(self) -> Tensor:
         """The opacities to render with at test time, shape (N,), if they do not depend on the camera."""
-        return self.chain.expected(self._plain).opacities
+        return self._tested(self._plain).opacities
 
     @property
     def _plain(self) -> Params:
         return self.gaussians.params(step=self.step)
 
+    def _tested(self, x: Params) -> Params:
+        return x if self.for_rendering else self.chain.expected(x)
+
     def test_rendering(self, view: Viewpoint) -> Rendering:
         """Render a view as at test time; co-adaptation is measured on the plain opacities."""
-        tested = self.chain.expected(self.gaussians.params(view.camera, step=self.step))
+        tested = self._tested(self.gaussians.params(view.camera, step=self.step))
         return render_gaussians(tested, view.camera, self.background, sh_degree=self.sh_degree)
 
     def render(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:

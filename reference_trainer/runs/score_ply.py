@@ -97,16 +97,16 @@ def of_ply(
             parse(text, imports=False)
         except ValueError as error:
             raise ValueError(f"{ply} says what it was trained with: {error} Give --regularizer.") from error
-    if loaded.for_rendering:
-        text = ""
-    elif baked > 0:
+    if baked > 0 and not loaded.for_rendering:
         gaussians = replace(
             gaussians, opacity_logits=inverse_sigmoid((gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6))
         )
         text = text or f"dropout({baked:g})"
     bands = [degree for degree in range(gaussians.sh_degree + 1) if degree == 0 or _band(gaussians, degree).any()]
     facts = PlyFacts(len(gaussians), gaussians.sh_degree, bands[-1], loaded.opacity_scale, loaded.for_rendering, text)
-    model = TrainedModel(gaussians.to(device), background.to(device), text, loaded.step)
+    model = TrainedModel(
+        gaussians.to(device), background.to(device), text, loaded.step, for_rendering=loaded.for_rendering
+    )
     if baked > 0 and not loaded.for_rendering and not math.isclose(model.dropout, baked, rel_tol=1e-6):
         raise ValueError(f"{ply} was scaled for dropout {baked:g}, not for {text}: leave out --regularizer.")
     return model, facts

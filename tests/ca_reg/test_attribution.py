@@ -7,7 +7,7 @@ import pytest
 import torch
 from oracles import random_scene
 
-from ca_reg import CAScore, ListMoments, PixelLists, Reason, attribute, total_effects
+from ca_reg import CAScore, ListMoments, Params, PixelLists, Reason, attribute, total_effects
 from ca_reg.types import ExactMoments
 from reference_trainer.render import splat
 from reference_trainer.render.moments import render_moments
@@ -181,7 +181,7 @@ def test_total_effects_come_through_the_reference_renderer():
 
     score = CAScore(exact=moments_fn, neutral=True, threshold=0.3)
     effects, result = total_effects(score, gaussians.opacities, None)
-    _, multiplier, background = score._exact(moments_fn, gaussians.opacities, None)
+    _, _, multiplier, background = score._exact(moments_fn, Params(gaussians.opacities), None)
 
     def value(variances):
         variance = moments_fn(gaussians.opacities, None, type(multiplier)(0.5, variances), background).variance

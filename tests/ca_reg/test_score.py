@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-import ca_reg.score
 from ca_reg import CAScore, Reason, summarize
 from ca_reg.types import Rendering
 
@@ -83,7 +82,7 @@ def test_expected_value_over_all_tuples_of_masks(monkeypatch, n, samples, ddof):
     values = []
     for masks in itertools.product(splats.all_masks(), repeat=samples):
         draws = iter(masks)
-        monkeypatch.setattr(ca_reg.score, "draw_keep_mask", lambda *args, draws=draws, **kwargs: next(draws))
+        monkeypatch.setattr("ca_reg.functional.draw_keep_mask", lambda *args, draws=draws, **kwargs: next(draws))
         values.append(score(splats.opacity, None).value)
     expected = splats.exact(0.5) * (samples - 1) / (samples - ddof)
     assert np.mean(values) == pytest.approx(expected, rel=1e-12)

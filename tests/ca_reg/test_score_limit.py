@@ -352,7 +352,7 @@ def test_limit_is_the_exact_score_in_expectation(monkeypatch, samples, ddof):
     found = []
     for draws in itertools.product(BITS, repeat=samples):
         order = map(torch.tensor, draws)
-        monkeypatch.setattr("ca_reg.score.draw_keep_mask", lambda *args, order=order, **kwargs: next(order))
+        monkeypatch.setattr("ca_reg.functional.draw_keep_mask", lambda *args, order=order, **kwargs: next(order))
         found.append(score(model.opacity, None))
     exact = CAScore(exact=model.moments, threshold=-1.0)(model.opacity, None).value
     assert np.mean([result.limit.value for result in found]) == pytest.approx(exact, rel=1e-12)

@@ -80,8 +80,8 @@ def test_an_adaptive_score_takes_the_region_of_the_expected_image():
 
 
 def test_the_protocol_is_the_score_of_uniform_dropout():
-    plain = CAScore(render, drop_rate=0.6, threshold=0.0, samples=7)(OPACITY, None)
-    same = CAScore(render, regularizer=GaussianDropout(0.6), threshold=0.0, samples=7)(OPACITY, None)
+    plain = CAScore(render, drop_rate=0.6, threshold=-1.0, samples=7)(OPACITY, None)
+    same = CAScore(render, regularizer=GaussianDropout(0.6), threshold=-1.0, samples=7)(OPACITY, None)
     assert plain.value == same.value
 
 

@@ -40,7 +40,7 @@ def test_records_come_back_as_they_were(tmp_path):
     again = KeptRecords(file, "as before", said.append)
     assert {key: again.get(key) for key in records} == records
     assert math.isnan(again.get("three")["x"])
-    assert said == [f"3 measured before the interruption, kept: {file}"]
+    assert said == [f"3 measured before, kept: {file}"]
 
 
 def test_a_record_whose_picture_is_gone_is_not_used(tmp_path):

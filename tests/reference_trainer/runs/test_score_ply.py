@@ -66,7 +66,7 @@ def test_a_ply_without_dropout_is_used_as_it_is(tmp_path, run):
 def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options, tmp_path):
     out, results = scaled
     scene = options.load()
-    model, facts = of_ply(out / BAKED_PLY, background=scene.background, regularizer="dropout(0.2)")
+    model, facts = of_ply(out / BAKED_PLY, background=scene.background)
     assert "those of the test, used as they are, for CA too" in str(facts)
     trained = of_run(out)[0]
     torch.testing.assert_close(model.test_opacities, trained.test_opacities, rtol=0, atol=1e-6)

@@ -61,8 +61,8 @@ def test_a_format_of_the_users_own_trains(photographs, tmp_path, monkeypatch, ho
     main(["train", "--path", str(photographs), "--out", str(tmp_path / "run"), "--iterations", "2", "--downscale", "4",
           "--points", "random:50", "--monitor-every", "0", *arguments])  # fmt: skip
     results = json.loads((tmp_path / "run" / "results.json").read_text())
-    assert sorted(results["mean"]) == ["train"]
-    assert len(results["views"]) == 3
+    assert sorted(results["mean"]) == ["around", "between", "train"]
+    assert sum(view["split"] == "train" for view in results["views"]) == 3
 
 
 def test_a_format_that_is_not_there(photographs):

@@ -166,7 +166,7 @@ def test_scores_are_those_of_the_evaluation(trained):
     ((name, case),) = ranking_study(folders[:1]).cases.items()
     run = ranking_module._measure(**case)
     assert name.endswith("both/seed_0")
-    assert (run["strategy"], run["training_views"], run["seed"]) == ("dropout 0.2 + noise 0.3", 3, 0)
+    assert (run["strategy"], run["training_views"], run["seed"]) == ("dropout(0.2) + noise(0.3)", 3, 0)
     assert run["scene"] == "synthetic (1/8)"
     assert run["gaussians"] == results["gaussians"]
     mean = results["mean"]["test"]
