@@ -12,7 +12,7 @@ from oracles import brute_force, random_scene
 from PIL import Image
 
 from ca_reg.functional import apply_dropout, draw_keep_mask
-from reference_trainer.evaluation import model as model_module
+from reference_trainer.evaluation import trained_model as model_module
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply, save_ply

@@ -8,6 +8,9 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
+from benchmarks import ranking as ranking_module
+from benchmarks.ranking import correlations, disagreements, group_labels, mean_of, ranking_study
+from benchmarks.score_variants import VARIANTS, score_view
 from reference_trainer.camera import Camera
 from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
@@ -15,9 +18,6 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies import ranking as ranking_module
-from reference_trainer.studies.ranking import correlations, disagreements, group_labels, mean_of, ranking_study
-from reference_trainer.studies.score_variants import VARIANTS, score_view
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
@@ -166,7 +166,7 @@ def test_scores_are_those_of_the_evaluation(trained):
     ((name, case),) = ranking_study(folders[:1]).cases.items()
     run = ranking_module._measure(**case)
     assert name.endswith("both/seed_0")
-    assert (run["strategy"], run["training_views"], run["seed"]) == ("dropout 0.2 + noise 0.3", 3, 0)
+    assert (run["strategy"], run["training_views"], run["seed"]) == ("dropout(0.2) + noise(0.3)", 3, 0)
     assert run["scene"] == "synthetic (1/8)"
     assert run["gaussians"] == results["gaussians"]
     mean = results["mean"]["test"]
