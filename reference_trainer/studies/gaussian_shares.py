@@ -15,7 +15,6 @@ from torch import Tensor
 from ca_reg import CAResult, Reason, attribute, total_effects
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
 from reference_trainer.evaluation.pictures import file_names, heat_map, save_png, side_by_side
-from reference_trainer.evaluation.rank_correlation import spearman
 from reference_trainer.evaluation.results import machine, markdown_table, write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
@@ -261,7 +260,9 @@ def _mean_over_views(
 def _correlations(
     model: TrainedModel, views: Sequence[View], shares: Tensor, weights: Tensor
 ) -> dict[str, float | None]:
-    """Rank correlation of the share with what else is known of a Gaussian."""
+    """Spearman's rank correlation of the share with what else is known of a Gaussian; None where all are equal."""
+    from scipy.stats import spearmanr  # a second to import
+
     gaussians = model.gaussians
     poses = [view.camera.world_to_camera.to(gaussians.means) for view in views]
     depth = torch.stack([gaussians.means @ pose[2, :3] + pose[2, 3] for pose in poses]).mean(0)
@@ -271,7 +272,11 @@ def _correlations(
         "mean depth": depth,
         "blend weight": weights,
     }
-    return {name: spearman(shares.tolist(), values.tolist()) for name, values in known.items()}
+    varies = {name: len(values.unique()) > 1 and len(shares.unique()) > 1 for name, values in known.items()}
+    return {
+        name: float(spearmanr(shares.cpu(), values.detach().cpu()).statistic) if varies[name] else None
+        for name, values in known.items()
+    }
 
 
 @torch.no_grad()

@@ -16,7 +16,6 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from benchmarks.score_variants import VARIANTS, score_view
-from reference_trainer.evaluation.rank_correlation import kendall, spearman
 from reference_trainer.evaluation.results import markdown_table, mean_std
 from reference_trainer.runs.folder import CONFIG
 from reference_trainer.runs.run import load_run, model_of
@@ -170,6 +169,8 @@ def correlations(runs: Sequence[Record]) -> dict[str, dict[str, float | None]]:
         By variant: ``"rho WHAT"`` (Spearman) and ``"tau WHAT"`` (Kendall's tau-b) over the runs that have both values,
         None where there is no order to compare.
     """
+    from scipy.stats import kendalltau, spearmanr  # a second to import
+
     out: dict[str, dict[str, float | None]] = {}
     for variant in VARIANTS:
         out[variant] = {}
@@ -177,8 +178,9 @@ def correlations(runs: Sequence[Record]) -> dict[str, dict[str, float | None]]:
             pairs = [(mean_of(run, variant), mean_of(run, reference)) for run in runs]
             known = [pair for pair in pairs if all(map(math.isfinite, pair))]
             x, y = [a for a, _ in known], [b for _, b in known]
-            out[variant][f"rho {reference}"] = spearman(x, y) if known else None
-            out[variant][f"tau {reference}"] = kendall(x, y) if known else None
+            ordered = len({*x}) > 1 and len({*y}) > 1
+            for name, correlation in (("rho", spearmanr), ("tau", kendalltau)):
+                out[variant][f"{name} {reference}"] = float(correlation(x, y).statistic) if ordered else None
     return out
 
 
