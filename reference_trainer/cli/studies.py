@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from reference_trainer.cli.drawing import Device
+
 __all__ = ["Attribution", "ErrorRuntime", "Stability", "Study"]
 
 
@@ -23,18 +25,15 @@ class ErrorRuntime:
     """Largest number of renders."""
     seeds: int = 3
     """Independent sequences of masks."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
+    device: Device = "cpu"
 
     def __call__(self) -> None:
         """Run the study."""
         from reference_trainer.studies.error_runtime import error_runtime_study
         from reference_trainer.studies.study import run_study
 
-        run_study(
-            error_runtime_study(self.sources, max_samples=self.max_samples, seeds=self.seeds, device=self.device),
-            self.out,
-        )
+        study = error_runtime_study(self.sources, max_samples=self.max_samples, seeds=self.seeds, device=self.device)
+        run_study(study, self.out)
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,7 @@ class Attribution:
     """Which views."""
     drop_rate: float = 0.5
     """Of the score."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
+    device: Device = "cpu"
 
     def __call__(self) -> None:
         """Run the study."""

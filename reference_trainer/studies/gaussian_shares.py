@@ -272,11 +272,9 @@ def _correlations(
         "mean depth": depth,
         "blend weight": weights,
     }
-    varies = {name: len(values.unique()) > 1 and len(shares.unique()) > 1 for name, values in known.items()}
-    return {
-        name: float(spearmanr(shares.cpu(), values.detach().cpu()).statistic) if varies[name] else None
-        for name, values in known.items()
-    }
+    pairs = {name: (shares.cpu(), values.detach().cpu()) for name, values in known.items()}
+    ordered = {name: all(bool(x.min() < x.max()) for x in pair) for name, pair in pairs.items()}
+    return {name: float(spearmanr(*pair).statistic) if ordered[name] else None for name, pair in pairs.items()}
 
 
 @torch.no_grad()

@@ -17,9 +17,8 @@ import tyro
 
 from benchmarks.score_variants import VARIANTS, score_view
 from reference_trainer.evaluation.results import markdown_table, mean_std
-from reference_trainer.runs.folder import CONFIG
+from reference_trainer.runs.folder import CONFIG, read_run_settings
 from reference_trainer.runs.run import load_run, model_of
-from reference_trainer.runs.settings import read_run_settings
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.study import Record, Records, Study, checkpoints, run_study
 
