@@ -262,14 +262,8 @@ def _measure(
         say(f"{out}: what is rendered at test time depends on the camera, so that there is no {BAKED_PLY}")
     elif model.factor != 1:
         save_for_viewers(model, out / BAKED_PLY)
-    evaluation = evaluate(
-        model,
-        measured_views(trainer.scene, say),
-        perceptual=perceptual,
-        pictures=out / VIEWS,
-        keep=out / PARTIAL,
-        say=say,
-    )
+    views, keep = measured_views(trainer.scene, say), out / PARTIAL
+    evaluation = evaluate(model, views, perceptual=perceptual, pictures=out / VIEWS, keep=keep, say=say)
     results = {
         "scene": trainer.scene.name,
         "config": dataclasses.asdict(trainer.config),
@@ -277,6 +271,6 @@ def _measure(
         **evaluation.as_dict(),
         "machine": machine(),
     }
-    (out / PARTIAL).unlink(missing_ok=True)  # first, because a complete run is not touched again
+    keep.unlink(missing_ok=True)  # first, because a complete run is not touched again
     write_json(out / RESULTS, results)
     return read_results(out)
