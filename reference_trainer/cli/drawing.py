@@ -7,16 +7,22 @@ from typing import Annotated, Literal
 
 import tyro
 
-__all__ = ["Draw", "DrawOfSweep", "Drawing", "DrawingOfSweep", "Warmup"]
+__all__ = ["Device", "Draw", "DrawOfSweep", "Drawing", "DrawingOfSweep", "Warmup"]
+
+
+Device = Annotated[str, tyro.conf.arg(help='"cpu" or "cuda".')]
+_Engine = Literal["auto", "torch", "loops"] | None
+_ENGINE_HELP = (
+    'What draws: "loops" (compiled; float32 on a CPU), "torch" (anything), or "auto", whichever fits. By default '
+    '$CA_REG_ENGINE, or "auto".'
+)
 
 
 @dataclass(frozen=True)
 class Drawing:
     """What draws; the same for all commands that render."""
 
-    engine: Literal["auto", "torch", "loops"] | None = None
-    """What draws: "loops" (compiled; float32 on a CPU), "torch" (anything), or "auto", whichever fits. By default
-    $CA_REG_ENGINE, or "auto"."""
+    engine: Annotated[_Engine, tyro.conf.arg(help=_ENGINE_HELP)] = None
 
     def begin(self, device: str, *, trains: bool = False) -> None:
         """Choose the engine of this process and its workers, and say which it is.
@@ -40,9 +46,7 @@ class Drawing:
 class DrawingOfSweep(Drawing):
     """The same under another name, where --engine says where the runs are done."""
 
-    engine: Annotated[Literal["auto", "torch", "loops"] | None, tyro.conf.arg(name="drawing-engine")] = None
-    """What draws: "loops" (compiled; float32 on a CPU), "torch" (anything), or "auto", whichever fits. By default
-    $CA_REG_ENGINE, or "auto"."""
+    engine: Annotated[_Engine, tyro.conf.arg(name="drawing-engine", help=_ENGINE_HELP)] = None
 
 
 Draw = Annotated[Drawing, tyro.conf.arg(name="")]

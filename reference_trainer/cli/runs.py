@@ -12,17 +12,27 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from reference_trainer.cli.drawing import Draw, Drawing, DrawingOfSweep, DrawOfSweep
+from reference_trainer.cli.drawing import Device, Draw, Drawing, DrawingOfSweep, DrawOfSweep
 from reference_trainer.runs.engines.choice import EngineName
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
-from reference_trainer.training.config import PRESETS, TrainConfig
+from reference_trainer.training.config import PRESETS, TrainConfig, with_preset
 
 __all__ = ["Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
-Folder = Annotated[str | None, tyro.conf.Positional]
+Folder = Annotated[
+    str | None, tyro.conf.Positional, tyro.conf.arg(help='Scene folder, or "synthetic"; the same as --path.')
+]
 Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="")]
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
+Preset = Annotated[
+    Literal["fsgs", "inria", "binocular"],
+    tyro.conf.arg(help="Schedule of a published code base; other options override it."),
+]
+Lpips = Annotated[
+    str | None,
+    tyro.conf.arg(help='Perceptual metric: "installed" to use what is installed, or a weights file; by default none.'),
+]
 Given = Annotated[frozenset[str], tyro.conf.Suppress]  # filled in from the command line itself, see given_fields
 
 
@@ -63,11 +73,21 @@ class Demo:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.runs.demo import demo
+        from reference_trainer.runs.compare import compare, strategies
+        from reference_trainer.runs.compare_report import report
+        from reference_trainer.runs.engines.processes import Processes
+        from reference_trainer.runs.grid import Running
 
         self.drawing.begin("cpu", trains=True)
-        done = demo(self.out, iterations=self.iterations, seeds=range(self.seeds), jobs=self.jobs, say=print)
-        if done.failures:
+        steps = self.iterations
+        config = with_preset("fsgs", iterations=steps, opacity_reset_every=0, densify_from=min(500, steps // 4))
+        chosen = strategies(["baseline", "dropout", "noise", "both"], config)
+        what = f"the built-in scene (3 views) with {', '.join(chosen)}"
+        print(f"Training {what}: {steps} steps each, {self.jobs} at a time.")
+        running = Running(Processes(self.jobs), monitor_every=max(1, steps // 5), say=print)
+        comparisons = compare({self.out: SceneOptions("synthetic")}, chosen, range(self.seeds), running)
+        report(comparisons, say=print)
+        if comparisons[self.out].failures:
             sys.exit(1)
 
 
@@ -80,23 +100,19 @@ class Train:
     """
 
     folder: Folder = None
-    """Scene folder, or "synthetic"; the same as --path."""
     out: Path = Path("runs/train")
     """Folder of the run."""
     scene: Scene = field(default_factory=SceneOptions)
     config: Config = field(default_factory=lambda: PRESETS["fsgs"])
-    preset: Literal["fsgs", "inria", "binocular"] = "fsgs"
-    """Schedule of a published code base; other options override it."""
+    preset: Preset = "fsgs"
     auto: bool = True
     """Leave out what the scene does not need, as `ca-reg plan` says; what other options or the preset set stays."""
     given: Given = frozenset()
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
+    device: Device = "cpu"
     drawing: Draw = field(default_factory=Drawing)
     monitor_every: int = 500
     """Steps between measurements of CA and PSNR for TensorBoard; 0 for none."""
-    lpips: str | None = None
-    """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
+    lpips: Lpips = None
     deterministic: bool = False
     """One thread and repeatable algorithms: the same result whatever the number of threads, and on CUDA every time."""
 
@@ -135,11 +151,9 @@ class Plan:
     """Say what training will use of a scene and what it leaves out, with the reasons; trains nothing."""
 
     folder: Folder = None
-    """Scene folder, or "synthetic"; the same as --path."""
     scene: Scene = field(default_factory=SceneOptions)
     config: Config = field(default_factory=lambda: PRESETS["fsgs"])
-    preset: Literal["fsgs", "inria", "binocular"] = "fsgs"
-    """Schedule of a published code base; other options override it."""
+    preset: Preset = "fsgs"
     given: Given = frozenset()
     out: Path | None = None
     """JSON file for the plan; by default none is written."""
@@ -187,10 +201,8 @@ class Evaluate:
     """Renders per view for the CA score."""
     seed: int = 0
     """Seed of the CA score's masks."""
-    lpips: str | None = None
-    """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
+    lpips: Lpips = None
+    device: Device = "cpu"
     out: Path | None = None
     """Folder for the results; by default <run>/evaluation, <run>/evaluation_<regularizer> or <ply>_evaluation."""
     drawing: Draw = field(default_factory=Drawing)
@@ -240,8 +252,7 @@ class Render:
     """Pictures of a flight."""
     out: Path | None = None
     """Folder for the pictures; by default <run>/render_<what>."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
+    device: Device = "cpu"
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
@@ -273,8 +284,7 @@ class Compare:
     """Scene folders, or "synthetic"; the other options hold for all of them."""
     scene: Annotated[EveryScene, tyro.conf.arg(name="")] = field(default_factory=EveryScene)
     config: Config = field(default_factory=lambda: PRESETS["fsgs"])
-    preset: Literal["fsgs", "inria", "binocular"] = "fsgs"
-    """Schedule of a published code base; other options override it."""
+    preset: Preset = "fsgs"
     strategies: tuple[str, ...] = ("baseline", "dropout", "noise", "both")
     """What to compare: these, "analytic-dropout", "analytic-noise", whose rates --dropout and --noise give (0.2 and 0.8
     if they are 0), or regularizers as of --regularizer, such as "d2gs"."""
@@ -289,14 +299,12 @@ class Compare:
     and the scenes must be on a file system that its machines share."""
     retries: int = 3
     """How many dead workers of one run are replaced; each continues from the last checkpoint."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
+    device: Device = "cpu"
     monitor_every: int = 500
     """Steps between measurements of CA and PSNR; 0 for none."""
     checkpoint_every: int = 500
     """Steps between checkpoints: what a dead worker costs at most."""
-    lpips: str | None = None
-    """Perceptual metric: "installed" to use what is installed, or a weights file; by default none."""
+    lpips: Lpips = None
     drawing: DrawOfSweep = field(default_factory=DrawingOfSweep)
 
     @property

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
-from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.run import save_for_viewers
-from reference_trainer.runs.score_ply import of_ply
+from reference_trainer.runs.score_ply import of_plain_ply
 
 __all__ = ["bake_ply"]
 
@@ -36,8 +33,9 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> s
 
     Example:
         >>> import tempfile
+        >>> import torch
         >>> from reference_trainer.model.gaussians import Gaussians
-        >>> from reference_trainer.model.ply import save_ply
+        >>> from reference_trainer.model.ply import load_ply, save_ply
         >>> gaussians = Gaussians.from_points(torch.rand(5, 3), torch.rand(5, 3), torch.full((5,), 0.1), sh_degree=0)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     plain, baked = Path(folder, "plain.ply"), Path(folder, "baked.ply")
@@ -48,11 +46,7 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> s
     """
     if target.exists():
         raise FileExistsError(f"{target} exists already: give another --out, or delete it.")
-    loaded = load_ply(source)
-    if loaded.for_rendering or loaded.opacity_scale != 1:
-        by = "those of the test" if loaded.for_rendering else f"scaled by {loaded.opacity_scale:g}"
-        raise ValueError(f"the opacities of {source} are {by} already: give the PLY with plain ones.")
-    model, facts = of_ply(source, background=torch.zeros(3), regularizer=regularizer)
+    model, facts = of_plain_ply(source, regularizer=regularizer)
     if not facts.regularizer:
         raise ValueError(f"{source} does not say what it was trained with: give --regularizer, such as 'dropout(0.2)'.")
     if model.depends_on_camera:

@@ -7,24 +7,15 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from reference_trainer.json_files import read_json
-from reference_trainer.runs.settings import read_run_settings
+from reference_trainer.json_files import read_json, settings_from
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import Plan
 
 __all__ = [
-    "BAKED_PLY",
-    "CHECKPOINT",
-    "CONFIG",
-    "PLAN",
-    "PLY",
-    "RESULTS",
-    "VIEWS",
-    "begun_with",
-    "claim",
-    "read_results",
-]
+    "BAKED_PLY", "CHECKPOINT", "CONFIG", "PLAN", "PLY", "RESULTS", "VIEWS",
+    "begun_with", "claim", "read_results", "read_run_settings",
+]  # fmt: skip
 
 CONFIG = "config.json"
 PLAN = "plan.json"
@@ -38,6 +29,30 @@ RESULTS = "results.json"
 def claim(options: SceneOptions, config: TrainConfig) -> dict[str, Any]:
     """Return the content of ``config.json``: the run that a folder belongs to."""
     return {"scene": dataclasses.asdict(options.absolute()), "config": dataclasses.asdict(config)}
+
+
+def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
+    """Return the scene and the training of a run from its ``config.json``.
+
+    A setting that the file lacks is at its default: the version that wrote it did not have it yet.
+
+    Raises:
+        ValueError: if the file is not such a file, or holds a setting that there is not or that is out of range.
+        OSError: if it cannot be read.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(folder, "config.json").write_text('{"scene": {"views": 3}, "config": {"dropout": 0.2}}')
+        ...     scene, config = read_run_settings(f"{folder}/config.json")
+        >>> scene.path, scene.views, config.dropout
+        ('synthetic', 3, 0.2)
+    """
+    content = read_json(path)
+    if not isinstance(content, dict) or not {"scene", "config"} <= content.keys():
+        raise ValueError(f"{path} is not the config.json of a run: it must hold the objects 'scene' and 'config'.")
+    scene = settings_from(SceneOptions, content["scene"], f"{path}, scene")
+    return scene, settings_from(TrainConfig, content["config"], f"{path}, config")
 
 
 def begun_with(
@@ -58,8 +73,21 @@ def begun_with(
     if not (out / CONFIG).exists():
         return None
     if auto and (out / PLAN).exists():
-        config = _read_plan(out / PLAN).applied(config, given=given)
-    _refuse_other_run(out, claim(options, config))
+        try:
+            config = Plan.from_dict(read_json(out / PLAN)).applied(config, given=given)
+        except ValueError as error:
+            raise ValueError(f"{out / PLAN}: {error}") from error
+    found = claim(*read_run_settings(out / CONFIG))
+    changed = [
+        f"{key}: {found[part][key]} -> {value}"
+        for part, values in claim(options, config).items()
+        for key, value in values.items()
+        if found[part][key] != value
+    ]
+    if changed:
+        raise ValueError(
+            f"{out} holds a run with other settings ({'; '.join(changed)}): give another folder, or delete this one."
+        )
     return config
 
 
@@ -74,26 +102,3 @@ def read_results(out: Path) -> dict[str, Any]:
     if not isinstance(results, dict) or "mean" not in results:
         raise ValueError(f"{out / RESULTS} does not hold the results of a run: delete it to measure again.")
     return results
-
-
-def _read_plan(path: Path) -> Plan:
-    """Read the plan of a run."""
-    try:
-        return Plan.from_dict(read_json(path))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _refuse_other_run(out: Path, settings: dict[str, Any]) -> None:
-    """Refuse a folder that holds a run with other settings."""
-    found = claim(*read_run_settings(out / CONFIG))
-    changed = [
-        f"{key}: {found[part][key]} -> {value}"
-        for part, values in settings.items()
-        for key, value in values.items()
-        if found[part][key] != value
-    ]
-    if changed:
-        raise ValueError(
-            f"{out} holds a run with other settings ({'; '.join(changed)}): give another folder, or delete this one."
-        )

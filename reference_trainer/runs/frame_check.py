@@ -11,6 +11,7 @@ from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.initial import pixels_of
 
 __all__ = ["check_frame"]
 
@@ -42,10 +43,11 @@ def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[st
             f"{name}: none of the {len(gaussians):,} Gaussians has an opacity of 1/255, all are invisible."
         )
     views = [*scene.train, *scene.test]
-    inside = torch.stack([_inside(means, view.camera) for view in views])
+    before = torch.stack([_depth(means, view.camera) >= NEAR_PLANE for view in views])
+    inside = torch.stack([pixels_of(means, view.camera)[2] for view in views]) & before
     seen = int(inside.any(0).sum())
     if seen < NEARLY_NONE * count:
-        behind = int(torch.stack([_depth(means, view.camera) < NEAR_PLANE for view in views]).all(0).sum())
+        behind = int((~before).all(0).sum())
         center = means.double().median(0).values
         reach = (means - center).norm(dim=1).kthvalue(-(-98 * count // 100)).values  # without the stray ones
         rig = torch.stack([view.camera.position for view in views]).double()
@@ -68,14 +70,6 @@ def _depth(means: Tensor, camera: Camera) -> Tensor:
     """Return the distance along the viewing direction, shape (N,)."""
     pose = camera.world_to_camera.to(means)
     return means @ pose[2, :3] + pose[2, 3]
-
-
-def _inside(means: Tensor, camera: Camera) -> Tensor:
-    """Whether centres lie in the picture and in front of the near plane, shape (N,)."""
-    pose = camera.world_to_camera.to(means)
-    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    return (z >= NEAR_PLANE) & (column >= 0) & (column <= camera.width) & (row >= 0) & (row <= camera.height)
 
 
 def _text(point: Tensor) -> str:

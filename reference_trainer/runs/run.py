@@ -34,9 +34,9 @@ from reference_trainer.runs.folder import (
     begun_with,
     claim,
     read_results,
-)
+    read_run_settings,
+)  # fmt: skip
 from reference_trainer.runs.lock import run_lock
-from reference_trainer.runs.settings import read_run_settings
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.threads import threads_for
@@ -44,7 +44,7 @@ from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.interruption import TrainingInterrupted
-from reference_trainer.training.plan import Plan, make_plan
+from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["load_run", "model_of", "run_experiment", "save_for_viewers"]
@@ -180,16 +180,11 @@ def _planned(
         return config
     plan = make_plan(scene, config, given=given)
     write_json(out / PLAN, plan.as_dict())
-    _tell(plan, out, say)
-    return plan.applied(config, given=given)
-
-
-def _tell(plan: Plan, out: Path, say: Callable[[str], None]) -> None:
-    """Say what the plan changes."""
     changing = [row for row in plan.rows() if row["change"] != "-"]
     for row in changing:
         say(f"plan: {row['item']} {row['decision']} ({row['change']}): {row['reason']}")
     say(f"plan: {len(changing)} settings changed, reasons in {out / PLAN}; --no-auto trains exactly as asked")
+    return plan.applied(config, given=given)
 
 
 @contextmanager
@@ -267,14 +262,8 @@ def _measure(
         say(f"{out}: what is rendered at test time depends on the camera, so that there is no {BAKED_PLY}")
     elif model.factor != 1:
         save_for_viewers(model, out / BAKED_PLY)
-    evaluation = evaluate(
-        model,
-        measured_views(trainer.scene, say),
-        perceptual=perceptual,
-        pictures=out / VIEWS,
-        keep=out / PARTIAL,
-        say=say,
-    )
+    views, keep = measured_views(trainer.scene, say), out / PARTIAL
+    evaluation = evaluate(model, views, perceptual=perceptual, pictures=out / VIEWS, keep=keep, say=say)
     results = {
         "scene": trainer.scene.name,
         "config": dataclasses.asdict(trainer.config),
@@ -282,6 +271,6 @@ def _measure(
         **evaluation.as_dict(),
         "machine": machine(),
     }
-    (out / PARTIAL).unlink(missing_ok=True)  # first, because a complete run is not touched again
+    keep.unlink(missing_ok=True)  # first, because a complete run is not touched again
     write_json(out / RESULTS, results)
     return read_results(out)

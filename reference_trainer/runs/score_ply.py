@@ -24,7 +24,7 @@ from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.scenes.orbit import bounding_sphere
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 
-__all__ = ["PlyFacts", "of_ply", "score_ply"]
+__all__ = ["PlyFacts", "of_plain_ply", "of_ply", "score_ply"]
 
 SMALLEST_RADIUS = 0.25
 """Smaller models are enlarged to this: the near plane of the renderer, at 0.2, would cut into them."""
@@ -109,6 +109,15 @@ def of_ply(
     )
     if baked > 0 and not loaded.for_rendering and not math.isclose(model.dropout, baked, rel_tol=1e-6):
         raise ValueError(f"{ply} was scaled for dropout {baked:g}, not for {text}: leave out --regularizer.")
+    return model, facts
+
+
+def of_plain_ply(ply: Path, *, regularizer: str | None = None, device: str = "cpu") -> tuple[TrainedModel, PlyFacts]:
+    """Do the same over black; a ValueError if the opacities are those of the test, or scaled."""
+    model, facts = of_ply(ply, background=torch.zeros(3), regularizer=regularizer, device=device)
+    if facts.for_rendering or facts.opacity_scale != 1:
+        by = "those of the test" if facts.for_rendering else f"scaled by {facts.opacity_scale:g}"
+        raise ValueError(f"the opacities of {ply} are {by} already: give the PLY with plain ones.")
     return model, facts
 
 

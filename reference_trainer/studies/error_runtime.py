@@ -18,9 +18,9 @@ from torch import Tensor
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.model.ply import load_ply
 from reference_trainer.render import first_order_map
 from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.score_ply import of_plain_ply
 from reference_trainer.scenes.orbit import orbit_views
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.both_engines import drawn_by, engines_on
@@ -321,11 +321,7 @@ def _panel(axes: Any, record: Record) -> None:
 
 def _of_ply(ply: Path, device: str) -> tuple[TrainedModel, View]:
     """Return the model of a PLY over black, and a view from an orbit; it has a camera but no photograph."""
-    loaded = load_ply(ply)
-    if loaded.opacity_scale != 1 or loaded.for_rendering:
-        by = "the mean of their noise" if loaded.for_rendering else f"{loaded.opacity_scale:g}"
-        raise ValueError(f"the opacities of {ply} are scaled by {by} for viewers: give the PLY with plain ones.")
-    gaussians = loaded.gaussians.to(device)
-    camera = orbit_views(gaussians.means, gaussians.opacities, count=1, width=PICTURE, height=PICTURE)[0]
-    nothing = torch.zeros(3, device=device)
-    return TrainedModel(gaussians, nothing), View("orbit", camera, nothing[:, None, None].expand(3, PICTURE, PICTURE))
+    model, _ = of_plain_ply(ply, device=device)
+    means, opacities = model.gaussians.means, model.gaussians.opacities
+    camera = orbit_views(means, opacities, count=1, width=PICTURE, height=PICTURE)[0]
+    return model, View("orbit", camera, model.background[:, None, None].expand(3, PICTURE, PICTURE))

@@ -15,7 +15,6 @@ from torch import Tensor
 from ca_reg import CAResult, Reason, attribute, total_effects
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
 from reference_trainer.evaluation.pictures import file_names, heat_map, save_png, side_by_side
-from reference_trainer.evaluation.rank_correlation import spearman
 from reference_trainer.evaluation.results import machine, markdown_table, write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
@@ -26,14 +25,9 @@ from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.scenes.scene import View
 
 __all__ = [
-    "blend_weights",
-    "colored_by",
-    "concentration",
-    "mean_effects",
-    "mean_shares",
-    "share_per_weight",
+    "blend_weights", "colored_by", "concentration", "mean_effects", "mean_shares", "share_per_weight",
     "study_attribution",
-]
+]  # fmt: skip
 
 # Ends of the colour scales in units of the mean. Shares grow with the size of a Gaussian, so that a picture of them
 # shows the large ones; per blend weight they show what the CA map shows, Gaussian by Gaussian.
@@ -222,11 +216,10 @@ def study_attribution(
     a, b, c = (x.cpu().numpy() for x in (shares, effects, weights))
     with replacing(out / "shares.npz") as place, place.open("wb") as file:
         np.savez(file, shares=a, total_effects=b, blend_weights=c)
+    per_gaussian = share_per_weight(shares, weights)
     colored = {
         "attribution": colored_by(model.gaussians, shares, *scales["share"]),
-        "attribution_per_weight": colored_by(
-            model.gaussians, share_per_weight(shares, weights), *scales["share_per_weight"]
-        ),
+        "attribution_per_weight": colored_by(model.gaussians, per_gaussian, *scales["share_per_weight"]),
     }
     for name, gaussians in colored.items():  # with the scaling baked in, as in a run's PLY for viewers
         save_for_viewers(dataclasses.replace(model, gaussians=gaussians), out / f"{name}.ply", pad_to_degree=3)
@@ -261,17 +254,17 @@ def _mean_over_views(
 def _correlations(
     model: TrainedModel, views: Sequence[View], shares: Tensor, weights: Tensor
 ) -> dict[str, float | None]:
-    """Rank correlation of the share with what else is known of a Gaussian."""
+    """Spearman's rank correlation of the share with what else is known of a Gaussian; None where all are equal."""
+    from scipy.stats import spearmanr  # a second to import
+
     gaussians = model.gaussians
     poses = [view.camera.world_to_camera.to(gaussians.means) for view in views]
     depth = torch.stack([gaussians.means @ pose[2, :3] + pose[2, 3] for pose in poses]).mean(0)
-    known = {
-        "opacity": gaussians.opacities,
-        "largest scale": gaussians.scales.amax(1),
-        "mean depth": depth,
-        "blend weight": weights,
-    }
-    return {name: spearman(shares.tolist(), values.tolist()) for name, values in known.items()}
+    known = {"opacity": gaussians.opacities, "largest scale": gaussians.scales.amax(1), "mean depth": depth}
+    known["blend weight"] = weights
+    pairs = {name: (shares.cpu(), values.detach().cpu()) for name, values in known.items()}
+    ordered = {name: all(bool(x.min() < x.max()) for x in pair) for name, pair in pairs.items()}
+    return {name: float(spearmanr(*pair).statistic) if ordered[name] else None for name, pair in pairs.items()}
 
 
 @torch.no_grad()

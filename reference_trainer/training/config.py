@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from ca_reg import Chain
@@ -103,40 +104,17 @@ class TrainConfig:
         for name, value in vars(self).items():
             if isinstance(value, float) and not math.isfinite(value):  # JSON has no word for it
                 raise ValueError(f"{name} must be finite, got {value}.")
-        if self.iterations < 1:
-            raise ValueError(f"iterations must be at least 1, got {self.iterations}.")
-        if not 0 <= self.dropout < 1:
-            raise ValueError(f"dropout must be in [0, 1), got {self.dropout}: 0 turns it off.")
-        if self.noise < 0:
-            raise ValueError(f"noise must not be negative, got {self.noise}: 0 turns it off.")
+        for names, right, rule, hint in _RANGES:
+            for name in names:
+                if not right(getattr(self, name)):
+                    raise ValueError(f"{name} must be {rule}, got {getattr(self, name)!r}{hint}.")
         if self.analytic and not self.regularizers:
             raise ValueError("analytic training needs something to average over: set dropout, noise or regularizer.")
-        for name in (
-            "seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from"
-        ):  # fmt: skip
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}.")
         if self.regularize_from >= self.iterations and self.regularizers:
             raise ValueError(
                 f"regularize_from must be below iterations ({self.iterations}), got {self.regularize_from}: no step "
                 "would use the regularizers."
             )
-        if self.sh_every < 1:
-            raise ValueError(f"sh_every must be at least 1, got {self.sh_every}: set sh_degree=0 for constant colours.")
-        if self.initial_points not in ("all", "seen"):
-            raise ValueError(f"initial_points must be all or seen, got {self.initial_points!r}.")
-        if self.prune_size is not None and not self.prune_size > 0:
-            raise ValueError(f"prune_size must be positive, or None to keep what is large, got {self.prune_size}.")
-        for name in ("means_rate", "means_rate_final", "initial_scale"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
-        for name in ("initial_opacity", "opacity_reset"):
-            if not 0 < getattr(self, name) < 1:
-                raise ValueError(f"{name} must be in (0, 1), got {getattr(self, name)}.")
-        if self.sh_degree not in (0, 1, 2, 3):
-            raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}.")
-        if not 0 < self.opacity_decay <= 1:
-            raise ValueError(f"opacity_decay must be in (0, 1], got {self.opacity_decay}: 1 turns it off.")
 
     @property
     def regularizers(self) -> str:
@@ -186,6 +164,22 @@ class TrainConfig:
                 f"analytic training has no draw, which {', '.join(drawn)} needs: leave out analytic, or the term."
             )
 
+
+_RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
+    (("iterations",), lambda x: x >= 1, "at least 1", ""),
+    (("dropout",), lambda x: 0 <= x < 1, "in [0, 1)", ": 0 turns it off"),
+    (("noise",), lambda x: x >= 0, "at least 0", ": 0 turns it off"),
+    (("seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from"),
+     lambda x: x >= 0, "at least 0", ""),
+    (("sh_every",), lambda x: x >= 1, "at least 1", ": set sh_degree=0 for constant colours"),
+    (("sh_degree",), lambda x: x in (0, 1, 2, 3), "0, 1, 2 or 3", ""),
+    (("initial_points",), lambda x: x in ("all", "seen"), "all or seen", ""),
+    (("prune_size",), lambda x: x is None or x > 0, "positive, or None to keep what is large", ""),
+    (("means_rate", "means_rate_final", "initial_scale"), lambda x: x > 0, "positive", ""),
+    (("initial_opacity", "opacity_reset"), lambda x: 0 < x < 1, "in (0, 1)", ""),
+    (("opacity_decay",), lambda x: 0 < x <= 1, "in (0, 1]", ": 1 turns it off"),
+)  # fmt: skip
+"""Fields, what their values must satisfy, and how to say so."""
 
 PRESETS: dict[str, TrainConfig] = {
     "fsgs": TrainConfig(iterations=10_000),

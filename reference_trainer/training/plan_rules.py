@@ -68,17 +68,14 @@ def depth_output(scene: Scene, config: TrainConfig) -> Finding:
 
 def distortion(scene: Scene, config: TrainConfig) -> Finding:
     """Cameras are pinholes once they are loaded."""
-    return Finding(
-        "lens distortion",
-        "left out",
-        "by construction: cameras are pinholes; the loader undoes it and says how far it goes",
-    )
+    reason = "by construction: cameras are pinholes; the loader undoes it and says how far it goes"
+    return Finding("lens distortion", "left out", reason)
 
 
 def densification(scene: Scene, config: TrainConfig) -> Finding:
     """Clones and splits."""
     name, points = "densification", _points(scene)
-    until = config.iterations if config.densify_until is None else min(config.densify_until, config.iterations)
+    until = _densify_until(config)
     if config.densify_every == 0:
         return Finding(name, "left out", "asked for (densify_every=0)")
     if until <= config.densify_from:
@@ -93,7 +90,7 @@ def opacity_reset(scene: Scene, config: TrainConfig) -> Finding:
     name, first = "opacity reset", config.opacity_reset_from
     if config.opacity_reset_over_white and scene.is_white:
         first = min(first, config.densify_from)
-    until = config.iterations if config.densify_until is None else min(config.densify_until, config.iterations)
+    until = _densify_until(config)
     if config.opacity_reset_every == 0:
         return Finding(name, "left out", "asked for (opacity_reset_every=0)")
     if first >= until:
@@ -103,12 +100,9 @@ def opacity_reset(scene: Scene, config: TrainConfig) -> Finding:
 
 def dropped(scene: Scene, config: TrainConfig) -> Finding:
     """Dropped Gaussians."""
-    name = "dropped Gaussians"
-    regularizer = config.make_regularizer()
-    if not regularizer.drops or config.analytic:
-        return Finding(name, "left out", "by construction: training draws no masks")
-    reason = "by construction: what a mask drops is neither projected nor sorted in the step"
-    return Finding(name, "left out", reason)
+    masks = config.make_regularizer().drops and not config.analytic
+    reason = "what a mask drops is neither projected nor sorted in the step" if masks else "training draws no masks"
+    return Finding("dropped Gaussians", "left out", f"by construction: {reason}")
 
 
 def regularizer_inputs(scene: Scene, config: TrainConfig) -> Finding:
@@ -145,10 +139,8 @@ def ssim_windows(scene: Scene, config: TrainConfig) -> Finding:
     share = sum(float(part.any(1).float().mean() * part.any(0).float().mean()) for part in busy) / len(busy)
     if not any(isinstance(term, Photometric) and term.lambda_dssim > 0 for term in config.make_losses()):
         return Finding("SSIM windows without change", "left out", "by construction: the loss has no SSIM")
-    reason = (
-        f"the box around what differs from the background is {share:.0%} of a picture; cutting it out gains nothing"
-    )
-    return Finding("SSIM windows without change", "used", reason)
+    reason = f"the box around what differs from the background is {share:.0%} of a picture"
+    return Finding("SSIM windows without change", "used", f"{reason}; cutting it out gains nothing")
 
 
 def moments(scene: Scene, config: TrainConfig) -> Finding:
@@ -170,21 +162,9 @@ def initial_size(scene: Scene, config: TrainConfig) -> Finding:
 
 
 RULES: tuple[Callable[[Scene, TrainConfig], Finding], ...] = (
-    sh_bands,
-    alpha_masks,
-    background,
-    depth_output,
-    distortion,
-    densification,
-    opacity_reset,
-    dropped,
-    regularizer_inputs,
-    unseen,
-    saturated,
-    ssim_windows,
-    moments,
-    initial_size,
-)
+    sh_bands, alpha_masks, background, depth_output, distortion, densification, opacity_reset, dropped,
+    regularizer_inputs, unseen, saturated, ssim_windows, moments, initial_size,
+)  # fmt: skip
 """All rules, in the order of the table."""
 
 
@@ -192,6 +172,11 @@ def _points(scene: Scene) -> PointCloud:
     """The initial points, which `make_plan` has made sure of."""
     assert scene.points is not None
     return scene.points
+
+
+def _densify_until(config: TrainConfig) -> int:
+    """The step before which densification ends."""
+    return config.iterations if config.densify_until is None else min(config.densify_until, config.iterations)
 
 
 def _views_per_point(scene: Scene) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from reference_trainer.training.randomness import stream
 __all__ = ["Step"]
 
 
+@dataclass(eq=False, repr=False)
 class Step:
     """A view, what was drawn of it, and the means to draw more.
 
@@ -44,35 +46,24 @@ class Step:
         observed: what density control is to see: splats and camera of every render that counts.
     """
 
-    image: Tensor
-    drawn: Params
+    number: int
+    view: View
+    views: Sequence[View]
+    gaussians: Gaussians
+    regularizer: Chain
+    background: Tensor
+    _: KW_ONLY
+    sh_degree: int
+    seed: int
+    renderer: Callable[..., Any]
+    image: Tensor = field(init=False)
+    drawn: Params = field(init=False)
+    variance: Tensor | None = field(default=None, init=False)
+    rendering: Rendering | None = field(default=None, init=False)
+    observed: list[tuple[Splats | GsplatSplats, Camera]] = field(default_factory=list, init=False)
 
-    def __init__(
-        self,
-        number: int,
-        view: View,
-        views: Sequence[View],
-        gaussians: Gaussians,
-        regularizer: Chain,
-        background: Tensor,
-        *,
-        sh_degree: int,
-        seed: int,
-        renderer: Callable[..., Any],
-    ) -> None:
-        self.number = number
-        self.view = view
-        self.views = views
-        self.gaussians = gaussians
-        self.regularizer = regularizer
-        self.background = background
-        self.sh_degree = sh_degree
-        self.seed = seed
-        self.params = gaussians.params(view.camera, step=number)
-        self.variance: Tensor | None = None
-        self.rendering: Rendering | None = None
-        self.observed: list[tuple[Splats | GsplatSplats, Camera]] = []
-        self._renderer = renderer
+    def __post_init__(self) -> None:
+        self.params = self.gaussians.params(self.view.camera, step=self.number)
 
     def sample(self, *, depth: bool) -> None:
         """Render the view with one draw of the regularizer."""
@@ -105,7 +96,7 @@ class Step:
             self.background,
             sh_degree=self.sh_degree,
             depth=depth,
-            renderer=self._renderer,
+            renderer=self.renderer,
         )
         if observed:
             self.observed.append((out.splats, camera))

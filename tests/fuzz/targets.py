@@ -14,7 +14,7 @@ from fuzz.harness import Target
 from ca_reg.dynamics import read_dynamics
 from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.model.ply import load_ply
-from reference_trainer.runs.settings import read_run_settings
+from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.scenes.colmap import read_colmap
 from reference_trainer.scenes.idr import read_idr
 from reference_trainer.scenes.images import LARGEST_IMAGE, read_image

@@ -1,4 +1,4 @@
-"""Tiny scenes and runs of seconds, for everything that trains."""
+"""Runs of seconds, for everything that trains."""
 
 import dataclasses
 import signal
@@ -6,55 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 import pytest
+from tiny import busy as busy
+from tiny import options as options
+from tiny import short as short
+from tiny import tiny_scene as tiny_scene
 
 from reference_trainer.runs.run import run_experiment
-from reference_trainer.scenes import synthetic_scene
-from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.scene import Scene
-from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.trainer import Trainer
-
-
-@pytest.fixture(scope="session")
-def tiny_scene() -> Scene:
-    """The built-in scene at 32 x 24 pixels with 150 points; a step takes a few milliseconds."""
-    return synthetic_scene(width=32, height=24, points=150)
-
-
-@pytest.fixture(scope="session")
-def busy() -> TrainConfig:
-    """A short schedule in which everything happens: dropout, noise, splits, clones, pruning, resets, all SH bands."""
-    return TrainConfig(
-        iterations=24,
-        dropout=0.2,
-        noise=0.4,
-        sh_every=5,
-        means_rate=1e-3,
-        densify_from=3,
-        densify_every=4,
-        densify_gradient=1e-4,
-        dense_fraction=0.12,
-        prune_opacity=0.02,
-        prune_size=0.1,
-        prune_size_from=9,
-        opacity_reset_from=10,
-        opacity_reset_every=9,
-    )
-
-
-@pytest.fixture(scope="session")
-def options() -> SceneOptions:
-    """The built-in scene at 20 x 15 pixels."""
-    return SceneOptions("synthetic", downscale=8)
-
-
-@pytest.fixture(scope="session")
-def short() -> TrainConfig:
-    """Eleven steps with splits, dropout and noise; measurements and checkpoints do not fall together."""
-    return TrainConfig(
-        iterations=11, dropout=0.2, noise=0.3, sh_every=4, densify_from=2, densify_every=4, densify_gradient=2e-3
-    )
 
 
 @pytest.fixture

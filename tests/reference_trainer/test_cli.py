@@ -20,8 +20,6 @@ from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.studies import error_runtime as error_runtime_module
 from reference_trainer.studies import gaussian_shares as shares_module
-from reference_trainer.studies import pruning as pruning_module
-from reference_trainer.studies import ranking as ranking_module
 from reference_trainer.studies import study as study_module
 from reference_trainer.training.config import PRESETS
 
@@ -249,9 +247,8 @@ def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch):
 def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):
     small = ["--cameras", "1", "--size", "24", "--samples", "2"]
     main(["bake", str(trained / "point_cloud.ply"), "--out", str(tmp_path / "baked.ply")])
-    assert "baked.ply: opacities are those of the test after dropout(0.2), and marked so" in plain(
-        capsys.readouterr().out
-    )
+    said = plain(capsys.readouterr().out)
+    assert "baked.ply: opacities are those of the test after dropout(0.2), and marked so" in said
     main(["evaluate", "--ply", str(tmp_path / "baked.ply"), *small])
     out = capsys.readouterr().out
     assert "0.8 baked in, taken out for CA; trained with: dropout(0.2)" in out
@@ -359,24 +356,14 @@ def test_attribution(arguments, expected, monkeypatch):
     assert asked == [(source, out, {**keywords, "device": "cpu"})]
 
 
-@pytest.mark.parametrize(
-    ("command", "module", "arguments", "expected"),
-    [
-        ("pruning", pruning_module, ["--out", "o"], {"fractions": (0.1, 0.2, 0.4), "refine": 300}),
-        ("pruning", pruning_module, ["--fractions", "0.2", "0.5", "--refine", "0", "--out", "o"],
-         {"fractions": (0.2, 0.5), "refine": 0}),
-        ("ranking", ranking_module, ["--split", "train", "--out", "o"], {"split": "train", "views": None}),
-        ("error-runtime", error_runtime_module, ["--seeds", "2", "--out", "o"], {"max_samples": 1024, "seeds": 2}),
-    ],
-)  # fmt: skip
-def test_studies(command, module, arguments, expected, monkeypatch):
+def test_error_runtime(monkeypatch):
     declared, ran = [], []
     monkeypatch.setattr(
-        module, f"{command.replace('-', '_')}_study", lambda runs, **keywords: declared.append((runs, keywords))
+        error_runtime_module, "error_runtime_study", lambda runs, **keywords: declared.append((runs, keywords))
     )
     monkeypatch.setattr(study_module, "run_study", lambda study, out: ran.append(out))
-    main(["study", command, "r", "s", *arguments])
-    assert declared == [((Path("r"), Path("s")), {**expected, "device": "cpu"})]
+    main(["study", "error-runtime", "r", "s", "--seeds", "2", "--out", "o"])
+    assert declared == [((Path("r"), Path("s")), {"max_samples": 1024, "seeds": 2, "device": "cpu"})]
     assert ran == [Path("o")]
 
 
@@ -455,7 +442,7 @@ def test_the_real_arguments_are_the_default(monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_a_reader_that_has_seen_enough_is_no_error():
-    code = "from reference_trainer.cli import main; main(['study', 'pruning', '--help'])"
+    code = "from reference_trainer.cli import main; main(['study', 'attribution', '--help'])"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
         assert b"ca-reg:" not in process.stderr.read()

@@ -11,10 +11,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.studies.stability.case import Case, Probe, decades, of_scene, single
-from reference_trainer.studies.stability.quantities import (
-    reference_quantities,
-    scene_quantities,
-)
+from reference_trainer.studies.stability.quantities import reference_quantities, scene_quantities
 from reference_trainer.studies.stability.scenes import StressScene, base_scene, camera_of
 
 __all__ = ["geometry_cases"]

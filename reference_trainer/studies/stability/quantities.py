@@ -16,15 +16,9 @@ from reference_trainer.studies.stability.baseline import render_simply
 from reference_trainer.studies.stability.scenes import PARAMETERS, StressScene
 
 __all__ = [
-    "IMAGES",
-    "SCENE_QUANTITIES",
-    "Quantities",
-    "independent_images",
-    "loss_weights",
-    "reference_quantities",
-    "scene_quantities",
-    "splats_of",
-]
+    "IMAGES", "SCENE_QUANTITIES", "Quantities",
+    "independent_images", "loss_weights", "reference_quantities", "scene_quantities", "splats_of",
+]  # fmt: skip
 
 Quantities = Mapping[str, Tensor]
 
@@ -132,9 +126,9 @@ def _loss(image: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
 
 def _gradients(loss: Tensor, parameters: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
     """Return the gradients of a loss by name, 0 for what it does not depend on."""
+    leaves = [*parameters.values()]
     if not loss.requires_grad:
-        return {name: torch.zeros_like(x) for name, x in zip(names, parameters.values(), strict=True)}
+        return dict(zip(names, map(torch.zeros_like, leaves), strict=True))
     with torch.autocast("cpu", enabled=False):  # as PyTorch asks of backward passes
-        gradients = torch.autograd.grad(loss, list(parameters.values()), allow_unused=True)
-    pairs = zip(names, parameters.values(), gradients, strict=True)
-    return {name: torch.zeros_like(x) if gradient is None else gradient for name, x, gradient in pairs}
+        gradients = torch.autograd.grad(loss, leaves, allow_unused=True, materialize_grads=True)
+    return dict(zip(names, gradients, strict=True))

@@ -25,13 +25,7 @@ from reference_trainer.studies.study import Record, Records, Study, run_study
 
 __all__ = ["all_cases", "judge_with", "stability_study", "study_stability"]
 
-_GROUPS = {
-    "image, alpha": ("image", "alpha"),
-    "gradients": tuple(name for name in SCENE_QUANTITIES if name.startswith("d ") and name != "d variance"),
-    "mean, variance, CA": ("mean", "variance", "d variance", "CA"),
-    "dropout, noise": ("dropout", "noise"),
-}
-_FLOOR, _CEILING = 1e-9, 1.0
+_FLOOR = 1e-9  # of the colours of the figure
 
 
 @cache
@@ -113,14 +107,19 @@ def _of_engine(records: Sequence[Record], engine: str) -> list[Record]:
 def _report(records: Records) -> str:
     """Return counts, errors by case and quantity, and how what ends does so."""
     cases, about = [*records.values()], machine()
-    rows = [_count_row(engine, _of_engine(cases, engine)) for engine in _engines(records)]
+    endings = {engine: Counter(case["ending"] for case in _of_engine(cases, engine)) for engine in _engines(records)}
+    columns = ["engine", "cases", "ok", "refused", "limit", "defect"]
+    rows = [
+        {**dict.fromkeys(columns, 0), "engine": engine, "cases": counts.total(), **counts}
+        for engine, counts in endings.items()
+    ]
     lines = [
         f"{about['cpu']}, torch {about['torch']}: {sum(len(case['points']) for case in cases)} magnitudes in "
         f"{sum(case['seconds'] for case in cases):.0f} s. Right is an error of at most {VALUE_TOLERANCE:g}, of "
         f"gradients (d) {GRADIENT_TOLERANCE:g}: the norm of the difference over that of the reference. What draws "
         "nothing in float32 is judged once and counted for every engine.",
         "",
-        markdown_table(rows, ["engine", "cases", "ok", "refused", "limit", "defect"]),
+        markdown_table(rows, columns),
         "### Largest error over the magnitudes at which everything is right",
     ]
     for family in dict.fromkeys(case["family"] for case in cases):
@@ -133,13 +132,6 @@ def _report(records: Records) -> str:
     columns = ["case", "engine", "ends as", "from", "how", "what it says"]
     lines += ["", "### Where and how the others end", "", markdown_table(rows, columns).rstrip()]
     return "\n".join(lines) + "\n"
-
-
-def _count_row(engine: str, cases: Sequence[Record]) -> dict[str, object]:
-    """Return how many cases end in which way."""
-    counts = Counter(case["ending"] for case in cases)
-    endings = {name: counts[name] for name in ("ok", "refused", "limit", "defect")}
-    return {"engine": engine, "cases": len(cases), **endings}
 
 
 def _error_row(case: Record) -> dict[str, object]:
@@ -165,21 +157,13 @@ def _ending_row(case: Record) -> dict[str, object]:
 
 
 def _draw(records: Records, figure: Any) -> None:
-    """Draw the errors as a heat map for each engine, and as lines for the cases that have an onset."""
+    """Draw the errors as a heat map for each engine."""
     cases = [case for case in records.values() if _worst_errors(case)]
-    sweeps = [case for case in cases if case["magnitudes"] and case["onset"] is not None]
     engines = _engines(records) or [""]
     rows = max(len(_of_engine(cases, engine)) for engine in engines)
-    figure.set_size_inches(6.5 * len(engines) + 7, max(4.0, 0.2 * rows + 2))
-    *left, right = figure.subfigures(1, len(engines) + 1)
-    for part, engine in zip(left, engines, strict=True):
+    figure.set_size_inches(6.5 * len(engines), max(4.0, 0.2 * rows + 2))
+    for part, engine in zip(figure.subfigures(1, len(engines), squeeze=False).flat, engines, strict=True):
         _heat(part, engine, _of_engine(cases, engine))
-    if sweeps:
-        panels = right.subplots(math.ceil(len(sweeps) / 2), 2, squeeze=False).flat
-        for panel, case in zip(panels, sweeps, strict=False):
-            _lines(panel, case)
-        if len(sweeps) % 2:
-            right.axes[-1].set_visible(False)
 
 
 def _heat(figure: Any, engine: str, cases: Sequence[Record]) -> None:
@@ -207,29 +191,3 @@ def _label(case: Record) -> str:
         return str(case["name"])
     end = f"; ends at {case['onset']:.2g}" if case["onset"] is not None else f" (to {case['magnitudes'][1]:.0e})"
     return f"{case['name']}{end}"
-
-
-def _lines(panel: Any, case: Record) -> None:
-    """Draw the errors of one case against the magnitude; a cross is an infinity, a grey area what is refused."""
-    for color, (label, names) in enumerate(_GROUPS.items()):
-        curve = {
-            point["magnitude"]: max(point["errors"][name] for name in names if name in point["errors"])
-            for point in case["points"]
-            if any(name in point["errors"] for name in names)
-        }
-        finite = {x: min(max(y, _FLOOR), _CEILING) for x, y in curve.items() if math.isfinite(y)}
-        if finite:
-            panel.plot(finite.keys(), finite.values(), ".-", color=f"C{color}", label=label, linewidth=1, markersize=4)
-        infinite = [x for x, y in curve.items() if not math.isfinite(y)]
-        panel.plot(infinite, [_CEILING] * len(infinite), "x", color=f"C{color}", markersize=5)
-    refused = [point["magnitude"] for point in case["points"] if point["status"] == "refused"]
-    if refused:
-        panel.axvspan(min(refused), max(refused), color="0.8")
-    panel.axvline(case["onset"], color="red", linewidth=0.8)
-    panel.set_xscale("log")
-    panel.set_yscale("log")
-    panel.set_ylim(_FLOOR / 2, _CEILING * 3)
-    panel.tick_params(labelsize=6)
-    panel.set_title(f"{case['name']}, {case['engine'] or 'any engine'} ({case['ending']})", fontsize=7)
-    panel.grid(alpha=0.3)
-    panel.legend(fontsize=5, loc="lower right")

@@ -10,11 +10,13 @@ import torch
 from stand_ins.engine import Here
 
 from ca_reg.monitor import LOG_NAME
+from reference_trainer.cli.drawing import Drawing
+from reference_trainer.cli.runs import Demo
 from reference_trainer.evaluation.pictures import save_png
 from reference_trainer.evaluation.tables import comparison_table, summary
 from reference_trainer.render import chosen_engine
-from reference_trainer.runs import demo as demo_module
-from reference_trainer.runs import grid
+from reference_trainer.runs import compare as compare_module
+from reference_trainer.runs import compare_report, grid
 from reference_trainer.runs.compare import NAMED, compare, scene_folders, strategies
 from reference_trainer.runs.compare_report import REPORT, TABLE, Comparison, report
 from reference_trainer.runs.engines.choice import choose_engine
@@ -199,9 +201,10 @@ def test_the_demo_is_a_comparison_of_all_strategies(tmp_path, monkeypatch):
         asked.update(scenes=scenes, configs=configs, seeds=list(seeds), running=running)
         return {tmp_path: Comparison({}, {})}
 
-    monkeypatch.setattr(demo_module, "compare", fake)
-    monkeypatch.setattr(demo_module, "report", lambda comparisons, say: None)
-    demo_module.demo(tmp_path, iterations=4, seeds=range(2), jobs=2, say=lambda text: None)
+    monkeypatch.setattr(compare_module, "compare", fake)
+    monkeypatch.setattr(compare_report, "report", lambda comparisons, say: None)
+    monkeypatch.setattr(Drawing, "begin", lambda self, device, trains: None)
+    Demo(tmp_path, iterations=4, seeds=2, jobs=2)()
     assert list(asked["configs"]) == ["baseline", "dropout", "noise", "both"]
     assert {config.iterations for config in asked["configs"].values()} == {4}
     assert asked["scenes"] == {tmp_path: SceneOptions("synthetic")}

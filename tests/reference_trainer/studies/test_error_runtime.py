@@ -260,9 +260,12 @@ def test_sources_that_cannot_be_told_apart_or_are_scaled_are_refused(ball, tmp_p
         with pytest.raises(ValueError, match="sources must have different names"):
             error_runtime_study(sources)
     gaussians = load_ply(ball).gaussians
-    for keywords, by in (({"bake_p": 0.2}, r"0\.8"), ({"opacities": gaussians.opacities}, "the mean of their noise")):
+    for keywords, by in (
+        ({"bake_p": 0.2}, r"scaled by 0\.8"),
+        ({"opacities": gaussians.opacities}, "those of the test"),
+    ):
         save_ply(gaussians, tmp_path / "baked.ply", **keywords)
-        with pytest.raises(ValueError, match=f"baked.ply are scaled by {by}"):
+        with pytest.raises(ValueError, match=f"baked.ply are {by}"):
             run_study(error_runtime_study([tmp_path / "baked.ply"]), tmp_path / "out", say=lambda text: None)
     with pytest.raises(ValueError, match="at least 1 run"):
         error_runtime_study([])

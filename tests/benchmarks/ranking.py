@@ -1,4 +1,7 @@
-"""The ranking study: how the variants of the CA score order the same models, and why they differ."""
+"""The ranking study: how the variants of the CA score order the same models, and why they differ.
+
+``PYTHONPATH=tests python -m benchmarks.ranking RUN ...``.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,16 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from reference_trainer.evaluation.rank_correlation import kendall, spearman
+import tyro
+
+from benchmarks.score_variants import VARIANTS, score_view
 from reference_trainer.evaluation.results import markdown_table, mean_std
-from reference_trainer.runs.folder import CONFIG
+from reference_trainer.runs.folder import CONFIG, read_run_settings
 from reference_trainer.runs.run import load_run, model_of
-from reference_trainer.runs.settings import read_run_settings
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.score_variants import VARIANTS, score_view
-from reference_trainer.studies.study import Record, Records, Study, checkpoints
+from reference_trainer.studies.study import Record, Records, Study, checkpoints, run_study
 
 __all__ = ["correlations", "disagreements", "group_labels", "mean_of", "ranking_study"]
 
@@ -37,6 +40,25 @@ protocol_half / limit_conditioned: on these pixels, five renders that leave no h
 is what the protocol makes of its limit at drop rate 1/2. `neutral` is neutral_half / exact_half: what remains of the
 score when holes show no background. The factor (K - 1)/K of the population variance is taken out of all of them.
 """
+
+
+def main(
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path = Path("runs/ranking"),
+    split: Literal["test", "train"] = "test",
+    views: int | None = None,
+    device: str = "cpu",
+) -> None:
+    """Compare how the variants of the score rank the same models: rank correlations, disagreements, and why.
+
+    Args:
+        runs: folders of runs; those of one scene are compared with each other.
+        out: folder for the JSON, the tables and the figure; what is in it is not measured again.
+        split: which views.
+        views: only the first so many.
+        device: "cpu" or "cuda".
+    """
+    run_study(ranking_study(runs, split=split, views=views, device=device), out)
 
 
 def ranking_study(runs: Sequence[Path], *, split: str = "test", views: int | None = None, device: str = "cpu") -> Study:
@@ -146,6 +168,8 @@ def correlations(runs: Sequence[Record]) -> dict[str, dict[str, float | None]]:
         By variant: ``"rho WHAT"`` (Spearman) and ``"tau WHAT"`` (Kendall's tau-b) over the runs that have both values,
         None where there is no order to compare.
     """
+    from scipy.stats import kendalltau, spearmanr  # a second to import
+
     out: dict[str, dict[str, float | None]] = {}
     for variant in VARIANTS:
         out[variant] = {}
@@ -153,8 +177,9 @@ def correlations(runs: Sequence[Record]) -> dict[str, dict[str, float | None]]:
             pairs = [(mean_of(run, variant), mean_of(run, reference)) for run in runs]
             known = [pair for pair in pairs if all(map(math.isfinite, pair))]
             x, y = [a for a, _ in known], [b for _, b in known]
-            out[variant][f"rho {reference}"] = spearman(x, y) if known else None
-            out[variant][f"tau {reference}"] = kendall(x, y) if known else None
+            ordered = len({*x}) > 1 and len({*y}) > 1
+            for name, correlation in (("rho", spearmanr), ("tau", kendalltau)):
+                out[variant][f"{name} {reference}"] = float(correlation(x, y).statistic) if ordered else None
     return out
 
 
@@ -287,3 +312,7 @@ def _reasons(run: Record) -> dict[str, float]:
 def _ratio(a: float, b: float) -> float:
     """Divide two scores; nan where there is no ratio."""
     return a / b if b > 0 else math.nan
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,4 +1,7 @@
-"""The pruning study: which Gaussians can go, by their shares of the score or by opacity, at equal count."""
+"""The pruning study: which Gaussians can go, by their shares of the score or by opacity, at equal count.
+
+``PYTHONPATH=tests python -m benchmarks.pruning RUN ...``.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +10,20 @@ import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+import tyro
 from torch import Tensor
 
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import format_mean_std, markdown_table, mean_std
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.runs.folder import CONFIG
+from reference_trainer.runs.folder import CONFIG, read_run_settings
 from reference_trainer.runs.run import load_run, model_of
-from reference_trainer.runs.settings import read_run_settings
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.gaussian_shares import blend_weights, mean_shares, share_per_weight
-from reference_trainer.studies.study import Record, Records, Study, checkpoints
+from reference_trainer.studies.study import Record, Records, Study, checkpoints, run_study
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 
@@ -44,6 +47,25 @@ _QUANTITIES = {
     "ca_protocol": ("protocol CA x1e-3", 1e-3),
 }
 _HALF = 0.5
+
+
+def main(
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path = Path("runs/pruning"),
+    fractions: tuple[float, ...] = (0.1, 0.2, 0.4),
+    refine: int = 300,
+    device: str = "cpu",
+) -> None:
+    """Prune by the shares and by opacity, equally many Gaussians: test PSNR and co-adaptation of what is left.
+
+    Args:
+        runs: folders of runs that differ only in their seed.
+        out: folder for the JSON, the table and the figure; what is in it is not measured again.
+        fractions: parts of the Gaussians to remove.
+        refine: steps of further training after pruning, without densification; 0 for none.
+        device: "cpu" or "cuda".
+    """
+    run_study(pruning_study(runs, fractions=fractions, refine=refine, device=device), out)
 
 
 def pruning_order(model: TrainedModel, views: Sequence[View], *, generator: torch.Generator) -> dict[str, Tensor]:
@@ -104,6 +126,7 @@ def train_on(trainer: Trainer, steps: int) -> None:
         opacity_reset_every=0,
         means_rate=config.means_rate_final,
     )
+    trainer.density.begin(trainer.config, trainer.scene, trainer.device, len(trainer.gaussians))
     trainer.train()
 
 
@@ -246,3 +269,7 @@ def _draw(records: Records, figure: Any) -> None:
             ax.set(xlabel="Gaussians removed (%)", ylabel=f"test {title}", title=after)
             ax.grid(linewidth=0.3)
     grid[0][1].legend(fontsize=8)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
