@@ -63,6 +63,16 @@ class Chain(Regularizer):
         """Whether a member may drop Gaussians."""
         return any(member.drops for member in self)
 
+    @property
+    def step(self) -> int:
+        """The training step: the latest that was told to the chain, to a member, or to a part of one."""
+        steps = (getattr(part, "step", 0) for member in self for part in member.modules())
+        return max([self._told, *(step for step in steps if isinstance(step, int))])
+
+    @step.setter
+    def step(self, step: int) -> None:
+        self._told = step
+
     def set_step(self, step: int) -> None:
         """Tell the step to every member."""
         super().set_step(step)

@@ -10,7 +10,7 @@ from torch import Tensor
 from ca_reg._check import check_finite
 from ca_reg._scheduled import Scheduled
 from ca_reg.functional import Multiplier
-from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.schedules import Schedule
 from ca_reg.types import Layout, MomentsFn, check_layout, read_moments
 
 __all__ = ["CAPenalty", "PenalizedRender"]
@@ -97,6 +97,8 @@ class CAPenalty(Scheduled):
         tensor(0.2500)
     """
 
+    rate_name = "weight"
+
     def __init__(
         self,
         moments_fn: MomentsFn,
@@ -115,10 +117,8 @@ class CAPenalty(Scheduled):
                 "multiplier must be a Multiplier, such as Multiplier.dropout(0.2), or a callable that makes one from "
                 f"the opacities, got {type(multiplier).__name__}."
             )
-        if not callable(weight):
-            check_finite(weight, "weight", minimum=0.0)
         check_layout(layout)
-        super().__init__(as_schedule(weight))
+        super().__init__(weight)
         self.moments_fn = moments_fn
         self.multiplier = multiplier
         self.layout: Layout = layout
@@ -128,8 +128,8 @@ class CAPenalty(Scheduled):
         """The factor of the penalty at the present step."""
         return self._present_rate()
 
-    def _check_rate(self, rate: float, step: int) -> None:
-        check_finite(rate, f"weight at step {step}", minimum=0.0)
+    def _check_rate(self, rate: float, name: str) -> None:
+        check_finite(rate, name, minimum=0.0)
 
     def forward(self, opacity: Tensor, view: Any, background: Tensor | None = None) -> PenalizedRender:
         """Render the moments of one view.
@@ -160,4 +160,4 @@ class CAPenalty(Scheduled):
     def extra_repr(self) -> str:
         """Return the arguments, for ``print``."""
         made = self.multiplier if isinstance(self.multiplier, Multiplier) else getattr(self.multiplier, "__name__", "?")
-        return f"multiplier={made}, weight={self._rate_repr()}"
+        return f"multiplier={made}, {super().extra_repr()}"

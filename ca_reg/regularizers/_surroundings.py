@@ -97,7 +97,7 @@ class SurroundingsDropout(IndependentDropout):
     needs: ClassVar[tuple[str, ...]] = ("means",)
 
     def __init__(
-        self, schedule: Schedule | None = None, *, every: int, compensate: bool = False, scale: bool = True
+        self, schedule: float | Schedule | None = None, *, every: int, compensate: bool = False, scale: bool = True
     ) -> None:
         super().__init__(schedule, compensate=compensate, scale=scale)
         self.trained, self.tested = Refreshed(every), Refreshed(1)
@@ -125,7 +125,16 @@ class SurroundingsDropout(IndependentDropout):
 class RankedDropout(SurroundingsDropout):
     """Rates between two bounds, by the rank of something that is measured: the base of density and geometry."""
 
-    def __init__(self, low: float, high: float, k: int, *, every: int, compensate: bool, scale: bool) -> None:
+    def __init__(
+        self,
+        low: float = 0.2,
+        high: float = 0.5,
+        k: int = 3,
+        *,
+        every: int = 100,
+        compensate: bool = False,
+        scale: bool = True,
+    ) -> None:
         check_rate(low, "low")
         check_rate(high, "high")
         check_count(k, "k", minimum=1)
@@ -135,10 +144,6 @@ class RankedDropout(SurroundingsDropout):
     def rates_from(self, x: Params, look: Callable[[], Tensor]) -> Rate:
         """Return ``low + (high - low) rank``."""
         return self.low if self.low == self.high else self.low + (self.high - self.low) * look()
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"low={self.low}, high={self.high}, k={self.k}, scale={self.scale}"
 
 
 def _version(x: Tensor) -> int:

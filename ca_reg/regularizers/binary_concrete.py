@@ -80,10 +80,6 @@ class BinaryConcrete(Regularizer):
         """Return ``x``, and the soft mask as its factor; exact but for the renderer's cut-off of faint alphas."""
         return x, Multiplier(*concrete_moments(self.logits(x), self.temperature, self.floor))
 
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"temperature={self.temperature}, floor={self.floor}"
-
 
 def concrete_moments(logits: Rate, temperature: float, floor: float = 0.0) -> tuple[Rate, Rate]:
     """Return mean and variance of ``y = clamp(1 - z, floor, 1 - floor)``, z as in :class:`BinaryConcrete`.

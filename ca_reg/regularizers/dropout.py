@@ -9,7 +9,7 @@ from ca_reg._check import Rate, check_rate
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Given
 from ca_reg.regularizers.independent import IndependentDropout
-from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.schedules import Schedule
 
 __all__ = ["GaussianDropout"]
 
@@ -58,18 +58,18 @@ class GaussianDropout(IndependentDropout):
         tensor([0.4000, 0.4000, 0.4000, 0.4000, 0.4000])
     """
 
+    rate_name = "p"
+
     def __init__(self, p: float | Schedule, *, compensate: bool = False) -> None:
-        if not callable(p):
-            check_rate(p)
-        super().__init__(as_schedule(p), compensate=compensate)
+        super().__init__(p, compensate=compensate)
 
     @property
     def p(self) -> float:
         """The drop rate at the present step."""
         return self._present_rate()
 
-    def _check_rate(self, rate: float, step: int) -> None:
-        check_rate(rate, f"p at step {step}")
+    def _check_rate(self, rate: float, name: str) -> None:
+        check_rate(rate, name)
 
     def forward(  # type: ignore[override]
         self, opacity: Given, *, keep: Tensor | None = None, generator: torch.Generator | None = None
@@ -93,7 +93,3 @@ class GaussianDropout(IndependentDropout):
     def rates(self, x: Params) -> Rate:
         """Return the rate of the step."""
         return self._rate_at(x.step)
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"p={self._rate_repr()}, compensate={self.compensate}"

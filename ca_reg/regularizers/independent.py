@@ -33,7 +33,9 @@ class IndependentDropout(Regularizer):
         tensor([0.4000, 1.0000])
     """
 
-    def __init__(self, schedule: Schedule | None = None, *, compensate: bool = False, scale: bool = True) -> None:
+    def __init__(
+        self, schedule: float | Schedule | None = None, *, compensate: bool = False, scale: bool = True
+    ) -> None:
         super().__init__(schedule)
         self.compensate = compensate
         self.scale = scale

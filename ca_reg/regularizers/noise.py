@@ -108,7 +108,3 @@ class OpacityNoise(ParameterNoise):
             return x, Multiplier(1.0, 0.0)
         multiplier = Multiplier.clamped_noise(x.opacities, float(sigma), clip=self.clip)
         return x._replace(opacities=x.opacities.clamp(max=1.0)), multiplier
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"{super().extra_repr()}, scale={self.scale}"
