@@ -6,9 +6,12 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor, nn
 
 from ca_reg import Chain, Params
+
+from ._tally import Skip, Tally
 
 __all__ = ["Call", "chain_of"]
 
@@ -102,7 +105,24 @@ class Call:
             found[name] = value
         return Params(opacities, step=step, **found)
 
-    def replace(self, before: Params, after: Params) -> bool:
+    def train(self, chain: Chain, step: int, tally: Tally, generator: torch.Generator | None) -> Tensor | None:
+        """Take what a draw leaves of the Gaussians; return which it did not drop, None if it dropped none."""
+        given = self.params(chain, step)
+        if self._replace(given, chain(given, generator=generator)):
+            tally.count_regularized(step)
+        else:
+            tally.skipped[Skip.RATE_ZERO] += 1
+        return chain.keep
+
+    def evaluate(self, chain: Chain, step: int, tally: Tally) -> None:
+        """Take the test-time values."""
+        given = self.params(chain, step)
+        if self._replace(given, chain.expected(given)):
+            tally.scaled += 1
+        else:
+            tally.skipped[Skip.NOTHING_TO_SCALE] += 1
+
+    def _replace(self, before: Params, after: Params) -> bool:
         """Hand what has changed to the rasterizer; return whether anything has."""
         changed = [name for name in Params._fields if getattr(after, name) is not getattr(before, name)]
         for name in changed:
