@@ -88,9 +88,6 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor, view: Any) -
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1), neither dropped nor scaled.
         view: passed on to both callables.
 
-    Returns:
-        Shares that add up to the score, and the score.
-
     Raises:
         TypeError: as for a call of the score.
         ValueError: as for a call of the score, if the score is not exact, or ``shares_fn`` returns another shape.
@@ -110,7 +107,7 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor, view: Any) -
     """
     result, opacity, multiplier, background = _measure(score, opacity, view, "attribute")
     if result.reason is not Reason.OK:
-        return CAAttribution(_nothing(opacity), result)
+        return CAAttribution(opacity.new_zeros(len(opacity), dtype=torch.float64), result)
     weights = result.visible.to(torch.float64) / result.visible.sum()
     with torch.no_grad():
         shares = shares_fn(opacity.clone(), view, multiplier, background, weights)
@@ -133,9 +130,6 @@ def total_effects(score: CAScore, opacity: Tensor, view: Any) -> CATotalEffects:
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1), neither dropped nor scaled.
         view: passed on to the moments callable.
 
-    Returns:
-        The total effects, and the score.
-
     Raises:
         TypeError: as for a call of the score.
         ValueError: as for a call of the score, if the score is not exact, or its moments are not differentiable.
@@ -152,7 +146,7 @@ def total_effects(score: CAScore, opacity: Tensor, view: Any) -> CATotalEffects:
     """
     result, opacity, multiplier, background = _measure(score, opacity, view, "total_effects")
     if result.reason is not Reason.OK:
-        return CATotalEffects(_nothing(opacity), result)
+        return CATotalEffects(opacity.new_zeros(len(opacity), dtype=torch.float64), result)
     assert score.exact is not None
     opacity = opacity.clone()
     spread = (multiplier.variance * opacity.new_ones(opacity.shape[:1])).requires_grad_()
@@ -183,8 +177,3 @@ def _measure(score: CAScore, opacity: Tensor, view: Any, name: str) -> ExactView
     x = score._params(opacity)
     with torch.no_grad():
         return score._exact(score.exact, x, view)
-
-
-def _nothing(opacity: Tensor) -> Tensor:
-    """Return a zero per Gaussian."""
-    return torch.zeros(opacity.shape[0], dtype=torch.float64, device=opacity.device)

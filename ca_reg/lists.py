@@ -128,19 +128,8 @@ class ListMoments:
         The sum over pixels of ``weights`` times its :func:`~ca_reg.functional.contributions`, mean over RGB. Together
         they are the weighted sum of the variances.
 
-        Args:
-            opacity: as for a call.
-            view: as for a call.
-            multiplier: as for a call.
-            background: as for a call.
-            weights: of the pixels, shape (H, W).
-
-        Returns:
-            The shares, shape (N,), float64; 0 for Gaussians that are in no list.
-
-        Raises:
-            TypeError: as for a call.
-            ValueError: as for a call, or if ``weights`` has another shape.
+        The other arguments and errors are those of a call; the weights of the pixels have shape (H, W). Returned are
+        the shares, shape (N,), float64, 0 for Gaussians that are in no list.
 
         Example:
             >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:

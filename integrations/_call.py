@@ -19,12 +19,7 @@ _OF_CALL = ("view_matrix", "step")  # fields that no argument with a row for eac
 
 
 def chain_of(regularizer: nn.Module) -> Chain:
-    """Return a chain of what a user gave.
-
-    Raises:
-        TypeError: if it is no module.
-        ValueError: if it learns numbers per Gaussian.
-    """
+    """Return a chain of what a user gave; refuse what is no module (TypeError), or learns per Gaussian (ValueError)."""
     chain = Chain(regularizer)
     if chain.learns:
         raise ValueError(
@@ -35,11 +30,7 @@ def chain_of(regularizer: nn.Module) -> Chain:
 
 
 class Call:
-    """A call whose arguments may be changed before it is made.
-
-    Args:
-        function: what does the work.
-        bound: its arguments.
+    """A call of a function whose bound arguments may be changed before it is made.
 
     Attributes:
         arguments: by name.
@@ -84,11 +75,7 @@ class Call:
         self.arguments[name] = value.reshape(self.arguments[name].shape)
 
     def params(self, chain: Chain, step: int) -> Params:
-        """Return the opacities (N,) and what else the regularizers need, batches as one set of Gaussians.
-
-        Raises:
-            ValueError: if this call has not all that is needed.
-        """
+        """Return the opacities (N,) and what else the regularizers need, batches as one set; raise if one lacks."""
         opacities = self.arguments["opacities"].reshape(-1)
         found: dict[str, Any] = {}
         for name in chain.needs:

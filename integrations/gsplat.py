@@ -306,15 +306,7 @@ def _takes_opacities(function: Any) -> bool:
 
 
 def load_gsplat(device: torch.device | None = None) -> Any:
-    """Return the module ``gsplat``.
-
-    Args:
-        device: of the tensors that it is going to render; None if nothing is rendered yet.
-
-    Raises:
-        ImportError: if it is missing; names the extra.
-        RuntimeError: if the device is not a CUDA device.
-    """
+    """Return the module ``gsplat``; raise ImportError without it, RuntimeError if it cannot render on a device."""
     if device is not None and device.type != "cuda":
         raise RuntimeError(f"gsplat renders on CUDA devices only, and the Gaussians are on {device}: move them there.")
     try:

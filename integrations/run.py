@@ -37,6 +37,8 @@ __all__ = ["main"]
 
 _OF_INRIA = ("scope", "outputs", "steps", "viewer", "allow_zeros")  # options that mean nothing to a script of gsplat's
 
+_REPORTED = ("script", "arguments", "regularizer", "dropout", "noise", "start", "ramp", "scope", "seed", "cpu")
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the launcher; what the script raises, its exit code among it, passes through.
@@ -179,21 +181,9 @@ def _reported(options: argparse.Namespace, hook: Hook | None) -> Iterator[None]:
         ended = f"{type(error).__name__}: {error}".rstrip(": ")
         raise
     finally:
-        report: dict[str, Any] = {
-            "script": str(options.script),
-            "arguments": options.arguments,
-            "regularizer": options.regularizer,
-            "dropout": options.dropout,
-            "noise": options.noise,
-            "start": options.start,
-            "ramp": options.ramp,
-            "scope": options.scope,
-            "seed": options.seed,
-            "cpu": options.cpu,
-            "ended": ended,
-            "problem": problem,
-            "renders": None if hook is None else hook.tally.as_dict(),
-        }
+        report: dict[str, Any] = {name: getattr(options, name) for name in _REPORTED}
+        report |= {"script": str(options.script), "ended": ended, "problem": problem}
+        report["renders"] = None if hook is None else hook.tally.as_dict()
         lines = ["no regularization was asked for; the script ran plain"] if hook is None else hook.tally.lines()
         name = options.script.name if isinstance(options.script, Path) else options.script
         for line in [f"{name}: {ended}", *lines, *([f"ERROR: {problem}"] if problem else [])]:

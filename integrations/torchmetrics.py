@@ -106,8 +106,7 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
             index: position of the view among all views, as for :meth:`ca_reg.CAScore.update`.
 
         Raises:
-            TypeError: as for a call of the score.
-            ValueError: as for a call of the score.
+            TypeError, ValueError: as for a call of the score.
         """
         tally = ViewTally()
         tally.add(self.score(opacity, view, index=self._position(self.update_count - 1) if index is None else index))
