@@ -53,27 +53,16 @@ class SharesFn(Protocol):
 
 
 class CAAttribution(NamedTuple):
-    """The score of a view, split over the Gaussians.
+    """The score of a view, split over the Gaussians."""
 
-    Args:
-        shares: at least 0, shape (N,), float64; they add up to ``result.value`` up to rounding. All 0 if the score has
-            no value.
-        result: the score; its ``reason`` says why it has no value.
-    """
-
-    shares: Tensor
+    shares: Tensor  # at least 0, (N,), float64; their sum is result.value up to rounding; all 0 if that has no value
     result: CAResult
 
 
 class CATotalEffects(NamedTuple):
-    """By how much the score of a view would fall if a single Gaussian were certain.
+    """By how much the score of a view would fall if a single Gaussian were certain."""
 
-    Args:
-        effects: at least 0, shape (N,), float64. All 0 if the score has no value.
-        result: the score; its ``reason`` says why it has no value.
-    """
-
-    effects: Tensor
+    effects: Tensor  # at least 0, (N,), float64; all 0 if the score has no value
     result: CAResult
 
 

@@ -17,17 +17,11 @@ __all__ = ["CAPenalty", "PenalizedRender"]
 
 
 class PenalizedRender(NamedTuple):
-    """What :class:`CAPenalty` returns.
+    """What :class:`CAPenalty` returns."""
 
-    Args:
-        image: expected render over the random factors, shape (3, H, W).
-        variance: variance of its pixels, at least 0, shape (3, H, W).
-        penalty: weight times the mean of the variance, a scalar: add it to the loss.
-    """
-
-    image: Tensor
-    variance: Tensor
-    penalty: Tensor
+    image: Tensor  # expected render over the random factors, (3, H, W)
+    variance: Tensor  # of its pixels, at least 0, (3, H, W)
+    penalty: Tensor  # weight times the mean of the variance, a scalar: add it to the loss
 
 
 class CAPenalty(Scheduled):
@@ -132,15 +126,10 @@ class CAPenalty(Scheduled):
         check_finite(rate, name, minimum=0.0)
 
     def forward(self, opacity: Tensor, view: Any, background: Tensor | None = None) -> PenalizedRender:
-        """Render the moments of one view.
+        """Render the moments of one view, with gradients.
 
-        Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
-            view: passed on to ``moments_fn`` as it is.
-            background: passed on likewise: None for the model's own, one colour (3,), or an image.
-
-        Returns:
-            The expected render, its variance and the penalty, all with gradients.
+        View and background are passed on to ``moments_fn`` as they are: None for the model's own background, one colour
+        (3,), or an image.
 
         Raises:
             TypeError: if ``opacity``, a multiplier or the moments are not of the right type.

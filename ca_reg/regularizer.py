@@ -18,15 +18,10 @@ Given = TypeVar("Given", Tensor, Params)
 
 
 class Learned(NamedTuple):
-    """A number per Gaussian that a regularizer learns; it is cloned, split, pruned and saved with its Gaussian.
+    """A number per Gaussian that a regularizer learns; it is cloned, split, pruned and saved with its Gaussian."""
 
-    Args:
-        start: its first value.
-        rate: Adam's learning rate.
-    """
-
-    start: float
-    rate: float
+    start: float  # its first value
+    rate: float  # Adam's learning rate
 
 
 class Regularizer(Scheduled):
@@ -73,12 +68,7 @@ class Regularizer(Scheduled):
     last: Draw | None = None
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw for one training step.
-
-        Args:
-            x: what the rasterizer would receive.
-            generator: source of the random numbers; None for the global one.
-        """
+        """Draw for one training step; ``x`` is what the rasterizer would receive, no generator the global one."""
         raise NotImplementedError
 
     def replay(self, x: Params, draw: Draw) -> Params:

@@ -145,11 +145,7 @@ class CAResult(_Score):
         The map shows the root of ``variance``, in units of colour: a few pixels hold most of the variance and would
         leave the rest black.
 
-        Args:
-            ax: where to draw; a new figure by default.
-
-        Returns:
-            The axes, for titles and ``ax.figure.savefig(path)``.
+        Drawn on ``ax``, by default in a new figure; returned for titles and ``ax.figure.savefig(path)``.
 
         Raises:
             ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.

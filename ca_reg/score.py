@@ -231,9 +231,6 @@ class CAScore:
                 :class:`torch.utils.data.DistributedSampler` does without shuffling: the result then is that of a single
                 process. Give the position in the whole set if they are split in another way.
 
-        Returns:
-            The result of this view.
-
         Raises:
             TypeError, ValueError: as for a call of the score.
         """

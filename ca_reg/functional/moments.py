@@ -32,12 +32,7 @@ __all__ = [
 
 
 class PixelMoments(NamedTuple):
-    """Mean and variance over the random factors.
-
-    Args:
-        mean: expected value of the pixel, shape (..., C) for colours, (...) for the accumulated alpha.
-        variance: its variance, at least 0, same shape.
-    """
+    """Mean and variance over the random factors, (..., C) for colours, (...) for the accumulated alpha."""
 
     mean: Tensor
     variance: Tensor
@@ -59,9 +54,6 @@ def pixel_moments(
         colors: their colours, finite also in the padding, shape (..., n, C), same dtype.
         multiplier: moments of the factor. Tensors in it must broadcast to the shape of ``alphas``.
         background: colour behind the last splat, shape (C,) or (..., C); None for zero.
-
-    Returns:
-        Mean and variance per pixel and channel, shape (..., C).
 
     Raises:
         TypeError: if an argument is not a tensor, or the dtypes are not float32 or float64, or differ.

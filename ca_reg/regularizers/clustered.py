@@ -57,12 +57,7 @@ class ClusteredDropout(Regularizer):
         check_rate(rate, name)
 
     def anchor_rate(self, rate: Rate, neighbors: Tensor) -> Rate:
-        """Return the rate of the anchors.
-
-        Args:
-            rate: ``p`` of the step.
-            neighbors: numbers of the neighbors of every Gaussian, shape (N, k).
-        """
+        """Return the rate of the anchors, given ``p`` of the step and the numbers of everybody's neighbors, (N, k)."""
         clusters = 1 + neighbors.flatten().bincount(minlength=len(neighbors))
         counts = clusters.bincount().double().cpu()
         sizes = torch.arange(len(counts), dtype=torch.float64)

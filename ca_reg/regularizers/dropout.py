@@ -21,8 +21,7 @@ class GaussianDropout(IndependentDropout):
     survivors are multiplied by ``1 / (1 - p)`` in training instead, and evaluation leaves the opacities as they are.
     The two schemes are not equivalent: compositing is not linear in the opacities, and rasterizers clamp the alpha of
     survivors, so that Gaussians of an opacity above ``0.99 (1 - p)`` are more opaque in evaluation than the mean over
-    all masks. The module has no
-    parameters; put it between the activation of the opacities and the rasterizer.
+    all masks. The module has no parameters; put it between the activation of the opacities and the rasterizer.
 
     Dropped Gaussians must leave no trace in density control: pass the radii through
     :meth:`~ca_reg.Regularizer.mask_radii`.
@@ -76,17 +75,8 @@ class GaussianDropout(IndependentDropout):
     ) -> Given:
         """Return the opacities to render.
 
-        Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
-            keep: a former mask to apply again instead of drawing one, shape (N,), bool; in training only.
-            generator: source of the draw; the global state of the random numbers is then untouched.
-
-        Returns:
-            Opacities of the same shape and dtype; the very same tensor if there is nothing to do.
-
-        Raises:
-            TypeError: if ``opacity`` is not a floating-point tensor or ``keep`` not a bool one.
-            ValueError: if a shape is wrong, ``opacity`` looks like logits, or ``keep`` is given in evaluation.
+        As :meth:`Regularizer.forward <ca_reg.Regularizer.forward>`; ``keep``, (N,) bool, is a former mask to apply
+        again instead of drawing one, in training only.
         """
         return super().forward(opacity, drawn=None if keep is None else Draw(keep, keep), generator=generator)
 

@@ -45,6 +45,10 @@ class IndependentDropout(Regularizer):
         """Return the drop rates in [0, 1) at ``x``: a number, or one for each Gaussian, shape (N,)."""
         raise NotImplementedError
 
+    def test_rates(self, x: Params) -> Rate:
+        """Return the rates by which :meth:`expected` scales."""
+        return self.rates(x)
+
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw which Gaussians stay."""
         rates = self.rates(x)
@@ -66,7 +70,7 @@ class IndependentDropout(Regularizer):
         """Scale by ``1 - p``, or not."""
         if self.compensate or not self.scale:
             return x
-        opacities = functional.scale_opacity(x.opacities, self.rates(x))
+        opacities = functional.scale_opacity(x.opacities, self.test_rates(x))
         return x if opacities is x.opacities else x._replace(opacities=opacities)
 
     def multiplied(self, x: Params) -> tuple[Params, Multiplier]:
