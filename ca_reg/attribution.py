@@ -53,16 +53,22 @@ class SharesFn(Protocol):
 
 
 class CAAttribution(NamedTuple):
-    """The score of a view, split over the Gaussians."""
+    """The score of a view, split over the Gaussians.
 
-    shares: Tensor  # at least 0, (N,), float64; their sum is result.value up to rounding; all 0 if that has no value
+    The shares, (N,) float64, at least 0, add up to ``result.value`` up to rounding; all are 0 if that has no value.
+    """
+
+    shares: Tensor
     result: CAResult
 
 
 class CATotalEffects(NamedTuple):
-    """By how much the score of a view would fall if a single Gaussian were certain."""
+    """By how much the score of a view would fall if a single Gaussian were certain.
 
-    effects: Tensor  # at least 0, (N,), float64; all 0 if the score has no value
+    The effects are (N,) float64, at least 0; all are 0 if the score has no value.
+    """
+
+    effects: Tensor
     result: CAResult
 
 
@@ -114,10 +120,7 @@ def total_effects(score: CAScore, opacity: Tensor, view: Any) -> CATotalEffects:
     Costs the score and a backward pass through its moments callable, which must be differentiable in the multiplier: it
     is called with a variance per Gaussian, shape (N,), that requires grad.
 
-    Args:
-        score: an exact one, :class:`~ca_reg.CAScore` with ``exact``, neutral or not.
-        opacity: activated opacities in [0, 1], shape (N,) or (N, 1), neither dropped nor scaled.
-        view: passed on to the moments callable.
+    The arguments are those of :func:`attribute`.
 
     Raises:
         TypeError: as for a call of the score.

@@ -93,16 +93,13 @@ class ListMoments:
         self.elements = int(elements)
 
     def __call__(self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None) -> ExactMoments:
-        """Return the exact moments of a view.
+        """Return the exact moments of a view: mean and variance (3, H, W) and the expected alpha (H, W).
 
         Args:
             opacity: activated opacities, shape (N,) or (N, 1).
             view: passed on to ``lists_fn``.
             multiplier: moments of the factors, numbers, or tensors of shape (N,) or (N, 1), one value per Gaussian.
             background: shape (3,) or (3, H, W); None for that of the lists.
-
-        Returns:
-            Mean and variance (3, H, W) and the expected alpha (H, W).
 
         Raises:
             TypeError: if the lists are of another type, or a dtype does not fit.

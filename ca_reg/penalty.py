@@ -17,11 +17,15 @@ __all__ = ["CAPenalty", "PenalizedRender"]
 
 
 class PenalizedRender(NamedTuple):
-    """What :class:`CAPenalty` returns."""
+    """What :class:`CAPenalty` returns.
 
-    image: Tensor  # expected render over the random factors, (3, H, W)
-    variance: Tensor  # of its pixels, at least 0, (3, H, W)
-    penalty: Tensor  # weight times the mean of the variance, a scalar: add it to the loss
+    Image and variance, (3, H, W), are the expected render over the random factors and the variance of its pixels, at
+    least 0; the penalty is weight times the mean of the variance, a scalar: add it to the loss.
+    """
+
+    image: Tensor
+    variance: Tensor
+    penalty: Tensor
 
 
 class CAPenalty(Scheduled):

@@ -81,12 +81,7 @@ class MomentsFn(Protocol):
 
 
 class Rendering(NamedTuple):
-    """One image with its accumulated alpha.
-
-    Args:
-        image: RGB, shape (3, H, W).
-        alpha: accumulated alpha, shape (H, W); None if the renderer returned none.
-    """
+    """One RGB image (3, H, W) with its accumulated alpha (H, W), None if the renderer returned none."""
 
     image: Tensor
     alpha: Tensor | None = None

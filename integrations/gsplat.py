@@ -108,13 +108,9 @@ class Regularized:
     _eager: Any = None
 
     def __init__(
-        self,
-        rasterization: Rasterization,
-        regularizer: nn.Module,
-        generator: torch.Generator | None = None,
-        *,
-        hook: Installation | None = None,
-    ) -> None:
+        self, rasterization: Rasterization, regularizer: nn.Module, generator: torch.Generator | None = None,
+        *, hook: Installation | None = None,
+    ) -> None:  # fmt: skip
         if isinstance(rasterization, Regularized):
             raise ValueError(
                 "this rasterization is regularized already, and opacities would be dropped twice: compose regularizers "
@@ -213,13 +209,9 @@ class Installation(Hook):
     rasterization: Regularized
 
     def __init__(
-        self,
-        regularizer: nn.Module,
-        *,
-        generator: torch.Generator | None = None,
-        seed: int | None = None,
+        self, regularizer: nn.Module, *, generator: torch.Generator | None = None, seed: int | None = None,
         patience: int = 100,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(patience)
         self.functions: dict[str, Regularized] = {}
         self.steps = itertools.count()

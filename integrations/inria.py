@@ -179,11 +179,7 @@ class RasterizerHook(Hook):
             self._patches.pop().remove()
 
     def step(self, step: int) -> None:
-        """Say which training step begins, counted from 1; ``update_learning_rate`` is no longer looked at.
-
-        Raises:
-            RuntimeError: if too many steps went by without a training render.
-        """
+        """Say which training step begins, counted from 1; ``update_learning_rate`` is no longer looked at."""
         self._iterations.step(step)
 
     def _explain(self) -> str:

@@ -59,11 +59,8 @@ def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:
     1, whose mean therefore falls.
 
     Args:
-        opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+        opacity: activated opacities in [0, 1], shape (N,) or (N, 1), as those that are returned.
         noise: relative noise, shape (N,).
-
-    Returns:
-        The noisy opacities, a new tensor of the same shape and dtype as ``opacity``.
 
     Raises:
         TypeError: if an argument is not a tensor, or ``opacity`` is not floating point.

@@ -13,12 +13,17 @@ __all__ = ["ColorVariance", "color_variance"]
 
 
 class ColorVariance(NamedTuple):
-    """Colour variance of an image and of its pixels."""
+    """Colour variance of an image and of its pixels.
 
-    value: Tensor  # mean of the variance over the covered pixels, a scalar; nan if there is none
-    variance: Tensor  # per pixel, mean over RGB, (...); 0 where nothing covers the pixel
-    covered: Tensor  # pixels whose weights do not sum to zero, (...), bool
-    reason: Reason  # OK, or EMPTY if no pixel is covered
+    The value is the mean over the covered pixels, a scalar, nan if there are none, which the reason then says. The
+    variance of a pixel, (...), is the mean over RGB, 0 where nothing covers it; covered, (...) bool, are the pixels
+    whose weights do not sum to zero.
+    """
+
+    value: Tensor
+    variance: Tensor
+    covered: Tensor
+    reason: Reason
 
 
 def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
