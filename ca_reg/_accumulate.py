@@ -35,11 +35,7 @@ class RenderMoments:
         if self.count == 0:
             self._first = image.to(torch.promote_types(image.dtype, torch.float32), copy=True)
             self._scratch = torch.empty_like(self._first)
-        elif image.shape != self._first.shape:
-            raise ValueError(
-                f"the renders of one view must have one size, got {tuple(self._first.shape)} and then "
-                f"{tuple(image.shape)}."
-            )
+        _check_size(image, self._first)
         group = self.count % self._groups
         if group == self.count:
             self._sums.append(image - self._first)
@@ -97,11 +93,7 @@ class Deviations:
 
     def add(self, image: Tensor) -> None:
         """Take in one render (3, H, W)."""
-        if image.shape != self._expected.shape:
-            raise ValueError(
-                f"the renders of one view must have one size, got {tuple(self._expected.shape)} and then "
-                f"{tuple(image.shape)}."
-            )
+        _check_size(image, self._expected)
         deviation = (image - self._expected).mul_(self._visible)
         self._squares.append(deviation.square().sum())
         if self._last is not None:
@@ -121,6 +113,12 @@ class Deviations:
         squares, products = (torch.stack(x).to(torch.float64) for x in (self._squares, self._products))
         both = squares.var() / count + 2.0 * products.square().mean() / (count * (count - 1))
         return math.sqrt(float(both)) / (3 * int(self._visible.sum()))
+
+
+def _check_size(image: Tensor, first: Tensor) -> None:
+    if image.shape != first.shape:
+        sizes = f"{tuple(first.shape)} and then {tuple(image.shape)}"
+        raise ValueError(f"the renders of one view must have one size, got {sizes}.")
 
 
 def _total(parts: list[Tensor]) -> Tensor:

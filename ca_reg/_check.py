@@ -15,16 +15,9 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "Rate",
-    "check_count",
-    "check_draw",
-    "check_finite",
-    "check_opacity",
-    "check_opacity_range",
-    "check_per_gaussian",
-    "check_rate",
-    "is_zero",
-]
+    "Rate", "check_count", "check_draw", "check_finite", "check_opacity", "check_opacity_range", "check_per_gaussian",
+    "check_rate", "is_zero",
+]  # fmt: skip
 
 Rate = float | Tensor
 """A number, or one for each Gaussian, shape (N,); inside ``torch.compile`` also a scalar tensor, so that a rate that

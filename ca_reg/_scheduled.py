@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from ca_reg._check import Rate, check_count, check_opacity, check_opacity_range
-from ca_reg.schedules import Constant, Schedule
+from ca_reg.schedules import Constant, Schedule, as_schedule
 
 __all__ = ["Scheduled"]
 
@@ -19,11 +20,18 @@ class Scheduled(nn.Module):
 
     ``state_dict`` holds nothing if the rate is constant, and ``step``, a float64 scalar that may be averaged like a
     parameter, if it follows a schedule. A checkpoint without it leaves the step as it is, also with ``strict``.
+
+    Args:
+        rate: a number, or a schedule of it; None for a module without one.
     """
 
-    def __init__(self, schedule: Schedule | None = None) -> None:
+    rate_name: ClassVar[str] = ""  # of the argument that is the rate, if one is
+
+    def __init__(self, rate: float | Schedule | None = None) -> None:
         super().__init__()
-        self._schedule = Constant(0.0) if schedule is None else schedule
+        if not (rate is None or callable(rate)):
+            self._check_rate(rate, self.rate_name)
+        self._schedule = as_schedule(0.0 if rate is None else rate)
         self._opacity_seen = False
         self._rate: Tensor | None = None
         self.step = 0
@@ -44,13 +52,14 @@ class Scheduled(nn.Module):
             # step. A new tensor, because one that was made in inference mode cannot be overwritten outside.
             self._rate = torch.tensor(self._present_rate(), dtype=torch.float64, device="cpu")
 
-    def _check_rate(self, rate: float, step: int) -> None:
-        """Raise unless the rate of a step is in its range."""
+    def _check_rate(self, rate: float, name: str) -> None:
+        """Raise unless a rate is in its range."""
 
-    def _present_rate(self) -> float:
-        """Return the rate at the present step, checked."""
-        rate = self._schedule(self.step)
-        self._check_rate(rate, self.step)
+    def _present_rate(self, step: int | None = None) -> float:
+        """Return the rate at a step, by default the present one, checked."""
+        step = self.step if step is None else step
+        rate = self._schedule(step)
+        self._check_rate(rate, f"{self.rate_name} at step {step}")
         return rate
 
     def _rate_at(self, step: int) -> Rate:
@@ -59,9 +68,7 @@ class Scheduled(nn.Module):
             return self._schedule.value  # checked at construction; a graph that read the step would not outlive it
         if self._rate is not None and torch.compiler.is_compiling():
             return self._rate
-        rate = self._schedule(step)
-        self._check_rate(rate, step)
-        return rate
+        return self._present_rate(step)
 
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
@@ -88,5 +95,10 @@ class Scheduled(nn.Module):
             check_opacity_range(opacity, upper=math.inf)
             self._opacity_seen = True
 
-    def _rate_repr(self) -> str:
-        return str(self._schedule.value) if isinstance(self._schedule, Constant) else repr(self._schedule)
+    def extra_repr(self) -> str:
+        """Return the arguments, for ``print``, as far as attributes of the same names tell them."""
+        rate = self._schedule.value if isinstance(self._schedule, Constant) else self._schedule
+        known: dict[str, Any] = {name: x for name, x in vars(self).items() if isinstance(x, int | float | str | tuple)}
+        known.setdefault(self.rate_name, rate)
+        names = inspect.signature(type(self).__init__).parameters
+        return ", ".join(f"{name}={known[name]}" for name in names if name in known)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from ca_reg._check import check_count, check_finite, check_rate
 from ca_reg.result import CASettings, Method
@@ -20,6 +21,7 @@ LEAST = 16
 """Renders after which it looks for the first time: the error is then known to 18 %. Stopping where an error happens to
 look small makes the stated errors too small, and the more so the less it is known: with 8 renders to 27 %."""
 
+_GIVEN = ("samples", "ddof", "relative_error", "max_samples")
 _APPLIES = {
     "sampling": ("samples", "ddof"),
     "adaptive": ("relative_error", "max_samples"),
@@ -42,32 +44,23 @@ def make_settings(
     regularizer: str | None,
     threshold: float,
     seed: int,
-    samples: int | None,
-    ddof: int | None,
-    relative_error: float | None,
-    max_samples: int | None,
+    **given: Any,
 ) -> CASettings:
-    """Find the method and fill in its defaults; raise if an argument is out of range or does not apply."""
+    """Find the method and fill in its defaults; raise if an argument is out of range or does not apply.
+
+    ``given`` are samples, ddof, relative_error and max_samples, each None if it is to be found.
+    """
     if drop_rate is not None:
         check_rate(drop_rate, "drop_rate")
     check_finite(threshold, "threshold")
     check_count(seed, "seed", minimum=0)
+    samples, ddof, relative_error, max_samples = (given[name] for name in _GIVEN)
     method = _method(exact, neutral, relative_error)
-    given = {"samples": samples, "ddof": ddof, "relative_error": relative_error, "max_samples": max_samples}
     for name, value in given.items():
         if value is not None and name not in _APPLIES[method]:
             raise ValueError(f"{name} does not apply to the method {method!r}: {_REMEDY[method]}.")
-    settings = CASettings(
-        method=method,
-        samples=None,
-        drop_rate=None if drop_rate is None else float(drop_rate),
-        regularizer=regularizer,
-        threshold=float(threshold),
-        ddof=None,
-        seed=None,
-        relative_error=None,
-        max_samples=None,
-    )
+    drop_rate = None if drop_rate is None else float(drop_rate)
+    settings = CASettings(method=method, drop_rate=drop_rate, regularizer=regularizer, threshold=float(threshold))
     if method == "sampling":
         samples, ddof = 5 if samples is None else samples, 0 if ddof is None else ddof
         check_count(samples, "samples", minimum=2)

@@ -55,10 +55,7 @@ class SharesFn(Protocol):
 class CAAttribution(NamedTuple):
     """The score of a view, split over the Gaussians.
 
-    Args:
-        shares: at least 0, shape (N,), float64; they add up to ``result.value`` up to rounding. All 0 if the score has
-            no value.
-        result: the score; its ``reason`` says why it has no value.
+    The shares, (N,) float64, at least 0, add up to ``result.value`` up to rounding; all are 0 if that has no value.
     """
 
     shares: Tensor
@@ -68,9 +65,7 @@ class CAAttribution(NamedTuple):
 class CATotalEffects(NamedTuple):
     """By how much the score of a view would fall if a single Gaussian were certain.
 
-    Args:
-        effects: at least 0, shape (N,), float64. All 0 if the score has no value.
-        result: the score; its ``reason`` says why it has no value.
+    The effects are (N,) float64, at least 0; all are 0 if the score has no value.
     """
 
     effects: Tensor
@@ -87,9 +82,6 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor, view: Any) -
         shares_fn: of the same renderer as the moments of the score.
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1), neither dropped nor scaled.
         view: passed on to both callables.
-
-    Returns:
-        Shares that add up to the score, and the score.
 
     Raises:
         TypeError: as for a call of the score.
@@ -110,7 +102,7 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor, view: Any) -
     """
     result, opacity, multiplier, background = _measure(score, opacity, view, "attribute")
     if result.reason is not Reason.OK:
-        return CAAttribution(_nothing(opacity), result)
+        return CAAttribution(opacity.new_zeros(len(opacity), dtype=torch.float64), result)
     weights = result.visible.to(torch.float64) / result.visible.sum()
     with torch.no_grad():
         shares = shares_fn(opacity.clone(), view, multiplier, background, weights)
@@ -128,13 +120,7 @@ def total_effects(score: CAScore, opacity: Tensor, view: Any) -> CATotalEffects:
     Costs the score and a backward pass through its moments callable, which must be differentiable in the multiplier: it
     is called with a variance per Gaussian, shape (N,), that requires grad.
 
-    Args:
-        score: an exact one, :class:`~ca_reg.CAScore` with ``exact``, neutral or not.
-        opacity: activated opacities in [0, 1], shape (N,) or (N, 1), neither dropped nor scaled.
-        view: passed on to the moments callable.
-
-    Returns:
-        The total effects, and the score.
+    The arguments are those of :func:`attribute`.
 
     Raises:
         TypeError: as for a call of the score.
@@ -152,7 +138,7 @@ def total_effects(score: CAScore, opacity: Tensor, view: Any) -> CATotalEffects:
     """
     result, opacity, multiplier, background = _measure(score, opacity, view, "total_effects")
     if result.reason is not Reason.OK:
-        return CATotalEffects(_nothing(opacity), result)
+        return CATotalEffects(opacity.new_zeros(len(opacity), dtype=torch.float64), result)
     assert score.exact is not None
     opacity = opacity.clone()
     spread = (multiplier.variance * opacity.new_ones(opacity.shape[:1])).requires_grad_()
@@ -183,8 +169,3 @@ def _measure(score: CAScore, opacity: Tensor, view: Any, name: str) -> ExactView
     x = score._params(opacity)
     with torch.no_grad():
         return score._exact(score.exact, x, view)
-
-
-def _nothing(opacity: Tensor) -> Tensor:
-    """Return a zero per Gaussian."""
-    return torch.zeros(opacity.shape[0], dtype=torch.float64, device=opacity.device)

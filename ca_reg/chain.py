@@ -63,6 +63,16 @@ class Chain(Regularizer):
         """Whether a member may drop Gaussians."""
         return any(member.drops for member in self)
 
+    @property
+    def step(self) -> int:
+        """The training step: the latest that was told to the chain, to a member, or to a part of one."""
+        steps = (getattr(part, "step", 0) for member in self for part in member.modules())
+        return max([self._told, *(step for step in steps if isinstance(step, int))])
+
+    @step.setter
+    def step(self, step: int) -> None:
+        self._told = step
+
     def set_step(self, step: int) -> None:
         """Tell the step to every member."""
         super().set_step(step)
@@ -147,9 +157,7 @@ class Foreign(Regularizer):
     def set_step(self, step: int) -> None:
         """Tell the step to the module and its parts, if they have a `set_step`."""
         super().set_step(step)
-        for part in self.module.modules():
-            if callable(set_step := getattr(part, "set_step", None)):
-                set_step(step)
+        _tell(self.module, step)
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Call the module."""
@@ -169,9 +177,7 @@ class Foreign(Regularizer):
     def expected(self, x: Params) -> Params:
         """Call the copy in ``eval()``."""
         twin = _evaluating(self.module)
-        for part in twin.modules():
-            if callable(set_step := getattr(part, "set_step", None)):
-                set_step(x.step)
+        _tell(twin, x.step)
         opacities: Tensor = twin(x.opacities)
         return x if opacities is x.opacities else x._replace(opacities=opacities)
 
@@ -194,6 +200,13 @@ def _multiplied(members: list[Regularizer], x: Params) -> tuple[Params, Multipli
             return None
         x, total = one[0], total * one[1]
     return x, total
+
+
+def _tell(module: nn.Module, step: int) -> None:
+    """Tell the step to a module and its parts, if they have a `set_step`."""
+    for part in module.modules():
+        if callable(set_step := getattr(part, "set_step", None)):
+            set_step(step)
 
 
 def _evaluating(module: nn.Module) -> nn.Module:

@@ -61,14 +61,8 @@ def plot_dynamics(
 ) -> tuple[Axes, Axes]:
     """Draw co-adaptation (left axis, solid) and PSNR (right axis, dotted) against the step.
 
-    One colour per run and group of views; nan leaves a gap.
-
-    Args:
-        runs: one log or log directory, or several by label.
-        ax: where to draw; a new figure by default.
-
-    Returns:
-        The axes of co-adaptation and those of PSNR.
+    One colour per run and group of views; nan leaves a gap. The runs are one log or log directory, or several by label;
+    they are drawn on ``ax``, by default in a new figure. Returns the axes of co-adaptation and those of PSNR.
 
     Raises:
         ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.

@@ -93,16 +93,13 @@ class ListMoments:
         self.elements = int(elements)
 
     def __call__(self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None) -> ExactMoments:
-        """Return the exact moments of a view.
+        """Return the exact moments of a view: mean and variance (3, H, W) and the expected alpha (H, W).
 
         Args:
             opacity: activated opacities, shape (N,) or (N, 1).
             view: passed on to ``lists_fn``.
             multiplier: moments of the factors, numbers, or tensors of shape (N,) or (N, 1), one value per Gaussian.
             background: shape (3,) or (3, H, W); None for that of the lists.
-
-        Returns:
-            Mean and variance (3, H, W) and the expected alpha (H, W).
 
         Raises:
             TypeError: if the lists are of another type, or a dtype does not fit.
@@ -128,19 +125,8 @@ class ListMoments:
         The sum over pixels of ``weights`` times its :func:`~ca_reg.functional.contributions`, mean over RGB. Together
         they are the weighted sum of the variances.
 
-        Args:
-            opacity: as for a call.
-            view: as for a call.
-            multiplier: as for a call.
-            background: as for a call.
-            weights: of the pixels, shape (H, W).
-
-        Returns:
-            The shares, shape (N,), float64; 0 for Gaussians that are in no list.
-
-        Raises:
-            TypeError: as for a call.
-            ValueError: as for a call, or if ``weights`` has another shape.
+        The other arguments and errors are those of a call; the weights of the pixels have shape (H, W). Returned are
+        the shares, shape (N,), float64, 0 for Gaussians that are in no list.
 
         Example:
             >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:

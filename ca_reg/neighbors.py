@@ -95,13 +95,7 @@ def mean_neighbor_distance(positions: Tensor) -> Tensor:
     """Return the root mean squared distance of each point to its three nearest others.
 
     Convention: the INRIA code takes the logarithm of this as the initial scale of a Gaussian. Coinciding points get
-    sqrt(1e-7) instead of 0. With fewer than three other points, all others count.
-
-    Args:
-        positions: world coordinates, shape (N, 3), N at least 2.
-
-    Returns:
-        Distances, shape (N,), positive.
+    sqrt(1e-7) instead of 0. With fewer than three other points, all others count. Shapes (N, 3) and (N,).
 
     Raises:
         ValueError: if the shape is not (N, 3) or N is less than 2.

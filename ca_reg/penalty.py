@@ -10,7 +10,7 @@ from torch import Tensor
 from ca_reg._check import check_finite
 from ca_reg._scheduled import Scheduled
 from ca_reg.functional import Multiplier
-from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.schedules import Schedule
 from ca_reg.types import Layout, MomentsFn, check_layout, read_moments
 
 __all__ = ["CAPenalty", "PenalizedRender"]
@@ -19,10 +19,8 @@ __all__ = ["CAPenalty", "PenalizedRender"]
 class PenalizedRender(NamedTuple):
     """What :class:`CAPenalty` returns.
 
-    Args:
-        image: expected render over the random factors, shape (3, H, W).
-        variance: variance of its pixels, at least 0, shape (3, H, W).
-        penalty: weight times the mean of the variance, a scalar: add it to the loss.
+    Image and variance, (3, H, W), are the expected render over the random factors and the variance of its pixels, at
+    least 0; the penalty is weight times the mean of the variance, a scalar: add it to the loss.
     """
 
     image: Tensor
@@ -97,6 +95,8 @@ class CAPenalty(Scheduled):
         tensor(0.2500)
     """
 
+    rate_name = "weight"
+
     def __init__(
         self,
         moments_fn: MomentsFn,
@@ -115,10 +115,8 @@ class CAPenalty(Scheduled):
                 "multiplier must be a Multiplier, such as Multiplier.dropout(0.2), or a callable that makes one from "
                 f"the opacities, got {type(multiplier).__name__}."
             )
-        if not callable(weight):
-            check_finite(weight, "weight", minimum=0.0)
         check_layout(layout)
-        super().__init__(as_schedule(weight))
+        super().__init__(weight)
         self.moments_fn = moments_fn
         self.multiplier = multiplier
         self.layout: Layout = layout
@@ -128,19 +126,14 @@ class CAPenalty(Scheduled):
         """The factor of the penalty at the present step."""
         return self._present_rate()
 
-    def _check_rate(self, rate: float, step: int) -> None:
-        check_finite(rate, f"weight at step {step}", minimum=0.0)
+    def _check_rate(self, rate: float, name: str) -> None:
+        check_finite(rate, name, minimum=0.0)
 
     def forward(self, opacity: Tensor, view: Any, background: Tensor | None = None) -> PenalizedRender:
-        """Render the moments of one view.
+        """Render the moments of one view, with gradients.
 
-        Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
-            view: passed on to ``moments_fn`` as it is.
-            background: passed on likewise: None for the model's own, one colour (3,), or an image.
-
-        Returns:
-            The expected render, its variance and the penalty, all with gradients.
+        View and background are passed on to ``moments_fn`` as they are: None for the model's own background, one colour
+        (3,), or an image.
 
         Raises:
             TypeError: if ``opacity``, a multiplier or the moments are not of the right type.
@@ -160,4 +153,4 @@ class CAPenalty(Scheduled):
     def extra_repr(self) -> str:
         """Return the arguments, for ``print``."""
         made = self.multiplier if isinstance(self.multiplier, Multiplier) else getattr(self.multiplier, "__name__", "?")
-        return f"multiplier={made}, weight={self._rate_repr()}"
+        return f"multiplier={made}, {super().extra_repr()}"

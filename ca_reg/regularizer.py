@@ -20,9 +20,7 @@ Given = TypeVar("Given", Tensor, Params)
 class Learned(NamedTuple):
     """A number per Gaussian that a regularizer learns; it is cloned, split, pruned and saved with its Gaussian.
 
-    Args:
-        start: its first value.
-        rate: Adam's learning rate.
+    ``start`` is its first value, ``rate`` Adam's learning rate.
     """
 
     start: float
@@ -73,12 +71,7 @@ class Regularizer(Scheduled):
     last: Draw | None = None
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw for one training step.
-
-        Args:
-            x: what the rasterizer would receive.
-            generator: source of the random numbers; None for the global one.
-        """
+        """Draw for one training step; ``x`` is what the rasterizer would receive, no generator the global one."""
         raise NotImplementedError
 
     def replay(self, x: Params, draw: Draw) -> Params:
@@ -162,11 +155,8 @@ class Regularizer(Scheduled):
         If they were counted as seen, their mean gradient would shrink by ``1 - p`` and the threshold in effect rise by
         ``1 / (1 - p)``.
 
-        Args:
-            radii: of all Gaussians as the rasterizer returned them, Gaussians first, shape (N,) or (N, ...).
-
-        Returns:
-            The same shape and dtype; the very same tensor if nothing was dropped.
+        The radii are those of all Gaussians as the rasterizer returned them, shape (N,) or (N, ...). Returns the same
+        shape and dtype, the very same tensor if nothing was dropped.
 
         Raises:
             ValueError: if the number of Gaussians is not that of the last call.

@@ -47,23 +47,18 @@ class CASettings:
     """
 
     method: Method
-    samples: int | None
-    drop_rate: float | None
-    regularizer: str | None
+    samples: int | None = None
+    drop_rate: float | None = None
+    regularizer: str | None = None
     threshold: float
-    ddof: int | None
-    seed: int | None
-    relative_error: float | None
-    max_samples: int | None
+    ddof: int | None = None
+    seed: int | None = None
+    relative_error: float | None = None
+    max_samples: int | None = None
 
 
 class LimitEstimate(NamedTuple):
-    """What a score would be with infinitely many renders, as far as these can tell.
-
-    Args:
-        value: estimate without bias for a given visible region.
-        std_error: its standard error.
-    """
+    """What a score would be with infinitely many renders, for a given visible region, and its standard error."""
 
     value: float
     std_error: float
@@ -150,11 +145,7 @@ class CAResult(_Score):
         The map shows the root of ``variance``, in units of colour: a few pixels hold most of the variance and would
         leave the rest black.
 
-        Args:
-            ax: where to draw; a new figure by default.
-
-        Returns:
-            The axes, for titles and ``ax.figure.savefig(path)``.
+        Drawn on ``ax``, by default in a new figure; returned for titles and ``ax.figure.savefig(path)``.
 
         Raises:
             ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.

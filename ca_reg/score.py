@@ -231,12 +231,8 @@ class CAScore:
                 :class:`torch.utils.data.DistributedSampler` does without shuffling: the result then is that of a single
                 process. Give the position in the whole set if they are split in another way.
 
-        Returns:
-            The result of this view.
-
         Raises:
-            TypeError: as for a call of the score.
-            ValueError: as for a call of the score.
+            TypeError, ValueError: as for a call of the score.
         """
         result = self(opacity, view, index=view_position(self._updates) if index is None else index)
         self._tally.add(result)
@@ -397,14 +393,8 @@ class CAScore:
         self, value: float, std_error: float, variance: Tensor, visible: Tensor, reason: Reason, samples: int | None
     ) -> CAResult:
         """Put a score together with its settings."""
-        return CAResult(
-            value=value,
-            std_error=std_error,
-            variance=variance,
-            visible=visible,
-            reason=reason,
-            **asdict(replace(self.settings, samples=samples)),
-        )
+        settings = asdict(replace(self.settings, samples=samples))
+        return CAResult(value=value, std_error=std_error, variance=variance, visible=visible, reason=reason, **settings)
 
 
 def _flat(x: Params) -> Params:

@@ -12,15 +12,8 @@ from torch import Tensor
 from ca_reg.functional import Multiplier
 
 __all__ = [
-    "ExactMoments",
-    "Layout",
-    "MomentsFn",
-    "RenderFn",
-    "Rendering",
-    "read_alpha_pass",
-    "read_moments",
-    "read_rendering",
-]
+    "ExactMoments", "Layout", "MomentsFn", "RenderFn", "Rendering", "read_alpha_pass", "read_moments", "read_rendering"
+]  # fmt: skip
 
 Layout = Literal["CHW", "HWC"]
 """Order of the axes of the images that a renderer returns."""
@@ -88,40 +81,22 @@ class MomentsFn(Protocol):
 
 
 class Rendering(NamedTuple):
-    """One image with its accumulated alpha.
-
-    Args:
-        image: RGB, shape (3, H, W).
-        alpha: accumulated alpha, shape (H, W); None if the renderer returned none.
-    """
+    """One RGB image (3, H, W) with its accumulated alpha (H, W), None if the renderer returned none."""
 
     image: Tensor
     alpha: Tensor | None = None
 
 
 class ExactMoments(NamedTuple):
-    """Moments of one image over the random factors.
-
-    Args:
-        mean: expected colours, shape (3, H, W).
-        variance: their variances, shape (3, H, W).
-        alpha_mean: expected accumulated alpha, shape (H, W); None if the callable returned none.
-    """
+    """Moments of one image over the random factors: images (3, H, W); the alpha is None if none was returned."""
 
     mean: Tensor
     variance: Tensor
-    alpha_mean: Tensor | None
+    alpha_mean: Tensor | None  # expected, (H, W)
 
 
 def read_rendering(result: Any, *, layout: Layout = "CHW") -> Rendering:
-    """Bring what a :class:`RenderFn` returned into one form.
-
-    Args:
-        result: see :class:`RenderFn`.
-        layout: order of the axes of the image, ``"CHW"`` or ``"HWC"``.
-
-    Returns:
-        The image (3, H, W) and the alpha (H, W) or None, torch tensors that share memory with torch results.
+    """Bring what a :class:`RenderFn` returned into one form, torch tensors that share memory with torch results.
 
     Raises:
         TypeError: if the result is of another kind, or not floating point.
@@ -148,17 +123,11 @@ def read_rendering(result: Any, *, layout: Layout = "CHW") -> Rendering:
 def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Tensor:
     """Read the accumulated alpha off a white-on-black render, whose colours are all 1 over a background of 0.
 
-    Args:
-        result: the alpha itself, (H, W), (1, H, W) or (H, W, 1), or a render in any form of :class:`RenderFn`.
-        image: the image that belongs to it, shape (3, H, W), for the size.
-        layout: order of the axes of a rendered image.
-
-    Returns:
-        The accumulated alpha, shape (H, W).
+    The result may also be the alpha itself, (H, W), (1, H, W) or (H, W, 1). Returned is (H, W), the size of the image.
 
     Raises:
         TypeError: if the result is of another kind, or not floating point.
-        ValueError: if its size is not that of ``image``.
+        ValueError: if its size is not that of ``image``, (3, H, W).
 
     Example:
         >>> white = torch.full((3, 4, 5), 0.9)
@@ -179,14 +148,7 @@ def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Te
 
 
 def read_moments(result: Any, *, layout: Layout = "CHW") -> ExactMoments:
-    """Bring what a :class:`MomentsFn` returned into one form.
-
-    Args:
-        result: see :class:`MomentsFn`.
-        layout: order of the axes of the images, ``"CHW"`` or ``"HWC"``.
-
-    Returns:
-        Images (3, H, W) and the expected alpha (H, W) or None, torch tensors.
+    """Bring what a :class:`MomentsFn` returned into one form, torch tensors.
 
     Raises:
         TypeError: if a member is missing or not floating point.

@@ -12,10 +12,7 @@ __all__ = ["AfterImport"]
 
 
 class AfterImport(MetaPathFinder):
-    """Watch imports: neither is a module imported early, nor does it matter who imports it first.
-
-    Args:
-        callbacks: what to call with which module. Modules that are already imported are handed over by :meth:`start`.
+    """Call back with a module once it is imported, whoever does; with one that is, at :meth:`start`.
 
     Example:
         >>> import colorsys

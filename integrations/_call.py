@@ -6,9 +6,12 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor, nn
 
 from ca_reg import Chain, Params
+
+from ._tally import Skip, Tally
 
 __all__ = ["Call", "chain_of"]
 
@@ -16,12 +19,7 @@ _OF_CALL = ("view_matrix", "step")  # fields that no argument with a row for eac
 
 
 def chain_of(regularizer: nn.Module) -> Chain:
-    """Return a chain of what a user gave.
-
-    Raises:
-        TypeError: if it is no module.
-        ValueError: if it learns numbers per Gaussian.
-    """
+    """Return a chain of what a user gave; refuse what is no module (TypeError), or learns per Gaussian (ValueError)."""
     chain = Chain(regularizer)
     if chain.learns:
         raise ValueError(
@@ -32,11 +30,7 @@ def chain_of(regularizer: nn.Module) -> Chain:
 
 
 class Call:
-    """A call whose arguments may be changed before it is made.
-
-    Args:
-        function: what does the work.
-        bound: its arguments.
+    """A call of a function whose bound arguments may be changed before it is made.
 
     Attributes:
         arguments: by name.
@@ -81,11 +75,7 @@ class Call:
         self.arguments[name] = value.reshape(self.arguments[name].shape)
 
     def params(self, chain: Chain, step: int) -> Params:
-        """Return the opacities (N,) and what else the regularizers need, batches as one set of Gaussians.
-
-        Raises:
-            ValueError: if this call has not all that is needed.
-        """
+        """Return the opacities (N,) and what else the regularizers need, batches as one set; raise if one lacks."""
         opacities = self.arguments["opacities"].reshape(-1)
         found: dict[str, Any] = {}
         for name in chain.needs:
@@ -102,7 +92,24 @@ class Call:
             found[name] = value
         return Params(opacities, step=step, **found)
 
-    def replace(self, before: Params, after: Params) -> bool:
+    def train(self, chain: Chain, step: int, tally: Tally, generator: torch.Generator | None) -> Tensor | None:
+        """Take what a draw leaves of the Gaussians; return which it did not drop, None if it dropped none."""
+        given = self.params(chain, step)
+        if self._replace(given, chain(given, generator=generator)):
+            tally.count_regularized(step)
+        else:
+            tally.skipped[Skip.RATE_ZERO] += 1
+        return chain.keep
+
+    def evaluate(self, chain: Chain, step: int, tally: Tally) -> None:
+        """Take the test-time values."""
+        given = self.params(chain, step)
+        if self._replace(given, chain.expected(given)):
+            tally.scaled += 1
+        else:
+            tally.skipped[Skip.NOTHING_TO_SCALE] += 1
+
+    def _replace(self, before: Params, after: Params) -> bool:
         """Hand what has changed to the rasterizer; return whether anything has."""
         changed = [name for name in Params._fields if getattr(after, name) is not getattr(before, name)]
         for name in changed:

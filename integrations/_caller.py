@@ -38,11 +38,9 @@ def find_instance(variables: Mapping[str, Any], classes: tuple[type, ...]) -> An
 
 
 def is_viewer(variables: Mapping[str, Any], camera: str | None) -> bool:
-    """Whether a viewer asked for the render: such renders are made with gradients on, before that of the training.
+    """Whether a viewer asked for the render: such are made with gradients on, before that of the training.
 
-    Args:
-        variables: of the calling render.
-        camera: name of the class of a viewer's cameras; None if there is no viewer.
+    ``camera`` is the name of the class of a viewer's cameras, None if there is no viewer.
     """
     return camera is not None and any(type(x).__name__ == camera for x in variables.values())
 

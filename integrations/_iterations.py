@@ -19,13 +19,7 @@ _NODES = 1000  # of the graph behind the opacities to search for a parameter
 
 
 class Field:
-    """One set of Gaussians in training.
-
-    Args:
-        index: tells the fields of one training apart, from 0.
-        step: the step that it starts in, 0 if that is not known.
-        steps: what tells that a step begins.
-    """
+    """One set of Gaussians in training: its number, from 0, its step, 0 if not known, and what begins the next."""
 
     def __init__(self, index: int, step: int, steps: Steps) -> None:
         self.index = index
@@ -45,15 +39,12 @@ class Field:
         self.step, self.renders = step, 0
 
     def update(self, iteration: int) -> bool:
-        """Take note of a call of update_learning_rate.
+        """Take note of a call of update_learning_rate; return False if the step that ends had no training render.
 
         It is called once per step, but its argument may have an offset (DNGaussian), so that calls are counted from the
         first argument on. FSGS and CoR-GS call it at the end of a step, which shows at the first call.
 
         If the parameters tell the steps, only the first call counts: it says where a resumed training goes on.
-
-        Returns:
-            Whether the step that has ended had a training render; True if none has.
         """
         rendered = self._updates_end_step is None or self._by_parameters or self.renders > 0
         if self._updates_end_step is None:
@@ -64,14 +55,9 @@ class Field:
         return rendered
 
     def count_render(self, parameters: tuple[Tensor, ...]) -> None:
-        """Count a training render.
+        """Count a training render; raise RuntimeError if steps go by without anyone saying so.
 
-        Args:
-            parameters: of the Gaussians. Whoever trains them changes their versions; that begins a step, or must not
-                happen within one.
-
-        Raises:
-            RuntimeError: if steps go by without anyone saying so.
+        Whoever trains the parameters changes their versions; that begins a step, or must not happen within one.
         """
         versions = tuple((id(x), x._version) for x in parameters)
         trained = self.renders > 0 and versions != self._versions
@@ -91,9 +77,7 @@ class Field:
 class Iterations:
     """The fields of one training, found by their model or, where that is not known, by a parameter.
 
-    Args:
-        steps: what tells that a step begins.
-        lose_step: called when a step of a field goes by without a training render.
+    ``lose_step`` is called when a step of a field goes by without a training render.
     """
 
     def __init__(self, steps: Steps, lose_step: Callable[[], None]) -> None:

@@ -40,14 +40,8 @@ def override(rasterizers: Sequence[type], opacity: Tensor) -> Iterator[list[tupl
     """Give the rasterizers these opacities in place of those that this thread calls them with.
 
     The classes are patched once for all threads, and put back when the last of them is done; renders of other threads
-    go through unchanged.
-
-    Args:
-        rasterizers: their classes.
-        opacity: activated, of all Gaussians, shape (N,) or (N, 1).
-
-    Yields:
-        The calls so far, each with what it returned.
+    go through unchanged. The opacities are activated, of all Gaussians, (N,) or (N, 1). Yields the calls so far, each
+    with what it returned.
     """
     mine = _Override(tuple(rasterizers), opacity, [])
     with ExitStack() as undo:

@@ -11,12 +11,7 @@ _INHERITED = object()
 
 
 class ClassPatch:
-    """A method of a class, replaced until :meth:`remove`.
-
-    Args:
-        owner: the class.
-        name: of the method, its own or an inherited one.
-        make: is given the method and returns what takes its place.
+    """A method of a class, its own or an inherited one, replaced by what ``make`` makes of it until :meth:`remove`.
 
     Example:
         >>> class Greeter:
@@ -49,11 +44,7 @@ class ClassPatch:
             )
 
     def remove(self) -> None:
-        """Put the method back: the same object, or none if it was inherited.
-
-        Raises:
-            RuntimeError: if someone replaced the method again.
-        """
+        """Put the method back: the same object, or none if it was inherited; raises as `check_removable`."""
         self.check_removable()
         if self._before is _INHERITED:
             delattr(self.owner, self.name)

@@ -15,15 +15,9 @@ from torch import Tensor
 from ._call import Call
 
 __all__ = [
-    "MODULES",
-    "ForwardCall",
-    "check_installed",
-    "forward_signature",
-    "hide_dropped",
-    "rasterizer_class",
-    "rasterizer_classes",
-    "white_alpha",
-]
+    "MODULES", "ForwardCall", "check_installed", "forward_signature", "hide_dropped", "rasterizer_class",
+    "rasterizer_classes", "white_alpha",
+]  # fmt: skip
 
 MODULES = ("diff_gaussian_rasterization", "diff_gaussian_rasterization_abs")
 _CLASS = "GaussianRasterizer"
@@ -84,22 +78,14 @@ def rasterizer_class(module: ModuleType) -> type | None:
 
 
 def rasterizer_classes() -> list[type]:
-    """Import the installed rasterizers and return their classes.
-
-    Raises:
-        ImportError: if there are none.
-    """
+    """Import the installed rasterizers and return their classes; raise ImportError if there are none."""
     check_installed()
     found = [rasterizer_class(import_module(name)) for name in _installed()]
     return list(dict.fromkeys(cls for cls in found if cls is not None))
 
 
 def forward_signature(rasterizer: type) -> inspect.Signature:
-    """Return the signature of a rasterizer's forward.
-
-    Raises:
-        TypeError: if it has not the arguments of the family.
-    """
+    """Return the signature of a rasterizer's forward; raise TypeError if it has not the arguments of the family."""
     forward = getattr(rasterizer, "forward", None)
     signature = inspect.signature(forward) if callable(forward) else inspect.Signature()
     missing = [name for name in ("means3D", "opacities") if name not in signature.parameters]
@@ -115,18 +101,11 @@ def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
     """Zero what a rasterizer counted for dropped Gaussians: in every integer it returned per Gaussian, radii first.
 
     Densification takes these for what was seen. Besides the radii some rasterizers return flags (3dgs-mcmc) or counts
-    (taming-3dgs). Floating-point sums of a Gaussian of opacity 0 are 0 already.
-
-    Args:
-        returned: (color, radii), (color, radii, depth, alpha), (color, radii, flags), ...
-        keep: what was not dropped, shape (N,) bool.
-
-    Returns:
-        The same tuple with integers, or bools, of shape (N,), (N, 1) or (N, 2) zeroed where ``keep`` is False.
+    (taming-3dgs). Floating-point sums of a Gaussian of opacity 0 are 0 already. Returned is the same tuple with
+    integers, or bools, of shape (N,), (N, 1) or (N, 2) zeroed where ``keep``, (N,) bool, is False.
 
     Raises:
-        TypeError: if no tuple came.
-        ValueError: if none of its members counts the Gaussians.
+        TypeError, ValueError: if no tuple came, or none of its members counts the Gaussians.
     """
     if not isinstance(returned, tuple):
         raise TypeError(f"the rasterizer returned {type(returned).__name__}, expected a tuple with colours and radii.")

@@ -15,8 +15,7 @@ __all__ = ["imported_packages", "run_script", "set_command_line"]
 def imported_packages(script: Path | str) -> set[str]:
     """Return the first names of all modules that a script imports, itself or through files beside it; runs nothing.
 
-    Args:
-        script: path of the file; or name of the module, which is looked for in the present folder.
+    The script is the path of a file, or the name of a module in the present folder; so it is below.
     """
     folder = script.resolve().parent if isinstance(script, Path) else Path.cwd()
     files = [script if isinstance(script, Path) else folder / f"{script.replace('.', '/')}.py"]
@@ -51,12 +50,7 @@ def _imports(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def set_command_line(script: Path | str, arguments: Sequence[str]) -> None:
-    """Give the script its command line, and its folder as the first place to import from.
-
-    Args:
-        script: path of the file; or name of the module, whose first place is the present folder.
-        arguments: what follows the name of the script on its command line.
-    """
+    """Give the script its command line, and its folder, or the present one, as the first place to import from."""
     sys.argv = [str(script), *arguments]
     # The first place is now the folder that `python -m` was called in; with -P (Python 3.11) there is no such place.
     if not getattr(sys.flags, "safe_path", False):
@@ -64,11 +58,7 @@ def set_command_line(script: Path | str, arguments: Sequence[str]) -> None:
 
 
 def run_script(script: Path | str) -> None:
-    """Run a script as the main program; whatever it raises is raised here, SystemExit and KeyboardInterrupt included.
-
-    Args:
-        script: path of the file, or name of the module.
-    """
+    """Run a script as the main program; what it raises is raised here, SystemExit and KeyboardInterrupt, too."""
     if isinstance(script, Path):
         runpy.run_path(str(script), run_name="__main__")
     else:

@@ -51,10 +51,7 @@ class Tally:
         """Say that a run was not, or hardly, regularized; None if it was.
 
         A training is if nine of ten steps had a render that was regularized, or that the schedule left alone at some
-        steps; a script that only renders, if it made a test render.
-
-        Args:
-            optimizer_steps: of Gaussians, which tell a training from a script that only renders.
+        steps; a script that only renders, which optimizer steps of Gaussians tell from one, if it made a test render.
         """
         rendered = self.regularized + self.skipped[Skip.RATE_ZERO]
         if not (rendered or optimizer_steps or self.lost):

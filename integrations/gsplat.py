@@ -14,16 +14,15 @@ import functools
 import importlib
 import inspect
 import itertools
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
-from types import TracebackType
-from typing import Any, ClassVar
+from collections.abc import Callable, MutableMapping
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
 from ._call import Call, chain_of
-from ._tally import Tally
-from ._watch import Watch
+from ._hook import Hook
+from ._tally import Skip, Tally
 
 __all__ = ["Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized"]
 
@@ -103,21 +102,15 @@ class Regularized:
         rasterization: the function underneath.
         regularizer: the module, as given.
         chain: what is made of it.
-        trained: number of calls that were regularized as training.
-        evaluated: number of calls that were rendered as evaluation.
+        tally: what was done; of an :class:`Installation`, by all its functions.
     """
 
     _eager: Any = None
 
     def __init__(
-        self,
-        rasterization: Rasterization,
-        regularizer: nn.Module,
-        generator: torch.Generator | None = None,
-        *,
-        steps: Iterator[int] | None = None,
-        watch: Watch | None = None,
-    ) -> None:
+        self, rasterization: Rasterization, regularizer: nn.Module, generator: torch.Generator | None = None,
+        *, hook: Installation | None = None,
+    ) -> None:  # fmt: skip
         if isinstance(rasterization, Regularized):
             raise ValueError(
                 "this rasterization is regularized already, and opacities would be dropped twice: compose regularizers "
@@ -130,15 +123,24 @@ class Regularized:
         _Call.check(self.chain, self._signature)
         self.rasterization = rasterization
         self.regularizer = regularizer
-        self.trained = self.evaluated = 0
+        self.tally = Tally() if hook is None else hook.tally
         self._generator = generator
-        self._steps = steps
-        self._watch = watch
+        self._hook = hook
         self._packed_is_safe = False
         # A compiled caller is cut here. On the class, so that instances can be pickled; now, because it imports dynamo.
         if Regularized._eager is None:
             Regularized._eager = torch.compiler.disable(Regularized._rasterize)  # type: ignore[no-untyped-call]
         functools.update_wrapper(self, rasterization)
+
+    @property
+    def trained(self) -> int:
+        """Number of training calls that were regularized; not of those at a rate of 0."""
+        return self.tally.regularized
+
+    @property
+    def evaluated(self) -> int:
+        """Number of calls that were rendered as evaluation."""
+        return self.tally.scaled + self.tally.skipped[Skip.NOTHING_TO_SCALE]
 
     def __call__(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Rasterize with regularized opacities; takes and returns what ``rasterization`` does."""
@@ -155,26 +157,20 @@ class Regularized:
         call = _Call(self.rasterization, self._signature.bind(*args, **kwargs))
         opacities: Tensor = call.arguments["opacities"]
         trains = trains and torch.is_grad_enabled() and opacities.requires_grad
-        self.trained += trains
-        self.evaluated += not trains
-        if trains and self._steps is not None:
-            self.chain.set_step(next(self._steps))
-        given = call.params(self.chain, self._step)
-        call.replace(given, self.chain(given, generator=self._generator) if trains else self.chain.expected(given))
-        keep = self.chain.keep if trains else None
-        if trains and self._watch is not None:
-            self._watch.regularized()
+        keep = None
+        if not trains:
+            call.evaluate(self.chain, self.chain.step, self.tally)
+        else:
+            if self._hook is not None:
+                self.chain.set_step(next(self._hook.steps))
+            keep = call.train(self.chain, self.chain.step, self.tally, self._generator)
+            if self._hook is not None:
+                self._hook.note_regularized()
         *images, info = call()
         # Several ranks exchange their Gaussians inside the call, after gsplat (1.5 on) has left out those of opacity 0.
         if keep is not None and not call.arguments.get("distributed"):
             self._hide_dropped(info, keep.view(opacities.shape))
         return (*images, info)
-
-    @property
-    def _step(self) -> int:
-        """The step that the user told to the regularizer or to its parts."""
-        steps = (getattr(part, "step", 0) for part in self.chain.modules())
-        return max(step for step in steps if isinstance(step, int))
 
     def _hide_dropped(self, info: MutableMapping[str, Any], keep: Tensor) -> None:
         """Zero the radii of dropped Gaussians; ``keep`` is [..., N]."""
@@ -201,59 +197,70 @@ class Regularized:
             self._packed_is_safe = True
 
 
-class Installation:
+class Installation(Hook):
     """What :func:`install` changed; undone by :meth:`uninstall` or at the end of a ``with`` block.
 
     Attributes:
-        rasterization: what is in the place of ``gsplat.rasterization``; counts its calls.
+        rasterization: what is in the place of ``gsplat.rasterization``.
         functions: all that was replaced, by name: what is in the place of each.
+        tally: what all of them did.
     """
 
+    rasterization: Regularized
+
     def __init__(
-        self, functions: Mapping[str, Regularized], replaced: dict[tuple[str, str], Any], watch: Watch
-    ) -> None:
-        self.functions = functions
-        self.rasterization = functions["rasterization"]
-        self._replaced = replaced
-        self._watch = watch
+        self, regularizer: nn.Module, *, generator: torch.Generator | None = None, seed: int | None = None,
+        patience: int = 100,
+    ) -> None:  # fmt: skip
+        super().__init__(patience)
+        self.functions: dict[str, Regularized] = {}
+        self.steps = itertools.count()
+        self._regularizer, self._generator, self._seed = regularizer, generator, seed
+        self._replaced: dict[tuple[str, str], Any] = {}
+
+    def install(self) -> Self:
+        """Replace the functions, as :func:`install`."""
+        load_gsplat()
+        if self._seed is not None:
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+            self._generator = torch.Generator(device).manual_seed(self._seed)
+        found = {
+            (holder, name): function
+            for holder in _HOLDERS
+            for name, function in vars(importlib.import_module(holder)).items()
+            if name.startswith("rasterization") and _takes_opacities(function)
+        }
+        made = {id(x): Regularized(x, self._regularizer, self._generator, hook=self) for x in found.values()}
+        for (holder, name), function in found.items():
+            self.functions[name] = made[id(function)]
+            setattr(importlib.import_module(holder), name, made[id(function)])
+        self._replaced, self.rasterization = found, self.functions["rasterization"]
+        self._watch()
+        return self
 
     @property
     def trained(self) -> int:
-        """Number of calls, of all functions, that were regularized as training."""
-        return sum(function.trained for function in self.functions.values())
-
-    @property
-    def tally(self) -> Tally:
-        """What was done, in the launcher's terms."""
-        evaluated = {id(function): function.evaluated for function in self.functions.values()}
-        return Tally(regularized=self.trained, scaled=sum(evaluated.values()))
-
-    def problem(self) -> str | None:
-        """Say that the training was not regularized, and the way out; None if it was, or if patience is 0."""
-        shortfall = self._watch.patience and self.tally.shortfall(self._watch.steps)
-        return f"{shortfall} {_explain()}" if shortfall else None
+        """Number of training calls, of all functions, that were regularized; not of those at a rate of 0."""
+        return self.tally.regularized
 
     def uninstall(self) -> None:
         """Put back what was there; a second call does nothing."""
-        self._watch.stop()
+        self._unwatch()
         while self._replaced:
             (holder, name), original = self._replaced.popitem()
             setattr(importlib.import_module(holder), name, original)
 
-    def __enter__(self) -> Installation:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Undo it.
-
-        Raises:
-            RuntimeError: if Gaussians were trained, and no call was regularized.
-        """
-        self.uninstall()
-        if error is None and self._watch.steps and (problem := self.problem()):
-            raise RuntimeError(problem)
+    def _explain(self) -> str:
+        return (
+            f"So far: {'; '.join(self.tally.lines())}. Either the script had imported the functions of gsplat before "
+            "install() replaced them, or it renders without them, or its opacities need no gradient, or the "
+            "regularizer is in eval(). Install first; else wrap what it calls with regularized(). If the rates are 0 "
+            "for longer than the training, let the schedule begin earlier (--start); if steps without regularization "
+            "are meant, raise patience."
+        )
 
 
 def install(regularizer: nn.Module, *, generator: torch.Generator | None = None, patience: int = 100) -> Installation:
@@ -282,23 +289,7 @@ def install(regularizer: nn.Module, *, generator: torch.Generator | None = None,
         >>> installation.trained  # doctest: +SKIP
         30000
     """
-    load_gsplat()
-    watch, steps = Watch(patience, _explain), itertools.count()
-    replaced = {
-        (holder, name): function
-        for holder in _HOLDERS
-        for name, function in vars(importlib.import_module(holder)).items()
-        if name.startswith("rasterization") and _takes_opacities(function)
-    }
-    made = {
-        id(function): Regularized(function, regularizer, generator, steps=steps, watch=watch)
-        for function in replaced.values()
-    }
-    functions = {name: made[id(function)] for (_, name), function in replaced.items()}
-    for (holder, name), function in replaced.items():
-        setattr(importlib.import_module(holder), name, made[id(function)])
-    watch.start()
-    return Installation(functions, replaced, watch)
+    return Installation(regularizer, generator=generator, patience=patience).install()
 
 
 def _takes_opacities(function: Any) -> bool:
@@ -306,25 +297,8 @@ def _takes_opacities(function: Any) -> bool:
     return callable(function) and "opacities" in inspect.signature(function).parameters
 
 
-def _explain() -> str:
-    """Say what may be the cause, and what to do."""
-    return (
-        "Either the script had imported the functions of gsplat before install() replaced them, or it renders without "
-        "them, or its opacities need no gradient, or the regularizer is in eval(). Install first; else wrap what it "
-        "calls with regularized(). If steps without regularization are meant, raise patience."
-    )
-
-
 def load_gsplat(device: torch.device | None = None) -> Any:
-    """Return the module ``gsplat``.
-
-    Args:
-        device: of the tensors that it is going to render; None if nothing is rendered yet.
-
-    Raises:
-        ImportError: if it is missing; names the extra.
-        RuntimeError: if the device is not a CUDA device.
-    """
+    """Return the module ``gsplat``; raise ImportError without it, RuntimeError if it cannot render on a device."""
     if device is not None and device.type != "cuda":
         raise RuntimeError(f"gsplat renders on CUDA devices only, and the Gaussians are on {device}: move them there.")
     try:

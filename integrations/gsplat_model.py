@@ -75,11 +75,7 @@ class GsplatModel:
     antialiased: bool = False
 
     def render(self, opacity: Tensor, view: GsplatView) -> tuple[Tensor, Tensor]:
-        """Render a view with these opacities: the render callable of :class:`~ca_reg.CAScore`.
-
-        Args:
-            opacity: activated, shape (N,) or (N, 1).
-            view: the camera.
+        """Render a view with activated opacities (N,) or (N, 1), as :class:`~ca_reg.CAScore` asks.
 
         Returns:
             Image (3, H, W) and accumulated alpha (H, W).
@@ -107,15 +103,8 @@ class GsplatModel:
     def lists(self, opacity: Tensor, view: GsplatView) -> PixelLists:
         """List what every pixel composites, without an early stop: what :class:`~ca_reg.ListMoments` needs.
 
-        Differentiable in everything but the choice of the pairs, as the rasterizer is.
-
-        Args:
-            opacity: activated, shape (N,) or (N, 1).
-            view: the camera.
-
-        Raises:
-            ImportError: if gsplat is missing.
-            RuntimeError: if the Gaussians are not on a CUDA device.
+        Differentiable in everything but the choice of the pairs, as the rasterizer is. Arguments and errors are those
+        of :meth:`render`.
         """
         gsplat = load_gsplat(self.means.device)
         camera = self._camera(view)

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from types import ModuleType, TracebackType
-from typing import Any, Literal, get_args
+from types import ModuleType
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from ca_reg.chain import Foreign
 from ._after_import import AfterImport
 from ._call import chain_of
 from ._caller import calling_render, find_instance, is_viewer, refuse_a_second_regularizer
+from ._hook import Hook
 from ._iterations import Field, Iterations, Steps, leaf_of
 from ._override import is_overridden
 from ._patch import ClassPatch
@@ -33,8 +34,7 @@ from ._rasterizer import (
     hide_dropped,
     rasterizer_class,
 )
-from ._tally import Skip, Tally
-from ._watch import Watch
+from ._tally import Skip
 
 __all__ = ["RasterizerHook", "Scope", "Steps"]
 
@@ -45,7 +45,7 @@ _MODEL_MODULE = "scene.gaussian_model"
 _MANY_ZEROS = 1e-3  # share of opacities that are 0 by no rounding
 
 
-class RasterizerHook:
+class RasterizerHook(Hook):
     """Regularize every render of an INRIA-style code base, as a context manager or with install and uninstall.
 
     Training renders (gradients on, opacities and positions trained) get regularized opacities, and the radii of dropped
@@ -111,6 +111,7 @@ class RasterizerHook:
         patience: int = 100,
         allow_zeros: bool = False,
     ) -> None:
+        super().__init__(patience)
         for name, value, choices in (("scope", scope, get_args(Scope)), ("steps", steps, get_args(Steps))):
             if value not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}.")
@@ -129,15 +130,13 @@ class RasterizerHook:
         self._rasterizer = rasterizer
         self._viewer = viewer
         self._allow_zeros = allow_zeros
-        self._watch_training = Watch(patience, self._explain)
-        self._iterations = Iterations(steps, self._lose_step)
+        self._iterations = Iterations(steps, self.note_lost)
         self._models: tuple[type, ...] = ()
         self._patches: list[ClassPatch] = []
         self._hooked: list[str] = []  # names of the classes, for messages
-        self._watch: AfterImport | None = None
-        self.tally = Tally()
+        self._imports: AfterImport | None = None
 
-    def install(self) -> RasterizerHook:
+    def install(self) -> Self:
         """Wrap the rasterizers, those that are imported and those that will be; return the hook.
 
         Raises:
@@ -146,17 +145,17 @@ class RasterizerHook:
             TypeError: if the rasterizer is not one of the INRIA family.
             ValueError: if it does not take what the regularizer needs.
         """
-        if self._watch is not None:
+        if self._imports is not None:
             raise RuntimeError("this hook is installed already; uninstall it first.")
         if self._rasterizer is None:
             check_installed()
-        watch = AfterImport({_MODEL_MODULE: self._found_model, **dict.fromkeys(MODULES, self._found_rasterizer)})
-        self._watch = watch
+        callbacks = dict.fromkeys(MODULES, self._found_rasterizer) | {_MODEL_MODULE: self._found_model}
+        self._imports = AfterImport(callbacks)
         try:
             if self._rasterizer is not None:
                 self._wrap(self._rasterizer)
-            watch.start()
-            self._watch_training.start()
+            self._imports.start()
+            self._watch()
         except BaseException:
             self.uninstall()
             raise
@@ -169,52 +168,21 @@ class RasterizerHook:
             RuntimeError: if the hook is not installed, or someone wrapped the classes again since; nothing is then
                 changed.
         """
-        if self._watch is None:
+        if self._imports is None:
             raise RuntimeError("this hook is not installed.")
         for patch in self._patches:
             patch.check_removable()
-        self._watch.stop()
-        self._watch = None
-        self._watch_training.stop()
+        self._imports.stop()
+        self._imports = None
+        self._unwatch()
         while self._patches:
             self._patches.pop().remove()
 
-    def __enter__(self) -> RasterizerHook:
-        """Install the hook."""
-        return self.install()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Uninstall the hook.
-
-        Raises:
-            RuntimeError: if a training came to its end without being regularized, see :meth:`problem`.
-        """
-        self.uninstall()
-        if error is None and self._watch_training.steps and (problem := self.problem()):
-            raise RuntimeError(problem)
-
     def step(self, step: int) -> None:
-        """Say which training step begins, counted from 1; ``update_learning_rate`` is no longer looked at.
-
-        Raises:
-            RuntimeError: if too many steps went by without a training render.
-        """
+        """Say which training step begins, counted from 1; ``update_learning_rate`` is no longer looked at."""
         self._iterations.step(step)
 
-    def problem(self) -> str | None:
-        """Say what went wrong unnoticed, and the way out; None if all is well.
-
-        See :meth:`Tally.shortfall`. With a patience of 0 nothing is wrong.
-        """
-        if not self._watch_training.patience:
-            return None
-        shortfall = self.tally.shortfall(self._watch_training.steps)
-        return None if shortfall is None else f"{shortfall} {self._explain()}"
-
     def _explain(self) -> str:
-        """Say what may be the cause, and what to do."""
         hooked = " and ".join(self._hooked) or "nothing, because no known rasterizer was imported"
         return (
             f"Hooked is {hooked}; so far: {'; '.join(self.tally.lines())}. If the training renders with another class, "
@@ -222,11 +190,6 @@ class RasterizerHook:
             "schedule begin earlier (--start); if steps without a regularized render are meant, raise patience "
             "(--patience; 0 for any number). Without --dropout and --noise the script runs plain."
         )
-
-    def _lose_step(self) -> None:
-        """Take note of a training step without a render."""
-        self.tally.lost += 1
-        self._watch_training.check_lost(self.tally.lost)
 
     def _found_rasterizer(self, module: ModuleType) -> None:
         """Wrap the rasterizer of a module that was imported, unless another class was asked for."""
@@ -308,11 +271,7 @@ class RasterizerHook:
 
     def _evaluate(self, call: ForwardCall, step: int) -> Any:
         """Make a call with the test-time values."""
-        given = call.params(self._chain, step)
-        if call.replace(given, self._chain.expected(given)):
-            self.tally.scaled += 1
-        else:
-            self.tally.skipped[Skip.NOTHING_TO_SCALE] += 1
+        call.evaluate(self._chain, step, self.tally)
         opacities: Tensor = call.arguments["opacities"]
         if torch.is_grad_enabled() and opacities.requires_grad:
             call.arguments["opacities"] = opacities = opacities.view_as(opacities)
@@ -326,13 +285,9 @@ class RasterizerHook:
         entropy = np.random.SeedSequence([self._seed, field.index, step]).generate_state(1, np.uint64)
         generator = torch.Generator(call.arguments["opacities"].device).manual_seed(int(entropy[0]) >> 1)
         self._chain.train().set_step(step)
-        given = call.params(self._chain, step)
-        changed = call.replace(given, self._chain(given, generator=generator))
-        self._watch_training.regularized()
-        if not changed:
-            return self._leave(call, Skip.RATE_ZERO)
-        self.tally.count_regularized(step)
-        returned, keep = call(), self._chain.keep
+        keep = call.train(self._chain, step, self.tally, generator)
+        self.note_regularized()
+        returned = call()
         return returned if keep is None else hide_dropped(returned, keep)
 
     def _refuse_zeros(self, opacities: Tensor) -> None:

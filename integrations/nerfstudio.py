@@ -25,11 +25,7 @@ __all__ = ["SplatfactoCAModel", "SplatfactoCAModelConfig", "Unavailable", "splat
 
 
 class Unavailable:
-    """Stands in for the method where it cannot be had; its text says why.
-
-    Args:
-        error: what happened.
-    """
+    """Stands in for the method where it cannot be had; its text says why."""
 
     def __init__(self, error: Exception) -> None:
         self.error = error

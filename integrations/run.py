@@ -27,14 +27,17 @@ from ca_reg import Chain, GaussianDropout, OpacityNoise
 from ca_reg.regularizers import parse
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
-from ._gsplat_hook import GsplatHook
+from ._hook import Hook
 from ._rasterizer import MODULES
 from ._script import imported_packages, run_script, set_command_line
+from .gsplat import Installation
 from .inria import RasterizerHook, Scope, Steps
 
 __all__ = ["main"]
 
 _OF_INRIA = ("scope", "outputs", "steps", "viewer", "allow_zeros")  # options that mean nothing to a script of gsplat's
+
+_REPORTED = ("script", "arguments", "regularizer", "dropout", "noise", "start", "ramp", "scope", "seed", "cpu")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -44,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: of the launcher, the script and the arguments of the script; those of the process by default.
     """
     options = _parse(arguments)
-    hook: RasterizerHook | GsplatHook | None = options.hook
+    hook: Hook | None = options.hook
     set_command_line(options.script, options.arguments)
     with _reported(options, hook), ExitStack() as undo:
         if options.cpu:
@@ -58,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run_script(options.script)
 
 
-def _uninstall(hook: RasterizerHook | GsplatHook) -> None:
+def _uninstall(hook: Hook) -> None:
     """Uninstall a hook unless the script has wrapped the class once more."""
     with suppress(RuntimeError):
         hook.uninstall()
@@ -134,7 +137,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def _hook(options: argparse.Namespace) -> RasterizerHook | GsplatHook | None:
+def _hook(options: argparse.Namespace) -> Hook | None:
     """Make the hook that the options ask for; None if they ask for no regularizer."""
 
     def scheduled(rate: float) -> Schedule:
@@ -150,7 +153,7 @@ def _hook(options: argparse.Namespace) -> RasterizerHook | GsplatHook | None:
     if not members:
         return None
     if options.gsplat:
-        return GsplatHook(Chain(*members), seed=options.seed, patience=options.patience)
+        return Installation(Chain(*members), seed=options.seed, patience=options.patience)
     return RasterizerHook(
         Chain(*members),
         scope=options.scope,
@@ -163,7 +166,7 @@ def _hook(options: argparse.Namespace) -> RasterizerHook | GsplatHook | None:
 
 
 @contextmanager
-def _reported(options: argparse.Namespace, hook: RasterizerHook | GsplatHook | None) -> Iterator[None]:
+def _reported(options: argparse.Namespace, hook: Hook | None) -> Iterator[None]:
     """Say at the end, whatever it is, what was done; exit with 1 if that is not what was asked for."""
     ended, problem = "finished", None
     try:
@@ -178,21 +181,9 @@ def _reported(options: argparse.Namespace, hook: RasterizerHook | GsplatHook | N
         ended = f"{type(error).__name__}: {error}".rstrip(": ")
         raise
     finally:
-        report: dict[str, Any] = {
-            "script": str(options.script),
-            "arguments": options.arguments,
-            "regularizer": options.regularizer,
-            "dropout": options.dropout,
-            "noise": options.noise,
-            "start": options.start,
-            "ramp": options.ramp,
-            "scope": options.scope,
-            "seed": options.seed,
-            "cpu": options.cpu,
-            "ended": ended,
-            "problem": problem,
-            "renders": None if hook is None else hook.tally.as_dict(),
-        }
+        report: dict[str, Any] = {name: getattr(options, name) for name in _REPORTED}
+        report |= {"script": str(options.script), "ended": ended, "problem": problem}
+        report["renders"] = None if hook is None else hook.tally.as_dict()
         lines = ["no regularization was asked for; the script ran plain"] if hook is None else hook.tally.lines()
         name = options.script.name if isinstance(options.script, Path) else options.script
         for line in [f"{name}: {ended}", *lines, *([f"ERROR: {problem}"] if problem else [])]:

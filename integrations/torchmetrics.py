@@ -98,16 +98,10 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
         return value
 
     def update(self, opacity: Tensor, view: Any, *, index: int | None = None) -> None:
-        """Measure one view and count it.
-
-        Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
-            view: passed on to the render callable as it is.
-            index: position of the view among all views, as for :meth:`ca_reg.CAScore.update`.
+        """Measure one view and count it; arguments as for :meth:`ca_reg.CAScore.update`.
 
         Raises:
-            TypeError: as for a call of the score.
-            ValueError: as for a call of the score.
+            TypeError, ValueError: as for a call of the score.
         """
         tally = ViewTally()
         tally.add(self.score(opacity, view, index=self._position(self.update_count - 1) if index is None else index))
@@ -123,14 +117,7 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
             return self._summarize()
 
     def plot(self, val: Tensor | Sequence[Tensor] | None = None, ax: Any = None) -> Any:
-        """Draw one value or a sequence of them, by default the present mean.
-
-        Args:
-            val: what ``forward`` or ``compute`` returned, or a list of such.
-            ax: matplotlib axes to draw on; a new figure by default.
-
-        Returns:
-            The figure and the axes.
+        """Draw one value or a sequence of them, by default the present mean; return the figure and its axes.
 
         Raises:
             ModuleNotFoundError: if matplotlib is missing; it comes with ``ca_reg[plot]``.

@@ -93,19 +93,8 @@ def gaussian_dropout(
 ) -> tuple[Tensor, Tensor | None]:
     """Draw a mask and apply it: :func:`draw_keep_mask`, then :func:`apply_dropout`.
 
-    Args:
-        opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
-        p: drop rate in [0, 1).
-        compensate: multiply the survivors by ``1 / (1 - p)``.
-        generator: source of the draw; the global state of the random numbers is then untouched.
-
-    Returns:
-        The masked opacities and the mask of shape (N,). With ``p = 0`` the very same ``opacity`` and None: nothing is
-        drawn.
-
-    Raises:
-        TypeError: if ``opacity`` is not a floating-point tensor.
-        ValueError: if its shape is neither (N,) nor (N, 1), or ``p`` is outside [0, 1).
+    Arguments and errors are theirs. Returns the masked opacities and the mask of shape (N,); with ``p = 0`` the very
+    same ``opacity`` and None: nothing is drawn.
 
     Example:
         >>> opacity, keep = gaussian_dropout(torch.full((4, 1), 0.5), 0.2)

@@ -27,22 +27,12 @@ from torch import Tensor
 from ca_reg.functional.multipliers import Multiplier
 
 __all__ = [
-    "PixelMoments",
-    "alpha_moments",
-    "contributions",
-    "first_order_variance",
-    "neutral_background",
-    "pixel_moments",
-]
+    "PixelMoments", "alpha_moments", "contributions", "first_order_variance", "neutral_background", "pixel_moments"
+]  # fmt: skip
 
 
 class PixelMoments(NamedTuple):
-    """Mean and variance over the random factors.
-
-    Args:
-        mean: expected value of the pixel, shape (..., C) for colours, (...) for the accumulated alpha.
-        variance: its variance, at least 0, same shape.
-    """
+    """Mean and variance over the random factors, (..., C) for colours, (...) for the accumulated alpha."""
 
     mean: Tensor
     variance: Tensor
@@ -64,9 +54,6 @@ def pixel_moments(
         colors: their colours, finite also in the padding, shape (..., n, C), same dtype.
         multiplier: moments of the factor. Tensors in it must broadcast to the shape of ``alphas``.
         background: colour behind the last splat, shape (C,) or (..., C); None for zero.
-
-    Returns:
-        Mean and variance per pixel and channel, shape (..., C).
 
     Raises:
         TypeError: if an argument is not a tensor, or the dtypes are not float32 or float64, or differ.
@@ -91,20 +78,7 @@ def contributions(
     attribute the whole score. The i-th one is the part of the variance that is due to the factor of splat i, given
     those in front, averaged over those behind; splats behind it matter only by their expected colour.
 
-    Convention: splats are ordered by depth, the nearest first.
-
-    Args:
-        alphas: as for :func:`pixel_moments`, shape (..., n).
-        colors: shape (..., n, C).
-        multiplier: moments of the factor.
-        background: shape (C,) or (..., C); None for zero.
-
-    Returns:
-        The contributions, shape (..., n, C); 0 in the padding.
-
-    Raises:
-        TypeError: as :func:`pixel_moments`.
-        ValueError: as :func:`pixel_moments`.
+    Arguments, order and errors are those of :func:`pixel_moments`. Returns shape (..., n, C), 0 in the padding.
 
     Example:
         >>> alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[1.0], [1.0]])
@@ -117,16 +91,7 @@ def contributions(
 def alpha_moments(alphas: Tensor, multiplier: Multiplier) -> PixelMoments:
     """Return the exact mean and variance of the accumulated alpha: that of white splats over black.
 
-    Args:
-        alphas: as for :func:`pixel_moments`, shape (..., n).
-        multiplier: moments of the factor.
-
-    Returns:
-        Mean and variance, shape (...).
-
-    Raises:
-        TypeError: as :func:`pixel_moments`.
-        ValueError: as :func:`pixel_moments`.
+    Arguments, order and errors are those of :func:`pixel_moments`. Mean and variance have shape (...).
 
     Example:
         >>> alpha_moments(torch.tensor([0.5, 0.5]), Multiplier.dropout(0.5)).mean
@@ -150,19 +115,8 @@ def neutral_background(alphas: Tensor, colors: Tensor, multiplier: Multiplier) -
     Pass it as ``background`` of :func:`pixel_moments` or :func:`contributions`; the mean is then ``b``.
     Differentiable; detach it to hold it fixed in a penalty.
 
-    Convention: splats are ordered by depth, the nearest first.
-
-    Args:
-        alphas: as for :func:`pixel_moments`, shape (..., n).
-        colors: shape (..., n, C).
-        multiplier: moments of the factor; only its mean matters.
-
-    Returns:
-        The colour, shape (..., C); 0 where nothing covers the pixel, whose variance is 0 over any background.
-
-    Raises:
-        TypeError: as :func:`pixel_moments`.
-        ValueError: as :func:`pixel_moments`.
+    Arguments, order and errors are those of :func:`pixel_moments`; of the multiplier only the mean matters. Returns
+    shape (..., C), 0 where nothing covers the pixel, whose variance is 0 over any background.
 
     Example:
         >>> alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[1.0], [0.0]])
@@ -188,17 +142,8 @@ def first_order_variance(alphas: Tensor, colors: Tensor, multiplier: Multiplier)
     background. It is right for a single splat over black and in the limit of small accumulated alpha over black, and
     otherwise mostly too large, the more so the longer the list.
 
-    Args:
-        alphas: as for :func:`pixel_moments`, shape (..., n).
-        colors: shape (..., n, C).
-        multiplier: moments of the factor; only its variance matters.
-
-    Returns:
-        The approximate variance per pixel and channel, shape (..., C).
-
-    Raises:
-        TypeError: as :func:`pixel_moments`.
-        ValueError: as :func:`pixel_moments`.
+    Arguments and errors are those of :func:`pixel_moments`; of the multiplier only the variance matters. Returns the
+    approximate variance per pixel and channel, shape (..., C).
 
     Example:
         >>> alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[1.0], [1.0]])

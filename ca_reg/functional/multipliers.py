@@ -77,12 +77,8 @@ class Multiplier:
         this: hand the renderer ``opacity / (1 - p)``, as its survivors have it, and take the multiplier *without*
         ``compensate``.
 
-        Args:
-            p: drop rate in [0, 1), a number or one for each Gaussian.
-            compensate: survivors are multiplied by ``1 / (1 - p)``, without the renderer's clamp.
-
         Raises:
-            TypeError: if ``p`` is not a number.
+            TypeError: if ``p`` is neither a number nor one for each Gaussian.
             ValueError: if ``p`` is outside [0, 1).
         """
         check_rate(p)
@@ -95,9 +91,7 @@ class Multiplier:
         A good approximation while few draws reach the clamp, that is for ``sigma`` well below 1 and opacities well
         below ``1 / (1 + sigma)``; :meth:`clamped_noise` is without that restriction.
 
-        Args:
-            sigma: standard deviation of the relative noise, at least 0.
-            clip: the draw is clipped to [-sigma, sigma], which leaves 0.516 of its variance.
+        With ``clip`` the draw is clipped to [-sigma, sigma], which leaves 0.516 of its variance.
 
         Raises:
             TypeError: if ``sigma`` is not a number.

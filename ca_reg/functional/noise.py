@@ -25,9 +25,7 @@ def draw_opacity_noise(
         sigma: standard deviation, at least 0.
         clip: clip the draw to [-sigma, sigma], as the authors' released code does and the paper does not say. The
             variance is then 0.516 sigma^2.
-        generator: source of the draw; the global state of the random numbers is then untouched. It decides where the
-            numbers are drawn, so one CPU generator gives the same noise for every device. Not inside a function that
-            ``torch.utils.checkpoint`` recomputes: draw outside it.
+        generator: source of the draw, with the limits of :func:`~ca_reg.functional.draw_keep_mask`.
         device: where the noise is returned; by default where it was drawn.
 
     Returns:
@@ -61,11 +59,8 @@ def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:
     1, whose mean therefore falls.
 
     Args:
-        opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+        opacity: activated opacities in [0, 1], shape (N,) or (N, 1), as those that are returned.
         noise: relative noise, shape (N,).
-
-    Returns:
-        The noisy opacities, a new tensor of the same shape and dtype as ``opacity``.
 
     Raises:
         TypeError: if an argument is not a tensor, or ``opacity`` is not floating point.
@@ -88,19 +83,8 @@ def opacity_noise(
 ) -> tuple[Tensor, Tensor | None]:
     """Draw noise and apply it: :func:`draw_opacity_noise`, then :func:`apply_opacity_noise`.
 
-    Args:
-        opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
-        sigma: standard deviation of the relative noise, at least 0. The paper tunes it in [0.05, 0.8].
-        clip: clip the draw to [-sigma, sigma].
-        generator: source of the draw; the global state of the random numbers is then untouched.
-
-    Returns:
-        The noisy opacities in [0, 1] and the noise of shape (N,). With ``sigma = 0`` the very same ``opacity`` and
-        None: nothing is drawn.
-
-    Raises:
-        TypeError: if ``opacity`` is not a floating-point tensor.
-        ValueError: if its shape is neither (N,) nor (N, 1), or ``sigma`` is negative or not finite.
+    Arguments and errors are theirs; the paper tunes ``sigma`` in [0.05, 0.8]. Returns the noisy opacities in [0, 1] and
+    the noise of shape (N,); with ``sigma = 0`` the very same ``opacity`` and None: nothing is drawn.
 
     Example:
         >>> noisy, noise = opacity_noise(torch.full((4,), 0.5), 0.1)

@@ -18,11 +18,8 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
     dropout, when it is rendered for a test or exported.
 
     Args:
-        opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+        opacity: activated opacities in [0, 1], shape (N,) or (N, 1); returned as they are with ``p = 0``.
         p: the drop rate of the training, in [0, 1); a number, or one for each Gaussian, shape (N,).
-
-    Returns:
-        The scaled opacities, same shape and dtype; with ``p = 0`` the very same ``opacity``.
 
     Raises:
         TypeError: if ``opacity`` is not a floating-point tensor.
@@ -52,13 +49,9 @@ def expected_opacity(opacity: Tensor, sigma: float, *, clip: bool = False) -> Te
     not, because the factor of the noise depends on the opacity.
 
     Args:
-        opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
+        opacity: activated opacities in [0, 1], shape (N,) or (N, 1); returned as they are with ``sigma = 0``.
         sigma: standard deviation of the relative noise of the training, at least 0.
         clip: the draw was clipped to [-sigma, sigma].
-
-    Returns:
-        The mean opacities in [0, 1], same shape and dtype, differentiable; with ``sigma = 0`` the very same
-        ``opacity``.
 
     Raises:
         TypeError: if ``opacity`` is not a floating-point tensor or ``sigma`` not a number.

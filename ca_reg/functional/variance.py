@@ -15,11 +15,9 @@ __all__ = ["ColorVariance", "color_variance"]
 class ColorVariance(NamedTuple):
     """Colour variance of an image and of its pixels.
 
-    Args:
-        value: mean of ``variance`` over the covered pixels, a scalar tensor; nan if there is none.
-        variance: per pixel, mean over RGB, shape (...); 0 where nothing covers the pixel.
-        covered: pixels whose weights do not sum to zero, shape (...), bool.
-        reason: ``Reason.OK``, or ``Reason.EMPTY`` if no pixel is covered.
+    The value is the mean over the covered pixels, a scalar, nan if there are none, which the reason then says. The
+    variance of a pixel, (...), is the mean over RGB, 0 where nothing covers it; covered, (...) bool, are the pixels
+    whose weights do not sum to zero.
     """
 
     value: Tensor
@@ -40,9 +38,6 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
         weights: blend weights ``w_i = alpha_i T_i``, at least 0, shape (..., n). A zero stands for no splat, so lists
             of different lengths are padded with zeros.
         colors: their colours, shape (..., n, 3).
-
-    Returns:
-        The mean over covered pixels, the map, the mask of covered pixels and the reason.
 
     Raises:
         TypeError: if an argument is not a tensor.

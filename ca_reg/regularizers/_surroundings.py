@@ -9,34 +9,25 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from ca_reg import functional
-from ca_reg._check import Rate, check_count, check_rate, is_zero
+from ca_reg._check import Rate, check_count, check_rate
 from ca_reg.neighbors import nearest_neighbors
 from ca_reg.params import Params
 from ca_reg.regularizers.independent import IndependentDropout
 from ca_reg.schedules import Schedule
 
 __all__ = [
-    "RankedDropout",
-    "Refreshed",
-    "SurroundingsDropout",
-    "camera_depths",
-    "mean_distances",
-    "neighbors_of",
+    "RankedDropout", "Refreshed", "SurroundingsDropout", "camera_depths", "mean_distances", "neighbors_of",
     "relative_ranks",
-]
+]  # fmt: skip
 
 
 class Refreshed(nn.Module):
-    """A tensor of one row per Gaussian that is computed anew every so many steps, and when their number changes.
+    """A tensor of one row per Gaussian that is computed anew ``every`` so many steps, and when their number changes.
 
     Without a step between two calls it is computed anew unless the very same means come again, unchanged: one object
     may score several models. ``state_dict`` holds the tensor and its step, so that a resumed run goes on with them; a
     checkpoint without them starts afresh. Not noticed is a pruning of as many Gaussians as were added, until the next
     time.
-
-    Args:
-        every: steps from one computation to the next, at least 1.
     """
 
     value: Tensor | None
@@ -86,18 +77,13 @@ class SurroundingsDropout(IndependentDropout):
     """Drop independently, at rates that follow from what is around each Gaussian; a subclass says from what and how.
 
     In training that is computed every so many steps (:class:`Refreshed`), at test time from the model that is rendered.
-
-    Args:
-        schedule: a rate that follows the step.
-        every: steps from one look at the neighbors to the next; a change of their number is another occasion.
-        compensate: scale the survivors in training.
-        scale: scale the opacities in evaluation.
+    The other arguments are those of :class:`~ca_reg.IndependentDropout`.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("means",)
 
     def __init__(
-        self, schedule: Schedule | None = None, *, every: int, compensate: bool = False, scale: bool = True
+        self, schedule: float | Schedule | None = None, *, every: int, compensate: bool = False, scale: bool = True
     ) -> None:
         super().__init__(schedule, compensate=compensate, scale=scale)
         self.trained, self.tested = Refreshed(every), Refreshed(1)
@@ -114,18 +100,24 @@ class SurroundingsDropout(IndependentDropout):
         """Return the rates by the neighbors of some former step."""
         return self.rates_from(x, lambda: self.trained(x, self.measure))
 
-    def expected(self, x: Params) -> Params:
-        """Scale by ``1 - p``, or not; the rates are those of ``x``, whatever the steps before."""
-        if self.compensate or not self.scale:
-            return x
-        rates = self.rates_from(x, lambda: self.tested(x, self.measure))
-        return x if is_zero(rates) else x._replace(opacities=functional.scale_opacity(x.opacities, rates))
+    def test_rates(self, x: Params) -> Rate:
+        """Return the rates by the neighbors of now, whatever the steps before."""
+        return self.rates_from(x, lambda: self.tested(x, self.measure))
 
 
 class RankedDropout(SurroundingsDropout):
     """Rates between two bounds, by the rank of something that is measured: the base of density and geometry."""
 
-    def __init__(self, low: float, high: float, k: int, *, every: int, compensate: bool, scale: bool) -> None:
+    def __init__(
+        self,
+        low: float = 0.2,
+        high: float = 0.5,
+        k: int = 3,
+        *,
+        every: int = 100,
+        compensate: bool = False,
+        scale: bool = True,
+    ) -> None:
         check_rate(low, "low")
         check_rate(high, "high")
         check_count(k, "k", minimum=1)
@@ -135,10 +127,6 @@ class RankedDropout(SurroundingsDropout):
     def rates_from(self, x: Params, look: Callable[[], Tensor]) -> Rate:
         """Return ``low + (high - low) rank``."""
         return self.low if self.low == self.high else self.low + (self.high - self.low) * look()
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"low={self.low}, high={self.high}, k={self.k}, scale={self.scale}"
 
 
 def _version(x: Tensor) -> int:

@@ -80,10 +80,6 @@ class BinaryConcrete(Regularizer):
         """Return ``x``, and the soft mask as its factor; exact but for the renderer's cut-off of faint alphas."""
         return x, Multiplier(*concrete_moments(self.logits(x), self.temperature, self.floor))
 
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"temperature={self.temperature}, floor={self.floor}"
-
 
 def concrete_moments(logits: Rate, temperature: float, floor: float = 0.0) -> tuple[Rate, Rate]:
     """Return mean and variance of ``y = clamp(1 - z, floor, 1 - floor)``, z as in :class:`BinaryConcrete`.
@@ -94,15 +90,8 @@ def concrete_moments(logits: Rate, temperature: float, floor: float = 0.0) -> tu
         E y = floor + integral T(s) ds,     E (y - floor)^2 = integral 2 (s - floor) T(s) ds
 
     which the double-exponential rule does to rounding, the logarithms at 0 and 1 included. Rates above 1/2 are taken
-    thus and rates below mirrored, ``y -> 1 - y``, so that nothing cancels at either end.
-
-    Args:
-        logits: ``log(p / (1 - p))``, a number or any tensor.
-        temperature: above 0 and at most 1.
-        floor: in [0, 0.5).
-
-    Returns:
-        Mean and variance, as ``logits``, differentiable.
+    thus and rates below mirrored, ``y -> 1 - y``, so that nothing cancels at either end. The logits,
+    ``log(p / (1 - p))``, are a number or any tensor; mean and variance are the same, differentiable.
 
     Example:
         >>> mean, variance = concrete_moments(torch.tensor([-2.0, 0.0, 2.0]), 0.1)

@@ -10,7 +10,7 @@ from ca_reg._check import Rate, check_count, check_rate, is_zero
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Regularizer
 from ca_reg.regularizers._surroundings import Refreshed, neighbors_of
-from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.schedules import Schedule
 
 __all__ = ["ClusteredDropout"]
 
@@ -45,25 +45,19 @@ class ClusteredDropout(Regularizer):
     """
 
     needs = ("means",)
+    rate_name = "p"
 
     def __init__(self, p: float | Schedule, k: int = 10, *, every: int = 100) -> None:
-        if not callable(p):
-            check_rate(p)
         check_count(k, "k", minimum=1)
-        super().__init__(as_schedule(p))
+        super().__init__(p)
         self.k = k
         self.neighbors = Refreshed(every)
 
-    def _check_rate(self, rate: float, step: int) -> None:
-        check_rate(rate, f"p at step {step}")
+    def _check_rate(self, rate: float, name: str) -> None:
+        check_rate(rate, name)
 
     def anchor_rate(self, rate: Rate, neighbors: Tensor) -> Rate:
-        """Return the rate of the anchors.
-
-        Args:
-            rate: ``p`` of the step.
-            neighbors: numbers of the neighbors of every Gaussian, shape (N, k).
-        """
+        """Return the rate of the anchors, given ``p`` of the step and the numbers of everybody's neighbors, (N, k)."""
         clusters = 1 + neighbors.flatten().bincount(minlength=len(neighbors))
         counts = clusters.bincount().double().cpu()
         sizes = torch.arange(len(counts), dtype=torch.float64)
@@ -90,7 +84,3 @@ class ClusteredDropout(Regularizer):
     def replay(self, x: Params, draw: Draw) -> Params:
         """Set the opacities of the dropped to 0."""
         return x if draw.keep is None else x._replace(opacities=functional.apply_dropout(x.opacities, draw.keep))
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"p={self._rate_repr()}, k={self.k}"

@@ -50,12 +50,12 @@ class ConcreteDropout(BinaryConcrete):
         if not 0 < p < 1:
             raise ValueError(f"p must be in (0, 1), got {p}: its logit is learned.")
         check_finite(rate, "rate", minimum=0.0)
-        self._learned = Learned(math.log(p / (1 - p)), rate)
+        self.p, self.rate = p, rate
 
     @property
     def learns(self) -> Mapping[str, Learned]:  # type: ignore[override]
         """The logits of the rates."""
-        return {"dropout_logits": self._learned}
+        return {"dropout_logits": Learned(math.log(self.p / (1 - self.p)), self.rate)}
 
     def logits(self, x: Params) -> Tensor:
         """Return what was learned."""

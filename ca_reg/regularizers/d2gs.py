@@ -16,7 +16,7 @@ from ca_reg.regularizers._surroundings import (
     mean_distances,
     relative_ranks,
 )
-from ca_reg.schedules import LinearRamp, Schedule, as_schedule
+from ca_reg.schedules import LinearRamp, Schedule
 
 __all__ = ["D2GSDropout"]
 
@@ -65,6 +65,7 @@ class D2GSDropout(SurroundingsDropout):
     """
 
     needs = ("means", "view_matrix")
+    rate_name = "rate"
 
     def __init__(
         self,
@@ -80,10 +81,9 @@ class D2GSDropout(SurroundingsDropout):
         check_finite(depth_weight, "depth_weight", minimum=0.0)
         check_finite(density_weight, "density_weight", minimum=0.0)
         check_count(k, "k", minimum=1)
-        super().__init__(as_schedule(rate), every=every, scale=scale)
-        self.weights = (depth_weight, density_weight)
-        self.k = k
-        self.literal = literal
+        super().__init__(rate, every=every, scale=scale)
+        self.depth_weight, self.density_weight = depth_weight, density_weight
+        self.k, self.literal = k, literal
         if literal:
             self.trained = _ByStepsAlone(every)
 
@@ -106,16 +106,9 @@ class D2GSDropout(SurroundingsDropout):
             nearness, density = 1 - relative_ranks(depths), look()
         ordered = depths.sort().values
         near, far = (ordered[int(len(depths) * quantile)] for quantile in QUANTILES)
-        tier = (
-            torch.full_like(depths, TIERS[2]).masked_fill(depths <= far, TIERS[1]).masked_fill(depths <= near, TIERS[0])
-        )
-        return rate * tier * (self.weights[0] * nearness + self.weights[1] * density)
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return (
-            f"rate={self._rate_repr()}, weights={self.weights}, k={self.k}, literal={self.literal}, scale={self.scale}"
-        )
+        tier = torch.full_like(depths, TIERS[2]).masked_fill_(depths <= far, TIERS[1])
+        tier.masked_fill_(depths <= near, TIERS[0])
+        return rate * tier * (self.depth_weight * nearness + self.density_weight * density)
 
 
 class _ByStepsAlone(Refreshed):

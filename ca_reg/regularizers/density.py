@@ -36,18 +36,6 @@ class DensityDropout(RankedDropout):
         tensor([0.4250, 0.4250, 0.4250, 0.2750, 0.2000])
     """
 
-    def __init__(
-        self,
-        low: float = 0.2,
-        high: float = 0.5,
-        k: int = 3,
-        *,
-        every: int = 100,
-        compensate: bool = False,
-        scale: bool = True,
-    ) -> None:
-        super().__init__(low, high, k, every=every, compensate=compensate, scale=scale)
-
     def measure(self, means: Tensor) -> Tensor:
         """Return the rank of the density, (N,)."""
         return relative_ranks(-mean_distances(means, self.k))

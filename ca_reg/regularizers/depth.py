@@ -7,7 +7,7 @@ from ca_reg.params import Params
 from ca_reg.regularizers._surroundings import camera_depths, relative_ranks
 from ca_reg.regularizers.d2gs import RATE
 from ca_reg.regularizers.independent import IndependentDropout
-from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.schedules import Schedule
 
 __all__ = ["DepthDropout"]
 
@@ -43,18 +43,14 @@ class DepthDropout(IndependentDropout):
     """
 
     needs = ("means", "view_matrix")
+    rate_name = "rate"
 
     def __init__(
-        self,
-        rate: float | Schedule = RATE,
-        near: float = 1.0,
-        far: float = 0.3,
-        *,
-        scale: bool = False,
+        self, rate: float | Schedule = RATE, near: float = 1.0, far: float = 0.3, *, scale: bool = False
     ) -> None:
         check_finite(near, "near", minimum=0.0)
         check_finite(far, "far", minimum=0.0)
-        super().__init__(as_schedule(rate), scale=scale)
+        super().__init__(rate, scale=scale)
         self.near, self.far = near, far
 
     def rates(self, x: Params) -> Rate:
@@ -63,7 +59,3 @@ class DepthDropout(IndependentDropout):
         if is_zero(rate):
             return 0.0
         return rate * (self.near + (self.far - self.near) * relative_ranks(camera_depths(x)))
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"rate={self._rate_repr()}, near={self.near}, far={self.far}, scale={self.scale}"

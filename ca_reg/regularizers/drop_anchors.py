@@ -40,6 +40,8 @@ class AnchorDropout(ClusteredDropout):
         False
     """
 
+    rate_name = "rate"
+
     def __init__(self, rate: float | Schedule = RATE, k: int = 10, *, every: int = 100) -> None:
         super().__init__(rate, k, every=every)
 

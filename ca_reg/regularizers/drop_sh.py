@@ -11,7 +11,7 @@ from ca_reg import functional
 from ca_reg._check import check_count, check_rate, is_zero
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Regularizer
-from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.schedules import Schedule
 
 __all__ = ["SHDropout"]
 
@@ -41,19 +41,18 @@ class SHDropout(Regularizer):
 
     needs = ("sh",)
     drops = False
+    rate_name = "p"
 
     def __init__(self, p: float | Schedule = 0.2, until: Sequence[int] = (2_000, 4_000, 6_000)) -> None:
-        if not callable(p):
-            check_rate(p)
         for step in until:
             check_count(step, "until", minimum=0)
         if list(until) != sorted(until):
             raise ValueError(f"until must be steps in rising order, got {tuple(until)}.")
-        super().__init__(as_schedule(p))
+        super().__init__(p)
         self.until = tuple(until)
 
-    def _check_rate(self, rate: float, step: int) -> None:
-        check_rate(rate, f"p at step {step}")
+    def _check_rate(self, rate: float, name: str) -> None:
+        check_rate(rate, name)
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw who shows all degrees, (N,) bool, beside the number of bands that the others show."""
@@ -72,7 +71,3 @@ class SHDropout(Regularizer):
         whole, bands = draw.value
         low, high = x.sh[:, :bands], x.sh[:, bands:]
         return x._replace(sh=torch.cat([low, high.masked_fill(~whole[:, None, None], 0.0)], dim=1))
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"p={self._rate_repr()}, until={self.until}"

@@ -9,7 +9,7 @@ from ca_reg._check import Rate, check_rate
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Given
 from ca_reg.regularizers.independent import IndependentDropout
-from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.schedules import Schedule
 
 __all__ = ["GaussianDropout"]
 
@@ -21,8 +21,7 @@ class GaussianDropout(IndependentDropout):
     survivors are multiplied by ``1 / (1 - p)`` in training instead, and evaluation leaves the opacities as they are.
     The two schemes are not equivalent: compositing is not linear in the opacities, and rasterizers clamp the alpha of
     survivors, so that Gaussians of an opacity above ``0.99 (1 - p)`` are more opaque in evaluation than the mean over
-    all masks. The module has no
-    parameters; put it between the activation of the opacities and the rasterizer.
+    all masks. The module has no parameters; put it between the activation of the opacities and the rasterizer.
 
     Dropped Gaussians must leave no trace in density control: pass the radii through
     :meth:`~ca_reg.Regularizer.mask_radii`.
@@ -58,42 +57,29 @@ class GaussianDropout(IndependentDropout):
         tensor([0.4000, 0.4000, 0.4000, 0.4000, 0.4000])
     """
 
+    rate_name = "p"
+
     def __init__(self, p: float | Schedule, *, compensate: bool = False) -> None:
-        if not callable(p):
-            check_rate(p)
-        super().__init__(as_schedule(p), compensate=compensate)
+        super().__init__(p, compensate=compensate)
 
     @property
     def p(self) -> float:
         """The drop rate at the present step."""
         return self._present_rate()
 
-    def _check_rate(self, rate: float, step: int) -> None:
-        check_rate(rate, f"p at step {step}")
+    def _check_rate(self, rate: float, name: str) -> None:
+        check_rate(rate, name)
 
     def forward(  # type: ignore[override]
         self, opacity: Given, *, keep: Tensor | None = None, generator: torch.Generator | None = None
     ) -> Given:
         """Return the opacities to render.
 
-        Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
-            keep: a former mask to apply again instead of drawing one, shape (N,), bool; in training only.
-            generator: source of the draw; the global state of the random numbers is then untouched.
-
-        Returns:
-            Opacities of the same shape and dtype; the very same tensor if there is nothing to do.
-
-        Raises:
-            TypeError: if ``opacity`` is not a floating-point tensor or ``keep`` not a bool one.
-            ValueError: if a shape is wrong, ``opacity`` looks like logits, or ``keep`` is given in evaluation.
+        As :meth:`Regularizer.forward <ca_reg.Regularizer.forward>`; ``keep``, (N,) bool, is a former mask to apply
+        again instead of drawing one, in training only.
         """
         return super().forward(opacity, drawn=None if keep is None else Draw(keep, keep), generator=generator)
 
     def rates(self, x: Params) -> Rate:
         """Return the rate of the step."""
         return self._rate_at(x.step)
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"p={self._rate_repr()}, compensate={self.compensate}"

@@ -59,16 +59,10 @@ class GeometryDropout(RankedDropout):
 
 
 def surface_variation(means: Tensor, k: int) -> Tensor:
-    """Return the share of the smallest eigenvalue in the covariance of each point and its k nearest neighbors.
+    """Return the share of the smallest eigenvalue in the covariance of each point (N, 3) and its k nearest neighbors.
 
-    The definition is that of Pauly, Gross and Kobbelt, "Efficient simplification of point-sampled surfaces" (2002).
-
-    Args:
-        means: shape (N, 3).
-        k: number of neighbors.
-
-    Returns:
-        In [0, 1/3], shape (N,): 0 on a plane or a line, 1/3 where all directions are alike; 0 if all points coincide.
+    The definition is that of Pauly, Gross and Kobbelt, "Efficient simplification of point-sampled surfaces" (2002). In
+    [0, 1/3], (N,): 0 on a plane or a line, 1/3 where all directions are alike; 0 if all points coincide.
     """
     _, numbers = neighbors_of(means, k)
     offsets = torch.cat([torch.zeros_like(means)[:, None], means[numbers] - means[:, None]], dim=1)

@@ -33,7 +33,9 @@ class IndependentDropout(Regularizer):
         tensor([0.4000, 1.0000])
     """
 
-    def __init__(self, schedule: Schedule | None = None, *, compensate: bool = False, scale: bool = True) -> None:
+    def __init__(
+        self, schedule: float | Schedule | None = None, *, compensate: bool = False, scale: bool = True
+    ) -> None:
         super().__init__(schedule)
         self.compensate = compensate
         self.scale = scale
@@ -42,6 +44,10 @@ class IndependentDropout(Regularizer):
     def rates(self, x: Params) -> Rate:
         """Return the drop rates in [0, 1) at ``x``: a number, or one for each Gaussian, shape (N,)."""
         raise NotImplementedError
+
+    def test_rates(self, x: Params) -> Rate:
+        """Return the rates by which :meth:`expected` scales."""
+        return self.rates(x)
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw which Gaussians stay."""
@@ -64,7 +70,7 @@ class IndependentDropout(Regularizer):
         """Scale by ``1 - p``, or not."""
         if self.compensate or not self.scale:
             return x
-        opacities = functional.scale_opacity(x.opacities, self.rates(x))
+        opacities = functional.scale_opacity(x.opacities, self.test_rates(x))
         return x if opacities is x.opacities else x._replace(opacities=opacities)
 
     def multiplied(self, x: Params) -> tuple[Params, Multiplier]:

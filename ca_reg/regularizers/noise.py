@@ -71,18 +71,8 @@ class OpacityNoise(ParameterNoise):
     ) -> Given:
         """Return the opacities to render.
 
-        Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
-            noise: a former draw to apply again instead of drawing one, shape (N,); in training only.
-            generator: source of the draw; the global state of the random numbers is then untouched.
-
-        Returns:
-            Opacities of the same shape and dtype; the very same tensor if there is nothing to do.
-
-        Raises:
-            TypeError: if ``opacity`` is not a floating-point tensor.
-            ValueError: if a shape is wrong, ``opacity`` looks like logits, or ``noise`` is given in evaluation; with
-                ``scale`` in evaluation also if an opacity is above 1.
+        As :meth:`Regularizer.forward <ca_reg.Regularizer.forward>`; ``noise``, (N,), is a former draw to apply again
+        instead of a new one, in training only. With ``scale`` an opacity above 1 is a ValueError in evaluation.
         """
         return super().forward(opacity, drawn=None if noise is None else Draw(noise), generator=generator)
 
@@ -108,7 +98,3 @@ class OpacityNoise(ParameterNoise):
             return x, Multiplier(1.0, 0.0)
         multiplier = Multiplier.clamped_noise(x.opacities, float(sigma), clip=self.clip)
         return x._replace(opacities=x.opacities.clamp(max=1.0)), multiplier
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"{super().extra_repr()}, scale={self.scale}"

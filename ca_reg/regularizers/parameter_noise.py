@@ -11,7 +11,7 @@ from ca_reg import functional
 from ca_reg._check import check_finite, is_zero
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Regularizer
-from ca_reg.schedules import Schedule, as_schedule
+from ca_reg.schedules import Schedule
 
 __all__ = ["ParameterNoise"]
 
@@ -45,12 +45,11 @@ class ParameterNoise(Regularizer):
     """
 
     drops = False
+    rate_name = "sigma"
     field: ClassVar[str]
 
     def __init__(self, sigma: float | Schedule, *, clip: bool = False) -> None:
-        if not callable(sigma):
-            check_finite(sigma, "sigma", minimum=0.0)
-        super().__init__(as_schedule(sigma))
+        super().__init__(sigma)
         self.clip = clip
 
     @property
@@ -63,8 +62,8 @@ class ParameterNoise(Regularizer):
         """The last draw, float32, the shape of the parameter; None if there was none."""
         return None if self.last is None else self.last.value
 
-    def _check_rate(self, rate: float, step: int) -> None:
-        check_finite(rate, f"sigma at step {step}", minimum=0.0)
+    def _check_rate(self, rate: float, name: str) -> None:
+        check_finite(rate, name, minimum=0.0)
 
     def perturb(self, values: Tensor, noise: Tensor) -> Tensor:
         """Return the parameter with the noise, in its own dtype."""
@@ -87,7 +86,3 @@ class ParameterNoise(Regularizer):
             return x
         changed: dict[str, Any] = {self.field: self.perturb(getattr(x, self.field), draw.value)}
         return x._replace(**changed)
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"sigma={self._rate_repr()}, clip={self.clip}"

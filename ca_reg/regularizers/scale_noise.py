@@ -23,8 +23,7 @@ class ScaleNoise(ParameterNoise):
         clip: clip the noise to [-sigma, sigma].
 
     Raises:
-        TypeError: if ``sigma`` is neither a number nor callable.
-        ValueError: if a constant ``sigma`` is negative or not finite; a schedule is checked at each use.
+        TypeError, ValueError: as :class:`~ca_reg.OpacityNoise`.
 
     Example:
         >>> import torch

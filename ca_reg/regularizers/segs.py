@@ -86,7 +86,7 @@ class SEGSNoise(Regularizer):
 
     def extra_repr(self) -> str:
         """Return the arguments, for ``print``."""
-        return self._rate_repr()
+        return repr(self._schedule)
 
 
 def _geometry(x: Params) -> tuple[Tensor, Tensor, Tensor]:

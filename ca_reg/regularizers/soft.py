@@ -60,7 +60,3 @@ class SoftDropout(BinaryConcrete):
         assert x.scales is not None, "checked by check_needs"
         ranks = x.scales.detach().amax(1).argsort(stable=True).argsort()
         return (2 * self.u * (ranks + 0.5) / len(ranks)).to(x.opacities.dtype).logit()
-
-    def extra_repr(self) -> str:
-        """Return the arguments, for ``print``."""
-        return f"u={self.u}, by_size={self.by_size}, {super().extra_repr()}"

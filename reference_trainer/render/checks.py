@@ -27,13 +27,8 @@ def check_projection(
 ) -> None:
     """Raise unless all numbers are finite and the world is not too far from its origin for their precision.
 
-    Args:
-        finite: whether what decides about who is drawn, depths and opacities, and all that is projected are finite;
-            only where they are not are the inputs looked at one by one.
-        projection: M projected Gaussians.
-        colors: of them, shape (M, 3).
-        inputs: the tensors as they were given, N Gaussians first, by name.
-        camera: the view.
+    ``finite`` says whether what decides about who is drawn, depths and opacities, and all that is projected are; only
+    where they are not are the inputs, by name and of all Gaussians, looked at one by one.
 
     Raises:
         NotFiniteError: if an input is nan or infinite, or so large that the projection is; names it.

@@ -32,16 +32,10 @@ class Engine(Protocol):
     name: str
 
     def splat(self, inputs: dict[str, Tensor], camera: Camera, degree: int) -> Splats:
-        """Project the Gaussians that can be seen, colour them, and list them per tile.
+        """Project the Gaussians that can be seen, colour them, and list them per tile, after `check_projection`.
 
-        Args:
-            inputs: means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh (N, K, 3) or colors
-                (N, 3), by name.
-            camera: the view.
-            degree: highest band of sh.
-
-        Raises:
-            NotFiniteError, ValueError: as `reference_trainer.render.checks`.
+        The inputs are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh (N, K, 3), of
+        which the bands up to ``degree`` are used, or colors (N, 3), by name.
         """
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
@@ -51,23 +45,14 @@ class Engine(Protocol):
         """Draw splats front to back over a background (3,): image (3, H, W), alpha (H, W), depth (H, W) if asked."""
 
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
-        """Return mean and variance of every pixel under random factors on the alphas.
+        """Return mean and variance of every pixel under random factors on the alphas of the full model.
 
-        Args:
-            splats: of the full model.
-            multiplier: mean and variance of every splat's factor, shape (M, 2).
-            behind: colours behind everything, shape (3, H, W).
+        The multiplier is mean and variance of every splat's factor, (M, 2), and ``behind`` the colours behind
+        everything, (3, H, W).
         """
 
     def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
-        """Return every splat's share of the weighted variance, (M,), float64.
-
-        Args:
-            splats: as for `moments`, and so on.
-            multiplier: likewise.
-            behind: likewise.
-            weights: of the pixels, shape (H, W).
-        """
+        """Return every splat's share of the variance, (M,), float64, for weights of the pixels (H, W)."""
 
 
 def use_engine(name: str) -> None:
@@ -106,20 +91,12 @@ def chosen_engine() -> str:
 
 
 def engine_for(like: Tensor) -> Engine:
-    """Return the engine that draws tensors of a dtype and device.
-
-    The loops know float32 on a CPU; everything else is drawn by torch, whatever was chosen.
-
-    Args:
-        like: a tensor of them.
-
-    Raises:
-        ValueError: if the environment names an engine that does not exist.
-    """
+    """Return the engine that draws tensors of this dtype and device; raises as `chosen_engine`."""
     return _engine(like.device, like.dtype)
 
 
 def _engine(device: torch.device, dtype: torch.dtype) -> Engine:
+    """Return the loops for float32 on a CPU, unless torch was chosen, which draws everything else."""
     if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
         return _torch_engine()
     return _loop_engine() or _torch_engine()

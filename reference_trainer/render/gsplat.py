@@ -24,28 +24,15 @@ __all__ = ["GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
 
 
 class GsplatSplats(NamedTuple):
-    """What density control reads of `Splats`, under the same names.
+    """What density control reads of `Splats`, under the same names."""
 
-    Args:
-        indices: which of the N Gaussians lie in view, shape (M,).
-        projection: has ``means``, pixel coordinates, shape (M, 2), which keep their gradient.
-        lists: has ``touched``, whether a Gaussian was drawn, shape (M,) bool.
-    """
-
-    indices: Tensor
-    projection: SimpleNamespace
-    lists: SimpleNamespace
+    indices: Tensor  # which of the N Gaussians lie in view, (M,)
+    projection: SimpleNamespace  # has means, pixel coordinates, (M, 2), which keep their gradient
+    lists: SimpleNamespace  # has touched, whether a Gaussian was drawn, (M,) bool
 
 
 class GsplatRendering(NamedTuple):
-    """A rendered view, with the fields of `Rendering`.
-
-    Args:
-        image: colours over the background, not clamped, shape (3, H, W).
-        alpha: accumulated alpha, shape (H, W).
-        depth: sum of weight times camera depth, not divided by alpha, shape (H, W); None unless asked for.
-        splats: what was drawn.
-    """
+    """A rendered view, with the fields of `Rendering`."""
 
     image: Tensor
     alpha: Tensor
@@ -54,10 +41,7 @@ class GsplatRendering(NamedTuple):
 
 
 def load_gsplat_render(device: torch.device | str) -> Callable[..., GsplatRendering]:
-    """Return a function with the arguments of `render` that draws with gsplat.
-
-    Args:
-        device: where the Gaussians are.
+    """Return a function with the arguments of `render` that draws with gsplat, for Gaussians on a device.
 
     Raises:
         RuntimeError: if the device is not a CUDA device, or there is none.
@@ -93,22 +77,9 @@ def render_by(
     background: Tensor | None = None,
     depth: bool = False,
 ) -> GsplatRendering:
-    """Render 3D Gaussians with a rasterization; differentiable in every tensor but the background.
+    """Render 3D Gaussians with ``gsplat.rasterization``, 1.5 or newer; differentiable in all but the background.
 
-    Convention: as `render`.
-
-    Args:
-        rasterization: ``gsplat.rasterization``, version 1.5 or newer.
-        means: world coordinates, shape (N, 3).
-        quaternions: orientation, need not be normalised, shape (N, 4).
-        scales: standard deviations along the axes, positive, shape (N, 3).
-        opacities: activated, in [0, 1], shape (N,) or (N, 1).
-        camera: the view.
-        sh: spherical-harmonic coefficients, shape (N, K, 3), or
-        sh_degree: highest band to evaluate; all of ``sh`` by default.
-        colors: colours, shape (N, 3).
-        background: colour behind everything, shape (3,); black by default.
-        depth: whether to accumulate depth as well.
+    Arguments and conventions are those of `render`.
 
     Raises:
         TypeError: if the Gaussians are not float32, the only kind that gsplat knows.

@@ -23,9 +23,6 @@ def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor
         multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,), one value each.
         background: fixed colour behind everything, shape (3,), or one for each pixel, (3, H, W); black by default.
 
-    Returns:
-        The moments of the colours, and the expected accumulated alpha.
-
     Raises:
         ValueError: if the background has another shape, or is not finite.
 
@@ -51,14 +48,8 @@ def variance_shares(
 
     A Gaussian's share at a pixel is its summand of the variance, `ca_reg.functional.contributions`, mean over RGB.
 
-    Args:
-        splats: of the full model, with its plain opacities.
-        multiplier: moments of the factor, as for `render_moments`.
-        weights: of the pixels, shape (H, W); 1 / count in the region of a score makes shares of the score.
-        background: as for `render_moments`.
-
-    Returns:
-        One share for every projected Gaussian (``splats.indices``), shape (M,), float64.
+    The weights have shape (H, W); 1 / count in the region of a score makes shares of the score. The other arguments are
+    those of `render_moments`. Returns one share for every projected Gaussian (``splats.indices``), (M,), float64.
 
     Raises:
         ValueError: if the weights or the background have another shape.

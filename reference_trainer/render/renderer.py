@@ -29,17 +29,7 @@ def splat(
     """Project Gaussians, evaluate their colours and list them per tile.
 
     Gaussians that cannot be seen (behind the near plane, or with an opacity below `MIN_ALPHA`, such as dropped ones)
-    are left out before the projection and cost nothing.
-
-    Args:
-        means: world coordinates, shape (N, 3).
-        quaternions: orientation, wxyz, shape (N, 4).
-        scales: standard deviations, positive, shape (N, 3).
-        opacities: activated, shape (N,) or (N, 1).
-        camera: the view.
-        sh: spherical-harmonic coefficients, shape (N, K, 3).
-        sh_degree: highest band to evaluate; all of ``sh`` by default.
-        colors: colours instead of ``sh``, shape (N, 3).
+    are left out before the projection and cost nothing. The arguments are those of `render`.
 
     Raises:
         TypeError: if a tensor is not floating point.
@@ -121,16 +111,7 @@ def render(
 
 
 def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = False) -> Rendering:
-    """Composite Gaussians that are ready for a camera.
-
-    Args:
-        splats: from `splat` or `masked`.
-        background: colour behind everything, shape (3,); black by default.
-        depth: whether to accumulate depth as well.
-
-    Raises:
-        NotFiniteError: if the background is not finite.
-    """
+    """Composite what `splat` or `masked` made; other arguments and errors are those of `render`."""
     if splats.projection.means.requires_grad:
         splats.projection.means.retain_grad()
     if background is None:
@@ -145,9 +126,8 @@ def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = Fals
 def masked(splats: Splats, opacities: Tensor) -> Splats:
     """Return the same view of the same Gaussians with lower opacities, without projecting and sorting them again.
 
-    Args:
-        splats: of the Gaussians with opacities at least as high.
-        opacities: activated, of all N Gaussians, shape (N,) or (N, 1); 0 leaves a Gaussian out, at no cost.
+    The opacities are activated, of all N Gaussians, (N,) or (N, 1), and nowhere higher than those of the splats; 0
+    leaves a Gaussian out, at no cost.
     """
     lower = opacities.reshape(-1)[splats.indices].to(splats.opacities.dtype)
     return splats.engine.masked(splats, lower)

@@ -101,41 +101,22 @@ class TileLists:
         return image[..., : self.height, : self.width]
 
     def only(self, kept: Tensor) -> TileLists:
-        """Return the lists without some Gaussians; without the numbers that the loops need.
-
-        Args:
-            kept: whether a Gaussian stays, shape (M,) bool.
-        """
+        """Return the lists of the Gaussians that are kept, (M,) bool; without the numbers that the loops need."""
         stays = kept[self.gaussians]
-        before = torch.nn.functional.pad(stays.cumsum(0), (1, 0))
-        return replace(
-            self,
-            starts=before[self.starts],
-            gaussians=self.gaussians[stays],
-            touched=self.touched & kept,
-            slots=None,
-            offsets=None,
-        )
+        starts = torch.nn.functional.pad(stays.cumsum(0), (1, 0))[self.starts]
+        gaussians, touched = self.gaussians[stays], self.touched & kept
+        return replace(self, starts=starts, gaussians=gaussians, touched=touched, slots=None, offsets=None)
 
 
 class Splats(NamedTuple):
-    """Gaussians made ready for one camera: projected, coloured, and listed per tile.
+    """Gaussians made ready for one camera: M of N are projected, coloured, and listed per tile."""
 
-    Args:
-        indices: which of the N Gaussians were projected, shape (M,).
-        projection: their ellipses.
-        opacities: activated, shape (M,).
-        colors: towards this camera, shape (M, 3).
-        lists: the splats of every tile.
-        engine: what made them, and draws them.
-    """
-
-    indices: Tensor
+    indices: Tensor  # which of the N, (M,)
     projection: Projection
-    opacities: Tensor
-    colors: Tensor
+    opacities: Tensor  # activated, (M,)
+    colors: Tensor  # towards this camera, (M, 3)
     lists: TileLists
-    engine: Engine
+    engine: Engine  # what made them, and draws them
 
 
 class Rendering(NamedTuple):
@@ -155,14 +136,8 @@ class Rendering(NamedTuple):
 
 
 class MomentImages(NamedTuple):
-    """Moments of every pixel over the random factors.
+    """Moments of every pixel over the random factors."""
 
-    Args:
-        mean: expected colours over the background, shape (3, H, W).
-        variance: variances of the colours, shape (3, H, W), at least 0.
-        alpha_mean: expected accumulated alpha, shape (H, W).
-    """
-
-    mean: Tensor
-    variance: Tensor
-    alpha_mean: Tensor
+    mean: Tensor  # expected colours over the background, (3, H, W)
+    variance: Tensor  # of the colours, at least 0, (3, H, W)
+    alpha_mean: Tensor  # expected accumulated alpha, (H, W)

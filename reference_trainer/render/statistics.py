@@ -20,9 +20,6 @@ __all__ = ["color_variance_map", "first_order_map"]
 def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
     """Measure how much the colours blended at each pixel differ (paper, appendix, CV metric).
 
-    Args:
-        splats: of a rendering.
-
     Returns:
         The variance, mean over RGB, shape (H, W), and where any splat contributes, shape (H, W) bool; the variance is 0
         elsewhere. The image's CV is the mean over the latter.
@@ -49,15 +46,8 @@ def first_order_map(splats: Splats, multiplier: Multiplier) -> Tensor:
     """Render ``v sum_i (c_i alpha_i)^2``, the paper's closed form (appendix, Eq. ca_final, where v is ``p (1 - p)``).
 
     An approximation that knows neither transmittance nor background nor what lies behind a splat: hidden splats count
-    like visible ones. `ca_reg.functional.first_order_variance` says when it is right.
-
-    Args:
-        splats: of the full model, with its plain opacities.
-        multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,); only the variance
-            matters.
-
-    Returns:
-        The approximate variance per channel, shape (3, H, W).
+    like visible ones. `ca_reg.functional.first_order_variance` says when it is right. The arguments are those of
+    `render_moments`, of the multiplier only the variance matters; returns shape (3, H, W).
 
     Example:
         >>> from reference_trainer.camera import Camera

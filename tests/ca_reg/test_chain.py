@@ -121,3 +121,25 @@ def test_foreign_modules_are_members():
     assert module.inner.step == 50 or module.inner.step == 30
     with pytest.raises(TypeError, match="must be a torch module"):
         Chain(torch.relu)
+
+
+def test_a_bare_tensor_meets_the_step_that_a_member_was_told():
+    dropout = GaussianDropout(lambda step: 0.9 * (step >= 50))
+    chain, opacity = Chain(OpacityNoise(0.0), nn.Sequential(dropout)), torch.full((1000,), 0.5)
+    assert chain(opacity) is opacity
+    dropout.set_step(50)
+    assert chain.step == 50
+    assert (chain(opacity) == 0).any()
+    chain.set_step(0)  # also back
+    assert chain(opacity) is opacity
+
+
+def test_the_text_of_a_regularizer_has_its_arguments():
+    class Fade(IndependentDropout):
+        rate_name = "speed"
+
+        def __init__(self, speed, share=0.5):
+            super().__init__(speed)
+            self.share = share
+
+    assert repr(Fade(0.1)) == "Fade(speed=0.1, share=0.5)"

@@ -58,7 +58,7 @@ def test_an_exact_score_has_the_rates_of_the_regularizer(shape):
     score = CAScore(exact=ListMoments(lists), regularizer=ByDepth(), threshold=0.1)
     result = score(Params(OPACITY.reshape(shape), means=MEANS), None)
     assert result.value == pytest.approx(variance_over(masks, probabilities), rel=1e-12)
-    assert (result.drop_rate, result.regularizer) == (None, "ByDepth()")
+    assert (result.drop_rate, result.regularizer) == (None, "ByDepth(compensate=False, scale=True)")
 
 
 def test_sampled_scores_draw_what_the_regularizer_draws():

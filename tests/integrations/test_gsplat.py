@@ -17,6 +17,7 @@ from torch import nn
 
 from ca_reg import GaussianDropout, OpacityNoise
 from ca_reg.functional import apply_dropout
+from ca_reg.integrations._tally import Skip
 from ca_reg.integrations.gsplat import install, regularized, unregularized
 from ca_reg.schedules import StartStop
 
@@ -293,7 +294,8 @@ def test_install_reaches_an_unedited_script_and_restores_exactly(fake_gsplat, pa
         with pytest.raises(ValueError, match="dropped twice"):
             install(dropout)
     assert fake_gsplat.rasterization is fake_gsplat.rendering.rasterization is rasterization
-    assert installation.trained == installation.rasterization.trained == 3
+    assert installation.trained == installation.rasterization.trained == 1
+    assert installation.tally.skipped[Skip.RATE_ZERO] == 2
     installation.uninstall()
     assert fake_gsplat.rasterization is rasterization
 
@@ -333,6 +335,15 @@ def test_a_training_past_the_installation_is_an_error(fake_gsplat, params, camer
     ):
         train()
     assert made == 2
+
+
+def test_a_schedule_that_never_begins_is_an_error(fake_gsplat, params, cameras):
+    optimizer = torch.optim.SGD([{"params": [params["opacities"]], "name": "opacities"}], lr=0.1)
+    installation = install(GaussianDropout(StartStop(0.5, start=1000)))
+    loss_of(fake_gsplat.rasterization(**activated(params), **cameras)[0]).backward()
+    optimizer.step()
+    with pytest.raises(RuntimeError, match=r"The training was not regularized\..*let the schedule begin earlier"):
+        installation.__exit__(None, None, None)
 
 
 @pytest.mark.slow

@@ -141,7 +141,7 @@ def test_every_field_reaches_the_rasterizer_changed(split):
     bound = forward_signature(kind).bind(kind(), means2D=None, opacities=torch.rand(5, 1), **given, **shs)
     call, chain = ForwardCall(kind.forward, bound), Chain(Move())
     before = call.params(chain, 3)
-    assert call.replace(before, chain(before))
+    assert call._replace(before, chain(before))
     for factor, (was, now) in enumerate(zip([*given.values(), sh], call(), strict=True), start=2):
         assert torch.equal(now, was * factor)
 

@@ -356,8 +356,8 @@ def test_a_script_that_calls_gsplat_is_told_from_the_others(tmp_path, capsys, re
         "regularized": 3,
         "scaled": 1,
         "skipped": {},
-        "first_step": None,
-        "last_step": None,
+        "first_step": 0,
+        "last_step": 2,
         "lost": 0,
     }
     assert all(a < 0.8 * b for a, b in zip(seen(regularized.out), seen(plain), strict=True))

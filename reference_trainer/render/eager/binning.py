@@ -16,12 +16,6 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
 
     A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the rectangle spanned by the
     tile's pixel centres. The test is exact: within a strip of tiles, an ellipse covers an interval of columns.
-
-    Args:
-        projection: M projected Gaussians.
-        opacities: activated, shape (M,).
-        width: image width, pixels.
-        height: image height, pixels.
     """
     device = opacities.device
     order = torch.argsort(projection.depths, stable=True)

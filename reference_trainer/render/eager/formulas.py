@@ -63,22 +63,18 @@ class _BlendWeights(torch.autograd.Function):
 
 
 def blend_weights(raw: Tensor) -> Tensor:
-    """Return alpha times the transmittance in front of every splat; 0 from the one on that ends its pixel.
+    """Return alpha times the transmittance in front of every splat, of alphas before the clamp, (T, 64, L).
 
-    Args:
-        raw: alphas before the clamp, shape (T, 64, L).
+    It is 0 from the splat on that ends its pixel.
     """
     weights: Tensor = _BlendWeights.apply(raw)  # type: ignore[no-untyped-call]
     return weights
 
 
 def composite(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
-    """Composite C values over what is behind, front to back; then the accumulated alpha, (T, C + 1, 64).
+    """Composite C values over what is behind, (T, C, 64), front to back; then the accumulated alpha, (T, C + 1, 64).
 
-    Args:
-        block: of tiles.
-        rows: geometry and values of the entries, shape (6 + C, T, L).
-        behind: shape (T, C, 64).
+    The rows are geometry and values of the entries, (6 + C, T, L).
     """
     return over(blend_weights(block.alphas(rows[:6])), rows[6:], behind)
 
@@ -86,10 +82,7 @@ def composite(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
 def over(weights: Tensor, values: Tensor, behind: Tensor) -> Tensor:
     """Return what splats show over what is behind them, and the accumulated alpha, (T, C + 1, 64).
 
-    Args:
-        weights: of the splats, shape (T, 64, L).
-        values: of the splats, shape (C, T, L).
-        behind: shape (T, C, 64), or one that broadcasts to it.
+    Weights are (T, 64, L), values (C, T, L), and what is behind broadcasts to (T, C, 64).
     """
     alpha = weights.sum(-1)[:, None]
     shown = values.transpose(0, 1) @ weights.transpose(1, 2)
@@ -111,10 +104,7 @@ def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
     what is behind it, the mean grows by m alpha d, and the variance V becomes ((1 - m alpha)^2 + v alpha^2) V
     + v alpha^2 d^2. Every term is a square times a non-negative weight: nothing cancels.
 
-    Args:
-        block: of tiles.
-        rows: geometry, mean m and variance v of the factor, and values of the entries, shape (8 + C, T, L).
-        behind: shape (T, C, 64).
+    The rows are geometry, mean m and variance v of the factor, and values of the entries, (8 + C, T, L).
     """
     expected, spread, shrink = _random(block, rows)
     values = rows[8:].permute(2, 1, 0)[..., None]
@@ -143,10 +133,7 @@ def summands(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
 def color_variances(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
     """Return the variance of the colours that are blended, and whether any are, (T, 2, 64) (paper, CV metric).
 
-    Args:
-        block: of tiles.
-        rows: geometry and colours of the entries, shape (9, T, L).
-        behind: one channel of zeros, shape (T, 1, 64).
+    The rows are geometry and colours of the entries, (9, T, L); what is behind is one channel of zeros.
     """
     weights = blend_weights(block.alphas(rows[:6]))
     colors = rows[6:].permute(1, 2, 0)[:, None].expand(-1, weights.shape[1], -1, -1)

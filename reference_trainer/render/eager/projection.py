@@ -15,15 +15,9 @@ _NO_DIRECTION = 1e-30  # a quaternion well below this is taken for 0
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Turn quaternions into rotation matrices.
+    """Turn quaternions (N, 4) into rotation matrices (N, 3, 3).
 
     Convention: wxyz; they are normalised here, whatever their norm. That of 0 is the identity, with a gradient of 0.
-
-    Args:
-        quaternions: shape (N, 4).
-
-    Returns:
-        Rotation matrices, shape (N, 3, 3).
 
     Example:
         >>> rotation_matrices(torch.tensor([[2.0, 0.0, 0.0, 0.0]]))[0].tolist()
@@ -50,14 +44,7 @@ def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) 
 
     Convention: OpenCV camera, half-pixel centres, wxyz quaternions. Every Gaussian must lie in front of the camera.
 
-    Args:
-        means: world coordinates, shape (M, 3).
-        quaternions: orientation, shape (M, 4).
-        scales: standard deviations along the axes, positive, shape (M, 3).
-        camera: the view.
-
-    Returns:
-        The ellipses, differentiable.
+    The arguments are those of `reference_trainer.render.render`; differentiable in each.
 
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)

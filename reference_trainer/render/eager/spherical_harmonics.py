@@ -22,16 +22,9 @@ _C3 = (
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Evaluate the real spherical harmonics.
+    """Evaluate the (degree + 1)^2 real spherical harmonics of unit vectors (N, 3).
 
     Convention: the Condon-Shortley phase is kept and the order within a band is m = -l .. l, as in the INRIA code.
-
-    Args:
-        directions: unit vectors, shape (N, 3).
-        degree: highest band, 0 to 3.
-
-    Returns:
-        The basis functions, shape (N, (degree + 1)^2).
 
     Raises:
         ValueError: if the degree is not 0 to 3.
@@ -48,13 +41,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
         basis += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        basis += [
-            _C2[0] * x * y,
-            -_C2[0] * y * z,
-            _C2[1] * (2 * zz - xx - yy),
-            -_C2[0] * x * z,
-            _C2[2] * (xx - yy),
-        ]
+        basis += [_C2[0] * x * y, -_C2[0] * y * z, _C2[1] * (2 * zz - xx - yy), -_C2[0] * x * z, _C2[2] * (xx - yy)]
     if degree >= 3:
         basis += [
             -_C3[0] * y * (3 * xx - yy),
@@ -73,13 +60,8 @@ def evaluate_sh(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor
 
     Convention: 0.5 is added and the result is clamped below at 0, as in the INRIA code; it is not clamped above.
 
-    Args:
-        coefficients: at least (degree + 1)^2 of them, shape (N, K, 3).
-        directions: unit vectors from the camera centre to the Gaussians, shape (N, 3).
-        degree: highest band to use, 0 to 3.
-
-    Returns:
-        Colours, shape (N, 3), at least 0.
+    The coefficients are (N, K, 3), the directions unit vectors from the camera centre to the Gaussians, (N, 3), the
+    colours (N, 3).
 
     Raises:
         ValueError: if there are fewer than (degree + 1)^2 coefficients.

@@ -39,31 +39,20 @@ class Block(NamedTuple):
     gaussians: Tensor
 
     def alphas(self, geometry: Tensor) -> Tensor:
-        """Evaluate the alphas at every pixel, before the clamp at `MAX_ALPHA`; 0 below `MIN_ALPHA`.
+        """Evaluate the alphas at every pixel, (T, 64, L), before the clamp at `MAX_ALPHA`; 0 below `MIN_ALPHA`.
 
-        Args:
-            geometry: `geometry_rows` of the entries, shape (6, T, L).
-
-        Returns:
-            Shape (T, 64, L), differentiable.
+        The geometry is `geometry_rows` of the entries, (6, T, L); differentiable in it.
         """
         x, y, l11, l21, l22, log_opacity = geometry.unbind(0)
         dx, dy = x - self.centers[0], y - self.centers[1]
         # log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2, expanded around the tile's centre. Squaring w1 and w2,
         # which are small wherever alpha is not, avoids the cancellation of a dx^2 + 2 b dx dy + c dy^2.
         w1, w2 = l11 * dx + l21 * dy, l22 * dy
-        polynomial = torch.stack(
-            [
-                log_opacity - _HALF * (w1 * w1 + w2 * w2),
-                2 * _HALF * (l11 * w1),
-                2 * _HALF * (l21 * w1 + l22 * w2),
-                -_HALF * (l11 * l11),
-                -2 * _HALF * (l11 * l21),
-                -_HALF * (l21 * l21 + l22 * l22),
-            ],
-            dim=1,
-        )
-        exponents = _monomials(geometry) @ polynomial
+        polynomial = [
+            log_opacity - _HALF * (w1 * w1 + w2 * w2), 2 * _HALF * (l11 * w1), 2 * _HALF * (l21 * w1 + l22 * w2),
+            -_HALF * (l11 * l11), -2 * _HALF * (l11 * l21), -_HALF * (l21 * l21 + l22 * l22),
+        ]  # fmt: skip
+        exponents = _monomials(geometry) @ torch.stack(polynomial, dim=1)
         return torch.nn.functional.threshold(exponents, math.log2(MIN_ALPHA), -math.inf).exp2()
 
 
@@ -115,10 +104,7 @@ def walk(formula: Formula, rows: Tensor, behind: Tensor, lists: TileLists, *, ex
         rows: numbers of every splat, the first six `geometry_rows`, shape (R, M).
         behind: images, shape (C, H, W).
         lists: the splats of every tile.
-        extra: channels of the result beyond those of ``behind``.
-
-    Returns:
-        Images, shape (C + extra, H, W).
+        extra: channels of the result, images (C + extra, H, W), beyond those of ``behind``.
     """
     result: Tensor = _Walk.apply(formula, rows, behind, lists, extra)  # type: ignore[no-untyped-call]
     return result

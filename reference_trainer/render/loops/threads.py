@@ -82,9 +82,7 @@ def _start(work: Callable[[], Any], count: int, futures: list[Future[Any]]) -> N
 def _finish(ranges: Iterator[int], futures: list[Future[Any]]) -> list[Future[Any]]:
     """Wait for all that have begun, whatever Ctrl-C says meanwhile; return them. The others never begin.
 
-    Args:
-        ranges: that are left after an error or Ctrl-C; nobody takes them any more.
-        futures: the work of other threads.
+    Nobody takes the ranges that are left after an error or Ctrl-C any more.
     """
     interruption = None
     while True:
