@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ca_reg import CAResult, CAScore
 from reference_trainer.evaluation.kept import KeptRecords
-from reference_trainer.evaluation.metrics import psnr, ssim
+from reference_trainer.evaluation.metrics import on_white, psnr, ssim
 from reference_trainer.evaluation.pictures import PANEL, error_map, file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.results import machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
@@ -112,7 +112,8 @@ def evaluate(
 ) -> Evaluation:
     """Measure a model at views, with their photographs or without.
 
-    Images are compared as floats clamped to [0, 1], without a detour over 8 bits.
+    Images are compared as floats clamped to [0, 1], without a detour over 8 bits. Where a view has a mask, PSNR counts
+    the pixels inside it, and SSIM and LPIPS see white outside: the DTU protocol.
 
     Args:
         model: what to measure.
@@ -172,6 +173,10 @@ def _measure(
     opacities = model.gaussians.opacities
     out = model.test_rendering(view)
     image, photograph = out.image.clamp(0, 1), view.image if isinstance(view, View) else None
+    quality = (math.nan,) * 3
+    if isinstance(view, View):
+        pair = on_white(image, view.mask), on_white(view.image, view.mask)
+        quality = psnr(image, view.image, view.mask), ssim(*pair), math.nan if perceptual is None else perceptual(*pair)
     protocol, at_half, *limits = scores
     ca, exact, neutral = (score(opacities, view, index=index) for score in (protocol, *limits))
     half = ca if protocol.settings == at_half.settings else at_half(opacities, view, index=index)
@@ -179,9 +184,9 @@ def _measure(
     found = ViewScores(
         name=view.name,
         split=split,
-        psnr=math.nan if photograph is None else psnr(image, photograph),
-        ssim=math.nan if photograph is None else ssim(image, photograph),
-        lpips=math.nan if photograph is None or perceptual is None else perceptual(image, photograph),
+        psnr=quality[0],
+        ssim=quality[1],
+        lpips=quality[2],
         ca=ca.value,
         ca_std_error=ca.std_error,
         ca_half=half.value,

@@ -15,7 +15,6 @@ from torch import Tensor
 from ca_reg import CAResult, Reason, attribute, total_effects
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
 from reference_trainer.evaluation.pictures import file_names, heat_map, save_png, side_by_side
-from reference_trainer.evaluation.rank_correlation import spearman
 from reference_trainer.evaluation.results import machine, markdown_table, write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
@@ -260,8 +259,10 @@ def _mean_over_views(
 
 def _correlations(
     model: TrainedModel, views: Sequence[View], shares: Tensor, weights: Tensor
-) -> dict[str, float | None]:
+) -> dict[str, float]:
     """Rank correlation of the share with what else is known of a Gaussian."""
+    from scipy.stats import spearmanr
+
     gaussians = model.gaussians
     poses = [view.camera.world_to_camera.to(gaussians.means) for view in views]
     depth = torch.stack([gaussians.means @ pose[2, :3] + pose[2, 3] for pose in poses]).mean(0)
@@ -271,7 +272,7 @@ def _correlations(
         "mean depth": depth,
         "blend weight": weights,
     }
-    return {name: spearman(shares.tolist(), values.tolist()) for name, values in known.items()}
+    return {name: spearmanr(shares.cpu(), values.detach().cpu()).statistic.item() for name, values in known.items()}
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from reference_trainer.evaluation.rank_correlation import kendall, spearman
+from benchmarks.rank_correlation import kendall, spearman
 from reference_trainer.evaluation.results import markdown_table, mean_std
 from reference_trainer.runs.folder import CONFIG
 from reference_trainer.runs.run import load_run, model_of

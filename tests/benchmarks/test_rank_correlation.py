@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from reference_trainer.evaluation.rank_correlation import kendall, spearman
+from benchmarks.rank_correlation import kendall, spearman
 
 
 @pytest.mark.parametrize("levels", [2, 4, 1000])  # nearly everything tied, many ties, hardly any
