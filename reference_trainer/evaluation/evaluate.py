@@ -16,7 +16,7 @@ from torch import Tensor
 from ca_reg import CAResult, CAScore
 from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.metrics import on_white, psnr, ssim
-from reference_trainer.evaluation.pictures import PANEL, error_map, file_names, heat_map, save_png, side_by_side
+from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.results import machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.render.statistics import color_variance_map
@@ -26,6 +26,8 @@ __all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "evaluate"]
 
 CA_PICTURE_RANGE = 0.02
 """Variance that gets the brightest colour in CA heat maps."""
+ERROR_PICTURE_RANGE = 0.25
+"""Absolute error, the mean of the channels, that gets the brightest colour."""
 
 
 class PerceptualMetric(Protocol):
@@ -202,7 +204,8 @@ def _measure(
         if photograph is None:
             panels = render | _maps({"CA": ca, "exact": exact, "neutral": neutral})
         else:
-            panels = {"photograph": photograph} | render | {"error": error_map(image, photograph)} | _maps({"CA": ca})
+            error = heat_map((image - photograph).abs().mean(0), ERROR_PICTURE_RANGE)
+            panels = {"photograph": photograph} | render | {"error": error} | _maps({"CA": ca})
         save_png(files[0], image)
         save_png(files[1], side_by_side([*panels.values()], [*panels]))
     return found

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.options import World
 
-__all__ = ["BoundingSphere", "bounding_sphere", "orbit_views"]
+__all__ = ["BoundingSphere", "bounding_sphere", "look_at", "orbit_views"]
 
 ELEVATION = math.radians(20)
 """Height of the cameras over the horizon of the centre: objects are mostly looked at from a little above."""
@@ -107,7 +107,7 @@ def orbit_views(
     cameras = []
     for turn in (start + step * i for i in range(count)):
         offset = center.new_tensor([level * math.sin(turn), -lift, -level * math.cos(turn)])
-        pose = _look_at(center + axes @ offset, center, axes[:, 1])
+        pose = look_at(center + axes @ offset, center, axes[:, 1])
         cameras.append(Camera(pose.float(), focal, focal, width / 2, height / 2, width, height))
     return cameras
 
@@ -169,7 +169,7 @@ def _quantile(values: Tensor, weights: Tensor, share: float) -> Tensor:
     return ordered[torch.searchsorted(held, share * held[-1])]
 
 
-def _look_at(position: Tensor, target: Tensor, down: Tensor) -> Tensor:
+def look_at(position: Tensor, target: Tensor, down: Tensor) -> Tensor:
     """Return the view matrix (4, 4) of a camera that looks at a target, upright."""
     forward = normalize(target - position, dim=0)
     right = normalize(torch.linalg.cross(down, forward), dim=0)

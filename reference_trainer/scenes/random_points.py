@@ -90,13 +90,11 @@ def random_points_in_frusta(
     chosen = torch.randint(len(cameras), (count,), generator=generator)
     u, v, share = torch.rand(3, count, generator=generator)
     depth = 1 / (share / near + (1 - share) / far)
-    intrinsics = torch.tensor([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], dtype=torch.float32)[
-        chosen
-    ]
-    fx, fy, cx, cy, width, height = intrinsics.unbind(1)
-    local = torch.stack([(u * width - cx) / fx * depth, (v * height - cy) / fy * depth, depth], dim=1)
-    poses = torch.stack([camera.world_to_camera.to(torch.float32) for camera in cameras])[chosen]
-    positions = torch.einsum("nji,nj->ni", poses[:, :3, :3], local - poses[:, :3, 3])
+    positions = torch.empty(count, 3)
+    for number, camera in enumerate(cameras):
+        mine = chosen == number
+        pixels = torch.stack([u[mine] * camera.width, v[mine] * camera.height], dim=1)
+        positions[mine] = camera.lift(pixels, depth[mine])
     return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
 
 

@@ -257,9 +257,7 @@ def _mean_over_views(
     return total / count, results
 
 
-def _correlations(
-    model: TrainedModel, views: Sequence[View], shares: Tensor, weights: Tensor
-) -> dict[str, float]:
+def _correlations(model: TrainedModel, views: Sequence[View], shares: Tensor, weights: Tensor) -> dict[str, float]:
     """Rank correlation of the share with what else is known of a Gaussian."""
     from scipy.stats import spearmanr
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.rank_correlation import kendall, spearman
+
 from reference_trainer.evaluation.results import markdown_table, mean_std
 from reference_trainer.runs.folder import CONFIG
 from reference_trainer.runs.run import load_run, model_of

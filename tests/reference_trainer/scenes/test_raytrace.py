@@ -6,22 +6,22 @@ import pytest
 import torch
 
 from reference_trainer.camera import Camera
-from reference_trainer.scenes.raytrace import AMBIENT, GAMMA, Box, Cylinder, Plane, Sphere, nearest_hit, render_solids
+from reference_trainer.scenes.raytrace import AMBIENT, GAMMA, Box, Plane, Round, nearest_hit, render_solids
 
 
 def white(points):
     return torch.ones_like(points)
 
 
-SPHERE = Sphere((0.3, -0.2, 4.0), 0.8, white)
-CYLINDER = Cylinder(0.2, 3.5, 0.6, -0.7, 0.9, white)
+SPHERE = Round((0.3, -0.2, 4.0), 0.8, white)
+CYLINDER = Round((0.2, 5.0, 3.5), 0.6, white, (-0.7, 0.9))
 PLANE = Plane((0.0, -1.0, 0.0), -1.0, white)
 BOX = Box((-0.2, 0.1, 4.0), (0.5, 0.7, 0.4), 0.6, white)
 
 
 def inside(solid, p):
     """Whether points are inside, from the definition of each shape alone."""
-    if isinstance(solid, Sphere):
+    if solid is SPHERE:
         return (p - torch.tensor(solid.center).to(p)).norm(dim=-1) < solid.radius
     if isinstance(solid, Plane):
         return p[..., 1] > 1
@@ -85,7 +85,7 @@ def test_sphere_normals_are_radial():
 
 def test_nearest_hit_is_the_nearest():
     origins, directions = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    near, far = Sphere((0.0, 0.0, 3.0), 1.0, white), Sphere((0.0, 0.0, 9.0), 1.0, white)
+    near, far = Round((0.0, 0.0, 3.0), 1.0, white), Round((0.0, 0.0, 9.0), 1.0, white)
     t, index = nearest_hit([far, near], origins, directions)
     assert t.tolist() == [2.0, math.inf]
     assert index[0] == 1
@@ -93,7 +93,7 @@ def test_nearest_hit_is_the_nearest():
 
 def test_depth_of_a_sphere_is_exact_at_pixel_centres():
     camera = Camera(torch.eye(4), fx=30.0, fy=30.0, cx=16.0, cy=12.0, width=32, height=24)
-    image, depth = render_solids(camera, [Sphere((0.0, 0.0, 4.0), 1.0, white)], torch.zeros(9, 3))
+    image, depth = render_solids(camera, [Round((0.0, 0.0, 4.0), 1.0, white)], torch.zeros(9, 3))
     for row in range(24):
         for column in range(32):
             x, y = (column + 0.5 - 16) / 30, (row + 0.5 - 12) / 30
@@ -112,6 +112,6 @@ def test_shading_is_lambert_and_shadows_are_ambient():
     lit, _ = render_solids(camera, [wall], oblique)
     linear = lit[:, 1, 1] ** GAMMA
     torch.testing.assert_close(linear, torch.full((3,), AMBIENT + (1 - AMBIENT) * math.sqrt(0.5)), atol=5e-3, rtol=0)
-    blocker = Sphere((10.0, 0.0, -5.0), 1.0, white)
+    blocker = Round((10.0, 0.0, -5.0), 1.0, white)
     shadowed, _ = render_solids(camera, [wall, blocker], oblique)
     torch.testing.assert_close(shadowed[:, 1, 1] ** GAMMA, torch.full((3,), AMBIENT), atol=1e-5, rtol=0)
