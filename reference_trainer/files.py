@@ -55,12 +55,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text in UTF-8 as `replacing` does.
-
-    Args:
-        path: the file to create or replace.
-        text: all of its content.
-    """
+    """Write a text in UTF-8 as `replacing` does."""
     with replacing(path) as place:
         place.write_text(text, encoding="utf-8")
 
@@ -68,9 +63,7 @@ def write_text(path: str | Path, text: str) -> None:
 def remove_leftovers(folder: str | Path, *, below: bool = True) -> int:
     """Remove what killed processes had begun to write in a folder, and return how many files that were.
 
-    Args:
-        folder: where no other process is writing now.
-        below: in all folders below it, too.
+    No other process may be writing there now. ``below`` also looks into all folders below it.
     """
     leftovers = [path for path in Path(folder).glob(f"{'**/' * below}.*{_PART}") if path.is_file()]
     for path in leftovers:

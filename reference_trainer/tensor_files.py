@@ -66,11 +66,7 @@ def load_tensors(path: str | Path, device: torch.device | str = "cpu", *, what: 
 
 
 def moved(state: Any, device: torch.device | str) -> Any:
-    """Return a state with its tensors on a device; those that are there already are not copied.
-
-    Args:
-        state: nested dicts and lists of tensors and anything else.
-        device: where to.
+    """Return nested dicts and lists with their tensors on a device; those that are there already are not copied.
 
     Example:
         >>> moved({"x": [torch.zeros(2)], "step": 3}, "meta")

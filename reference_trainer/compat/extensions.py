@@ -41,16 +41,10 @@ def neighbor_modules(*, indices: bool) -> dict[str, ModuleType]:
 
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
-    """Return the mean SSIM of pictures, as `ssim_map` has it; differentiable in the first.
+    """Return the mean SSIM of pictures (B, C, H, W), as `ssim_map` has it; differentiable in the first.
 
-    Args:
-        img1: renderings, shape (B, C, H, W).
-        img2: photographs, same shape.
-        padding: "same" for all pixels, zeros beyond the border; "valid" for those whose window lies in the picture.
-        train: not read; gradients are there if they are needed.
-
-    Raises:
-        ValueError: if ``padding`` is something else.
+    ``padding`` is "same" for all pixels, zeros beyond the border, or "valid" for those whose window lies inside;
+    ``train`` is not read. Raises ValueError for another padding.
 
     Example:
         >>> import torch

@@ -80,8 +80,8 @@ class GaussianRasterizer(nn.Module):
             )
         if means2D.shape != (n, self.columns):
             raise ValueError(
-                f"means2D of {type(self).__module__} must have {self.columns} columns and a row for each of {n} "
-                f"Gaussians, got shape {tuple(means2D.shape)}."
+                f"means2D of {type(self).__module__} must have {self.columns} columns, shape ({n}, {self.columns}), "
+                f"got shape {tuple(means2D.shape)}."
             )
         if settings.antialiasing:
             raise ValueError(
@@ -138,11 +138,7 @@ def rasterizer_module(name: str, members: tuple[str, ...]) -> ModuleType:
         >>> module.GaussianRasterizationSettings._fields[:2]
         ('image_height', 'image_width')
     """
-    own = {
-        "forward": GaussianRasterizer.forward,
-        "members": members,
-        "columns": 4 if name.endswith("_abs") else 3,
-        "__module__": name,
-    }
+    columns, forward = 4 if name.endswith("_abs") else 3, GaussianRasterizer.forward
+    own = {"members": members, "columns": columns, "forward": forward, "__module__": name}
     rasterizer = type("GaussianRasterizer", (GaussianRasterizer,), own)
     return make_module(name, GaussianRasterizationSettings=GaussianRasterizationSettings, GaussianRasterizer=rasterizer)

@@ -143,7 +143,8 @@ def evaluate(
     members = [(split, *each) for split, group in views.items() for each in enumerate(group)]
     names = [name for group in views.values() for name in file_names([view.name for view in group])]
     photographs = (view.image.to(model.background.device) for _, _, view in members if isinstance(view, View))
-    metric = perceptual and [_identity(perceptual, image) for image in islice(photographs, 1)]
+    # Weights of one name may differ: what the metric says of a photograph tells.
+    metric = perceptual and [perceptual.name, *(float(perceptual(x, x.flip(2))) for x in islice(photographs, 1))]
     kept = KeptRecords(keep, (model, views, samples, seed, metric, machine()), say)
     done: list[ViewScores] = []
     start, measured = time.perf_counter(), 0
@@ -219,8 +220,3 @@ def _maps(results: Mapping[str, CAResult]) -> dict[str, Tensor]:
         )
         for name, r in results.items()
     }
-
-
-def _identity(perceptual: PerceptualMetric, image: Tensor) -> tuple[str, float]:
-    """Return what tells a metric from others: its name, and what it says of a photograph, as weights may differ."""
-    return perceptual.name, float(perceptual(image, image.flip(2)))

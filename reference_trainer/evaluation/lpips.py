@@ -72,17 +72,9 @@ class LPIPS:
 
     @torch.no_grad()
     def __call__(self, image: Tensor, target: Tensor) -> float:
-        """Return the distance of two images.
+        """Return the distance of two images (3, H, W) in [0, 1]: 0 for equal ones; computed in float32.
 
-        Args:
-            image: colours in [0, 1], shape (3, H, W), at least 32 pixels high and wide.
-            target: colours in [0, 1], same shape.
-
-        Returns:
-            The distance, 0 for equal images; computed in float32.
-
-        Raises:
-            ValueError: if the shapes differ, are not (3, H, W) or are too small.
+        Raises ValueError if the shapes differ, are others, or have less than 32 pixels a side.
         """
         if image.ndim != 3 or image.shape[0] != 3 or image.shape != target.shape:
             raise ValueError(

@@ -58,15 +58,9 @@ def file_names(views: Sequence[str]) -> list[str]:
 
 
 def save_png(path: str | Path, image: Tensor) -> None:
-    """Write an image as an 8-bit PNG; the file appears at once or not at all.
+    """Write an image (3, H, W), clamped to [0, 1], as an 8-bit PNG; at once or not at all, missing folders are made.
 
-    Args:
-        path: the file; missing folders are made.
-        image: colours, shape (3, H, W); clamped to [0, 1] and rounded to the nearest byte.
-
-    Raises:
-        ValueError: if the shape is not (3, H, W) or a value is NaN.
-        OSError: if the file cannot be written.
+    Raises ValueError if the shape is another or a value is NaN, and OSError if the file cannot be written.
     """
     picture = _picture(image)
     with replacing(path) as place:
@@ -93,17 +87,10 @@ def _picture(image: Tensor) -> Any:
 
 
 def heat_map(values: Tensor, vmax: float) -> Tensor:
-    """Colour a map of numbers from 0 (black) through red to ``vmax`` (pale yellow): matplotlib's "inferno".
+    """Colour numbers (H, W) from 0 (black) through red to ``vmax`` (pale yellow): matplotlib's "inferno".
 
     Numbers beyond the ends take the end colours; those that are not finite (a pixel without a score) are grey. Use one
-    ``vmax`` for all maps that are to be compared.
-
-    Args:
-        values: numbers, shape (H, W).
-        vmax: the number that gets the brightest colour, positive.
-
-    Returns:
-        Colours in [0, 1], shape (3, H, W), float32, on the CPU.
+    ``vmax`` for all maps that are to be compared. The colours are (3, H, W) in [0, 1], float32, on the CPU.
 
     Raises:
         ValueError: if ``values`` is not (H, W) or ``vmax`` is not positive.
@@ -127,16 +114,13 @@ def heat_map(values: Tensor, vmax: float) -> Tensor:
 
 
 def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: int | None = None) -> Tensor:
-    """Lay pictures out in a grid with a label above each and a thin white gap between them.
+    """Lay pictures (3, H, W) in [0, 1] of one size out in a grid, a label above each and a thin white gap between them.
 
-    Args:
-        images: pictures of one size, each (3, H, W), colours in [0, 1].
-        labels: one line for each, Latin letters (the built-in font has few others); a column is as wide as its widest
-            label.
-        columns: pictures in a row; None puts all of them in one.
+    Labels are Latin letters (the built-in font has few others); a column is as wide as its widest label. Without
+    ``columns`` all pictures stand in one row.
 
     Returns:
-        Colours in [0, 1], shape (3, H', W'), on the CPU.
+        Colours in [0, 1], shape (3, H', W'), on the CPU, rounded to bytes.
 
     Raises:
         ValueError: if there is no image, the sizes or the numbers differ, or ``columns`` is not positive.

@@ -18,11 +18,7 @@ __all__ = ["COLMAP", "colmap_folders", "colmap_frames", "read_colmap"]
 def read_colmap(folder: str | Path) -> ColmapModel:
     """Read a reconstruction: cameras, images and points, from ``.bin`` files, or ``.txt`` where there is no ``.bin``.
 
-    Args:
-        folder: the folder of the three files, often ``sparse/0``.
-
-    Returns:
-        The reconstruction, its images sorted by name. It has no points if a ``points3D.ply`` stands in their place.
+    Its folder is often ``sparse/0``. It has no points if a ``points3D.ply`` stands in their place.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -49,16 +45,9 @@ def colmap_folders(root: Path) -> list[Path]:
 
 
 def colmap_frames(model: ColmapModel, folder: str | Path) -> list[Frame]:
-    """Pair the images of a reconstruction with their files.
+    """Pair the images of a reconstruction with their files in a folder, maybe of resized copies; sorted by name.
 
     The frame has the pinhole part of the camera, and its distortion beside it.
-
-    Args:
-        model: the reconstruction.
-        folder: the image folder; it may hold resized copies.
-
-    Returns:
-        The frames, sorted by name.
 
     Raises:
         FileNotFoundError: if there is no such folder.

@@ -65,23 +65,19 @@ def orbit_views(
     The renderer does not draw what is nearer than 0.2: models with a radius below about 0.13 must be enlarged first.
 
     Args:
-        means: world coordinates, finite, shape (N, 3).
-        opacities: activated, in [0, 1], shape (N,) or (N, 1).
-        count: number of cameras, at least 1.
-        width: image width, pixels.
-        height: image height, pixels.
+        means: as for `bounding_sphere`.
+        opacities: likewise.
+        count: number of cameras.
+        width: of their pictures, pixels.
+        height: likewise.
         field_of_view: along the shorter side of the picture, radians, in (0, pi).
         fill: diameter of the sphere as a share of the shorter side, in (0, 1].
         world: the vertical axis.
         arc: angle between the first and the last camera, radians, in (0, 2 pi]; a full circle has no camera twice. A
             model that was captured from one side (LLFF scenes) looks sensible on a small arc only.
 
-    Returns:
-        The cameras, with float32 poses on the device of the means.
-
     Raises:
-        ValueError: if an argument is out of range, the shapes do not match, or the Gaussians that are not transparent
-            do not span a volume, because there are none or they lie on one point.
+        ValueError: if an argument is out of range, or as `bounding_sphere` does.
 
     Example:
         >>> corners = torch.tensor([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])

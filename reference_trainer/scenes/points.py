@@ -42,7 +42,7 @@ def choose_points(
     passed = ""
     if points == "auto":
         offered = [own] if own is not None else []
-        offered += [cloud for folder in colmap_folders(root) if (cloud := _points_of(folder)) is not None]
+        offered += [cloud for folder in colmap_folders(root) if (cloud := colmap_points(folder)) is not None]
         names = {frame.name for frame in train}
         honest = [cloud for cloud in offered if (cloud.seen_by or frozenset()) <= names]
         if honest:
@@ -66,30 +66,20 @@ def choose_points(
             f"there is no folder {path} to take points from; choose auto, random or one of {found}."
         )
     cloud = ply_points(path) if path.suffix == ".ply" else colmap_points(path)
+    if cloud is None:
+        raise ValueError(f"{path} has no points to start from; choose another folder or random points.")
     return cloud, f"initial points: {len(cloud.positions):,} from {cloud.source}"
 
 
-def colmap_points(folder: str | Path) -> PointCloud:
-    """Read the points of a COLMAP reconstruction, or InstantSplat's ``points3D.ply`` in their place.
+def colmap_points(folder: Path) -> PointCloud | None:
+    """Read the points of a COLMAP reconstruction, or InstantSplat's ``points3D.ply`` in their place; None without any.
 
-    Args:
-        folder: the folder of its files, such as ``sparse/0``.
-
-    Returns:
-        The points; ``seen_by`` names the images in their tracks, or all of the reconstruction's if tracks are missing.
+    ``seen_by`` names the images in their tracks, or all of the reconstruction's if tracks are missing.
 
     Raises:
         FileNotFoundError: if a file is missing.
-        ValueError: if a file is damaged or there are no points.
+        ValueError: if a file is damaged.
     """
-    cloud = _points_of(Path(folder))
-    if cloud is None:
-        raise ValueError(f"{folder} has no points to start from; choose another folder or random points.")
-    return cloud
-
-
-def _points_of(folder: Path) -> PointCloud | None:
-    """Read the points of a reconstruction, None if it has none."""
     model = read_colmap(folder)
     if len(model.points.ids):
         positions = torch.from_numpy(model.points.positions).to(torch.float32)

@@ -109,33 +109,19 @@ Solid = Round | Plane | Box
 
 
 def nearest_hit(solids: Sequence[Solid], origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Intersect rays with solids.
+    """Intersect rays with solids: parameters (R,) of the nearest hits, inf for none, and the solids' numbers (R,).
 
-    Args:
-        solids: the surfaces.
-        origins: where the rays start, shape (R, 3).
-        directions: where they go, any length, shape (R, 3).
-
-    Returns:
-        The ray parameters of the nearest hits, shape (R,), inf for none, and the numbers of the solids, shape (R,).
+    Origins and directions have shape (R, 3); a direction may have any length.
     """
     return torch.stack([solid.intersect(origins, directions) for solid in solids]).min(0)
 
 
 def render_solids(camera: Camera, solids: Sequence[Solid], light: Tensor) -> tuple[Tensor, Tensor]:
-    """Render solids, 3x3 rays a pixel.
+    """Render solids, 3x3 rays a pixel: the image (3, H, W) in [0, 1] and the depth (H, W) at pixel centres, float32.
 
-    Surfaces are matt, so their colour does not depend on the view. The light is a small square; each of a pixel's nine
-    rays sees another of its nine points, which makes the shadows soft.
-
-    Args:
-        camera: the camera.
-        solids: the surfaces.
-        light: positions of the nine points of the light, shape (9, 3).
-
-    Returns:
-        The image, shape (3, H, W), in [0, 1], black where nothing is hit, and the depth along the camera's z axis of
-        the surface at each pixel centre, shape (H, W), 0 where nothing is hit; float32.
+    Surfaces are matt, so their colour does not depend on the view. The light is a small square of nine points (9, 3);
+    each of a pixel's nine rays sees another of them, which makes the shadows soft. Depth is along the camera's z axis;
+    image and depth are 0 where nothing is hit.
     """
     steps = (torch.arange(SAMPLES) + 0.5) / SAMPLES
     shape = (camera.height, camera.width, SAMPLES, SAMPLES)

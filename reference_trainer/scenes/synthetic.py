@@ -36,23 +36,14 @@ def synthetic_scene(
 ) -> Scene:
     """Ray-trace the built-in scene: columns, spheres and a box on a tiled floor before a painted wall.
 
-    Training cameras stand side by side on a slightly bent row and look at one point, like the LLFF captures. All test
-    cameras but the last stand between and above or below them (interpolation), the last one beyond the end of the row
-    (extrapolation, the hardest). Every view has its exact depth. The initial points lie on surfaces that training views
-    see, with a depth error of 0.5 %, as if they had been triangulated.
+    Training cameras, at least 2, stand side by side on a slightly bent row and look at one point, like the LLFF
+    captures. All test cameras but the last stand between and above or below them (interpolation), the last one beyond
+    the end of the row (extrapolation, the hardest). Every view has its exact depth. The initial points lie on surfaces
+    that training views see, with a depth error of 0.5 %, as if they had been triangulated. ``seed`` is that of the
+    points: the photographs are the same for every seed, so that runs can be compared. No ray reaches the background,
+    which is black.
 
     Convention: OpenCV world: x right, y down, z forward; the floor is at y = 1.
-
-    Args:
-        width: image width, pixels.
-        height: image height, pixels.
-        train_views: number of training views, at least 2.
-        test_views: number of test views, at least 1.
-        points: number of initial points.
-        seed: seed of the initial points. The photographs are the same for every seed, so that runs can be compared.
-
-    Returns:
-        The scene, on a black background that no ray reaches.
 
     Raises:
         ValueError: if there are too few views or no points.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from reference_trainer.camera import Camera
 from reference_trainer.json_files import read_json
 from reference_trainer.scenes.formats import Capture, SceneFormat, only_default
-from reference_trainer.scenes.frames import Frame
+from reference_trainer.scenes.frames import Frame, view_matrix
 from reference_trainer.scenes.images import IMAGE_SUFFIXES, image_size, path_inside
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.points import ply_points
@@ -125,13 +125,10 @@ def _world_to_camera(entry: dict[str, Any], back: NDArray[np.float64]) -> torch.
             f"transform_matrix of {entry['file_path']} must be a finite 4x4 matrix, got {matrix.tolist()}."
         )
     matrix = back @ matrix
-    rotation = (matrix[:3, :3] * [1, -1, -1]).T
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise ValueError(f"transform_matrix of {entry['file_path']} holds no rotation: {matrix[:3, :3].tolist()}.")
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ matrix[:3, 3]
-    return torch.from_numpy(pose)
+    try:
+        return view_matrix((matrix[:3, :3] * [1, -1, -1]).T, matrix[:3, 3])
+    except ValueError as error:
+        raise ValueError(f"transform_matrix of {entry['file_path']}: {error}") from error
 
 
 def _points(path: Path, frames: list[Frame]) -> PointCloud | None:

@@ -48,18 +48,11 @@ def corner_displacement(camera: Camera, distortion: Sequence[float]) -> float:
 
 
 def undistort(pixels: Tensor, camera: Camera, distortion: Sequence[float]) -> tuple[Tensor, Camera]:
-    """Resample a picture, bicubically and once, so that straight lines are straight.
+    """Resample a picture (C, H, W), bicubically and once, so that straight lines are straight; return its camera, too.
 
     The picture keeps its size. Where the lens saw less than the straight picture would show, the focal length grows
-    until no pixel is empty, as COLMAP's undistorter does by default.
-
-    Args:
-        pixels: values in [0, 1], shape (C, H, W).
-        camera: the camera of the picture, without its distortion.
-        distortion: as for `distort`.
-
-    Returns:
-        The picture, same shape, and its pinhole camera.
+    until no pixel is empty, as COLMAP's undistorter does by default. ``camera`` is that of the picture without its
+    distortion, which is given as for `distort`.
 
     Raises:
         ValueError: if the lens folds the picture over itself, or shows less than a quarter of it.
