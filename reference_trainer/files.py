@@ -16,14 +16,9 @@ _PART = ".part"
 def replacing(path: str | Path) -> Iterator[Path]:
     """Give a place to write to; on success it becomes ``path`` in one move, on failure nothing has changed.
 
-    Missing folders are made. The content is on disk before the move, and the move before this returns: a power cut
-    leaves the old file or the new, and what is written later does not survive without what was written before.
-
-    Args:
-        path: the file to create or replace.
-
-    Yields:
-        A path in the same folder to write the content to.
+    Missing folders are made; the place is in the same folder. The content is on disk before the move, and the move
+    before this returns: a power cut leaves the old file or the new, and what is written later does not survive without
+    what was written before.
 
     Raises:
         OSError: if it cannot be written, such as on a full disk; it names ``path``.

@@ -21,11 +21,7 @@ _active = ExitStack()
 
 
 def install(repository: str | Path | None = None, outputs: Outputs | None = None) -> tuple[str, ...]:
-    """Do what `stand_in` does, until `uninstall`; same arguments and exceptions.
-
-    Returns:
-        The names of the modules.
-    """
+    """Do what `stand_in` does, until `uninstall`; same arguments and exceptions. Returns the names of the modules."""
     names = _active.enter_context(stand_in(repository, outputs))
     return names
 

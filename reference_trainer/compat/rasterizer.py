@@ -52,17 +52,10 @@ class GaussianRasterizer(nn.Module):
         rotations: Tensor | None = None,
         cov3D_precomp: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """Render Gaussians.
+        """Render Gaussians: world coordinates (N, 3), opacities (N, 1) or (N,), scales (N, 3), rotations wxyz (N, 4).
 
-        Args:
-            means3D: world coordinates, shape (N, 3).
-            means2D: receives the screen-space gradients, shape (N, 3), or (N, 4) for AbsGS.
-            opacities: activated, shape (N, 1) or (N,).
-            shs: spherical-harmonic coefficients, shape (N, K, 3), or
-            colors_precomp: colours, shape (N, 3).
-            scales: standard deviations, positive, shape (N, 3).
-            rotations: orientation, quaternions wxyz, shape (N, 4).
-            cov3D_precomp: refused.
+        ``means2D`` (N, 3), or (N, 4) for AbsGS, receives the screen-space gradients. Colours are spherical-harmonic
+        coefficients ``shs`` (N, K, 3) or ``colors_precomp`` (N, 3).
 
         Returns:
             The image (3, H, W), not clamped; radii in pixels, shape (N,) int32, 0 for what is out of view; and the

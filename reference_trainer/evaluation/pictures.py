@@ -29,11 +29,8 @@ _UNDEFINED = 0.5  # grey of values that are not finite: no colour of the map
 def file_names(views: Sequence[str]) -> list[str]:
     """Return a file name without extension for the pictures of each view; no two are equal, nor is one another's panel.
 
-    That is the view's own name without its folder, or with the folders where two views would share it, as in
-    ``a/r_0.png`` and ``b/r_0.png``. Upper and lower case count as equal, as they do to some file systems.
-
-    Args:
-        views: names of all views whose pictures go into one folder; they decide together.
+    That is the view's own name without its folder, or with the folders where two views would share it. Upper and lower
+    case count as equal, as they do to some file systems. All views whose pictures go into one folder decide together.
 
     Example:
         >>> file_names(["images/0001.jpg", "a/r_0.png", "b/r_0.png"])

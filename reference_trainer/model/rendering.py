@@ -26,16 +26,11 @@ def render_gaussians(
     depth: bool = False,
     renderer: Callable[..., Any] = render,
 ) -> Rendering:
-    """Render a model.
+    """Render Gaussians, or what is to be rendered of them, such as what a regularizer returned, over a colour (3,).
 
-    Args:
-        model: Gaussians, or what is to be rendered of them, such as what a regularizer returned.
-        camera: the view.
-        background: colour behind it, shape (3,).
-        opacities: activated opacities (N,) to use instead of the model's own.
-        sh_degree: highest band of spherical harmonics to use; all by default.
-        depth: whether to accumulate depth as well.
-        renderer: with the arguments of `render`, such as gsplat's; what it returns is returned.
+    Opacities (N,), activated, take the place of the model's own; ``sh_degree`` is the highest band to use, by default
+    all; with ``depth`` it is accumulated as well. Another renderer, such as gsplat's, has the arguments of `render`;
+    what it returns is returned.
 
     Example:
         >>> import torch

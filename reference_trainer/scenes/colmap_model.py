@@ -55,12 +55,10 @@ _MODELS: dict[int | str, CameraModel] = {k: m for n, m in enumerate(CAMERA_MODEL
 
 
 class ColmapCamera(NamedTuple):
-    """Intrinsics of one camera. Convention: half-pixel centres, as in the rest of the program.
+    """Intrinsics of one camera: the pinhole part at the origin of the world, float64, and the distortion beside it.
 
-    Args:
-        model: its camera model.
-        pinhole: the camera at the origin of the world without its distortion, float64.
-        distortion: its parameters, in COLMAP's order; empty for the pinhole models.
+    Convention: half-pixel centres, as in the rest of the program; the distortion is in COLMAP's order, empty for the
+    pinhole models.
     """
 
     model: CameraModel
@@ -127,18 +125,10 @@ def view_matrix(qvec: Sequence[float], tvec: Sequence[float]) -> NDArray[np.floa
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """One registered image.
+    """One registered image: its number, path within the image folder, camera's number and pose (4, 4), float64.
 
-    Args:
-        id: number of the image.
-        name: its path within the image folder.
-        camera_id: number of its camera.
-        world_to_camera: its pose, shape (4, 4), float64.
-        keypoints: its 2D features, pixels, shape (K, 2), float64.
-        point_ids: number of the 3D point of each feature, -1 for none, shape (K,), int64.
-
-    Raises:
-        ValueError: if a feature has no finite position.
+    Its 2D features are at ``keypoints`` (K, 2), pixels, float64, and belong to the 3D points of the numbers
+    ``point_ids`` (K,), -1 for none. Raises ValueError if a feature has no finite position.
     """
 
     id: int
@@ -155,17 +145,10 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapPoints:
-    """The triangulated points.
+    """The M triangulated points: numbers (M,), world coordinates (M, 3), float64, and RGB (M, 3), uint8.
 
-    Args:
-        ids: their numbers, shape (M,), int64.
-        positions: world coordinates, shape (M, 3), float64.
-        colors: RGB, shape (M, 3), uint8.
-        tracks: for each point the numbers of the images that it was found in, each an int64 array; empty if the
-            reconstruction does not say.
-
-    Raises:
-        ValueError: if a position is not finite.
+    ``tracks`` holds for each the numbers of the images that it was found in, each an int64 array; empty if the
+    reconstruction does not say. Raises ValueError if a position is not finite.
     """
 
     ids: NDArray[np.int64]
@@ -214,15 +197,9 @@ class PointRecords:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A reconstruction.
+    """A reconstruction: cameras by number, images sorted by name, and points, of which there may be none.
 
-    Args:
-        cameras: from number to camera.
-        images: the images, sorted by name.
-        points: the points; there may be none.
-
-    Raises:
-        ValueError: if an image has a camera that is not there, or two images have one name or number.
+    Raises ValueError if an image has a camera that is not there, or two images have one name or number.
     """
 
     cameras: dict[int, ColmapCamera]

@@ -43,14 +43,9 @@ class Frame:
 
 
 def view_matrix(axes: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
-    """Return the view matrix (4, 4), float64, of a camera at a position (3,).
+    """Return the view matrix (4, 4), float64, of a camera at a world position (3,), for its right, down and forward.
 
-    Args:
-        axes: right, down and forward in world coordinates, one a row, shape (3, 3).
-        position: world coordinates.
-
-    Raises:
-        ValueError: if the axes are no rotation, to a thousandth.
+    These axes are one a row, shape (3, 3); ValueError is raised if they are no rotation, to a thousandth.
     """
     with np.errstate(all="ignore"):
         is_rotation = np.allclose(axes @ axes.T, np.eye(3), atol=1e-3) and np.linalg.det(axes) > 0

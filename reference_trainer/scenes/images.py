@@ -125,9 +125,7 @@ def resize_image(image: Tensor, width: int, height: int) -> Tensor:
 def list_images(folder: str | Path) -> list[Path]:
     """Return the image files of a folder, sorted by name.
 
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if it holds no images.
+    Raises FileNotFoundError if there is no such folder, ValueError if it holds no images.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -190,13 +188,10 @@ def path_inside(root: str | Path, relative: str) -> Path:
 
 
 def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
-    """Return the folder of a scene's photographs.
+    """Return the folder of a scene's photographs, the one that was asked for by name or the usual one.
 
-    Args:
-        root: the scene folder.
-        name: the folder that was asked for; if None, ``usual``, or of it and the ``<usual>_<factor>`` beside it the
-            largest pictures of at most half a megapixel, or the smallest if there are none.
-        usual: what this kind of scene calls it.
+    Of that and the ``<usual>_<factor>`` beside it, it is the one with the largest pictures of at most half a megapixel,
+    or with the smallest if there are none.
 
     Raises:
         FileNotFoundError: if there is none; the message lists the folders with pictures.

@@ -28,12 +28,9 @@ place with surroundings and no object: objects have 1.6 to 1.9 (a plant, a mesh,
 
 @dataclass(frozen=True)
 class BoundingSphere:
-    """The part of a model that is to be looked at.
+    """The part of a model that is to be looked at: its centre (3,), float64, and radius, in world units.
 
-    Args:
-        center: world coordinates, shape (3,), float64.
-        radius: in units of the world.
-        surroundings: whether it is the middle of a place, such as a room, and not an object as a whole.
+    It may be the middle of a place with surroundings, such as a room, and not an object as a whole.
     """
 
     center: Tensor
@@ -113,11 +110,8 @@ def bounding_sphere(means: Tensor, opacities: Tensor) -> BoundingSphere:
 
     Of an object, the centre is that of the box between the quantiles 1 - `INSIDE` and `INSIDE` of each coordinate, and
     the radius the quantile `INSIDE` of the distances from it. Of a place with `SURROUNDINGS`, where that sphere would
-    be the room, the centre is the median and the radius twice that of half of the opacity. All is weighted by opacity.
-
-    Args:
-        means: world coordinates, finite, shape (N, 3).
-        opacities: activated, in [0, 1], shape (N,) or (N, 1).
+    be the room, the centre is the median and the radius twice that of half of the opacity. All is weighted by opacity,
+    activated, (N,) or (N, 1); the means (N, 3) are finite world coordinates.
 
     Raises:
         ValueError: if the shapes do not match, or the Gaussians that are not transparent do not span a volume, because

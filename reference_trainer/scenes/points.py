@@ -27,12 +27,8 @@ def choose_points(
 ) -> tuple[PointCloud, str]:
     """Return the initial points that an option of a scene asks for, and a sentence about the choice.
 
-    Args:
-        root: the scene folder.
-        points: ``"auto"``, ``"random"``, ``"random:<count>"``, a ``.ply`` file or a COLMAP folder within the scene.
-        train: the training frames.
-        generator: source of randomness.
-        own: the points that the scene file names.
+    ``points`` is ``"auto"``, ``"random"``, ``"random:<count>"``, or a ``.ply`` file or a COLMAP folder within the
+    scene; ``own`` are those that the scene file names.
 
     Raises:
         FileNotFoundError: if the file or folder is missing.

@@ -90,15 +90,8 @@ def file_split(path: str | Path, names: Sequence[str], views: int | None) -> tup
     """Read a split from a JSON file with a list ``test`` and one or more lists of training images.
 
     With ``views`` given, the list is ``train_<views>``, else ``train`` if it has that length, else ``views`` images
-    spread evenly over ``train_all``. Without, it is ``train``, else ``train_3``.
-
-    Args:
-        path: the JSON file; it names images with or without extension.
-        names: the names of all images of the scene.
-        views: number of training views, or None for the file's own choice.
-
-    Returns:
-        Indices into ``names`` of the training views and of the test views, each in increasing order.
+    spread evenly over ``train_all``. Without, it is ``train``, else ``train_3``. Images are named with or without
+    extension. Returned are indices into ``names``, all images of the scene, each list in increasing order.
 
     Raises:
         FileNotFoundError: if there is no such file.

@@ -17,9 +17,6 @@ Texture = Callable[[Tensor], Tensor]
 class Noise:
     """Smooth noise in space: random values on a periodic integer lattice, interpolated, summed over octaves.
 
-    Args:
-        generator: source of the lattice values.
-
     Example:
         >>> noise = Noise(torch.Generator().manual_seed(0))
         >>> noise(torch.rand(10, 3), octaves=4).shape

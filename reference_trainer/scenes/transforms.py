@@ -30,14 +30,9 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
     COLMAP files it came from. The focal length is ``fl_x`` and ``fl_y``, pixels, for a picture of ``w`` x ``h``, else
     it follows from the horizontal field of view ``camera_angle_x``, radians. The principal point ``cx``, ``cy`` is the
     centre of the picture unless given; ``k1 k2 p1 p2 k3`` are OpenCV's distortion. A frame may have its own of each.
-    ``file_path`` is relative to the JSON file; without an extension it means a PNG file.
-
-    Args:
-        path: the JSON file.
-        images: another folder, beside the file, for the pictures of the same names.
-
-    Returns:
-        The frames; their names are the file paths without a leading ``./`` and without extension.
+    ``file_path`` is relative to the JSON file; without an extension it means a PNG file. Pictures of the same names are
+    taken from another folder beside the file if one is given. The frames' names are the file paths without a leading
+    ``./`` and without extension.
 
     Raises:
         FileNotFoundError: if the file or images are missing.

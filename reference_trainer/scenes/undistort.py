@@ -17,15 +17,10 @@ LARGEST_ZOOM = 4.0
 
 
 def distort(points: Tensor, camera: Camera, distortion: Sequence[float]) -> Tensor:
-    """Return where the lens puts points that a pinhole camera without distortion would see at some pixel.
+    """Return where the lens puts pixels (..., N, 2), float64, of a pinhole camera without distortion.
 
     Convention: OpenCV's rational model; the coefficients are k1 k2 p1 p2 k3 k4 k5 k6 or a beginning of that list, which
-    is also the order of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV.
-
-    Args:
-        points: pixels (x, y), half-integer at pixel centres, shape (..., N, 2), float64.
-        camera: the pinhole camera of the picture, whose pose does not matter.
-        distortion: the coefficients.
+    is also the order of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV. Pixel centres are half-integer.
 
     Example:
         >>> camera = Camera(torch.eye(4), 100.0, 100.0, 50.0, 40.0, 100, 80)
