@@ -96,9 +96,7 @@ class LPIPS:
 def load_lpips(choice: str | Path | None, *, device: torch.device | str = "cpu") -> LPIPS | None:
     """Return what the option ``--lpips`` asks for; its ``name`` belongs beside every number.
 
-    Args:
-        choice: ``"installed"`` for the wheel ``stlpips-pytorch``, a state dict file as the module says, or None.
-        device: where to compute.
+    That is ``"installed"`` for the wheel ``stlpips-pytorch``, a state dict file as the module says, or None.
 
     Raises:
         FileNotFoundError: if the named file does not exist.

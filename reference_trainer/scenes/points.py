@@ -127,15 +127,10 @@ def _colors(vertices: PlyVertices) -> Tensor:
 
 
 def check_no_leak(points: PointCloud, train_names: Iterable[str], *, allow: bool = False) -> None:
-    """Refuse points that were triangulated with the help of images outside the training split.
+    """Refuse points that were triangulated with the help of images outside the training split, unless they are allowed.
 
     A point found in a test view brings that view's geometry into training. A cloud whose origin is unknown
     (``seen_by`` is None) passes: nothing is known against it.
-
-    Args:
-        points: the initial points.
-        train_names: names of the training images.
-        allow: accept such points all the same.
 
     Raises:
         ValueError: if the points have seen other images and ``allow`` is False.

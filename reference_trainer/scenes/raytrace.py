@@ -12,7 +12,7 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.textures import Texture
 
-__all__ = ["Box", "Plane", "Round", "Solid", "nearest_hit", "render_solids"]
+__all__ = ["Box", "Round", "Solid", "nearest_hit", "render_solids"]
 
 SAMPLES = 3  # a side per pixel; odd, so that one ray passes through the pixel centre and gives its depth
 SHADOW_OFFSET = 1e-3  # shadow rays start this far off the surface, lest rounding make it shadow itself
@@ -53,25 +53,6 @@ class Round:
 
 
 @dataclass(frozen=True)
-class Plane:
-    """An endless plane: the points with ``normal . x = offset``."""
-
-    normal: tuple[float, float, float]
-    offset: float
-    texture: Texture
-
-    def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """See `Round`."""
-        normal = origins.new_tensor(self.normal)
-        t = (self.offset - origins @ normal) / (directions @ normal)
-        return torch.where(t > 0, t, torch.inf)
-
-    def normals(self, points: Tensor) -> Tensor:
-        """See `Round`."""
-        return points.new_tensor(self.normal).expand_as(points)
-
-
-@dataclass(frozen=True)
 class Box:
     """A box turned about the vertical axis by ``turn`` radians."""
 
@@ -105,7 +86,7 @@ class Box:
         return torch.zeros_like(share).scatter(1, face, share.gather(1, face).sign()) @ self._axes(points)
 
 
-Solid = Round | Plane | Box
+Solid = Round | Box
 
 
 def nearest_hit(solids: Sequence[Solid], origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.orbit import look_at
-from reference_trainer.scenes.raytrace import Box, Plane, Round, Solid, render_solids
+from reference_trainer.scenes.raytrace import Box, Round, Solid, render_solids
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.scenes.textures import Noise, Texture, checker, color_ramp
 
@@ -160,8 +160,8 @@ def _courtyard(noise: Noise) -> list[Solid]:
     crate = Box((1.35, 0.55, 5.6), (0.45, 0.45, 0.45), 0.6, mosaic)
     columns = [Round((x, 0.0, 7.0), 0.2, stone((0.80, 0.72, 0.60)), (-6.0, GROUND)) for x in (-3.3, -1.1, 1.1, 3.3)]
     return [
-        Plane((0.0, -1.0, 0.0), -GROUND, floor),
-        Plane((0.0, 0.0, -1.0), -8.5, wall),
+        Box((0.0, GROUND + 20, 0.0), (40.0, 20.0, 40.0), 0.0, floor),
+        Box((0.0, 0.0, 28.5), (40.0, 40.0, 20.0), 0.0, wall),
         Round((-0.95, 0.25, 4.7), 0.75, marble),
         Round((0.42, 0.60, 3.6), 0.40, citrus),
         Round((-0.25, 0.72, 6.0), 0.28, moss),
