@@ -119,8 +119,8 @@ def _weighted(x: Tensor, weight: Tensor) -> Tensor:
 def rasterizer_module(name: str, members: tuple[str, ...]) -> ModuleType:
     """Make a module with the interface of a rasterizer package, maybe that of AbsGS, ``..._abs``.
 
-    Its class is new for every call: a patch of its ``forward`` ends with the module. ``members`` are what the rasterizer
-    returns after image and radii: ``depth`` or ``inverse_depth``, ``alpha``; for AbsGS ``weights`` alone.
+    Its class is new for every call: a patch of its ``forward`` ends with the module. ``members`` is what the result has
+    after image and radii: ``depth`` or ``inverse_depth``, ``alpha``; for AbsGS ``weights`` alone.
 
     Example:
         >>> module = rasterizer_module("diff_gaussian_rasterization", ())
