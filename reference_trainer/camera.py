@@ -33,10 +33,8 @@ class Camera:
 
     Example:
         >>> camera = Camera(torch.eye(4), fx=100.0, fy=100.0, cx=32.0, cy=24.0, width=64, height=48)
-        >>> camera.scaled(0.5).width
-        32
-        >>> camera.position.tolist()
-        [0.0, 0.0, 0.0]
+        >>> camera.lift(torch.tensor([32.0, 124.0]), torch.tensor(2.0)).tolist()
+        [0.0, 2.0, 2.0]
     """
 
     world_to_camera: Tensor
@@ -69,13 +67,12 @@ class Camera:
         """Unit viewing direction (the camera's +z axis) in world coordinates, shape (3,)."""
         return self.world_to_camera[2, :3]
 
-    def scaled(self, factor: float) -> Camera:
-        """Return the camera of the same picture resized by ``factor``; the size is rounded to whole pixels.
-
-        The intrinsics follow the rounded size exactly, so that the picture keeps its field of view.
-        """
-        width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
-        return self.resized(width, height)
+    def lift(self, pixels: Tensor, depth: Tensor) -> Tensor:
+        """Return the world points (..., 3) at pixels (..., 2) and depths (...) along the camera's z axis."""
+        pose = self.world_to_camera.to(depth)
+        across = (pixels - depth.new_tensor([self.cx, self.cy])) / depth.new_tensor([self.fx, self.fy])
+        local = torch.cat([across, torch.ones_like(across[..., :1])], -1) * depth[..., None]
+        return (local - pose[:3, 3]) @ pose[:3, :3]
 
     def resized(self, width: int, height: int) -> Camera:
         """Return the camera of the same picture resized to ``width`` x ``height`` pixels."""

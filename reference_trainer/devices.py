@@ -6,14 +6,10 @@ __all__ = ["check_device"]
 
 
 def check_device(name: str, *, here: bool = True) -> None:
-    """Refuse a device that PyTorch cannot compute on.
-
-    Args:
-        name: such as ``"cpu"``, ``"cuda"`` or ``"cuda:1"``.
-        here: whether this machine must have it; else only the name is looked at.
+    """Refuse a device, such as ``"cuda:1"``, that PyTorch cannot compute on, unless it is another machine's.
 
     Raises:
-        ValueError: if it is no device, or there is none here.
+        ValueError: if it is no device, or there is none ``here``, if this machine must have it.
 
     Example:
         >>> check_device("cpu")

@@ -16,14 +16,9 @@ _PART = ".part"
 def replacing(path: str | Path) -> Iterator[Path]:
     """Give a place to write to; on success it becomes ``path`` in one move, on failure nothing has changed.
 
-    Missing folders are made. The content is on disk before the move, and the move before this returns: a power cut
-    leaves the old file or the new, and what is written later does not survive without what was written before.
-
-    Args:
-        path: the file to create or replace.
-
-    Yields:
-        A path in the same folder to write the content to.
+    Missing folders are made; the place is in the same folder. The content is on disk before the move, and the move
+    before this returns: a power cut leaves the old file or the new, and what is written later does not survive without
+    what was written before.
 
     Raises:
         OSError: if it cannot be written, such as on a full disk; it names ``path``.
@@ -55,12 +50,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text in UTF-8 as `replacing` does.
-
-    Args:
-        path: the file to create or replace.
-        text: all of its content.
-    """
+    """Write a text in UTF-8 as `replacing` does."""
     with replacing(path) as place:
         place.write_text(text, encoding="utf-8")
 
@@ -68,9 +58,7 @@ def write_text(path: str | Path, text: str) -> None:
 def remove_leftovers(folder: str | Path, *, below: bool = True) -> int:
     """Remove what killed processes had begun to write in a folder, and return how many files that were.
 
-    Args:
-        folder: where no other process is writing now.
-        below: in all folders below it, too.
+    No other process may be writing there now. ``below`` also looks into all folders below it.
     """
     leftovers = [path for path in Path(folder).glob(f"{'**/' * below}.*{_PART}") if path.is_file()]
     for path in leftovers:

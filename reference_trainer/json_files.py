@@ -15,16 +15,7 @@ T = TypeVar("T")
 def read_json(path: str | Path) -> Any:
     """Return the content of a JSON file.
 
-    Raises:
-        ValueError: if it is not JSON in UTF-8, or nested too deeply; the message names the file.
-        OSError: if it cannot be read.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = Path(folder, "split.json").write_text('{"test": ["a.png"]}')
-        ...     read_json(f"{folder}/split.json")
-        {'test': ['a.png']}
+    Raises ValueError, which names the file, if it is not JSON in UTF-8 or nested too deeply.
     """
     path = Path(path)
     try:
@@ -36,10 +27,7 @@ def read_json(path: str | Path) -> Any:
 def settings_from(kind: type[T], values: Any, where: str) -> T:
     """Make a dataclass of plain fields from a JSON object; fields that it lacks get their defaults.
 
-    Args:
-        kind: a dataclass whose fields are numbers, strings, booleans or None, or a choice of strings.
-        values: what was read.
-        where: what to call it in errors: a file, and a place in it.
+    The fields are numbers, strings, booleans or None, or a choice of strings; ``where`` is what errors call it.
 
     Raises:
         ValueError: if it is no object, has a field that there is not, a value of another type, or one that ``kind``

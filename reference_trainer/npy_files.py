@@ -15,14 +15,10 @@ __all__ = ["read_npy", "read_npz"]
 
 
 def read_npy(data: bytes, name: str | Path) -> NDArray[np.float64]:
-    """Read an array of floats; its announced size is compared with the data before anything is allocated for it.
+    """Read an array of floats from the content of an ``.npy`` file, which errors call ``name``.
 
-    Args:
-        data: the content of an ``.npy`` file. (Reading from a file would allocate whatever length its header has.)
-        name: what to call it in errors.
-
-    Raises:
-        ValueError: if it is none, is damaged, or holds anything but finite floats.
+    Its announced size is compared with the data before anything is allocated for it. (Reading from a file would
+    allocate whatever length its header has.) Raises ValueError if it is damaged or holds anything but finite floats.
     """
     file = io.BytesIO(data)
     try:

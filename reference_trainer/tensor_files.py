@@ -32,12 +32,7 @@ def load_tensors(path: str | Path, device: torch.device | str = "cpu", *, what: 
     Beyond what ``torch.load(weights_only=True)`` does, the checksums are compared, so that a damaged file is refused
     and not read as other numbers, and nothing is read that would take much more memory than the file has bytes: what
     describes the tensors is small, and no list or dict in it stands at two places. Files from before PyTorch 1.6 have
-    no checksums; they are read, too.
-
-    Args:
-        path: the file.
-        device: where the tensors go.
-        what: what the file should be, for the error.
+    no checksums; they are read, too. ``what`` the file should be goes into the error.
 
     Raises:
         ValueError: if the file is damaged, or holds anything else.
@@ -66,11 +61,7 @@ def load_tensors(path: str | Path, device: torch.device | str = "cpu", *, what: 
 
 
 def moved(state: Any, device: torch.device | str) -> Any:
-    """Return a state with its tensors on a device; those that are there already are not copied.
-
-    Args:
-        state: nested dicts and lists of tensors and anything else.
-        device: where to.
+    """Return nested dicts and lists with their tensors on a device; those that are there already are not copied.
 
     Example:
         >>> moved({"x": [torch.zeros(2)], "step": 3}, "meta")

@@ -21,14 +21,10 @@ def chosen_threads() -> int | None:
 
 
 def thread_count(pixels: int | None = None, *, jobs: int = 1) -> int:
-    """Return how many threads a computation gets.
+    """Return how many threads a computation on pictures of so many pixels gets, with so many processes side by side.
 
     What the user has set wins. Else it is the share of the processors that this process may run on, and for small
     pictures fewer. It does not depend on how busy the machine is: a training repeats bit for bit with the same number.
-
-    Args:
-        pixels: of the pictures; None if they are not known yet.
-        jobs: processes that compute side by side.
 
     Example:
         >>> thread_count(96 * 64, jobs=2) == (chosen_threads() or 1)

@@ -209,7 +209,7 @@ class Evaluate:
 
     def __call__(self) -> None:
         """Run the command."""
-        from reference_trainer.evaluation.lpips import lpips_option
+        from reference_trainer.evaluation.lpips import load_lpips
         from reference_trainer.evaluation.trajectory import measured_views
         from reference_trainer.runs.measure import measure, of_run
         from reference_trainer.runs.score_ply import score_ply
@@ -228,7 +228,7 @@ class Evaluate:
             )
         self.drawing.begin(self.device)
         shared: dict[str, Any] = {
-            "samples": self.samples, "seed": self.seed, "perceptual": lpips_option(self.lpips, device=self.device)
+            "samples": self.samples, "seed": self.seed, "perceptual": load_lpips(self.lpips, device=self.device)
         }  # fmt: skip
         if run is not None:
             model, scene, default = of_run(run, self.device, regularizer=self.regularizer)

@@ -27,16 +27,10 @@ def splat_weights(splats: Splats) -> Tensor:
 
 
 def absolute_gradients(splats: Splats, values: Tensor, gradient: Tensor, background: Tensor) -> Tensor:
-    """Sum the absolute values of the gradients that the pixels give to a splat's position (AbsGS).
+    """Sum the absolute values of the gradients that the pixels give to a splat's position (AbsGS), shape (M, 2).
 
-    Args:
-        splats: of a rendering, without gradients.
-        values: of the splats that were drawn, shape (M, C).
-        gradient: of the loss with respect to their picture and the accumulated alpha, shape (C + 1, H, W).
-        background: values behind everything, shape (C,).
-
-    Returns:
-        Sums of absolute values in x and y, loss per pixel of displacement, shape (M, 2).
+    The values (M, C) of the splats were drawn over the background (C,); ``gradient`` (C + 1, H, W) is that of the loss
+    with respect to their picture and the accumulated alpha. The sums are loss per pixel of displacement in x and y.
     """
     rows = pad_entries(torch.cat([geometry_rows(splats), values.T]))
     upstream = tile(gradient, splats.lists)
@@ -74,12 +68,9 @@ class _AbsoluteGradients(torch.autograd.Function):
 
 
 def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tensor | None = None) -> Rendering:
-    """Return the rendering, whose backward pass also delivers `absolute_gradients`.
+    """Return the rendering, whose backward pass also delivers `absolute_gradients`: as the gradient of ``sink`` (M, 2).
 
-    Args:
-        rendering: of some splats.
-        sink: receives them as its gradient; its values do not matter, shape (M, 2).
-        background: of the image, shape (3,); black by default.
+    The values of the sink do not matter. The background (3,) of the image is black by default.
     """
     splats = rendering.splats
     detached = splats._replace(

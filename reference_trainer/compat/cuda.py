@@ -119,11 +119,10 @@ class _Event:
         """Whether the work is done."""
         return True
 
-    def synchronize(self) -> None:
-        """Wait for nothing."""
-
     def wait(self, stream: Any = None) -> None:
         """Wait for nothing."""
+
+    synchronize = wait
 
 
 def _nothing() -> Callable[..., None]:

@@ -10,11 +10,10 @@ from tempfile import TemporaryDirectory
 from types import ModuleType
 
 from reference_trainer.compat.cuda import cuda_on_cpu
+from reference_trainer.compat.extensions import fused_ssim, make_module, neighbor_modules
 from reference_trainer.compat.gsplat_functions import gsplat_functions
-from reference_trainer.compat.neighbors import neighbor_modules
 from reference_trainer.compat.rasterizer import rasterizer_module
 from reference_trainer.compat.repository import Interface, Outputs, read_interface
-from reference_trainer.compat.similarity import similarity_module
 
 __all__ = ["install", "install_in_worker", "stand_in", "uninstall"]
 
@@ -22,11 +21,7 @@ _active = ExitStack()
 
 
 def install(repository: str | Path | None = None, outputs: Outputs | None = None) -> tuple[str, ...]:
-    """Do what `stand_in` does, until `uninstall`; same arguments and exceptions.
-
-    Returns:
-        The names of the modules.
-    """
+    """Do what `stand_in` does, until `uninstall`; same arguments and exceptions. Returns the names of the modules."""
     names = _active.enter_context(stand_in(repository, outputs))
     return names
 
@@ -97,7 +92,7 @@ def install_in_worker(interface: tuple[str, tuple[str, ...], bool] | None) -> No
 def _modules(interface: Interface | None) -> dict[str, ModuleType]:
     """Make the modules that are imported, by name."""
     if interface is None:
-        return {"fused_ssim": similarity_module()}
+        return {"fused_ssim": make_module("fused_ssim", fused_ssim=fused_ssim)}
     return {
         interface.rasterizer: rasterizer_module(interface.rasterizer, interface.members),
         **neighbor_modules(indices=interface.neighbor_indices),

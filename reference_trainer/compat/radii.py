@@ -15,30 +15,17 @@ CUDA_TILE = 16  # pixels; a Gaussian is visible to the INRIA code if the square 
 
 
 def in_front(means: Tensor, camera: Camera) -> Tensor:
-    """Say which Gaussians lie beyond the near plane; shape (N,) bool.
-
-    Args:
-        means: world coordinates, shape (N, 3).
-        camera: the view.
-    """
+    """Say which Gaussians, at world coordinates (N, 3), lie beyond the near plane; shape (N,) bool."""
     pose = camera.world_to_camera.to(means)
     return means.detach() @ pose[2, :3] + pose[2, 3] > NEAR_PLANE
 
 
 @torch.no_grad()
 def visible_radii(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) -> Tensor:
-    """Measure the radii of the splats that meet the picture.
+    """Measure the radii of the splats that meet the picture: pixels, (N,) int32, 0 before the near plane or off it.
 
     As in the originals the opacity does not matter: a Gaussian of opacity 0 has a radius, though it is not drawn.
-
-    Args:
-        means: world coordinates, shape (N, 3).
-        quaternions: orientation, wxyz, shape (N, 4).
-        scales: standard deviations, positive, shape (N, 3).
-        camera: the view.
-
-    Returns:
-        Radii in pixels, shape (N,) int32; 0 for Gaussians before the near plane or off the picture.
+    Quaternions are wxyz, scales standard deviations.
 
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)

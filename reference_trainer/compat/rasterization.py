@@ -84,12 +84,9 @@ def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterizat
 
 
 class _View(NamedTuple):
-    """What one camera sees.
+    """What one camera sees: M of the N Gaussians; gsplat's radii (M, 2), 0 for what it does not draw.
 
-    Args:
-        splats: M of the N Gaussians.
-        radii: gsplat's, 0 for what it does not draw, shape (M, 2).
-        listed: numbers of those with a radius, among the M.
+    ``listed`` are the numbers of those with a radius, among the M.
     """
 
     splats: Splats

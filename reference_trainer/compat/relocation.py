@@ -14,17 +14,11 @@ __all__ = ["compute_relocation", "quat_scale_to_covar_preci"]
 def compute_relocation(
     opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Return opacity and scales of Gaussians that, n at one place, look as one does (3DGS-MCMC, equation 9).
+    """Return opacities and scales of Gaussians that, n at one place, look as one does (3DGS-MCMC, equation 9).
 
-    Args:
-        opacities: of the one, shape (N,).
-        scales: of the one, shape (N, 3).
-        ratios: n, which is taken for at most the size of the table, shape (N,).
-        binoms: row n, column k holds n over k; shape (n_max, n_max).
-        min_opacity: the opacities are no lower, and that is what the scales are for (gsplat 1.6).
-
-    Returns:
-        Opacities (N,) and scales (N, 3) of each of the n.
+    Opacities (N,) and scales (N, 3) are those of the one; ``ratios`` (N,) are n, which is taken for at most the size
+    of the table of binomials: row n, column k holds n over k. The opacities are no lower than ``min_opacity``, and
+    that is what the scales are for (gsplat 1.6).
 
     Example:
         >>> table = torch.tensor([[1.0, 0.0], [1.0, 1.0]])
@@ -44,14 +38,9 @@ def compute_relocation(
 def quat_scale_to_covar_preci(
     quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Return covariances and their inverses, None for what was not asked for.
+    """Return covariances and their inverses, None for what was not asked for: (N, 3, 3), or if ``triu`` (N, 6).
 
-    Args:
-        quats: orientation, wxyz, shape (N, 4).
-        scales: standard deviations, shape (N, 3).
-        compute_covar: whether the covariances are needed.
-        compute_preci: whether their inverses are.
-        triu: whether to return the entries xx, xy, xz, yy, yz, zz, shape (N, 6), in place of matrices (N, 3, 3).
+    The six are xx, xy, xz, yy, yz, zz. Quaternions (N, 4) are wxyz, scales (N, 3) standard deviations.
 
     Example:
         >>> quat_scale_to_covar_preci(torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[1.0, 2, 3]]), triu=True)[0]

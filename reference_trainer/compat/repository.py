@@ -25,10 +25,8 @@ SAY_IT = "outputs=2, 4, 'depth' or 'inverse-depth', in the launcher --outputs"
 class Interface(NamedTuple):
     """What a repository expects of its CUDA extensions.
 
-    Args:
-        rasterizer: module name.
-        members: what the rasterizer returns after colour and radii.
-        neighbor_indices: whether ``distCUDA2`` returns the neighbours' numbers as well.
+    That is the rasterizer's module, what it returns after colour and radii, and whether ``distCUDA2`` returns the
+    neighbours' numbers as well.
     """
 
     rasterizer: str
@@ -37,15 +35,11 @@ class Interface(NamedTuple):
 
 
 def read_interface(repository: Path, outputs: Outputs | None = None) -> Interface:
-    """Read ``gaussian_renderer/__init__.py`` and ``scene/`` without importing them.
+    """Read ``gaussian_renderer/__init__.py`` and ``scene/`` without importing them; ``outputs`` says it instead.
 
     The number of outputs is that of the names to which the result of the rasterizer is assigned; if it is not taken
     apart there, a field of the settings may tell. A third of three outputs is what the settings tell, too: those with
     ``antialiasing`` (INRIA since October 2024) go with inverse depths, and no other field says what it is.
-
-    Args:
-        repository: the root of the foreign repository.
-        outputs: to say it instead.
 
     Raises:
         ValueError: if the outputs cannot be told, or no rasterizer has them.

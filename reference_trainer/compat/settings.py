@@ -18,22 +18,10 @@ class GaussianRasterizationSettings(NamedTuple):
     """What the rasterizers of the INRIA family are told about a view: the fields of all variants.
 
     Convention: matrices act on row vectors (``x_world @ viewmatrix``), so they are the transposes of the textbook's.
-
-    Args:
-        image_height: pixels.
-        image_width: pixels.
-        tanfovx: tangent of half the horizontal field of view.
-        tanfovy: tangent of half the vertical field of view.
-        bg: background colour, shape (3,).
-        scale_modifier: factor on every scale.
-        viewmatrix: world to camera, shape (4, 4).
-        projmatrix: world to clip space, shape (4, 4).
-        sh_degree: highest band of spherical harmonics to use.
-        campos: camera centre, shape (3,); not read, the view matrix has it too.
-        prefiltered: not read; it only lets the CUDA code stop at a culled Gaussian.
-        debug: not read.
-        confidence: factor on the gradients of every Gaussian, shape (N, 1) (FSGS, CoR-GS).
-        antialiasing: of newer INRIA versions; only False is supported.
+    ``viewmatrix`` is world to camera, ``projmatrix`` world to clip space, both (4, 4); sizes are in pixels, ``tanfovx``
+    and ``tanfovy`` tangents of half the fields of view. ``confidence`` (N, 1) is a factor on the gradients of every
+    Gaussian (FSGS, CoR-GS). Not read are ``campos``, which the view matrix has too, ``prefiltered`` and ``debug``; of
+    ``antialiasing`` only False is supported.
     """
 
     image_height: int

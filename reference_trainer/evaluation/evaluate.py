@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ca_reg import CAResult, CAScore
 from reference_trainer.evaluation.kept import KeptRecords
-from reference_trainer.evaluation.metrics import psnr, ssim
-from reference_trainer.evaluation.pictures import PANEL, error_map, file_names, heat_map, save_png, side_by_side
+from reference_trainer.evaluation.metrics import on_white, psnr, ssim
+from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.results import machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.render.statistics import color_variance_map
@@ -26,6 +26,8 @@ __all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "evaluate"]
 
 CA_PICTURE_RANGE = 0.02
 """Variance that gets the brightest colour in CA heat maps."""
+ERROR_PICTURE_RANGE = 0.25
+"""Absolute error, the mean of the channels, that gets the brightest colour."""
 
 
 class PerceptualMetric(Protocol):
@@ -112,7 +114,8 @@ def evaluate(
 ) -> Evaluation:
     """Measure a model at views, with their photographs or without.
 
-    Images are compared as floats clamped to [0, 1], without a detour over 8 bits.
+    Images are compared as floats clamped to [0, 1], without a detour over 8 bits. Where a view has a mask, PSNR counts
+    the pixels inside it, and SSIM and LPIPS see white outside: the DTU protocol.
 
     Args:
         model: what to measure.
@@ -140,7 +143,8 @@ def evaluate(
     members = [(split, *each) for split, group in views.items() for each in enumerate(group)]
     names = [name for group in views.values() for name in file_names([view.name for view in group])]
     photographs = (view.image.to(model.background.device) for _, _, view in members if isinstance(view, View))
-    metric = perceptual and [_identity(perceptual, image) for image in islice(photographs, 1)]
+    # Weights of one name may differ: what the metric says of a photograph tells.
+    metric = perceptual and [perceptual.name, *(float(perceptual(x, x.flip(2))) for x in islice(photographs, 1))]
     kept = KeptRecords(keep, (model, views, samples, seed, metric, machine()), say)
     done: list[ViewScores] = []
     start, measured = time.perf_counter(), 0
@@ -172,6 +176,10 @@ def _measure(
     opacities = model.gaussians.opacities
     out = model.test_rendering(view)
     image, photograph = out.image.clamp(0, 1), view.image if isinstance(view, View) else None
+    quality = (math.nan,) * 3
+    if isinstance(view, View):
+        pair = on_white(image, view.mask), on_white(view.image, view.mask)
+        quality = psnr(image, view.image, view.mask), ssim(*pair), math.nan if perceptual is None else perceptual(*pair)
     protocol, at_half, *limits = scores
     ca, exact, neutral = (score(opacities, view, index=index) for score in (protocol, *limits))
     half = ca if protocol.settings == at_half.settings else at_half(opacities, view, index=index)
@@ -179,9 +187,9 @@ def _measure(
     found = ViewScores(
         name=view.name,
         split=split,
-        psnr=math.nan if photograph is None else psnr(image, photograph),
-        ssim=math.nan if photograph is None else ssim(image, photograph),
-        lpips=math.nan if photograph is None or perceptual is None else perceptual(image, photograph),
+        psnr=quality[0],
+        ssim=quality[1],
+        lpips=quality[2],
         ca=ca.value,
         ca_std_error=ca.std_error,
         ca_half=half.value,
@@ -197,7 +205,8 @@ def _measure(
         if photograph is None:
             panels = render | _maps({"CA": ca, "exact": exact, "neutral": neutral})
         else:
-            panels = {"photograph": photograph} | render | {"error": error_map(image, photograph)} | _maps({"CA": ca})
+            error = heat_map((image - photograph).abs().mean(0), ERROR_PICTURE_RANGE)
+            panels = {"photograph": photograph} | render | {"error": error} | _maps({"CA": ca})
         save_png(files[0], image)
         save_png(files[1], side_by_side([*panels.values()], [*panels]))
     return found
@@ -211,8 +220,3 @@ def _maps(results: Mapping[str, CAResult]) -> dict[str, Tensor]:
         )
         for name, r in results.items()
     }
-
-
-def _identity(perceptual: PerceptualMetric, image: Tensor) -> tuple[str, float]:
-    """Return what tells a metric from others: its name, and what it says of a photograph, as weights may differ."""
-    return perceptual.name, float(perceptual(image, image.flip(2)))

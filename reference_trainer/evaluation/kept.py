@@ -90,9 +90,7 @@ def fingerprint(x: object) -> str:
     """Return a digest of tensors, numbers, strings and None, nested in dataclasses, mappings, lists and tuples.
 
     Equal values give equal digests in every process; the device of a tensor counts, because results depend on it.
-
-    Raises:
-        TypeError: if there is anything else in ``x``.
+    Raises TypeError if there is anything else.
 
     Example:
         >>> fingerprint([torch.zeros(2), 3]) == fingerprint([torch.zeros(2), 3]) != fingerprint([torch.zeros(2), 4])

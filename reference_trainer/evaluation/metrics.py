@@ -8,12 +8,12 @@ from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 from torch.nn.functional import pad
 
-__all__ = ["psnr", "ssim"]
+__all__ = ["on_white", "psnr", "ssim"]
 
 _WINDOW = 11
 
 
-def psnr(image: Tensor, target: Tensor) -> float:
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Return the peak signal-to-noise ratio ``-10 log10(mean squared error)`` in decibels; the peak is 1.
 
     Over several images report the mean of their values, as the papers do, not the PSNR of the pooled error.
@@ -21,9 +21,10 @@ def psnr(image: Tensor, target: Tensor) -> float:
     Args:
         image: colours in [0, 1], shape (3, H, W).
         target: colours in [0, 1], shape (3, H, W).
+        mask: of the pixels that count, in [0, 1], shape (H, W): those of DTU's object, which are 1 to 8 bits.
 
     Returns:
-        Decibels, computed in float64; infinite for equal images.
+        Decibels, computed in float64; infinite for equal images, nan if no pixel counts.
 
     Raises:
         ValueError: if the shapes differ, are not (C, H, W), or a value is not finite.
@@ -34,7 +35,8 @@ def psnr(image: Tensor, target: Tensor) -> float:
         20.0
     """
     x, y = _checked(image, target)
-    error = (x - y).square().mean().item()
+    squares = (x - y).square()
+    error = (squares if mask is None else squares[:, mask > 254.5 / 255]).mean().item()
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
@@ -63,6 +65,11 @@ def ssim(image: Tensor, target: Tensor) -> float:
     x, y = (pad(z[None], (_WINDOW // 2,) * 4) for z in _checked(image, target))
     # eps would shift every value by 1e-12 / denominator; the constants already keep the denominator positive.
     return float(kornia_ssim(x, y, _WINDOW, max_val=1.0, eps=0.0, padding="valid").mean().item())
+
+
+def on_white(image: Tensor, mask: Tensor | None) -> Tensor:
+    """Return what SSIM and LPIPS see of an image (3, H, W) in the DTU protocol: white outside of the mask (H, W)."""
+    return image if mask is None else image * mask + 1 - mask
 
 
 def _checked(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Pictures of results: PNG files, heat maps, error maps, comparisons side by side."""
+"""Pictures of results: PNG files, animations, heat maps, comparisons side by side."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from reference_trainer.files import replacing
 from reference_trainer.scenes.images import IMAGE_SUFFIXES
 
-__all__ = ["PANEL", "error_map", "file_names", "heat_map", "save_gif", "save_png", "side_by_side", "to_uint8"]
+__all__ = ["PANEL", "file_names", "heat_map", "save_gif", "save_png", "side_by_side"]
 
 PANEL = "_panel"
 """What is appended to the name of a view's render to make that of its panel."""
@@ -27,11 +29,8 @@ _UNDEFINED = 0.5  # grey of values that are not finite: no colour of the map
 def file_names(views: Sequence[str]) -> list[str]:
     """Return a file name without extension for the pictures of each view; no two are equal, nor is one another's panel.
 
-    That is the view's own name without its folder, or with the folders where two views would share it, as in
-    ``a/r_0.png`` and ``b/r_0.png``. Upper and lower case count as equal, as they do to some file systems.
-
-    Args:
-        views: names of all views whose pictures go into one folder; they decide together.
+    That is the view's own name without its folder, or with the folders where two views would share it. Upper and lower
+    case count as equal, as they do to some file systems. All views whose pictures go into one folder decide together.
 
     Example:
         >>> file_names(["images/0001.jpg", "a/r_0.png", "b/r_0.png"])
@@ -55,72 +54,40 @@ def file_names(views: Sequence[str]) -> list[str]:
     return names
 
 
-def to_uint8(image: Tensor) -> Tensor:
-    """Return colours as bytes, rounded to nearest after clamping to [0, 1].
-
-    Args:
-        image: colours, any shape, floating point; values outside [0, 1] are clamped.
-
-    Returns:
-        Same shape, uint8, on the CPU.
-
-    Raises:
-        ValueError: if a value is NaN: it has no byte.
-
-    Example:
-        >>> to_uint8(torch.tensor([-1.0, 0.5, 1.0, 7.0])).tolist()
-        [0, 128, 255, 255]
-    """
-    if bool(image.isnan().any()):
-        raise ValueError("the image holds NaN; look for the cause in the rendering, or draw it with heat_map.")
-    return (image.detach().clamp(0, 1) * 255).round().to("cpu", torch.uint8)
-
-
 def save_png(path: str | Path, image: Tensor) -> None:
-    """Write an image as an 8-bit PNG; the file appears at once or not at all.
+    """Write an image (3, H, W), clamped to [0, 1], as an 8-bit PNG; at once or not at all, missing folders are made.
 
-    Args:
-        path: the file; missing folders are made.
-        image: colours in [0, 1], shape (3, H, W); values outside are clamped.
-
-    Raises:
-        ValueError: if the shape is not (3, H, W) or a value is NaN.
-        OSError: if the file cannot be written.
+    Raises ValueError if the shape is another or a value is NaN, and OSError if the file cannot be written.
     """
-    from PIL import Image
-
-    picture = Image.fromarray(to_uint8(_checked(image)).permute(1, 2, 0).contiguous().numpy())
+    picture = _picture(image)
     with replacing(path) as place:
         picture.save(place, format="PNG")
 
 
 def save_gif(path: str | Path, images: Sequence[Tensor], *, fps: int = 20) -> None:
-    """Write pictures as an endless animation; the file appears at once or not at all.
-
-    Args:
-        path: the file; missing folders are made.
-        images: at least one, each (3, H, W), colours in [0, 1].
-        fps: pictures per second.
-    """
-    from PIL import Image
-
-    frames = [Image.fromarray(to_uint8(_checked(image)).permute(1, 2, 0).contiguous().numpy()) for image in images]
+    """Write pictures, at least one, as an endless animation at ``fps`` pictures per second; else as `save_png`."""
+    frames = [_picture(image) for image in images]
     with replacing(path) as place:
         frames[0].save(place, "GIF", save_all=True, append_images=frames[1:], duration=1000 // fps, loop=0)
 
 
+def _picture(image: Tensor) -> Any:
+    """Return an image (3, H, W) as Pillow has it."""
+    from PIL import Image
+
+    if image.ndim != 3 or image.shape[0] != 3:
+        raise ValueError(f"expected an image of shape (3, H, W), got {tuple(image.shape)}.")
+    if bool(image.isnan().any()):
+        raise ValueError("the image holds NaN; look for the cause in the rendering, or draw it with heat_map.")
+    pixels = (image.detach().clamp(0, 1) * 255).round().to("cpu", torch.uint8)
+    return Image.fromarray(pixels.permute(1, 2, 0).contiguous().numpy())
+
+
 def heat_map(values: Tensor, vmax: float) -> Tensor:
-    """Colour a map of numbers from 0 (black) through red to ``vmax`` (pale yellow): matplotlib's "inferno".
+    """Colour numbers (H, W) from 0 (black) through red to ``vmax`` (pale yellow): matplotlib's "inferno".
 
     Numbers beyond the ends take the end colours; those that are not finite (a pixel without a score) are grey. Use one
-    ``vmax`` for all maps that are to be compared.
-
-    Args:
-        values: numbers, shape (H, W).
-        vmax: the number that gets the brightest colour, positive.
-
-    Returns:
-        Colours in [0, 1], shape (3, H, W), float32, on the CPU.
+    ``vmax`` for all maps that are to be compared. The colours are (3, H, W) in [0, 1], float32, on the CPU.
 
     Raises:
         ValueError: if ``values`` is not (H, W) or ``vmax`` is not positive.
@@ -143,36 +110,14 @@ def heat_map(values: Tensor, vmax: float) -> Tensor:
     return colours.permute(2, 0, 1).contiguous()
 
 
-def error_map(image: Tensor, target: Tensor, *, vmax: float = 0.25) -> Tensor:
-    """Colour the absolute error, averaged over the channels.
-
-    Args:
-        image: a rendering, shape (3, H, W).
-        target: the photograph, shape (3, H, W).
-        vmax: the error that gets the brightest colour; colours lie in [0, 1].
-
-    Returns:
-        Colours in [0, 1], shape (3, H, W).
-
-    Raises:
-        ValueError: if the shapes differ or are not (3, H, W), or ``vmax`` is not positive.
-    """
-    if _checked(image).shape != target.shape:
-        raise ValueError(f"image and target must have one shape, got {tuple(image.shape)} and {tuple(target.shape)}.")
-    return heat_map((image - target).abs().mean(0), vmax)
-
-
 def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: int | None = None) -> Tensor:
-    """Lay pictures out in a grid with a label above each and a thin white gap between them.
+    """Lay pictures (3, H, W) in [0, 1] of one size out in a grid, a label above each and a thin white gap between them.
 
-    Args:
-        images: pictures of one size, each (3, H, W), colours in [0, 1].
-        labels: one line for each, Latin letters (the built-in font has few others); a column is as wide as its widest
-            label.
-        columns: pictures in a row; None puts all of them in one.
+    Labels are Latin letters (the built-in font has few others); a column is as wide as its widest label. Without
+    ``columns`` all pictures stand in one row.
 
     Returns:
-        Colours in [0, 1], shape (3, H', W'), on the CPU.
+        Colours in [0, 1], shape (3, H', W'), on the CPU, rounded to bytes.
 
     Raises:
         ValueError: if there is no image, the sizes or the numbers differ, or ``columns`` is not positive.
@@ -181,39 +126,26 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
         >>> side_by_side([torch.zeros(3, 30, 40)] * 3, ["a", "b", "c"], columns=2).shape
         torch.Size([3, 96, 84])
     """
-    if not images or len(images) != len(labels):
-        raise ValueError(f"expected one label for each of at least one image, got {len(images)} and {len(labels)}.")
-    if len({_checked(image).shape for image in images}) != 1:
-        raise ValueError(f"the images must have one size, got {[tuple(image.shape) for image in images]}.")
-    columns = len(images) if columns is None else columns
-    if columns < 1:
-        raise ValueError(f"columns must be positive, got {columns}.")
-    _, height, width = images[0].shape
-    cell_height, rows = height + _LABEL_HEIGHT, -(-len(images) // columns)
-    columns = min(columns, len(images))
-    strips = [_label(label) for label in labels]
-    widths = [max(width, *(strip.shape[1] for strip in strips[column::columns])) for column in range(columns)]
-    grid = torch.ones(3, rows * (cell_height + _GAP) - _GAP, sum(widths) + (columns - 1) * _GAP)
-    for index, (image, strip) in enumerate(zip(images, strips, strict=True)):
-        row, column = divmod(index, columns)
-        top, left = row * (cell_height + _GAP), sum(widths[:column]) + column * _GAP
-        grid[:, top : top + _LABEL_HEIGHT, left : left + strip.shape[1]] = strip
-        grid[:, top + _LABEL_HEIGHT : top + cell_height, left : left + width] = image.detach().cpu().clamp(0, 1)
-    return grid
-
-
-def _label(text: str) -> Tensor:
-    """Return black text on white, shape (_LABEL_HEIGHT, its width), in [0, 1]."""
     from PIL import Image, ImageDraw
 
-    width = math.ceil(ImageDraw.Draw(Image.new("L", (1, 1))).textlength(text)) + 4
-    strip = Image.new("L", (width, _LABEL_HEIGHT), 255)
-    ImageDraw.Draw(strip).text((2, 2), text, fill=0)
-    return torch.frombuffer(bytearray(strip.tobytes()), dtype=torch.uint8).reshape(_LABEL_HEIGHT, width) / 255
-
-
-def _checked(image: Tensor) -> Tensor:
-    """Return the image if it is (3, H, W)."""
-    if image.ndim != 3 or image.shape[0] != 3:
-        raise ValueError(f"expected an image of shape (3, H, W), got {tuple(image.shape)}.")
-    return image
+    if not images or len(images) != len(labels):
+        raise ValueError(f"expected one label for each of at least one image, got {len(images)} and {len(labels)}.")
+    pictures = [_picture(image) for image in images]
+    if len({picture.size for picture in pictures}) != 1:
+        raise ValueError(f"the images must have one size, got {[tuple(image.shape) for image in images]}.")
+    columns = min(len(images), len(images) if columns is None else columns)
+    if columns < 1:
+        raise ValueError(f"columns must be positive, got {columns}.")
+    width, cell = pictures[0].width, pictures[0].height + _LABEL_HEIGHT + _GAP
+    measure = ImageDraw.Draw(pictures[0]).textlength
+    needed = [max(width, math.ceil(measure(label)) + 4) for label in labels]
+    widths = [max(needed[column::columns]) for column in range(columns)]
+    size = (sum(widths) + (columns - 1) * _GAP, -(-len(images) // columns) * cell - _GAP)
+    sheet = Image.new("RGB", size, "white")
+    pen = ImageDraw.Draw(sheet)
+    for index, (picture, label) in enumerate(zip(pictures, labels, strict=True)):
+        row, column = divmod(index, columns)
+        left = sum(widths[:column]) + column * _GAP
+        pen.text((left + 2, row * cell + 2), label, fill="black")
+        sheet.paste(picture, (left, row * cell + _LABEL_HEIGHT))
+    return torch.from_numpy(np.array(sheet)).permute(2, 0, 1) / 255

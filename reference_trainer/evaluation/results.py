@@ -22,16 +22,10 @@ _ABSENT = "n/a"
 
 
 def write_json(path: str | Path, data: object) -> None:
-    """Write data as indented JSON; the file appears at once or not at all.
+    """Write nested plain data as indented JSON; the file appears at once or not at all, missing folders are made.
 
-    Args:
-        path: the file; missing folders are made.
-        data: nested mappings, lists, tuples, strings, numbers, booleans and None. NaN and infinities become null,
-            because JSON has no word for them. Keys must be strings.
-
-    Raises:
-        TypeError: if something else is in ``data``.
-        OSError: if the file cannot be written.
+    NaN and infinities become null, because JSON has no word for them. Raises TypeError for what is no plain data, among
+    it keys that are no strings, and OSError if the file cannot be written.
 
     Example:
         >>> import tempfile
@@ -45,13 +39,7 @@ def write_json(path: str | Path, data: object) -> None:
 
 
 def mean_std(values: Iterable[float]) -> tuple[float, float]:
-    """Return the mean and the sample standard deviation (divided by n - 1) of the values that are finite.
-
-    Args:
-        values: numbers, such as one score per seed; those that are NaN or infinite are left out.
-
-    Returns:
-        Mean and deviation. The mean of nothing and the deviation of fewer than two values are NaN.
+    """Return mean and sample standard deviation (divided by n - 1) of the finite values; nan of none, or of one.
 
     Example:
         >>> mean_std([1.0, 3.0, math.nan])
@@ -65,15 +53,8 @@ def mean_std(values: Iterable[float]) -> tuple[float, float]:
 def format_mean_std(values: Iterable[float], *, unit: float = 1.0) -> str:
     """Return mean and spread as text: two digits of the deviation, and the mean to the same place.
 
-    Args:
-        values: numbers; those that are not finite are left out, and the text says how many remain.
-        unit: what one counts in: with ``unit=1e-3``, 0.0023 is written 2.3 (name it in the column's header).
-
-    Returns:
-        ``"20.51 ± 0.12"``; the mean alone, to four digits, if there is no deviation; ``"n/a"`` if there is no value.
-
-    Raises:
-        ValueError: if ``unit`` is not positive.
+    Values that are not finite are left out, and the text says how many remain; a mean without a deviation has four
+    digits, and no value at all is ``"n/a"``. ``unit`` is what one counts in: with 1e-3, 0.0023 is written 2.3.
 
     Example:
         >>> format_mean_std([20.39, 20.51, 20.63])
@@ -99,18 +80,10 @@ def format_mean_std(values: Iterable[float], *, unit: float = 1.0) -> str:
 
 
 def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
-    """Return rows as a Markdown table.
+    """Return rows, mappings from column to content, as a Markdown table with a line break at its end.
 
-    Args:
-        rows: one mapping from column to content each. Text is kept, fractions get four digits; what is missing, None
-            or not finite becomes ``n/a``.
-        columns: the columns in their order, which are also the headers; the first is aligned left, the others right.
-
-    Returns:
-        The table, with a line break at its end.
-
-    Raises:
-        ValueError: if there is no column.
+    Text is kept, fractions get four digits; what is missing, None or not finite becomes ``n/a``. The columns, at least
+    one, are also the headers; the first is aligned left, the others right.
 
     Example:
         >>> print(markdown_table([{"run": "baseline", "PSNR": 19.36}, {"run": "dropout"}], ["run", "PSNR"]), end="")

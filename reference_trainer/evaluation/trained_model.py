@@ -13,7 +13,7 @@ from ca_reg import CAScore, Chain, GaussianDropout, Params, RenderFn
 from ca_reg.functional import Multiplier
 from ca_reg.regularizers import parse
 from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.model.rendering import render_gaussians, splat_gaussians
+from reference_trainer.model.rendering import arguments, render_gaussians
 from reference_trainer.render import (
     MomentImages,
     Rendering,
@@ -21,6 +21,7 @@ from reference_trainer.render import (
     draw,
     masked,
     render_moments,
+    splat,
     variance_shares,
 )
 from reference_trainer.scenes.scene import Viewpoint
@@ -104,64 +105,38 @@ class TrainedModel:
     ) -> MomentImages:
         """Render the exact moments of a view under random factors: the moments callable of `CAScore`.
 
-        Args:
-            opacities: activated, shape (N,).
-            view: what to render.
-            multiplier: moments of the factors.
-            background: instead of the model's own, shape (3,) or (3, H, W).
+        The background is the model's own, or one of shape (3,) or (3, H, W).
         """
-        return render_moments(self.splats(opacities, view), multiplier, background=self._behind(background))
+        return render_moments(
+            self.splats(opacities, view), multiplier, background=self.background if background is None else background
+        )
 
     def shares(
         self, opacities: Tensor, view: Viewpoint, multiplier: Multiplier, background: Tensor | None, weights: Tensor
     ) -> Tensor:
         """Attribute a weighted sum of the variance to the Gaussians: the shares callable of `ca_reg.attribute`.
 
-        Args:
-            opacities: activated, shape (N,).
-            view: what to render.
-            multiplier: moments of the factors.
-            background: instead of the model's own, shape (3,) or (3, H, W).
-            weights: of the pixels, shape (H, W).
-
-        Returns:
-            Shares of all Gaussians, shape (N,), float64; 0 for those outside the view.
+        The background is the model's own, or one of shape (3,) or (3, H, W); the pixels' weights have shape (H, W). The
+        result is float64, shape (N,), 0 for Gaussians outside the view.
         """
-        splats = self.splats(opacities, view)
+        splats, behind = self.splats(opacities, view), self.background if background is None else background
         shares = torch.zeros(len(self.gaussians), dtype=torch.float64, device=opacities.device)
-        shares[splats.indices] = variance_shares(splats, multiplier, weights, background=self._behind(background))
+        shares[splats.indices] = variance_shares(splats, multiplier, weights, background=behind)
         return shares
 
     def splats(self, opacities: Tensor, view: Viewpoint) -> Splats:
         """Project the model with given opacities (N,) and list it per tile."""
-        return splat_gaussians(self.gaussians, view.camera, opacities=opacities, sh_degree=self.sh_degree)
-
-    def _behind(self, background: Tensor | None) -> Tensor:
-        """The background that was asked for, or the model's own."""
-        return self.background if background is None else background
+        return splat(**arguments(self.gaussians, opacities), camera=view.camera, sh_degree=self.sh_degree)
 
     def ca_score(
         self, *, samples: int = 5, drop_rate: float | None = None, seed: int = 0, render_fn: RenderFn | None = None
     ) -> CAScore:
-        """Return the paper's CA protocol for this model.
-
-        Args:
-            samples: K.
-            drop_rate: instead of the paper's 1 - (1 - p) / 2.
-            seed: of the masks.
-            render_fn: instead of `MaskedRenders`, for a model that changes.
-        """
-        return CAScore(
-            render_fn or MaskedRenders(self), samples=samples, p=self.dropout, drop_rate=drop_rate, seed=seed
-        )
+        """Return the paper's CA protocol for this model; ``render_fn`` is for one that changes."""
+        renders = render_fn or MaskedRenders(self)
+        return CAScore(renders, samples=samples, p=self.dropout, drop_rate=drop_rate, seed=seed)
 
     def exact_ca_score(self, *, drop_rate: float | None = None, neutral: bool = False) -> CAScore:
-        """Return the limit of the protocol for infinitely many samples, over the region of expected alpha above 0.8.
-
-        Args:
-            drop_rate: instead of the paper's 1 - (1 - p) / 2.
-            neutral: composite every pixel over its own expected colour instead of the background.
-        """
+        """Return its limit for infinitely many samples, over the region of expected alpha above 0.8."""
         return CAScore(exact=self.moments, p=self.dropout, drop_rate=drop_rate, neutral=neutral)
 
 

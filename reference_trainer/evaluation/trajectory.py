@@ -14,17 +14,10 @@ __all__ = ["interpolate_cameras", "measured_views"]
 
 
 def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """Move through cameras in their order: positions on straight lines, orientations on great arcs.
+    """Move through cameras in their order, in equal steps: positions on straight lines, orientations on great arcs.
 
-    Args:
-        cameras: at least two; the intrinsics and the size are those of the first.
-        frames: number of cameras to return, at least 2, the first and the last given one included.
-
-    Returns:
-        Cameras at equal steps of the path parameter.
-
-    Raises:
-        ValueError: if there are fewer than two cameras or frames.
+    ``frames`` counts the first and the last given camera; intrinsics and size are those of the first. Raises ValueError
+    if there are fewer than two cameras or frames.
 
     Example:
         >>> first = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
@@ -46,13 +39,9 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 def measured_views(scene: Scene, say: Callable[[str], None]) -> dict[str, Sequence[Viewpoint]]:
     """Return the views of a scene that a model is measured at, by split: ``"train"`` and ``"test"``.
 
-    Where all photographs are trained on, viewpoints without one take the place of the test views: ``"between"``, half
-    the way from each training camera to its nearest neighbour, and ``"around"``, as far away on the other side. The
-    orientation turns on at the same rate. A single camera has neither.
-
-    Args:
-        scene: the scene.
-        say: receives a line if there is no test view.
+    Where all photographs are trained on, which is said, viewpoints without one take the place of the test views:
+    ``"between"``, half the way from each training camera to its nearest neighbour, and ``"around"``, as far away on the
+    other side. The orientation turns on at the same rate. A single camera has neither.
     """
     if scene.test:
         return {"train": scene.train, "test": scene.test}

@@ -132,12 +132,7 @@ class Gaussians:
         return torch.cat([self.sh_dc, self.sh_rest], dim=1)
 
     def params(self, camera: Camera | None = None, *, step: int = 0) -> Params:
-        """Return what a rasterizer receives, activated: what every `ca_reg` regularizer works on.
-
-        Args:
-            camera: that is rendered.
-            step: of the training.
-        """
+        """Return what a rasterizer receives, activated, for a camera, at a step: what every regularizer works on."""
         view_matrix = None if camera is None else camera.world_to_camera
         return Params(
             self.opacities, self.means, self.scales, self.quaternions, self.sh, view_matrix, self.learned, step

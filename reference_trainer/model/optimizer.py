@@ -16,16 +16,9 @@ __all__ = ["GaussianOptimizer", "LearningRates"]
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's learning rate of each parameter; that of the means is set at every step by the trainer.
+    """Adam's learning rate of each parameter, per step, and of what regularizers learn per Gaussian, by name.
 
-    Args:
-        means: world units per step.
-        log_scales: per step.
-        quaternions: per step.
-        opacity_logits: per step.
-        sh_dc: per step.
-        sh_rest: per step; a twentieth of ``sh_dc`` in the INRIA code.
-        learned: of what regularizers learn per Gaussian, by name.
+    That of the means is in world units and set at every step by the trainer; the others are the INRIA code's.
     """
 
     means: float
@@ -90,10 +83,9 @@ class GaussianOptimizer:
         parameter = self.gaussians.opacity_logits
         with torch.no_grad():
             parameter.copy_(logits)
-        if forget:
-            for name in ("exp_avg", "exp_avg_sq"):
-                if name in self._adam.state[parameter]:
-                    self._adam.state[parameter][name].zero_()
+        for name, value in self._adam.state[parameter].items():
+            if forget and name != "step":
+                value.zero_()
 
     def state_dict(self) -> dict[str, Any]:
         """Return parameters and moments as plain tensors, for a checkpoint."""

@@ -133,12 +133,6 @@ def load_ply(path: str | Path) -> PlyModel:
     Mip-Splatting changes scales and opacities, so a file with one is refused rather than drawn without it; compressed
     files are refused as well.
 
-    Args:
-        path: the file.
-
-    Returns:
-        The Gaussians in float32, and what their opacities already carry.
-
     Raises:
         ValueError: if the file is no such PLY, is shorter than its header says, or holds values that are not finite;
             the message says what is missing.

@@ -13,7 +13,7 @@ from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import MomentImages, Rendering, Splats, render, render_moments, splat
 
-__all__ = ["render_gaussians", "render_moments_of", "splat_gaussians"]
+__all__ = ["arguments", "render_gaussians", "render_moments_of"]
 
 
 def render_gaussians(
@@ -26,16 +26,11 @@ def render_gaussians(
     depth: bool = False,
     renderer: Callable[..., Any] = render,
 ) -> Rendering:
-    """Render a model.
+    """Render Gaussians, or what is to be rendered of them, such as what a regularizer returned, over a colour (3,).
 
-    Args:
-        model: Gaussians, or what is to be rendered of them, such as what a regularizer returned.
-        camera: the view.
-        background: colour behind it, shape (3,).
-        opacities: activated opacities (N,) to use instead of the model's own.
-        sh_degree: highest band of spherical harmonics to use; all by default.
-        depth: whether to accumulate depth as well.
-        renderer: with the arguments of `render`, such as gsplat's; what it returns is returned.
+    Opacities (N,), activated, take the place of the model's own; ``sh_degree`` is the highest band to use, by default
+    all; with ``depth`` it is accumulated as well. Another renderer, such as gsplat's, has the arguments of `render`;
+    what it returns is returned.
 
     Example:
         >>> import torch
@@ -44,16 +39,10 @@ def render_gaussians(
         >>> render_gaussians(gaussians, camera, torch.zeros(3)).image.shape
         torch.Size([3, 16, 16])
     """
-    arguments = _arguments(model, opacities)
-    out: Rendering = renderer(**arguments, camera=camera, sh_degree=sh_degree, background=background, depth=depth)
+    out: Rendering = renderer(
+        **arguments(model, opacities), camera=camera, sh_degree=sh_degree, background=background, depth=depth
+    )
     return out
-
-
-def splat_gaussians(
-    model: Gaussians | Params, camera: Camera, *, opacities: Tensor | None = None, sh_degree: int | None = None
-) -> Splats:
-    """Project a model and list it per tile; arguments as of `render_gaussians`."""
-    return splat(**_arguments(model, opacities), camera=camera, sh_degree=sh_degree)
 
 
 def render_moments_of(
@@ -64,31 +53,19 @@ def render_moments_of(
     *,
     sh_degree: int | None = None,
 ) -> tuple[MomentImages, Splats]:
-    """Render the exact moments of a model under random factors on its alphas.
+    """Render the exact moments of a model under random factors on its alphas, given their moments.
 
-    Args:
-        model: Gaussians, or what is to be rendered of them.
-        multiplier: moments of the factor.
-        camera: the view.
-        background: colour behind it, shape (3,), or one for each pixel, (3, H, W).
-        sh_degree: highest band of spherical harmonics to use; all by default.
-
-    Returns:
-        The moments, and what was drawn; its projected centres keep their gradient.
+    The background has shape (3,), or (3, H, W). Returned with the moments is what was drawn; its projected centres keep
+    their gradient.
     """
-    splats = splat_gaussians(model, camera, sh_degree=sh_degree)
+    splats = splat(**arguments(model), camera=camera, sh_degree=sh_degree)
     if splats.projection.means.requires_grad:
         splats.projection.means.retain_grad()
     return render_moments(splats, multiplier, background=background), splats
 
 
-def _arguments(model: Gaussians | Params, opacities: Tensor | None) -> dict[str, Any]:
-    """Return the renderer's arguments about the Gaussians."""
+def arguments(model: Gaussians | Params, opacities: Tensor | None = None) -> dict[str, Any]:
+    """Return the renderer's arguments about the Gaussians; ``opacities`` (N,) instead of the model's own."""
     x = model.params() if isinstance(model, Gaussians) else model
-    return {
-        "means": x.means,
-        "quaternions": x.quaternions,
-        "scales": x.scales,
-        "opacities": x.opacities if opacities is None else opacities,
-        "sh": x.sh,
-    }
+    opacities = x.opacities if opacities is None else opacities
+    return dict(means=x.means, quaternions=x.quaternions, scales=x.scales, opacities=opacities, sh=x.sh)

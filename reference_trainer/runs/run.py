@@ -16,7 +16,7 @@ from torch import Tensor
 from ca_reg import CAMonitor
 from reference_trainer.evaluation.evaluate import PerceptualMetric, evaluate
 from reference_trainer.evaluation.kept import PARTIAL
-from reference_trainer.evaluation.lpips import lpips_option
+from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
@@ -126,7 +126,7 @@ def run_experiment(
         OSError: if a file cannot be written, such as on a full disk; what was there before is kept.
     """
     config.check()
-    perceptual = lpips_option(lpips, device=device)
+    perceptual = load_lpips(lpips, device=device)
     begun_with(out, options, config, auto=auto, given=given)
     if (out / RESULTS).exists():
         return _complete(out, say)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
-from reference_trainer.scenes.colmap_binary import read_cameras_binary, read_images_binary, read_points_binary
+from reference_trainer.scenes.colmap_files import READERS
 from reference_trainer.scenes.colmap_model import ColmapModel, PointRecords
-from reference_trainer.scenes.colmap_text import read_cameras_text, read_images_text, read_points_text
 from reference_trainer.scenes.formats import Capture, SceneFormat
 from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.images import match_images, picture_folder
@@ -16,29 +14,20 @@ from reference_trainer.scenes.options import SceneOptions
 
 __all__ = ["COLMAP", "colmap_folders", "colmap_frames", "read_colmap"]
 
-T = TypeVar("T")
-
 
 def read_colmap(folder: str | Path) -> ColmapModel:
     """Read a reconstruction: cameras, images and points, from ``.bin`` files, or ``.txt`` where there is no ``.bin``.
 
-    Args:
-        folder: the folder of the three files, often ``sparse/0``.
-
-    Returns:
-        The reconstruction, its images sorted by name. It has no points if a ``points3D.ply`` stands in their place.
+    Its folder is often ``sparse/0``. It has no points if a ``points3D.ply`` stands in their place.
 
     Raises:
         FileNotFoundError: if a file is missing.
         ValueError: if a file is truncated, inconsistent or not COLMAP's; the message names it.
     """
     folder = Path(folder)
-    cameras = _read(folder, "cameras", read_cameras_binary, read_cameras_text)
-    images = _read(folder, "images", read_images_binary, read_images_text)
+    cameras, images = _read(folder, "cameras"), _read(folder, "images")
     instantsplat = not _has(folder, "points3D") and (folder / "points3D.ply").is_file()
-    points = (
-        PointRecords().finish() if instantsplat else _read(folder, "points3D", read_points_binary, read_points_text)
-    )
+    points = PointRecords().finish() if instantsplat else _read(folder, "points3D")
     try:
         return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points)
     except ValueError as error:
@@ -56,16 +45,9 @@ def colmap_folders(root: Path) -> list[Path]:
 
 
 def colmap_frames(model: ColmapModel, folder: str | Path) -> list[Frame]:
-    """Pair the images of a reconstruction with their files.
+    """Pair the images of a reconstruction with their files in a folder, maybe of resized copies; sorted by name.
 
     The frame has the pinhole part of the camera, and its distortion beside it.
-
-    Args:
-        model: the reconstruction.
-        folder: the image folder; it may hold resized copies.
-
-    Returns:
-        The frames, sorted by name.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -75,14 +57,14 @@ def colmap_frames(model: ColmapModel, folder: str | Path) -> list[Frame]:
     frames = []
     for image in model.images:
         camera = model.cameras[image.camera_id]
-        pinhole = camera.pinhole(image.world_to_camera)
-        frames.append(Frame(image.name, files[image.name], pinhole, camera.distortion))
+        pose = camera.at(image.world_to_camera)
+        frames.append(Frame(image.name, files[image.name], pose, camera.distortion))
     return frames
 
 
-def _read(folder: Path, stem: str, binary: Callable[[Path], T], text: Callable[[Path], T]) -> T:
+def _read(folder: Path, stem: str) -> Any:
     """Read one of the three files in whichever form is there."""
-    for suffix, reader in ((".bin", binary), (".txt", text)):
+    for suffix, reader in READERS[stem].items():
         path = folder / (stem + suffix)
         if path.is_file():
             try:
@@ -95,7 +77,7 @@ def _read(folder: Path, stem: str, binary: Callable[[Path], T], text: Callable[[
 
 def _has(folder: Path, stem: str) -> bool:
     """Whether one of the three files is there in either form."""
-    return any((folder / (stem + suffix)).is_file() for suffix in (".bin", ".txt"))
+    return any((folder / (stem + suffix)).is_file() for suffix in READERS[stem])
 
 
 def _read_scene(root: Path, options: SceneOptions) -> Capture:

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from reference_trainer.camera import Camera
+from reference_trainer.render.eager.projection import rotation_matrices
 
-__all__ = ["CAMERA_MODELS", "CameraModel", "ColmapCamera", "ColmapImage", "ColmapModel", "ColmapPoints", "PointRecords"]
+__all__ = [
+    "CAMERA_MODELS", "ColmapCamera", "ColmapImage", "ColmapModel", "ColmapPoints", "PointRecords", "add_camera",
+    "view_matrix",
+]  # fmt: skip
 
 
-@dataclass(frozen=True)
-class CameraModel:
-    """A camera model: its number and name, how many focal lengths it has, and how many distortion parameters.
+class CameraModel(NamedTuple):
+    """A camera model: its name, how many focal lengths it has, and how many distortion parameters.
 
     A fisheye model is no pinhole even where its distortion parameters are 0, so it cannot be approximated by one.
     """
 
-    id: int
     name: str
     focal_lengths: int
     distortion: int
@@ -34,77 +37,35 @@ class CameraModel:
         return self.focal_lengths + 2 + self.distortion
 
 
-# COLMAP, src/colmap/sensor/models.h. The distortion parameters are k1 k2 p1 p2 k3 k4 k5 k6 or a beginning of that list.
+# By number, COLMAP, src/colmap/sensor/models.h. The distortion is k1 k2 p1 p2 k3 k4 k5 k6 or a beginning of that list.
 CAMERA_MODELS = (
-    CameraModel(0, "SIMPLE_PINHOLE", 1, 0),
-    CameraModel(1, "PINHOLE", 2, 0),
-    CameraModel(2, "SIMPLE_RADIAL", 1, 1),
-    CameraModel(3, "RADIAL", 1, 2),
-    CameraModel(4, "OPENCV", 2, 4),
-    CameraModel(5, "OPENCV_FISHEYE", 2, 4, fisheye=True),
-    CameraModel(6, "FULL_OPENCV", 2, 8),
-    CameraModel(7, "FOV", 2, 1, fisheye=True),
-    CameraModel(8, "SIMPLE_RADIAL_FISHEYE", 1, 1, fisheye=True),
-    CameraModel(9, "RADIAL_FISHEYE", 1, 2, fisheye=True),
-    CameraModel(10, "THIN_PRISM_FISHEYE", 2, 8, fisheye=True),
+    CameraModel("SIMPLE_PINHOLE", 1, 0),
+    CameraModel("PINHOLE", 2, 0),
+    CameraModel("SIMPLE_RADIAL", 1, 1),
+    CameraModel("RADIAL", 1, 2),
+    CameraModel("OPENCV", 2, 4),
+    CameraModel("OPENCV_FISHEYE", 2, 4, fisheye=True),
+    CameraModel("FULL_OPENCV", 2, 8),
+    CameraModel("FOV", 2, 1, fisheye=True),
+    CameraModel("SIMPLE_RADIAL_FISHEYE", 1, 1, fisheye=True),
+    CameraModel("RADIAL_FISHEYE", 1, 2, fisheye=True),
+    CameraModel("THIN_PRISM_FISHEYE", 2, 8, fisheye=True),
 )
+_MODELS: dict[int | str, CameraModel] = {k: m for n, m in enumerate(CAMERA_MODELS) for k in (n, m.name)}
 
 
-@dataclass(frozen=True)
-class ColmapCamera:
-    """Intrinsics of one camera. Convention: half-pixel centres, as in the rest of the program.
+class ColmapCamera(NamedTuple):
+    """Intrinsics of one camera: the pinhole part at the origin of the world, float64, and the distortion beside it.
 
-    Args:
-        id: number of the camera.
-        model: name of the camera model.
-        width: image width, pixels.
-        height: image height, pixels.
-        parameters: focal length or lengths, principal point, distortion, in COLMAP's order.
-
-    Raises:
-        ValueError: if the size or a parameter makes no sense.
+    Convention: half-pixel centres, as in the rest of the program; the distortion is in COLMAP's order, empty for the
+    pinhole models.
     """
 
-    id: int
     model: CameraModel
-    width: int
-    height: int
-    parameters: tuple[float, ...]
+    pinhole: Camera
+    distortion: tuple[float, ...]
 
-    def __post_init__(self) -> None:
-        if len(self.parameters) != self.model.parameters or not np.isfinite(self.parameters).all():
-            raise ValueError(
-                f"camera {self.id}: {self.model.name} needs {self.model.parameters} finite parameters, "
-                f"got {self.parameters}."
-            )
-        if self.width < 1 or self.height < 1 or self.fx <= 0 or self.fy <= 0:
-            raise ValueError(
-                f"camera {self.id}: size and focal lengths must be positive, got {self.width}x{self.height}, "
-                f"fx={self.fx}, fy={self.fy}."
-            )
-
-    @property
-    def fx(self) -> float:
-        """Focal length in x, pixels."""
-        return self.parameters[0]
-
-    @property
-    def fy(self) -> float:
-        """Focal length in y, pixels."""
-        return self.parameters[self.model.focal_lengths - 1]
-
-    @property
-    def principal_point(self) -> tuple[float, float]:
-        """Principal point (x, y), pixels."""
-        x, y = self.parameters[self.model.focal_lengths : self.model.focal_lengths + 2]
-        return x, y
-
-    @property
-    def distortion(self) -> tuple[float, ...]:
-        """Distortion parameters, in COLMAP's order; empty for the pinhole models."""
-        return self.parameters[self.model.focal_lengths + 2 :]
-
-    def pinhole(self, world_to_camera: NDArray[np.float64]) -> Camera:
+    def at(self, world_to_camera: NDArray[np.float64]) -> Camera:
         """Return the camera at a pose (4, 4) without its distortion.
 
         Raises:
@@ -112,27 +73,62 @@ class ColmapCamera:
         """
         if self.model.fisheye:
             raise ValueError(
-                f"camera {self.id} is {self.model.name}, which no pinhole camera approximates. Undistort the images "
-                "first (colmap image_undistorter)."
+                f"a camera is {self.model.name}, which no pinhole camera approximates. Undistort the images first "
+                "(colmap image_undistorter)."
             )
-        cx, cy = self.principal_point
-        return Camera(torch.from_numpy(world_to_camera), self.fx, self.fy, cx, cy, self.width, self.height)
+        return replace(self.pinhole, world_to_camera=torch.from_numpy(world_to_camera))
+
+
+def add_camera(
+    cameras: dict[int, ColmapCamera],
+    number: int,
+    model: int | str,
+    width: int,
+    height: int,
+    parameters: tuple[float, ...],
+) -> None:
+    """Add a camera by its number: model number or name, size in pixels, parameters in COLMAP's order.
+
+    Raises:
+        ValueError: if it is there already, its model is unknown, or the size or a parameter makes no sense.
+    """
+    if number in cameras:
+        raise ValueError(f"it has camera {number} twice.")
+    if model not in _MODELS:
+        raise ValueError(f"camera {number} has the unknown camera model {model}.")
+    known = _MODELS[model]
+    if len(parameters) != known.parameters or not np.isfinite(parameters).all():
+        raise ValueError(f"camera {number}: {known.name} needs {known.parameters} finite parameters, got {parameters}.")
+    *focal, cx, cy = parameters[: known.focal_lengths + 2]
+    try:
+        pinhole = Camera(torch.eye(4, dtype=torch.float64), focal[0], focal[-1], cx, cy, width, height)
+    except ValueError as error:
+        raise ValueError(f"camera {number}: {error}") from error
+    cameras[number] = ColmapCamera(known, pinhole, parameters[known.focal_lengths + 2 :])
+
+
+def view_matrix(qvec: Sequence[float], tvec: Sequence[float]) -> NDArray[np.float64]:
+    """Build the view matrix (4, 4) from COLMAP's quaternion, wxyz, and translation.
+
+    Raises:
+        ValueError: if they are not finite, or the quaternion is zero.
+    """
+    with np.errstate(over="ignore"):  # becomes infinite, which is refused
+        norm = np.linalg.norm(qvec)
+    if not (np.isfinite(tvec).all() and 0 < norm < np.inf):
+        raise ValueError(f"the pose must be a finite non-zero quaternion and translation, got {qvec} and {tvec}.")
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_matrices(torch.from_numpy(np.array([qvec]) / norm))[0].numpy()
+    matrix[:3, 3] = tvec
+    return matrix
 
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """One registered image.
+    """One registered image: its number, path within the image folder, camera's number and pose (4, 4), float64.
 
-    Args:
-        id: number of the image.
-        name: its path within the image folder.
-        camera_id: number of its camera.
-        world_to_camera: its pose, shape (4, 4), float64.
-        keypoints: its 2D features, pixels, shape (K, 2), float64.
-        point_ids: number of the 3D point of each feature, -1 for none, shape (K,), int64.
-
-    Raises:
-        ValueError: if a feature has no finite position.
+    Its 2D features are at ``keypoints`` (K, 2), pixels, float64, and belong to the 3D points of the numbers
+    ``point_ids`` (K,), -1 for none. Raises ValueError if a feature has no finite position.
     """
 
     id: int
@@ -146,42 +142,13 @@ class ColmapImage:
         if not np.isfinite(self.keypoints).all():
             raise ValueError(f"image {self.id} ({self.name!r}) has features without a finite position.")
 
-    @staticmethod
-    def pose(qvec: tuple[float, ...], tvec: tuple[float, ...]) -> NDArray[np.float64]:
-        """Build the view matrix (4, 4) from COLMAP's quaternion, wxyz, and translation.
-
-        Raises:
-            ValueError: if they are not finite, or the quaternion is zero.
-        """
-        q = np.array(qvec)
-        with np.errstate(over="ignore"):  # becomes infinite, which is refused
-            norm = np.linalg.norm(q)
-        if not (np.isfinite(tvec).all() and 0 < norm < np.inf):
-            raise ValueError(f"the pose must be a finite non-zero quaternion and translation, got {qvec} and {tvec}.")
-        w, x, y, z = q / norm
-        matrix = np.eye(4)
-        matrix[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        matrix[:3, 3] = tvec
-        return matrix
-
 
 @dataclass(frozen=True)
 class ColmapPoints:
-    """The triangulated points.
+    """The M triangulated points: numbers (M,), world coordinates (M, 3), float64, and RGB (M, 3), uint8.
 
-    Args:
-        ids: their numbers, shape (M,), int64.
-        positions: world coordinates, shape (M, 3), float64.
-        colors: RGB, shape (M, 3), uint8.
-        tracks: for each point the numbers of the images that it was found in, each an int64 array; empty if the
-            reconstruction does not say.
-
-    Raises:
-        ValueError: if a position is not finite.
+    ``tracks`` holds for each the numbers of the images that it was found in, each an int64 array; empty if the
+    reconstruction does not say. Raises ValueError if a position is not finite.
     """
 
     ids: NDArray[np.int64]
@@ -230,15 +197,9 @@ class PointRecords:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A reconstruction.
+    """A reconstruction: cameras by number, images sorted by name, and points, of which there may be none.
 
-    Args:
-        cameras: from number to camera.
-        images: the images, sorted by name.
-        points: the points; there may be none.
-
-    Raises:
-        ValueError: if an image has a camera that is not there, or two images have one name or number.
+    Raises ValueError if an image has a camera that is not there, or two images have one name or number.
     """
 
     cameras: dict[int, ColmapCamera]

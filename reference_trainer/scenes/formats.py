@@ -68,14 +68,13 @@ def register_format(format: SceneFormat) -> None:
     """Add a format, after those that are there: of several that a folder fits, the first counts.
 
     Example:
-        >>> from reference_trainer.scenes.load import detect_format
         >>> found = lambda root: (root / "toy.txt").exists()
         >>> toy = SceneFormat("toy", "toy.txt", found, lambda root, options: Capture([]))
         >>> register_format(toy)
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = Path(folder, "toy.txt").write_text("a camera")
-        ...     detect_format(folder)
+        ...     find_format(Path(folder), "auto")[0]
         'toy'
         >>> del _FORMATS["toy"]
     """

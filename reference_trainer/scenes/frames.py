@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from reference_trainer.camera import Camera
@@ -13,7 +15,7 @@ from reference_trainer.scenes.images import composite, read_image, resize_image
 from reference_trainer.scenes.scene import View
 from reference_trainer.scenes.undistort import undistort
 
-__all__ = ["Frame", "load_view"]
+__all__ = ["Frame", "load_view", "view_matrix"]
 
 # Resizing to whole pixels changes the aspect ratio by about 1 / height; a wrong picture folder changes it by more.
 ASPECT_TOLERANCE = 0.02
@@ -40,19 +42,25 @@ class Frame:
     mask: Path | None = None
 
 
+def view_matrix(axes: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
+    """Return the view matrix (4, 4), float64, of a camera at a world position (3,), for its right, down and forward.
+
+    These axes are one a row, shape (3, 3); ValueError is raised if they are no rotation, to a thousandth.
+    """
+    with np.errstate(all="ignore"):
+        is_rotation = np.allclose(axes @ axes.T, np.eye(3), atol=1e-3) and np.linalg.det(axes) > 0
+    if not is_rotation:
+        raise ValueError(f"its pose holds no rotation: {axes.tolist()}.")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = axes, -axes @ position
+    return torch.from_numpy(pose)
+
+
 def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, straight: bool = True) -> View:
-    """Read the photograph of a frame and fit its camera to the picture's size.
+    """Read the photograph of a frame and fit its camera to the picture's size, float32.
 
-    A picture with an alpha channel is composited on the background first, resized then, and undistorted last.
-
-    Args:
-        frame: the photograph.
-        background: RGB in [0, 1], shape (3,).
-        downscale: factor, at least 1, by which the picture is made smaller.
-        straight: whether to undo lens distortion.
-
-    Returns:
-        The view, float32.
+    A picture with an alpha channel is composited on the background (3,) first, then made smaller by the factor
+    ``downscale``, at least 1, and, if it is to be ``straight``, undistorted last.
 
     Raises:
         FileNotFoundError: if there is no such file.

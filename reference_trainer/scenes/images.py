@@ -77,12 +77,7 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Return the width and height of an image file, pixels, without decoding it.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is not an image.
-    """
+    """Return the width and height of an image file, pixels, without decoding it; errors are those of `read_image`."""
     with _opened(path) as file:
         return int(file.width), int(file.height)
 
@@ -114,40 +109,14 @@ def _check_strips(file: Any) -> None:
 
 
 def composite(image: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
-    """Lay a picture with straight alpha over a plain background: ``image * alpha + background * (1 - alpha)``.
-
-    Args:
-        image: colours in [0, 1], shape (3, H, W).
-        alpha: coverage in [0, 1], shape (H, W).
-        background: RGB in [0, 1], shape (3,).
-
-    Returns:
-        Colours in [0, 1], shape (3, H, W).
-
-    Example:
-        >>> image, alpha = torch.ones(3, 1, 1), torch.full((1, 1), 0.25)
-        >>> composite(image, alpha, torch.zeros(3)).flatten().tolist()
-        [0.25, 0.25, 0.25]
-    """
+    """Lay a picture (3, H, W) with straight alpha (H, W) over a plain background (3,)."""
     return image * alpha + background[:, None, None] * (1 - alpha)
 
 
 def resize_image(image: Tensor, width: int, height: int) -> Tensor:
-    """Resize a picture with the bicubic filter, widened when shrinking so that nothing aliases.
+    """Resize a picture (C, H, W) in [0, 1] with the bicubic filter, widened when shrinking so that nothing aliases.
 
     This is Pillow's default filter, with which the published 3DGS loaders resize, without their rounding to 8 bits.
-
-    Args:
-        image: values in [0, 1], shape (C, H, W).
-        width: new width, pixels.
-        height: new height, pixels.
-
-    Returns:
-        Values clamped to [0, 1], shape (C, height, width).
-
-    Example:
-        >>> resize_image(torch.full((3, 4, 6), 0.5), 3, 2).shape
-        torch.Size([3, 2, 3])
     """
     resized = torch.nn.functional.interpolate(image[None], size=(height, width), mode="bicubic", antialias=True)[0]
     return resized.clamp(0, 1)
@@ -156,9 +125,7 @@ def resize_image(image: Tensor, width: int, height: int) -> Tensor:
 def list_images(folder: str | Path) -> list[Path]:
     """Return the image files of a folder, sorted by name.
 
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if it holds no images.
+    Raises FileNotFoundError if there is no such folder, ValueError if it holds no images.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -175,18 +142,11 @@ def is_image(path: Path) -> bool:
 
 
 def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
-    """Find the file of each named image, also in a folder of resized copies.
+    """Find the file of each named image in a folder, also in one of resized copies.
 
-    Files are matched by their full name, else by their name without extension, else, if there are as many files as
-    names, by the order of both sorted lists, which is how the LLFF data set relates ``images_8/image000.png`` to
-    ``images/IMG_4026.JPG``.
-
-    Args:
-        folder: the image folder.
-        names: image names, as a scene file gives them, with ``/`` between folders.
-
-    Returns:
-        From each name to its file.
+    Files are matched by their full name (``/`` between folders), else by their name without extension, else, if there
+    are as many files as names, by the order of both sorted lists, which is how the LLFF data set relates
+    ``images_8/image000.png`` to ``images/IMG_4026.JPG``.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -228,13 +188,10 @@ def path_inside(root: str | Path, relative: str) -> Path:
 
 
 def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
-    """Return the folder of a scene's photographs.
+    """Return the folder of a scene's photographs, the one that was asked for by name or the usual one.
 
-    Args:
-        root: the scene folder.
-        name: the folder that was asked for; if None, ``usual``, or of it and the ``<usual>_<factor>`` beside it the
-            largest pictures of at most half a megapixel, or the smallest if there are none.
-        usual: what this kind of scene calls it.
+    Of that and the ``<usual>_<factor>`` beside it, it is the one with the largest pictures of at most half a megapixel,
+    or with the smallest if there are none.
 
     Raises:
         FileNotFoundError: if there is none; the message lists the folders with pictures.

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from reference_trainer.camera import Camera
 from reference_trainer.npy_files import read_npy
 from reference_trainer.scenes.formats import Capture, SceneFormat
-from reference_trainer.scenes.frames import Frame
+from reference_trainer.scenes.frames import Frame, view_matrix
 from reference_trainer.scenes.images import list_images, picture_folder
 from reference_trainer.scenes.options import SceneOptions
 
@@ -25,13 +24,6 @@ def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
     [R | t | (height, width, focal length)], camera to world, with the camera's axes down, right, back. The principal
     point is the centre of the picture. The frames' cameras are OpenCV and world to camera.
 
-    Args:
-        path: the file ``poses_bounds.npy``.
-        folder: the image folder; it may hold resized copies.
-
-    Returns:
-        The frames, sorted by name.
-
     Raises:
         FileNotFoundError: if the file or the folder is missing.
         ValueError: if the file is not (N, 17) finite numbers with rotations in them, or there are not N images.
@@ -39,7 +31,9 @@ def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.")
-    rows = _rows(path)
+    rows = read_npy(path.read_bytes(), path)
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise ValueError(f"{path} must hold floats of shape (N, 17), got shape {rows.shape}.")
     files = list_images(folder)
     if len(files) != len(rows):
         raise ValueError(f"{path} has {len(rows)} poses but {folder} has {len(files)} images; each needs one.")
@@ -52,28 +46,13 @@ def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
     return frames
 
 
-def _rows(path: Path) -> NDArray[np.float64]:
-    """Read the array."""
-    rows = read_npy(path.read_bytes(), path)
-    if rows.ndim != 2 or rows.shape[1] != 17:
-        raise ValueError(f"{path} must hold floats of shape (N, 17), got shape {rows.shape}.")
-    return rows
-
-
 def _camera(row: NDArray[np.float64]) -> Camera:
     """Build the camera of one row."""
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4].tolist()
     down, right, back = matrix[:, 0], matrix[:, 1], matrix[:, 2]
-    rotation = np.stack([right, down, -back])  # rows: the OpenCV axes in world coordinates
-    with np.errstate(all="ignore"):
-        is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
-    if not is_rotation:
-        raise ValueError(f"its pose is not a rotation: {matrix[:, :3].tolist()}.")
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ matrix[:, 3]
-    return Camera(torch.from_numpy(pose), focal, focal, width / 2, height / 2, width=round(width), height=round(height))
+    pose = view_matrix(np.stack([right, down, -back]), matrix[:, 3])
+    return Camera(pose, focal, focal, width / 2, height / 2, width=round(width), height=round(height))
 
 
 def _read(root: Path, options: SceneOptions) -> Capture:

@@ -24,7 +24,7 @@ from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.scenes.transforms import BLENDER, TRANSFORMS
 from reference_trainer.scenes.undistort import corner_displacement
 
-__all__ = ["detect_format", "load_options", "load_scene"]
+__all__ = ["load_options", "load_scene"]
 
 for _format in (BLENDER, IDR, COLMAP, TRANSFORMS, LLFF):  # the table; of several that a folder fits, the first counts
     register_format(_format)
@@ -94,16 +94,6 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
         notes=tuple(filter(None, (about_size, _about_lenses([*train, *test], options), about_points))),
     )
-
-
-def detect_format(path: str | Path) -> str:
-    """Return the format of a scene folder, the first in the table whose files are there.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if it holds none of them; the message lists what it holds.
-    """
-    return find_format(Path(path), "auto")[0]
 
 
 def _built_in(options: SceneOptions, seed: int) -> Scene:

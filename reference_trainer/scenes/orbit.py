@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.options import World
 
-__all__ = ["BoundingSphere", "bounding_sphere", "orbit_views"]
+__all__ = ["BoundingSphere", "bounding_sphere", "look_at", "orbit_views"]
 
 ELEVATION = math.radians(20)
 """Height of the cameras over the horizon of the centre: objects are mostly looked at from a little above."""
@@ -28,12 +28,9 @@ place with surroundings and no object: objects have 1.6 to 1.9 (a plant, a mesh,
 
 @dataclass(frozen=True)
 class BoundingSphere:
-    """The part of a model that is to be looked at.
+    """The part of a model that is to be looked at: its centre (3,), float64, and radius, in world units.
 
-    Args:
-        center: world coordinates, shape (3,), float64.
-        radius: in units of the world.
-        surroundings: whether it is the middle of a place, such as a room, and not an object as a whole.
+    It may be the middle of a place with surroundings, such as a room, and not an object as a whole.
     """
 
     center: Tensor
@@ -65,23 +62,19 @@ def orbit_views(
     The renderer does not draw what is nearer than 0.2: models with a radius below about 0.13 must be enlarged first.
 
     Args:
-        means: world coordinates, finite, shape (N, 3).
-        opacities: activated, in [0, 1], shape (N,) or (N, 1).
-        count: number of cameras, at least 1.
-        width: image width, pixels.
-        height: image height, pixels.
+        means: as for `bounding_sphere`.
+        opacities: likewise.
+        count: number of cameras.
+        width: of their pictures, pixels.
+        height: likewise.
         field_of_view: along the shorter side of the picture, radians, in (0, pi).
         fill: diameter of the sphere as a share of the shorter side, in (0, 1].
         world: the vertical axis.
         arc: angle between the first and the last camera, radians, in (0, 2 pi]; a full circle has no camera twice. A
             model that was captured from one side (LLFF scenes) looks sensible on a small arc only.
 
-    Returns:
-        The cameras, with float32 poses on the device of the means.
-
     Raises:
-        ValueError: if an argument is out of range, the shapes do not match, or the Gaussians that are not transparent
-            do not span a volume, because there are none or they lie on one point.
+        ValueError: if an argument is out of range, or as `bounding_sphere` does.
 
     Example:
         >>> corners = torch.tensor([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
@@ -107,7 +100,7 @@ def orbit_views(
     cameras = []
     for turn in (start + step * i for i in range(count)):
         offset = center.new_tensor([level * math.sin(turn), -lift, -level * math.cos(turn)])
-        pose = _look_at(center + axes @ offset, center, axes[:, 1])
+        pose = look_at(center + axes @ offset, center, axes[:, 1])
         cameras.append(Camera(pose.float(), focal, focal, width / 2, height / 2, width, height))
     return cameras
 
@@ -117,11 +110,8 @@ def bounding_sphere(means: Tensor, opacities: Tensor) -> BoundingSphere:
 
     Of an object, the centre is that of the box between the quantiles 1 - `INSIDE` and `INSIDE` of each coordinate, and
     the radius the quantile `INSIDE` of the distances from it. Of a place with `SURROUNDINGS`, where that sphere would
-    be the room, the centre is the median and the radius twice that of half of the opacity. All is weighted by opacity.
-
-    Args:
-        means: world coordinates, finite, shape (N, 3).
-        opacities: activated, in [0, 1], shape (N,) or (N, 1).
+    be the room, the centre is the median and the radius twice that of half of the opacity. All is weighted by opacity,
+    activated, (N,) or (N, 1); the means (N, 3) are finite world coordinates.
 
     Raises:
         ValueError: if the shapes do not match, or the Gaussians that are not transparent do not span a volume, because
@@ -169,7 +159,7 @@ def _quantile(values: Tensor, weights: Tensor, share: float) -> Tensor:
     return ordered[torch.searchsorted(held, share * held[-1])]
 
 
-def _look_at(position: Tensor, target: Tensor, down: Tensor) -> Tensor:
+def look_at(position: Tensor, target: Tensor, down: Tensor) -> Tensor:
     """Return the view matrix (4, 4) of a camera that looks at a target, upright."""
     forward = normalize(target - position, dim=0)
     right = normalize(torch.linalg.cross(down, forward), dim=0)

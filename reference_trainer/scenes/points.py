@@ -27,12 +27,8 @@ def choose_points(
 ) -> tuple[PointCloud, str]:
     """Return the initial points that an option of a scene asks for, and a sentence about the choice.
 
-    Args:
-        root: the scene folder.
-        points: ``"auto"``, ``"random"``, ``"random:<count>"``, a ``.ply`` file or a COLMAP folder within the scene.
-        train: the training frames.
-        generator: source of randomness.
-        own: the points that the scene file names.
+    ``points`` is ``"auto"``, ``"random"``, ``"random:<count>"``, or a ``.ply`` file or a COLMAP folder within the
+    scene; ``own`` are those that the scene file names.
 
     Raises:
         FileNotFoundError: if the file or folder is missing.
@@ -42,7 +38,7 @@ def choose_points(
     passed = ""
     if points == "auto":
         offered = [own] if own is not None else []
-        offered += [cloud for folder in colmap_folders(root) if (cloud := _points_of(folder)) is not None]
+        offered += [cloud for folder in colmap_folders(root) if (cloud := colmap_points(folder)) is not None]
         names = {frame.name for frame in train}
         honest = [cloud for cloud in offered if (cloud.seen_by or frozenset()) <= names]
         if honest:
@@ -66,30 +62,20 @@ def choose_points(
             f"there is no folder {path} to take points from; choose auto, random or one of {found}."
         )
     cloud = ply_points(path) if path.suffix == ".ply" else colmap_points(path)
+    if cloud is None:
+        raise ValueError(f"{path} has no points to start from; choose another folder or random points.")
     return cloud, f"initial points: {len(cloud.positions):,} from {cloud.source}"
 
 
-def colmap_points(folder: str | Path) -> PointCloud:
-    """Read the points of a COLMAP reconstruction, or InstantSplat's ``points3D.ply`` in their place.
+def colmap_points(folder: Path) -> PointCloud | None:
+    """Read the points of a COLMAP reconstruction, or InstantSplat's ``points3D.ply`` in their place; None without any.
 
-    Args:
-        folder: the folder of its files, such as ``sparse/0``.
-
-    Returns:
-        The points; ``seen_by`` names the images in their tracks, or all of the reconstruction's if tracks are missing.
+    ``seen_by`` names the images in their tracks, or all of the reconstruction's if tracks are missing.
 
     Raises:
         FileNotFoundError: if a file is missing.
-        ValueError: if a file is damaged or there are no points.
+        ValueError: if a file is damaged.
     """
-    cloud = _points_of(Path(folder))
-    if cloud is None:
-        raise ValueError(f"{folder} has no points to start from; choose another folder or random points.")
-    return cloud
-
-
-def _points_of(folder: Path) -> PointCloud | None:
-    """Read the points of a reconstruction, None if it has none."""
     model = read_colmap(folder)
     if len(model.points.ids):
         positions = torch.from_numpy(model.points.positions).to(torch.float32)
@@ -141,15 +127,10 @@ def _colors(vertices: PlyVertices) -> Tensor:
 
 
 def check_no_leak(points: PointCloud, train_names: Iterable[str], *, allow: bool = False) -> None:
-    """Refuse points that were triangulated with the help of images outside the training split.
+    """Refuse points that were triangulated with the help of images outside the training split, unless they are allowed.
 
     A point found in a test view brings that view's geometry into training. A cloud whose origin is unknown
     (``seen_by`` is None) passes: nothing is known against it.
-
-    Args:
-        points: the initial points.
-        train_names: names of the training images.
-        allow: accept such points all the same.
 
     Raises:
         ValueError: if the points have seen other images and ``allow`` is False.

@@ -42,18 +42,7 @@ def _looks_at_box(frame: Frame) -> bool:
 
 
 def random_points_in_box(count: int, half_size: float, *, generator: torch.Generator | None = None) -> PointCloud:
-    """Draw grey points uniformly in a cube around the origin.
-
-    Args:
-        count: number of points.
-        half_size: half the edge of the cube, world units; 1.3 for the NeRF-synthetic scenes.
-        generator: source of randomness; the global one if None.
-
-    Example:
-        >>> cloud = random_points_in_box(5, 1.3, generator=torch.Generator().manual_seed(0))
-        >>> bool((cloud.positions.abs() <= 1.3).all())
-        True
-    """
+    """Draw grey points uniformly in a cube around the origin whose edge is twice ``half_size``, world units."""
     positions = (2 * torch.rand(count, 3, generator=generator) - 1) * half_size
     return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
 
@@ -68,15 +57,8 @@ def random_points_in_frusta(
 ) -> PointCloud:
     """Draw grey points that some camera sees: uniform over its picture, and in inverse depth between two bounds.
 
-    Without bounds, the point closest to all optical axes is looked for; near and far are a quarter of its median depth
-    and four times that.
-
-    Args:
-        cameras: the training cameras, at least one.
-        count: number of points.
-        near: smallest depth, world units.
-        far: largest depth, world units.
-        generator: source of randomness; the global one if None.
+    The bounds are in world units. Without them, the point closest to all optical axes is looked for; near and far are a
+    quarter of its median depth and four times that.
 
     Raises:
         ValueError: if no depth can be found because the optical axes do not meet in front of the cameras, or the bounds
@@ -90,13 +72,11 @@ def random_points_in_frusta(
     chosen = torch.randint(len(cameras), (count,), generator=generator)
     u, v, share = torch.rand(3, count, generator=generator)
     depth = 1 / (share / near + (1 - share) / far)
-    intrinsics = torch.tensor([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], dtype=torch.float32)[
-        chosen
-    ]
-    fx, fy, cx, cy, width, height = intrinsics.unbind(1)
-    local = torch.stack([(u * width - cx) / fx * depth, (v * height - cy) / fy * depth, depth], dim=1)
-    poses = torch.stack([camera.world_to_camera.to(torch.float32) for camera in cameras])[chosen]
-    positions = torch.einsum("nji,nj->ni", poses[:, :3, :3], local - poses[:, :3, 3])
+    positions = torch.empty(count, 3)
+    for number, camera in enumerate(cameras):
+        mine = chosen == number
+        pixels = torch.stack([u[mine] * camera.width, v[mine] * camera.height], dim=1)
+        positions[mine] = camera.lift(pixels, depth[mine])
     return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.textures import Texture
 
-__all__ = ["Box", "Cylinder", "Plane", "Solid", "Sphere", "nearest_hit", "render_solids"]
+__all__ = ["Box", "Round", "Solid", "nearest_hit", "render_solids"]
 
 SAMPLES = 3  # a side per pixel; odd, so that one ray passes through the pixel centre and gives its depth
 SHADOW_OFFSET = 1e-3  # shadow rays start this far off the surface, lest rounding make it shadow itself
@@ -21,94 +20,36 @@ AMBIENT = 0.3
 GAMMA = 2.2
 
 
-class Solid(Protocol):
-    """A surface that rays can hit."""
-
-    @property
-    def texture(self) -> Texture:
-        """The reflectance of its points."""
-        ...
-
-    def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """Return the ray parameters (R,) of the first hits in front of the origins, inf for none."""
-        ...
-
-    def normals(self, points: Tensor) -> Tensor:
-        """Return the outward unit normals (R, 3) at surface points (R, 3)."""
-        ...
-
-
-def _first_root(a: Tensor, half_b: Tensor, c: Tensor) -> Tensor:
-    """Smallest positive root of ``a t^2 + 2 half_b t + c = 0``, inf where there is none."""
-    disc = half_b * half_b - a * c
-    root = disc.clamp_min(0).sqrt()
-    near, far = (-half_b - root) / a, (-half_b + root) / a
-    t = torch.where(near > 0, near, far)
-    return torch.where((disc > 0) & (t > 0), t, torch.inf)
-
-
 @dataclass(frozen=True)
-class Sphere:
-    """A sphere."""
+class Round:
+    """A sphere, or, where it has two heights, an upright cylinder without ends between them."""
 
     center: tuple[float, float, float]
     radius: float
     texture: Texture
+    heights: tuple[float, float] | None = None
+
+    def _across(self, points: Tensor) -> Tensor:
+        """Return vectors without what the shape does not see of them: the height, if it is a cylinder."""
+        return points if self.heights is None else points * points.new_tensor([1.0, 0.0, 1.0])
 
     def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """See ``Solid``."""
-        offset = origins - origins.new_tensor(self.center)
-        a, half_b = directions.square().sum(1), (offset * directions).sum(1)
-        return _first_root(a, half_b, offset.square().sum(1) - self.radius**2)
+        """Return the ray parameters (R,) of the first hits in front of the origins, inf for none."""
+        offset, along = self._across(origins - origins.new_tensor(self.center)), self._across(directions)
+        a, half_b, c = along.square().sum(1), (offset * along).sum(1), offset.square().sum(1) - self.radius**2
+        disc = half_b * half_b - a * c
+        root = disc.clamp_min(0).sqrt()
+        near, far = (-half_b - root) / a, (-half_b + root) / a
+        t = torch.where(near > 0, near, far)
+        hit = (disc > 0) & (t > 0)
+        if self.heights is not None:
+            y = origins[:, 1] + t * directions[:, 1]
+            hit &= (y > self.heights[0]) & (y < self.heights[1])
+        return torch.where(hit, t, torch.inf)
 
     def normals(self, points: Tensor) -> Tensor:
-        """See ``Solid``."""
-        return (points - points.new_tensor(self.center)) / self.radius
-
-
-@dataclass(frozen=True)
-class Cylinder:
-    """An upright cylinder without ends, between two heights."""
-
-    x: float
-    z: float
-    radius: float
-    top: float
-    bottom: float
-    texture: Texture
-
-    def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """See ``Solid``."""
-        ox, oz = origins[:, 0] - self.x, origins[:, 2] - self.z
-        dx, dz = directions[:, 0], directions[:, 2]
-        t = _first_root(dx * dx + dz * dz, ox * dx + oz * dz, ox * ox + oz * oz - self.radius**2)
-        y = origins[:, 1] + t * directions[:, 1]
-        return torch.where((y > self.top) & (y < self.bottom), t, torch.inf)
-
-    def normals(self, points: Tensor) -> Tensor:
-        """See ``Solid``."""
-        across = points - points.new_tensor([self.x, 0.0, self.z])
-        across[:, 1] = 0
-        return across / self.radius
-
-
-@dataclass(frozen=True)
-class Plane:
-    """An endless plane: the points with ``normal . x = offset``."""
-
-    normal: tuple[float, float, float]
-    offset: float
-    texture: Texture
-
-    def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """See ``Solid``."""
-        normal = origins.new_tensor(self.normal)
-        t = (self.offset - origins @ normal) / (directions @ normal)
-        return torch.where(t > 0, t, torch.inf)
-
-    def normals(self, points: Tensor) -> Tensor:
-        """See ``Solid``."""
-        return points.new_tensor(self.normal).expand_as(points)
+        """Return the outward unit normals (R, 3) at surface points (R, 3)."""
+        return self._across(points - points.new_tensor(self.center)) / self.radius
 
 
 @dataclass(frozen=True)
@@ -130,7 +71,7 @@ class Box:
         return (points - points.new_tensor(self.center)) @ self._axes(points).T
 
     def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """See ``Solid``."""
+        """See `Round`."""
         offset, along = self.local(origins), directions @ self._axes(directions).T
         half = origins.new_tensor(self.half_size)
         one, other = (-half - offset) / along, (half - offset) / along
@@ -139,49 +80,37 @@ class Box:
         return torch.where((enter < leave) & (enter > 0), enter, torch.inf)
 
     def normals(self, points: Tensor) -> Tensor:
-        """See ``Solid``."""
+        """See `Round`."""
         share = self.local(points) / points.new_tensor(self.half_size)
         face = share.abs().argmax(1, keepdim=True)
         return torch.zeros_like(share).scatter(1, face, share.gather(1, face).sign()) @ self._axes(points)
 
 
+Solid = Round | Box
+
+
 def nearest_hit(solids: Sequence[Solid], origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Intersect rays with solids.
+    """Intersect rays with solids: parameters (R,) of the nearest hits, inf for none, and the solids' numbers (R,).
 
-    Args:
-        solids: the surfaces.
-        origins: where the rays start, shape (R, 3).
-        directions: where they go, any length, shape (R, 3).
-
-    Returns:
-        The ray parameters of the nearest hits, shape (R,), inf for none, and the numbers of the solids, shape (R,).
+    Origins and directions have shape (R, 3); a direction may have any length.
     """
     return torch.stack([solid.intersect(origins, directions) for solid in solids]).min(0)
 
 
 def render_solids(camera: Camera, solids: Sequence[Solid], light: Tensor) -> tuple[Tensor, Tensor]:
-    """Render solids, 3x3 rays a pixel.
+    """Render solids, 3x3 rays a pixel: the image (3, H, W) in [0, 1] and the depth (H, W) at pixel centres, float32.
 
-    Surfaces are matt, so their colour does not depend on the view. The light is a small square; each of a pixel's nine
-    rays sees another of its nine points, which makes the shadows soft.
-
-    Args:
-        camera: the camera.
-        solids: the surfaces.
-        light: positions of the nine points of the light, shape (9, 3).
-
-    Returns:
-        The image, shape (3, H, W), in [0, 1], black where nothing is hit, and the depth along the camera's z axis of
-        the surface at each pixel centre, shape (H, W), 0 where nothing is hit; float32.
+    Surfaces are matt, so their colour does not depend on the view. The light is a small square of nine points (9, 3);
+    each of a pixel's nine rays sees another of them, which makes the shadows soft. Depth is along the camera's z axis;
+    image and depth are 0 where nothing is hit.
     """
-    pose = camera.world_to_camera.to(torch.float32)
     steps = (torch.arange(SAMPLES) + 0.5) / SAMPLES
     shape = (camera.height, camera.width, SAMPLES, SAMPLES)
     y = (torch.arange(camera.height)[:, None, None, None] + steps[:, None]).expand(shape)
     x = (torch.arange(camera.width)[:, None, None] + steps).expand(shape)
-    local = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones(shape)], dim=-1)
-    directions = local.reshape(-1, 3) @ pose[:3, :3]
-    origins = camera.position.to(torch.float32).expand_as(directions)
+    position = camera.position.to(torch.float32)
+    directions = (camera.lift(torch.stack([x, y], dim=-1), torch.ones(shape)) - position).reshape(-1, 3)
+    origins = position.expand_as(directions)
     t, index = nearest_hit(solids, origins, directions)  # directions have unit z in the camera, so t is the depth
     radiance = torch.zeros_like(directions)
     targets = light.repeat(camera.height * camera.width, 1)

@@ -56,13 +56,10 @@ class View(Viewpoint):
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points to initialise Gaussians from.
+    """Points to initialise Gaussians from: world coordinates and RGB in [0, 1], both (M, 3), float32.
 
-    Args:
-        positions: world coordinates, shape (M, 3), float32.
-        colors: RGB in [0, 1], shape (M, 3), float32.
-        source: where they come from, for the log: a path or ``"random"``.
-        seen_by: names of all the images that the points were triangulated from, where that is known.
+    ``source`` says for the log where they come from; ``seen_by`` names all the images that the points were triangulated
+    from, where that is known.
     """
 
     positions: Tensor

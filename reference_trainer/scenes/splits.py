@@ -36,19 +36,10 @@ def evenly_spaced(count: int, views: int) -> list[int]:
 
 
 def llff_split(count: int, views: int) -> tuple[list[int], list[int]]:
-    """Split the images of a forward-facing scene, sorted by name, the LLFF way.
+    """Split so many images of a forward-facing scene, sorted by name: indices of the training and of the test views.
 
     Every eighth image is a test view, beginning with the first; the training views are spread evenly over the rest.
-
-    Args:
-        count: number of images.
-        views: number of training views.
-
-    Returns:
-        Indices of the training views and of the test views.
-
-    Raises:
-        ValueError: if there are not enough images.
+    Raises ValueError if there are not enough images.
 
     Example:
         >>> llff_split(20, 3)
@@ -59,17 +50,9 @@ def llff_split(count: int, views: int) -> tuple[list[int], list[int]]:
 
 
 def dtu_split(count: int, views: int) -> tuple[list[int], list[int]]:
-    """Split a DTU scan of 49 or 64 pictures, sorted by name: the protocol of PixelNeRF and RegNeRF.
+    """Split a DTU scan of 49 or 64 pictures, sorted by name, as PixelNeRF and RegNeRF do: training and 25 test indices.
 
-    Args:
-        count: number of images.
-        views: number of training views, 1 to 9.
-
-    Returns:
-        Indices of the training views and of the 25 test views, each in increasing order.
-
-    Raises:
-        ValueError: if there are too few images, or ``views`` is out of range.
+    Raises ValueError if there are too few images, or not 1 to 9 training views.
 
     Example:
         >>> train, test = dtu_split(49, 3)
@@ -82,19 +65,11 @@ def dtu_split(count: int, views: int) -> tuple[list[int], list[int]]:
 
 
 def blender_split(train_count: int, test_count: int, views: int) -> tuple[list[int], list[int]]:
-    """Choose the training and test views of a Blender (NeRF-synthetic) scene, by their place in the JSON files.
+    """Choose training and test views of a Blender (NeRF-synthetic) scene: indices into its two JSON files.
 
     From the full data set the 8-view protocol takes eight fixed training views and every eighth of the 200 test views.
     A scene that lists no more than ``views`` training frames is subsampled already: all are taken. Other numbers of
     views are spread evenly. A test list shorter than 200 is taken whole.
-
-    Args:
-        train_count: frames in ``transforms_train.json``.
-        test_count: frames in ``transforms_test.json``.
-        views: number of training views.
-
-    Returns:
-        Indices of the training views and of the test views.
 
     Raises:
         ValueError: if there is no training frame or ``views`` is not positive.
@@ -103,8 +78,6 @@ def blender_split(train_count: int, test_count: int, views: int) -> tuple[list[i
         >>> train, test = blender_split(100, 200, 8)
         >>> train, len(test)
         ([2, 16, 26, 55, 73, 76, 86, 93], 25)
-        >>> blender_split(8, 25, 8)[0]
-        [0, 1, 2, 3, 4, 5, 6, 7]
     """
     if views == len(BLENDER_TRAIN) and train_count > max(BLENDER_TRAIN):
         train = list(BLENDER_TRAIN)
@@ -117,15 +90,8 @@ def file_split(path: str | Path, names: Sequence[str], views: int | None) -> tup
     """Read a split from a JSON file with a list ``test`` and one or more lists of training images.
 
     With ``views`` given, the list is ``train_<views>``, else ``train`` if it has that length, else ``views`` images
-    spread evenly over ``train_all``. Without, it is ``train``, else ``train_3``.
-
-    Args:
-        path: the JSON file; it names images with or without extension.
-        names: the names of all images of the scene.
-        views: number of training views, or None for the file's own choice.
-
-    Returns:
-        Indices into ``names`` of the training views and of the test views, each in increasing order.
+    spread evenly over ``train_all``. Without, it is ``train``, else ``train_3``. Images are named with or without
+    extension. Returned are indices into ``names``, all images of the scene, each list in increasing order.
 
     Raises:
         FileNotFoundError: if there is no such file.

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.scenes.raytrace import Box, Cylinder, Plane, Solid, Sphere, render_solids
+from reference_trainer.scenes.orbit import look_at
+from reference_trainer.scenes.raytrace import Box, Round, Solid, render_solids
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.scenes.textures import Noise, Texture, checker, color_ramp
 
@@ -35,23 +36,14 @@ def synthetic_scene(
 ) -> Scene:
     """Ray-trace the built-in scene: columns, spheres and a box on a tiled floor before a painted wall.
 
-    Training cameras stand side by side on a slightly bent row and look at one point, like the LLFF captures. All test
-    cameras but the last stand between and above or below them (interpolation), the last one beyond the end of the row
-    (extrapolation, the hardest). Every view has its exact depth. The initial points lie on surfaces that training views
-    see, with a depth error of 0.5 %, as if they had been triangulated.
+    Training cameras, at least 2, stand side by side on a slightly bent row and look at one point, like the LLFF
+    captures. All test cameras but the last stand between and above or below them (interpolation), the last one beyond
+    the end of the row (extrapolation, the hardest). Every view has its exact depth. The initial points lie on surfaces
+    that training views see, with a depth error of 0.5 %, as if they had been triangulated. ``seed`` is that of the
+    points: the photographs are the same for every seed, so that runs can be compared. No ray reaches the background,
+    which is black.
 
     Convention: OpenCV world: x right, y down, z forward; the floor is at y = 1.
-
-    Args:
-        width: image width, pixels.
-        height: image height, pixels.
-        train_views: number of training views, at least 2.
-        test_views: number of test views, at least 1.
-        points: number of initial points.
-        seed: seed of the initial points. The photographs are the same for every seed, so that runs can be compared.
-
-    Returns:
-        The scene, on a black background that no ray reaches.
 
     Raises:
         ValueError: if there are too few views or no points.
@@ -99,11 +91,7 @@ def _between(places: list[float], count: int) -> list[float]:
 def _camera(place: float, lift: float, width: int, height: int) -> Camera:
     """Stand at ``place`` on the row, in half widths, and look at the target with the horizon level."""
     position = torch.tensor([RIG_HALF_WIDTH * place, -0.75 - lift, 0.25 * place * place], dtype=torch.float64)
-    forward = torch.nn.functional.normalize(torch.tensor(TARGET, dtype=torch.float64) - position, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(position.new_tensor([0.0, 1.0, 0.0]), forward), dim=0)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
+    pose = look_at(position, position.new_tensor(TARGET), position.new_tensor([0.0, 1.0, 0.0]))
     focal = 0.5 * width / math.tan(0.5 * FIELD_OF_VIEW)
     return Camera(pose.to(torch.float32), focal, focal, width / 2, height / 2, width, height)
 
@@ -117,12 +105,9 @@ def _surface_points(views: list[View], count: int, generator: torch.Generator) -
     for number, view in enumerate(views):
         mine = chosen // (height * width) == number
         pixel = chosen[mine] % (height * width)
-        camera = view.camera
         assert view.depth is not None
         depth = view.depth.flatten()[pixel] * error[mine]
-        x, y = pixel % width + 0.5, pixel // width + 0.5
-        local = torch.stack([(x - camera.cx) / camera.fx * depth, (y - camera.cy) / camera.fy * depth, depth], dim=1)
-        positions[mine] = (local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
+        positions[mine] = view.camera.lift(torch.stack([pixel % width, pixel // width], dim=1) + 0.5, depth)
         colors[mine] = view.image.flatten(1)[:, pixel].T
     return PointCloud(positions, colors, source="synthetic", seen_by=frozenset(view.name for view in views))
 
@@ -173,14 +158,14 @@ def _courtyard(noise: Noise) -> list[Solid]:
         return tiles * torch.where(layer == 0, 1.0, 0.45)[:, None] * (0.75 + 0.4 * noise(p * 20))[:, None]
 
     crate = Box((1.35, 0.55, 5.6), (0.45, 0.45, 0.45), 0.6, mosaic)
-    columns = [Cylinder(x, 7.0, 0.2, -6.0, GROUND, stone((0.80, 0.72, 0.60))) for x in (-3.3, -1.1, 1.1, 3.3)]
+    columns = [Round((x, 0.0, 7.0), 0.2, stone((0.80, 0.72, 0.60)), (-6.0, GROUND)) for x in (-3.3, -1.1, 1.1, 3.3)]
     return [
-        Plane((0.0, -1.0, 0.0), -GROUND, floor),
-        Plane((0.0, 0.0, -1.0), -8.5, wall),
-        Sphere((-0.95, 0.25, 4.7), 0.75, marble),
-        Sphere((0.42, 0.60, 3.6), 0.40, citrus),
-        Sphere((-0.25, 0.72, 6.0), 0.28, moss),
-        Sphere((1.35, -0.22, 5.6), 0.32, moss),
+        Box((0.0, GROUND + 20, 0.0), (40.0, 20.0, 40.0), 0.0, floor),
+        Box((0.0, 0.0, 28.5), (40.0, 40.0, 20.0), 0.0, wall),
+        Round((-0.95, 0.25, 4.7), 0.75, marble),
+        Round((0.42, 0.60, 3.6), 0.40, citrus),
+        Round((-0.25, 0.72, 6.0), 0.28, moss),
+        Round((1.35, -0.22, 5.6), 0.32, moss),
         crate,
         *columns,
     ]

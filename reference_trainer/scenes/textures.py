@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample, pad
 
 __all__ = ["Noise", "Texture", "checker", "color_ramp"]
 
@@ -16,9 +17,6 @@ Texture = Callable[[Tensor], Tensor]
 class Noise:
     """Smooth noise in space: random values on a periodic integer lattice, interpolated, summed over octaves.
 
-    Args:
-        generator: source of the lattice values.
-
     Example:
         >>> noise = Noise(torch.Generator().manual_seed(0))
         >>> noise(torch.rand(10, 3), octaves=4).shape
@@ -28,7 +26,8 @@ class Noise:
     PERIOD = 32
 
     def __init__(self, generator: torch.Generator) -> None:
-        self.lattice = torch.rand(self.PERIOD**3, generator=generator)
+        self.lattice = torch.rand((self.PERIOD,) * 3, generator=generator)
+        self._wrapped = pad(self.lattice[None, None], (0, 1) * 3, mode="circular")
 
     def __call__(self, points: Tensor, octaves: int = 1) -> Tensor:
         """Return the noise at points (R, 3): values in [0, 1], shape (R,), with a feature size of 1 and below."""
@@ -43,19 +42,9 @@ class Noise:
         """One octave: trilinear interpolation with the smoothstep fade."""
         base = points.floor()
         fade = points - base
-        fade = fade * fade * (3 - 2 * fade)
-        low = base.long() % self.PERIOD
-        high = (low + 1) % self.PERIOD
-        strides = (self.PERIOD**2, self.PERIOD, 1)
-        (x0, x1), (y0, y1), (z0, z1) = ((low[:, i] * strides[i], high[:, i] * strides[i]) for i in range(3))
-        fx, fy, fz = fade.unbind(1)
-
-        def along_z(xy: Tensor) -> Tensor:
-            return torch.lerp(self.lattice[xy + z0], self.lattice[xy + z1], fz)
-
-        return torch.lerp(
-            torch.lerp(along_z(x0 + y0), along_z(x0 + y1), fy), torch.lerp(along_z(x1 + y0), along_z(x1 + y1), fy), fx
-        )
+        at = (base % self.PERIOD + fade * fade * (3 - 2 * fade)) * (2 / self.PERIOD) - 1
+        grid = at.flip(1)[None, None, None]  # the last axis of the lattice comes first
+        return grid_sample(self._wrapped, grid, align_corners=True).flatten()
 
 
 def color_ramp(values: Tensor, colors: Sequence[tuple[float, float, float]]) -> Tensor:

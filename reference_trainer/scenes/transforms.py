@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from reference_trainer.camera import Camera
 from reference_trainer.json_files import read_json
 from reference_trainer.scenes.formats import Capture, SceneFormat, only_default
-from reference_trainer.scenes.frames import Frame
+from reference_trainer.scenes.frames import Frame, view_matrix
 from reference_trainer.scenes.images import IMAGE_SUFFIXES, image_size, path_inside
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.points import ply_points
@@ -30,14 +30,9 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
     COLMAP files it came from. The focal length is ``fl_x`` and ``fl_y``, pixels, for a picture of ``w`` x ``h``, else
     it follows from the horizontal field of view ``camera_angle_x``, radians. The principal point ``cx``, ``cy`` is the
     centre of the picture unless given; ``k1 k2 p1 p2 k3`` are OpenCV's distortion. A frame may have its own of each.
-    ``file_path`` is relative to the JSON file; without an extension it means a PNG file.
-
-    Args:
-        path: the JSON file.
-        images: another folder, beside the file, for the pictures of the same names.
-
-    Returns:
-        The frames; their names are the file paths without a leading ``./`` and without extension.
+    ``file_path`` is relative to the JSON file; without an extension it means a PNG file. Pictures of the same names are
+    taken from another folder beside the file if one is given. The frames' names are the file paths without a leading
+    ``./`` and without extension.
 
     Raises:
         FileNotFoundError: if the file or images are missing.
@@ -125,13 +120,10 @@ def _world_to_camera(entry: dict[str, Any], back: NDArray[np.float64]) -> torch.
             f"transform_matrix of {entry['file_path']} must be a finite 4x4 matrix, got {matrix.tolist()}."
         )
     matrix = back @ matrix
-    rotation = (matrix[:3, :3] * [1, -1, -1]).T
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise ValueError(f"transform_matrix of {entry['file_path']} holds no rotation: {matrix[:3, :3].tolist()}.")
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ matrix[:3, 3]
-    return torch.from_numpy(pose)
+    try:
+        return view_matrix((matrix[:3, :3] * [1, -1, -1]).T, matrix[:3, 3])
+    except ValueError as error:
+        raise ValueError(f"transform_matrix of {entry['file_path']}: {error}") from error
 
 
 def _points(path: Path, frames: list[Frame]) -> PointCloud | None:

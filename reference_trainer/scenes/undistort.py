@@ -17,15 +17,10 @@ LARGEST_ZOOM = 4.0
 
 
 def distort(points: Tensor, camera: Camera, distortion: Sequence[float]) -> Tensor:
-    """Return where the lens puts points that a pinhole camera without distortion would see at some pixel.
+    """Return where the lens puts pixels (..., N, 2), float64, of a pinhole camera without distortion.
 
     Convention: OpenCV's rational model; the coefficients are k1 k2 p1 p2 k3 k4 k5 k6 or a beginning of that list, which
-    is also the order of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV.
-
-    Args:
-        points: pixels (x, y), half-integer at pixel centres, shape (..., N, 2), float64.
-        camera: the pinhole camera of the picture, whose pose does not matter.
-        distortion: the coefficients.
+    is also the order of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV. Pixel centres are half-integer.
 
     Example:
         >>> camera = Camera(torch.eye(4), 100.0, 100.0, 50.0, 40.0, 100, 80)
@@ -48,18 +43,11 @@ def corner_displacement(camera: Camera, distortion: Sequence[float]) -> float:
 
 
 def undistort(pixels: Tensor, camera: Camera, distortion: Sequence[float]) -> tuple[Tensor, Camera]:
-    """Resample a picture, bicubically and once, so that straight lines are straight.
+    """Resample a picture (C, H, W), bicubically and once, so that straight lines are straight; return its camera, too.
 
     The picture keeps its size. Where the lens saw less than the straight picture would show, the focal length grows
-    until no pixel is empty, as COLMAP's undistorter does by default.
-
-    Args:
-        pixels: values in [0, 1], shape (C, H, W).
-        camera: the camera of the picture, without its distortion.
-        distortion: as for `distort`.
-
-    Returns:
-        The picture, same shape, and its pinhole camera.
+    until no pixel is empty, as COLMAP's undistorter does by default. ``camera`` is that of the picture without its
+    distortion, which is given as for `distort`.
 
     Raises:
         ValueError: if the lens folds the picture over itself, or shows less than a quarter of it.

@@ -13,7 +13,7 @@ from fuzz import samples
 from ca_reg import CAMonitor, CAScore
 from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.colmap import read_colmap
-from reference_trainer.scenes.colmap_model import ColmapImage
+from reference_trainer.scenes.colmap_model import view_matrix
 from reference_trainer.scenes.images import LARGEST_IMAGE, read_image
 from reference_trainer.scenes.llff import read_llff
 from reference_trainer.scenes.points import ply_points
@@ -54,7 +54,7 @@ def test_a_number_given_twice_hides_no_record(tmp_path):
         read_colmap(tmp_path)
     cameras = (tmp_path / "cameras.bin").read_bytes()
     (tmp_path / "cameras.bin").write_bytes(cameras[:8] + struct.pack("<i", 7) + cameras[12:])
-    with pytest.raises(ValueError, match=r"cameras\.bin has camera 7 twice"):
+    with pytest.raises(ValueError, match=r"cameras\.bin: it has camera 7 twice"):
         read_colmap(tmp_path)
 
 
@@ -235,7 +235,7 @@ def test_a_tiff_with_lost_strips_is_refused(tmp_path):
 
 def test_a_quaternion_whose_length_overflows_is_no_identity():
     with pytest.raises(ValueError, match="finite non-zero quaternion"):
-        ColmapImage.pose((1e200, 1e200, 0.0, 0.0), (0.0, 0.0, 0.0))
+        view_matrix((1e200, 1e200, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("bad", ["[1, 2]", '["r_1.png", null]', '[["r_1.png"]]', '["r_1.png", {"a": 1}]'])

@@ -38,13 +38,13 @@ def test_a_point_lands_where_the_hand_puts_it():
     )
     torch.testing.assert_close(projected.means, torch.tensor([[33 + 60 * 2 / 5, 23 + 50 * 1 / 5]]).double())
     assert projected.depths.item() == pytest.approx(5.0)
+    torch.testing.assert_close(camera(world_to_camera=quarter_turn()).lift(projected.means, projected.depths), point)
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.3, 2.0, 1e-3])
 def test_scaling_keeps_the_field_of_view_and_the_principal_ray(factor):
     old = camera()
-    new = old.scaled(factor)
-    assert (new.width, new.height) == (max(1, round(64 * factor)), max(1, round(48 * factor)))
+    new = old.resized(max(1, round(64 * factor)), max(1, round(48 * factor)))
     for size, focal, centre in (("width", "fx", "cx"), ("height", "fy", "cy")):
         for edge in (0, 1):  # the rays through both edges of the picture stay
             slope = (edge * getattr(old, size) - getattr(old, centre)) / getattr(old, focal)

@@ -53,6 +53,22 @@ def test_scores_are_those_of_the_rendered_views(tiny_scene, gaussians):
     assert result.perceptual_metric is None
 
 
+def test_outside_of_its_mask_a_view_does_not_count(tiny_scene, gaussians):
+    view = tiny_scene.test[0]
+    mask = torch.zeros(view.image.shape[1:])
+    mask[8:20, 4:30] = 1
+    spoiled = torch.where(mask == 1, view.image, 1 - view.image)  # what lies outside must not matter
+    model, metric = TrainedModel(gaussians, tiny_scene.background), Brightness()
+    masked = [dataclasses.replace(view, image=image, mask=mask) for image in (view.image, spoiled)]
+    found, other = (evaluate(model, {"test": [each]}, perceptual=metric).views[0] for each in masked)
+    image = model.test_rendering(view).image.clamp(0, 1)
+    error = (image - view.image)[:, 8:20, 4:30].double().square().mean().item()
+    assert found.psnr == other.psnr == pytest.approx(-10 * math.log10(error))
+    white = [torch.where(mask == 1, x, 1.0) for x in (image, view.image)]
+    assert found.ssim == other.ssim == pytest.approx(ssim(*white))
+    assert found.lpips == other.lpips == pytest.approx(metric(*white))
+
+
 def test_images_are_scaled_for_the_test_and_co_adaptation_is_not(tiny_scene, gaussians):
     half = dataclasses.replace(gaussians, opacity_logits=inverse_sigmoid(0.5 * gaussians.opacities))
     plain = evaluate(TrainedModel(gaussians, tiny_scene.background), of_scene(tiny_scene))

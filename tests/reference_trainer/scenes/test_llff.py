@@ -55,8 +55,8 @@ def test_poses_become_opencv_view_matrices(tmp_path):
         (np.zeros((3, 16)), r"shape \(N, 17\)"),
         (np.full((3, 17), np.nan), "finite"),
         (rows_of(some_poses(2)), "has 2 poses but .* has 3 images"),
-        (rows_of([np.diag([2.0, 2, 2, 1])] * 3), "not a rotation"),
-        (rows_of([np.diag([1.0, 1, -1, 1])] * 3), "not a rotation"),
+        (rows_of([np.diag([2.0, 2, 2, 1])] * 3), "no rotation"),
+        (rows_of([np.diag([1.0, 1, -1, 1])] * 3), "no rotation"),
     ],
 )
 def test_bad_files_are_refused(tmp_path, rows, reason):

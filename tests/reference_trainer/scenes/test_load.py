@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from reference_trainer.scenes import load_scene
-from reference_trainer.scenes.load import detect_format
+from reference_trainer.scenes.formats import find_format
 
 
 @pytest.fixture
@@ -165,16 +165,16 @@ def test_synthetic_scene_by_name():
 
 
 def test_detect_format(photo_scene, blender_scene, tmp_path):
-    assert detect_format(photo_scene) == "colmap"
-    assert detect_format(blender_scene) == "blender"
+    assert find_format(photo_scene, "auto")[0] == "colmap"
+    assert find_format(blender_scene, "auto")[0] == "blender"
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").touch()
     with pytest.raises(ValueError, match=r"none of transforms_train\.json.*notes\.txt"):
-        detect_format(tmp_path / "other")
+        find_format(tmp_path / "other", "auto")
     (tmp_path / "other" / "poses_bounds.npy").touch()
-    assert detect_format(tmp_path / "other") == "llff"
+    assert find_format(tmp_path / "other", "auto")[0] == "llff"
     with pytest.raises(FileNotFoundError, match="say 'synthetic'"):
-        detect_format(tmp_path / "none")
+        find_format(tmp_path / "none", "auto")
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import torch
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.points import (
     check_no_leak,
+    choose_points,
     colmap_points,
 )
 from reference_trainer.scenes.random_points import random_points_in_box, random_points_in_frusta
@@ -40,8 +41,9 @@ def test_colmap_points(tmp_path, colmap_binary):
     torch.testing.assert_close(points.colors[0] * 255, torch.tensor([255.0, 0, 17]))
     assert points.seen_by == {"b.png", "c.png"}
     (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 0))
+    assert colmap_points(tmp_path) is None
     with pytest.raises(ValueError, match="no points to start from"):
-        colmap_points(tmp_path)
+        choose_points(tmp_path, ".", [], torch.Generator())
 
 
 def looking(position, target):

@@ -6,24 +6,24 @@ import pytest
 import torch
 
 from reference_trainer.camera import Camera
-from reference_trainer.scenes.raytrace import AMBIENT, GAMMA, Box, Cylinder, Plane, Sphere, nearest_hit, render_solids
+from reference_trainer.scenes.raytrace import AMBIENT, GAMMA, Box, Round, nearest_hit, render_solids
 
 
 def white(points):
     return torch.ones_like(points)
 
 
-SPHERE = Sphere((0.3, -0.2, 4.0), 0.8, white)
-CYLINDER = Cylinder(0.2, 3.5, 0.6, -0.7, 0.9, white)
-PLANE = Plane((0.0, -1.0, 0.0), -1.0, white)
+SPHERE = Round((0.3, -0.2, 4.0), 0.8, white)
+CYLINDER = Round((0.2, 5.0, 3.5), 0.6, white, (-0.7, 0.9))
+FLOOR = Box((0.0, 21.0, 0.0), (40.0, 20.0, 40.0), 0.0, white)
 BOX = Box((-0.2, 0.1, 4.0), (0.5, 0.7, 0.4), 0.6, white)
 
 
 def inside(solid, p):
     """Whether points are inside, from the definition of each shape alone."""
-    if isinstance(solid, Sphere):
+    if solid is SPHERE:
         return (p - torch.tensor(solid.center).to(p)).norm(dim=-1) < solid.radius
-    if isinstance(solid, Plane):
+    if solid is FLOOR:
         return p[..., 1] > 1
     c, s = math.cos(0.6), math.sin(0.6)
     x, y, z = (p - torch.tensor(solid.center).to(p)).unbind(-1)
@@ -38,7 +38,7 @@ def rays(count):
     return origins, targets - origins
 
 
-@pytest.mark.parametrize("solid", [SPHERE, PLANE, BOX], ids=lambda solid: type(solid).__name__)
+@pytest.mark.parametrize("solid", [SPHERE, FLOOR, BOX])
 def test_hits_are_where_marching_enters_the_solid(solid):
     origins, directions = rays(400)
     t = solid.intersect(origins, directions)
@@ -69,7 +69,7 @@ def test_cylinder_hits_lie_on_it_and_are_the_nearest():
     assert ((across * directions[hit]).sum(1) < 0).all()
 
 
-@pytest.mark.parametrize("solid", [SPHERE, CYLINDER, BOX, PLANE], ids=lambda solid: type(solid).__name__)
+@pytest.mark.parametrize("solid", [SPHERE, CYLINDER, BOX, FLOOR])
 def test_normals_are_unit_and_face_the_viewer(solid):
     origins, directions = rays(400)
     t = solid.intersect(origins, directions)
@@ -85,7 +85,7 @@ def test_sphere_normals_are_radial():
 
 def test_nearest_hit_is_the_nearest():
     origins, directions = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    near, far = Sphere((0.0, 0.0, 3.0), 1.0, white), Sphere((0.0, 0.0, 9.0), 1.0, white)
+    near, far = Round((0.0, 0.0, 3.0), 1.0, white), Round((0.0, 0.0, 9.0), 1.0, white)
     t, index = nearest_hit([far, near], origins, directions)
     assert t.tolist() == [2.0, math.inf]
     assert index[0] == 1
@@ -93,7 +93,7 @@ def test_nearest_hit_is_the_nearest():
 
 def test_depth_of_a_sphere_is_exact_at_pixel_centres():
     camera = Camera(torch.eye(4), fx=30.0, fy=30.0, cx=16.0, cy=12.0, width=32, height=24)
-    image, depth = render_solids(camera, [Sphere((0.0, 0.0, 4.0), 1.0, white)], torch.zeros(9, 3))
+    image, depth = render_solids(camera, [Round((0.0, 0.0, 4.0), 1.0, white)], torch.zeros(9, 3))
     for row in range(24):
         for column in range(32):
             x, y = (column + 0.5 - 16) / 30, (row + 0.5 - 12) / 30
@@ -107,11 +107,11 @@ def test_depth_of_a_sphere_is_exact_at_pixel_centres():
 
 def test_shading_is_lambert_and_shadows_are_ambient():
     camera = Camera(torch.eye(4), fx=30.0, fy=30.0, cx=1.5, cy=1.5, width=3, height=3)
-    wall = Plane((0.0, 0.0, -1.0), -5.0, white)
+    wall = Box((0.0, 0.0, 25.0), (40.0, 40.0, 20.0), 0.0, white)
     oblique = torch.tensor([100.0, 0.0, -95.0]).expand(9, 3)  # 45 degrees off the wall's normal
     lit, _ = render_solids(camera, [wall], oblique)
     linear = lit[:, 1, 1] ** GAMMA
     torch.testing.assert_close(linear, torch.full((3,), AMBIENT + (1 - AMBIENT) * math.sqrt(0.5)), atol=5e-3, rtol=0)
-    blocker = Sphere((10.0, 0.0, -5.0), 1.0, white)
+    blocker = Round((10.0, 0.0, -5.0), 1.0, white)
     shadowed, _ = render_solids(camera, [wall, blocker], oblique)
     torch.testing.assert_close(shadowed[:, 1, 1] ** GAMMA, torch.full((3,), AMBIENT), atol=1e-5, rtol=0)

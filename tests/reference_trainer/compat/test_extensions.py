@@ -1,13 +1,11 @@
-"""The stand-in for `fused_ssim` against kornia."""
+"""The stand-ins for `fused_ssim`, against kornia, and for the two forms of `simple_knn`."""
 
 import pytest
 import torch
 from kornia.metrics import ssim
 from torch.nn.functional import pad
 
-from reference_trainer.compat.similarity import similarity_module
-
-fused_ssim = similarity_module().fused_ssim
+from reference_trainer.compat.extensions import fused_ssim, neighbor_modules
 
 
 @pytest.mark.parametrize("padding", ["same", "valid"])
@@ -27,3 +25,21 @@ def test_values_and_gradients_are_kornias(padding):
 def test_another_padding_is_refused():
     with pytest.raises(ValueError, match="padding must be 'same' or 'valid', got 'reflect'"):
         fused_ssim(torch.rand(1, 3, 16, 16), torch.rand(1, 3, 16, 16), padding="reflect")
+
+
+def test_both_forms_of_the_extension(generator):
+    points = torch.rand(20, 3, generator=generator).requires_grad_()
+    squares = (points.detach()[:, None] - points.detach()).square().sum(-1).fill_diagonal_(torch.inf)
+    expected = squares.sort(dim=1)
+    alone = neighbor_modules(indices=False)["simple_knn._C"].distCUDA2(points)
+    pair = neighbor_modules(indices=True)["simple_knn._C"].distCUDA2(points)
+    torch.testing.assert_close(alone, expected.values[:, :3].mean(1))
+    assert not alone.requires_grad
+    assert torch.equal(pair[0], alone)
+    assert torch.equal(pair[1], expected.indices[:, :3].int())
+    assert pair[1].dtype == torch.int32
+
+
+def test_too_few_points_are_refused():
+    with pytest.raises(ValueError, match=r"\(N, 3\) with N > 3"):
+        neighbor_modules(indices=False)["simple_knn._C"].distCUDA2(torch.zeros(3, 3))

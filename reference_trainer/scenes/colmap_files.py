@@ -1,9 +1,10 @@
-"""COLMAP's text files: ``cameras.txt``, ``images.txt``, ``points3D.txt``."""
+"""COLMAP's files ``cameras``, ``images`` and ``points3D``, binary (little-endian throughout) and text."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+import struct
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,97 @@ from reference_trainer.scenes.colmap_model import (
     ColmapImage,
     ColmapPoints,
     PointRecords,
+    add_camera,
+    view_matrix,
 )
 
-__all__ = ["read_cameras_text", "read_images_text", "read_points_text"]
+__all__ = ["READERS"]
+
+_KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+_TRACK = np.dtype([("image", "<i4"), ("feature", "<i4")])
+
+
+class _Cursor:
+    """Reads a file from front to end, and refuses what is not there before anything is allocated for it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.data, self.at = path, path.read_bytes(), 0
+
+    def need(self, size: int, what: str) -> None:
+        if size > len(self.data) - self.at:
+            raise ValueError(
+                f"{self.path} is truncated or not a COLMAP file: {what} needs {size} bytes at offset {self.at}, "
+                f"but {len(self.data) - self.at} are left."
+            )
+
+    def take(self, layout: str, what: str) -> tuple[Any, ...]:
+        size = struct.calcsize("<" + layout)
+        self.need(size, what)
+        self.at += size
+        return struct.unpack_from("<" + layout, self.data, self.at - size)
+
+    def count(self, smallest: int, what: str) -> int:
+        """Read a number of records of at least ``smallest`` bytes each."""
+        count: int = self.take("Q", f"the number of {what}")[0]
+        self.need(count * smallest, f"{count} {what}")
+        return count
+
+    def array(self, dtype: np.dtype[np.void], what: str) -> np.ndarray:
+        """Read a number of records, and them."""
+        count = self.count(dtype.itemsize, what)
+        self.at += count * dtype.itemsize
+        return np.frombuffer(self.data, dtype, count, self.at - count * dtype.itemsize)
+
+    def text(self, what: str) -> str:
+        end = self.data.find(b"\0", self.at)
+        self.need(end + 1 - self.at if end >= 0 else len(self.data) + 1, what)
+        raw, self.at = self.data[self.at : end], end + 1
+        return raw.decode("utf-8", errors="replace")
+
+    def records(self, smallest: int, what: str) -> Iterator[None]:
+        """Go through the file's records, and refuse what is left after their number: it passes for a smaller scene."""
+        for _ in range(self.count(smallest, what)):
+            yield
+        if self.at != len(self.data):
+            raise ValueError(
+                f"{self.path} is damaged or not a COLMAP file: {len(self.data) - self.at} bytes are left after the "
+                "announced number of records."
+            )
+
+
+def read_cameras_binary(path: Path) -> dict[int, ColmapCamera]:
+    """Read ``cameras.bin``. Raises ValueError if it is damaged or has an unknown camera model."""
+    cursor = _Cursor(path)
+    cameras: dict[int, ColmapCamera] = {}
+    for _ in cursor.records(24 + 3 * 8, "cameras"):
+        number, model, width, height = cursor.take("iiQQ", "a camera")
+        parameters = CAMERA_MODELS[model].parameters if 0 <= model < len(CAMERA_MODELS) else 0
+        values = cursor.take(f"{parameters}d", "the parameters of a camera")
+        add_camera(cameras, number, model, width, height, values)
+    return cameras
+
+
+def read_images_binary(path: Path) -> list[ColmapImage]:
+    """Read ``images.bin``. Raises ValueError if it is damaged."""
+    cursor = _Cursor(path)
+    images = []
+    for _ in cursor.records(64 + 1 + 8, "images"):
+        number, *pose, camera = cursor.take("i7di", "an image")
+        name, keypoints = cursor.text("the name of an image"), cursor.array(_KEYPOINT, "features")
+        xy, points = keypoints["xy"].astype(np.float64), keypoints["point"].astype(np.int64)
+        images.append(ColmapImage(number, name, camera, view_matrix(pose[:4], pose[4:]), xy, points))
+    return images
+
+
+def read_points_binary(path: Path) -> ColmapPoints:
+    """Read ``points3D.bin``. Raises ValueError if it is damaged."""
+    cursor = _Cursor(path)
+    points = PointRecords()
+    for _ in cursor.records(43 + 8, "points"):
+        number, x, y, z, red, green, blue, _error = cursor.take("q3d3Bd", "a point")
+        points.add(number, (x, y, z), (red, green, blue), cursor.array(_TRACK, "track elements")["image"])
+    return points.finish()
+
 
 _ANNOUNCED = re.compile(r"#\s*Number of \w+:\s*(\d{1,18})\b")
 
@@ -69,18 +158,12 @@ def _damaged(path: Path, number: int, error: Exception) -> ValueError:
 
 def read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
     """Read ``cameras.txt``. Raises ValueError if it is damaged or has an unknown camera model."""
-    models = {model.name: model for model in CAMERA_MODELS}
-    cameras = {}
+    cameras: dict[int, ColmapCamera] = {}
     for number, line in _records(path):
         try:
             words = line.split()
-            camera_id, width, height = int(words[0]), int(words[2]), int(words[3])
-            if words[1] not in models:
-                raise ValueError(f"camera {camera_id} has the unknown camera model {words[1]}.")
-            parameters = tuple(float(word) for word in words[4:])
-            if camera_id in cameras:
-                raise ValueError(f"it has camera {camera_id} twice.")
-            cameras[camera_id] = ColmapCamera(camera_id, models[words[1]], width, height, parameters)
+            size = int(words[2]), int(words[3])
+            add_camera(cameras, int(words[0]), words[1], *size, tuple(map(float, words[4:])))
         except (ValueError, IndexError) as error:
             raise _damaged(path, number, error) from error
     return cameras
@@ -98,7 +181,7 @@ def read_images_text(path: Path) -> list[ColmapImage]:
             continue
         try:
             words = line.split(maxsplit=9)  # a name may contain spaces
-            matrix = ColmapImage.pose(tuple(map(float, words[1:5])), tuple(map(float, words[5:8])))
+            matrix = view_matrix([*map(float, words[1:5])], [*map(float, words[5:8])])
             features = _numbers(second, float).reshape(-1, 3)
             if not (np.abs(features[:, 2]) <= 2**53).all():  # also refuses nan
                 raise ValueError("a feature has no number of a point.")
@@ -125,3 +208,11 @@ def read_points_text(path: Path) -> ColmapPoints:
         except (ValueError, IndexError, OverflowError) as error:
             raise _damaged(path, number, error) from error
     return points.finish()
+
+
+READERS: dict[str, dict[str, Callable[[Path], Any]]] = {
+    "cameras": {".bin": read_cameras_binary, ".txt": read_cameras_text},
+    "images": {".bin": read_images_binary, ".txt": read_images_text},
+    "points3D": {".bin": read_points_binary, ".txt": read_points_text},
+}
+"""By file and form."""
