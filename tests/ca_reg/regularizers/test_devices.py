@@ -8,13 +8,15 @@ from ca_reg.regularizers import REGULARIZERS, parse
 
 ARGUMENTS = {"dropout": "(0.5)", "noise": "(0.5)", "clustered": "(0.3)", "position_noise": "(0.1)"}
 
+N = 60  # of 20 points two have the same neighbors, and rounding alone would rank them
+
 
 def params(chain, device) -> Params:
     g = torch.Generator().manual_seed(0)
     named = {"means": (3,), "scales": (3,), "quaternions": (4,), "sh": (9, 3)}
-    tensors = {name: (0.1 + torch.rand(20, *shape, generator=g)).to(device) for name, shape in named.items()}
-    learned = {name: torch.full((20,), of.start, device=device) for name, of in chain.learns.items()}
-    opacities = torch.rand(20, generator=g).to(device)
+    tensors = {name: (0.1 + torch.rand(N, *shape, generator=g)).to(device) for name, shape in named.items()}
+    learned = {name: torch.full((N,), of.start, device=device) for name, of in chain.learns.items()}
+    opacities = torch.rand(N, generator=g).to(device)
     return Params(opacities, **tensors, view_matrix=torch.eye(4, device=device), learned=learned, step=3_000)
 
 
