@@ -91,9 +91,18 @@ class GaussianOptimizer:
         with torch.no_grad():
             parameter.copy_(logits)
         if forget:
-            for name in ("exp_avg", "exp_avg_sq"):
-                if name in self._adam.state[parameter]:
-                    self._adam.state[parameter][name].zero_()
+            self._forget(parameter, slice(None))
+
+    def relocate(self, index: Tensor, new: Gaussians) -> None:
+        """Overwrite the Gaussians of ``index``, positions, with as many new ones; their optimizer state stays."""
+        with torch.no_grad():
+            for (_, x), (_, value) in zip(self.gaussians.named(), new.named(), strict=True):
+                x[index] = value
+
+    def forget(self, index: Tensor) -> None:
+        """Clear the optimizer state of the Gaussians of ``index`` (bool mask or positions)."""
+        for _, x in self.gaussians.named():
+            self._forget(x, index)
 
     def state_dict(self) -> dict[str, Any]:
         """Return parameters and moments as plain tensors, for a checkpoint."""
@@ -108,6 +117,11 @@ class GaussianOptimizer:
         self._replace({name: x.detach().clone().requires_grad_() for name, x in state["gaussians"].items()})
         for name, x in self.gaussians.named():
             self._adam.state[x] = {key: value.clone() for key, value in state["moments"][name].items()}
+
+    def _forget(self, parameter: Tensor, index: Tensor | slice) -> None:
+        for name in ("exp_avg", "exp_avg_sq"):
+            if name in self._adam.state[parameter]:
+                self._adam.state[parameter][name][index] = 0
 
     def _group(self, name: str) -> dict[str, Any]:
         return next(group for group in self._adam.param_groups if group["name"] == name)

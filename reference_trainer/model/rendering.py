@@ -24,6 +24,7 @@ def render_gaussians(
     opacities: Tensor | None = None,
     sh_degree: int | None = None,
     depth: bool = False,
+    absgrad: bool = False,
     renderer: Callable[..., Any] = render,
 ) -> Rendering:
     """Render a model.
@@ -35,6 +36,7 @@ def render_gaussians(
         opacities: activated opacities (N,) to use instead of the model's own.
         sh_degree: highest band of spherical harmonics to use; all by default.
         depth: whether to accumulate depth as well.
+        absgrad: whether ``splats.projection.means.absgrad`` is wanted; of renderers that are capable of it.
         renderer: with the arguments of `render`, such as gsplat's; what it returns is returned.
 
     Example:
@@ -44,7 +46,7 @@ def render_gaussians(
         >>> render_gaussians(gaussians, camera, torch.zeros(3)).image.shape
         torch.Size([3, 16, 16])
     """
-    arguments = _arguments(model, opacities)
+    arguments = _arguments(model, opacities) | ({"absgrad": True} if absgrad else {})
     out: Rendering = renderer(**arguments, camera=camera, sh_degree=sh_degree, background=background, depth=depth)
     return out
 

@@ -92,6 +92,7 @@ def render_by(
     colors: Tensor | None = None,
     background: Tensor | None = None,
     depth: bool = False,
+    absgrad: bool = False,
 ) -> GsplatRendering:
     """Render 3D Gaussians with a rasterization; differentiable in every tensor but the background.
 
@@ -109,6 +110,7 @@ def render_by(
         colors: colours, shape (N, 3).
         background: colour behind everything, shape (3,); black by default.
         depth: whether to accumulate depth as well.
+        absgrad: whether ``projection.means.absgrad`` is wanted at the backward pass: absolute gradients (M, 2).
 
     Raises:
         TypeError: if the Gaussians are not float32, the only kind that gsplat knows.
@@ -137,6 +139,7 @@ def render_by(
         packed=True,  # the projected means of M Gaussians, as the gradient is wanted, not those of a batch of views
         backgrounds=None if background is None else background.to(means)[None],
         render_mode="RGB+D" if depth else "RGB",
+        absgrad=absgrad,
     )
     if info["means2d"].requires_grad:
         info["means2d"].retain_grad()

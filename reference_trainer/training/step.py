@@ -34,6 +34,7 @@ class Step:
         sh_degree: highest band of spherical harmonics of this step.
         seed: of the training.
         renderer: what draws.
+        absgrad: whether density control is to see absolute gradients.
 
     Attributes:
         params: the parameters of the view's camera, activated, as they are without a regularizer.
@@ -59,6 +60,7 @@ class Step:
         sh_degree: int,
         seed: int,
         renderer: Callable[..., Any],
+        absgrad: bool = False,
     ) -> None:
         self.number = number
         self.view = view
@@ -72,7 +74,7 @@ class Step:
         self.variance: Tensor | None = None
         self.rendering: Rendering | None = None
         self.observed: list[tuple[Splats | GsplatSplats, Camera]] = []
-        self._renderer = renderer
+        self._renderer, self._absgrad = renderer, absgrad
 
     def sample(self, *, depth: bool) -> None:
         """Render the view with one draw of the regularizer."""
@@ -105,6 +107,7 @@ class Step:
             self.background,
             sh_degree=self.sh_degree,
             depth=depth,
+            absgrad=observed and self._absgrad,
             renderer=self._renderer,
         )
         if observed:

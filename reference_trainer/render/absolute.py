@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from reference_trainer.render import Rendering, Splats
 from reference_trainer.render.eager.formulas import blend_weights, over
 from reference_trainer.render.eager.walk import blocks, geometry_rows, pad_entries, pixel_offsets, tile
+from reference_trainer.render.splats import Rendering, Splats
 
-__all__ = ["absolute_gradients", "splat_weights", "with_absolute_gradients"]
+__all__ = ["absgrad_sink", "absolute_gradients", "splat_weights", "with_absolute_gradients"]
 
 
 @torch.no_grad()
@@ -71,6 +71,13 @@ class _AbsoluteGradients(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         splats, values, background = ctx.rest
         return gradients[0], absolute_gradients(splats, values, gradients[0], background), None, None, None
+
+
+def absgrad_sink(means: Tensor) -> Tensor:
+    """Return zeros of the shape of ``means``, whose gradient becomes ``means.absgrad``, as gsplat calls it."""
+    sink = torch.zeros_like(means).requires_grad_()
+    sink.register_hook(lambda gradient: setattr(means, "absgrad", gradient))  # type: ignore[no-untyped-call]
+    return sink
 
 
 def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tensor | None = None) -> Rendering:
