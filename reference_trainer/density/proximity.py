@@ -24,9 +24,10 @@ class ProximityDensity(AdaptiveDensity):
     A Gaussian is sparse if the mean of the *squared* distances to its 3 nearest neighbors exceeds a multiple of the
     scene's extent, and its largest standard deviation exceeds the extent. At every densification sparse ones are split
     as well; before step ``until`` each gets three more: halfway to each neighbor, with opacity and scales of the
-    neighbor, no rotation, and spherical harmonics zero, which is grey. Defaults, order and the comparison of a square
-    with a length, which depends on the unit of the scene, are the source's (VITA-Group/FSGS a536a64, train.py and
-    scene/gaussian_model.py, lines 405-490). Of a small scene in large units it unpools nothing.
+    neighbor, no rotation, and spherical harmonics zero, which is gray. Defaults, order and the comparison of a square
+    with a length, which depends on the unit of the scene, are the source's (VITA-Group/FSGS a536a64,
+    scene/gaussian_model.py, lines 405-490), but not its pairs: with several sparse Gaussians, its new ones stand
+    between one and the neighbors of another.
 
     Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; who is whose neighbor is asked of all.
 
