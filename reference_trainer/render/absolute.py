@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from reference_trainer.render.eager.formulas import blend_weights, over
-from reference_trainer.render.eager.walk import blocks, geometry_rows, pad_entries, pixel_offsets, tile
+from reference_trainer.render.eager.walk import Block, blocks, geometry_rows, pad_entries, pixel_offsets, tile
 from reference_trainer.render.splats import Rendering, Splats
 
 __all__ = ["absgrad_sink", "absolute_gradients", "splat_weights", "with_absolute_gradients"]
@@ -26,7 +27,9 @@ def splat_weights(splats: Splats) -> Tensor:
     return sums[:-1]
 
 
-def absolute_gradients(splats: Splats, values: Tensor, gradient: Tensor, background: Tensor) -> Tensor:
+def absolute_gradients(
+    splats: Splats, values: Tensor, gradient: Tensor, background: Tensor, tiles: Iterable[Block] | None = None
+) -> Tensor:
     """Sum the absolute values of the gradients that the pixels give to a splat's position (AbsGS).
 
     Args:
@@ -34,6 +37,7 @@ def absolute_gradients(splats: Splats, values: Tensor, gradient: Tensor, backgro
         values: of the splats that were drawn, shape (M, C).
         gradient: of the loss with respect to their picture and the accumulated alpha, shape (C + 1, H, W).
         background: values behind everything, shape (C,).
+        tiles: the blocks of their lists, if they are known.
 
     Returns:
         Sums of absolute values in x and y, loss per pixel of displacement, shape (M, 2).
@@ -43,7 +47,7 @@ def absolute_gradients(splats: Splats, values: Tensor, gradient: Tensor, backgro
     behind = background.to(gradient)[:, None]
     sums = rows.new_zeros(2, rows.shape[1])
     pixels = pixel_offsets(rows)
-    for block in blocks(splats.lists, rows.device):
+    for block in blocks(splats.lists, rows.device) if tiles is None else tiles:
         entries = rows[:, block.gaussians]
         raw = block.alphas(entries[:6]).requires_grad_()
         with torch.enable_grad():
@@ -64,13 +68,13 @@ class _AbsoluteGradients(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, drawn: Tensor, sink: Tensor, *rest: Any) -> Tensor:
-        ctx.rest = rest
+        ctx.rest = (*rest, list(blocks(rest[0].lists, drawn.device)))  # now: the backward pass is to wait for nothing
         return drawn.view_as(drawn)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        splats, values, background = ctx.rest
-        return gradients[0], absolute_gradients(splats, values, gradients[0], background), None, None, None
+        splats, values, background, tiles = ctx.rest
+        return gradients[0], absolute_gradients(splats, values, gradients[0], background, tiles), None, None, None
 
 
 def absgrad_sink(means: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from devices import CARD, DEVICES
 from scipy.spatial.transform import Rotation
 
 from ca_reg import CAScore
@@ -80,6 +81,17 @@ def test_a_resumed_training_is_identical(tiny_scene, busy, tmp_path, expression)
         assert states[0][1].keys() == states[1][1].keys()
         for name, x in states[0][1].items():
             assert torch.equal(x, states[1][1][name]), name
+
+
+@pytest.mark.parametrize("device", [pytest.param(CARD, marks=pytest.mark.slow), DEVICES[2]], indirect=True)
+@pytest.mark.parametrize("expression", ALL.values(), ids=ALL)
+def test_all_work_on_a_device(tiny_scene, busy, expression, device):
+    trainer = Trainer(tiny_scene, dataclasses.replace(busy, density=expression, iterations=10), device)
+    trainer.train()
+    assert len(trainer.gaussians) != 150
+    assert all(bool(x.isfinite().all()) for _, x in trainer.gaussians.named())
+    found = [*trainer.gaussians.named(), *trainer.density.state_dict().items()]
+    assert {x.device.type for _, x in found} == {torch.device(device).type}
 
 
 @pytest.mark.parametrize(
