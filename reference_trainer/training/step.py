@@ -36,6 +36,7 @@ class Step:
         sh_degree: highest band of spherical harmonics of this step.
         seed: of the training.
         renderer: what draws.
+        absgrad: whether density control is to see absolute gradients.
 
     Attributes:
         params: the parameters of the view's camera, activated, as they are without a regularizer.
@@ -56,6 +57,7 @@ class Step:
     sh_degree: int
     seed: int
     renderer: Callable[..., Any]
+    absgrad: bool = False
     image: Tensor = field(init=False)
     drawn: Params = field(init=False)
     variance: Tensor | None = field(default=None, init=False)
@@ -96,6 +98,7 @@ class Step:
             self.background,
             sh_degree=self.sh_degree,
             depth=depth,
+            absgrad=observed and self.absgrad,
             renderer=self.renderer,
         )
         if observed:

@@ -82,7 +82,7 @@ class Trainer:
     @property
     def sh_degree(self) -> int:
         """The highest band of spherical harmonics that the last step used."""
-        return self._sh_degree(self.step)
+        return self.config.sh_degree_at(self.step)
 
     @property
     def regularized(self) -> bool:
@@ -249,18 +249,11 @@ class Trainer:
             self.gaussians,
             self.regularizer if begun else Chain(),
             self.background,
-            sh_degree=self._sh_degree(self.step + 1),
+            sh_degree=self.config.sh_degree_at(self.step + 1),
             seed=self.config.seed,
             renderer=self.renderer,
+            absgrad="absgrad" in self.density.needs,
         )
 
-    def _sh_degree(self, number: int) -> int:
-        """Highest band of spherical harmonics of the step with this number, the first being 1."""
-        return min(self.config.sh_degree, number // self.config.sh_every)
-
     def _means_rate(self, step: int) -> float:
-        """Learning rate of the means: falls exponentially over the run, in world units."""
-        config = self.config
-        along = step / config.iterations
-        rate = math.exp((1 - along) * math.log(config.means_rate) + along * math.log(config.means_rate_final))
-        return rate * self.scene.extent
+        return self.config.means_rate_at(step) * self.scene.extent
