@@ -59,7 +59,7 @@ def test_what_needs_a_draw_is_refused_in_analytic_training(name):
 @pytest.mark.parametrize(
     "term",
     ["pearson(0.5, None)", "patch_depth", "patch_depth(which='hard') + patch_depth(which='soft')", "warp(smooth=0.1)",
-     "smooth_depth(0.1)", "alpha(dark=0.2)", "views(2)", "flat(0.1)", "scale(1.0)", "opacity(0.1, 0.2)"],
+     "smooth_depth(0.1)", "alpha(dark=1.0)", "views(2)", "flat(0.1)", "scale(1.0)", "opacity(0.1, 0.2)"],
 )  # fmt: skip
 def test_every_term_trains_beside_dropout(tiny_scene, term):
     views = tuple(dataclasses.replace(view, depth_prior=view.depth) for view in tiny_scene.train)
