@@ -28,7 +28,8 @@ class PatchDepth(PriorTerm):
     patch_depth(which="soft")``.
 
     Args:
-        weight: at least 0, or a schedule.
+        weight: at least 0, or a schedule. The source's separate steps of Adam have none; in one loss 1 makes all Gaussians
+            transparent, docs/losses_and_density.md.
         near: weight of the local part.
         far: weight of the global part.
         smallest: side of the smallest patch, pixels, at least 2; 17 on DTU.
@@ -44,7 +45,7 @@ class PatchDepth(PriorTerm):
 
     def __init__(
         self,
-        weight: float | Schedule = 1.0,
+        weight: float | Schedule = 0.01,
         near: float = 0.1,
         far: float = 1.0,
         smallest: int = 5,
