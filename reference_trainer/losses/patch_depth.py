@@ -28,8 +28,8 @@ class PatchDepth(PriorTerm):
     patch_depth(which="soft")``.
 
     Args:
-        weight: at least 0, or a schedule. The source's separate steps of Adam have none; in one loss 1 makes all Gaussians
-            transparent, docs/losses_and_density.md.
+        weight: at least 0, or a schedule. The source's separate steps of Adam have none; in one loss 1 can make all
+            Gaussians transparent, see docs/losses_and_density.md.
         near: weight of the local part.
         far: weight of the global part.
         smallest: side of the smallest patch, pixels, at least 2; 17 on DTU.
