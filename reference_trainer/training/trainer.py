@@ -42,8 +42,8 @@ class Trainer:
         renderer: what draws the draws of the regularizers.
 
     Raises:
-        ValueError: if the scene has no initial points, or the training is to be analytic and a regularizer has no
-            exact expectation.
+        ValueError: if the scene has no initial points, its photographs lack what a term of the loss compares with, or
+            the training is to be analytic and a regularizer has no exact expectation.
         ImportError: if gsplat is to draw, and is missing.
         RuntimeError: if gsplat is to draw on something else than a CUDA device.
 
@@ -68,6 +68,8 @@ class Trainer:
         self.background = scene.background.to(self.device)
         self.regularizer = config.make_regularizer()
         self.losses = config.make_losses()
+        for term in self.losses:
+            term.begin(self.views)
         self.optimizer = GaussianOptimizer(self._start().to(self.device), self._rates())
         self.density = config.make_density()
         self.density.begin(config, scene, self.device, len(self.gaussians))
@@ -132,12 +134,13 @@ class Trainer:
         """Take one step on one view; return the loss and the mean squared error of the (regularized) render."""
         self.density.before_step(self.optimizer, self.step)
         step = self._begin_step()
+        terms = [term for term in self.losses if term.acts(self.step)]
         try:
             if step.regularizer is self.regularizer and self.config.analytic:
                 step.expect()
             else:
-                step.sample(depth=any("depth" in term.needs for term in self.losses))
-            loss = sum((term(step) for term in self.losses), start=step.image.new_zeros(()))
+                step.sample(depth=any("depth" in term.needs for term in terms))
+            loss = sum((term(step) for term in terms), start=step.image.new_zeros(()))
         except NotFiniteError as error:
             raise TrainingStoppedError(f"step {self.step + 1} cannot be rendered: {error}") from error
         value = loss.item()
