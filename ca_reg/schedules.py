@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from ca_reg._check import check_count, check_finite
 
-__all__ = ["Constant", "ExponentialDecay", "LinearRamp", "Schedule", "StartStop", "as_schedule"]
+__all__ = ["SCHEDULES", "Constant", "ExponentialDecay", "LinearRamp", "Schedule", "StartStop", "as_schedule"]
 
 Schedule = Callable[[int], float]
 """Anything that maps a training step to a rate. The modules check the rate whenever they use it."""
@@ -149,6 +149,10 @@ class ExponentialDecay:
             return 0.0
         done = (step - self.start) / (self.stop - self.start)
         return self.start_value * math.pow(self.end_value / self.start_value, done)
+
+
+SCHEDULES = {"ramp": LinearRamp, "between": StartStop, "decay": ExponentialDecay}
+"""What may stand for a number in an expression, such as ``dropout(ramp(0, 0.2, 0, 10_000))``."""
 
 
 def as_schedule(rate: float | Schedule) -> Schedule:

@@ -20,13 +20,11 @@ from ca_reg.regularizers.scale_noise import ScaleNoise
 from ca_reg.regularizers.segs import SEGSNoise
 from ca_reg.regularizers.sh_noise import SHNoise
 from ca_reg.regularizers.soft import SoftDropout
-from ca_reg.schedules import ExponentialDecay, LinearRamp, StartStop
+from ca_reg.schedules import SCHEDULES
 
 __all__ = ["REGULARIZERS", "GaussianDropout", "IndependentDropout", "OpacityNoise", "parse"]
 
-REGULARIZERS: Registry[Regularizer] = Registry(
-    "regularizer", Regularizer, {"ramp": LinearRamp, "between": StartStop, "decay": ExponentialDecay}
-)
+REGULARIZERS: Registry[Regularizer] = Registry("regularizer", Regularizer, SCHEDULES)
 """What can be asked for by name; ``REGULARIZERS.register("name")`` adds a class."""
 
 _TABLE: dict[str, type[Regularizer]] = {

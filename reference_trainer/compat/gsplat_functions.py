@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 from unittest.mock import patch
 
 from reference_trainer.compat.rasterization import make_rasterization
-from reference_trainer.compat.relocation import compute_relocation, quat_scale_to_covar_preci
+from reference_trainer.model.relocation import compute_relocation, quat_scale_to_covar_preci
 
 __all__ = ["gsplat_functions"]
 

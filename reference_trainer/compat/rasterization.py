@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.compat.absolute import with_absolute_gradients
 from reference_trainer.render import Splats, draw, splat
+from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradients
 from reference_trainer.render.constants import DILATION, MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.eager.projection import project
 
@@ -117,10 +117,7 @@ def _rasterize(given: SimpleNamespace, per_axis: bool) -> tuple[Tensor, Tensor, 
         return table[number].index_select(0, views[number].splats.indices)
 
     means2d = tabulate([view.splats.projection.means for view in views])
-    sink = None
-    if given.absgrad and means2d.requires_grad:
-        sink = torch.zeros_like(means2d).requires_grad_()
-        sink.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient))  # type: ignore[no-untyped-call]
+    sink = absgrad_sink(means2d) if given.absgrad and means2d.requires_grad else None
     images, alphas = [], []
     for number, view in enumerate(views):
         projection = view.splats.projection

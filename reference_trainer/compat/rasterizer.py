@@ -6,11 +6,11 @@ from types import ModuleType
 
 from torch import Tensor, nn
 
-from reference_trainer.compat.absolute import splat_weights, with_absolute_gradients
 from reference_trainer.compat.extensions import make_module
 from reference_trainer.compat.radii import in_front, visible_radii
 from reference_trainer.compat.settings import GaussianRasterizationSettings, camera_of
 from reference_trainer.render import draw, splat
+from reference_trainer.render.absolute import splat_weights, with_absolute_gradients
 
 __all__ = ["GaussianRasterizer", "rasterizer_module"]
 

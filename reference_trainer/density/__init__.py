@@ -1,12 +1,28 @@
 """Density control: strategies, one file each, and their registry: what ``--density`` knows by name."""
 
 from ca_reg.registry import Registry
+from reference_trainer.density.absgrad import AbsGradDensity
 from reference_trainer.density.adaptive import AdaptiveDensity
+from reference_trainer.density.mcmc import MCMCDensity
+from reference_trainer.density.proximity import ProximityDensity
+from reference_trainer.density.share_pruning import SharePruning
 from reference_trainer.density.strategy import DensityStrategy
 
-__all__ = ["DENSITY", "AdaptiveDensity", "DensityStrategy"]
+__all__ = [
+    "DENSITY",
+    "AbsGradDensity",
+    "AdaptiveDensity",
+    "DensityStrategy",
+    "MCMCDensity",
+    "ProximityDensity",
+    "SharePruning",
+]
 
 DENSITY: Registry[DensityStrategy] = Registry("density strategy", DensityStrategy)  # type: ignore[type-abstract]
 """What can be asked for by name; ``DENSITY.register("name")`` adds a class."""
 
 DENSITY.register("adaptive")(AdaptiveDensity)
+DENSITY.register("absgrad")(AbsGradDensity)
+DENSITY.register("proximity")(ProximityDensity)
+DENSITY.register("mcmc")(MCMCDensity)
+DENSITY.register("share_pruning")(SharePruning)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.density.operations import decay_opacity, densify, prune, reset_opacity
+from reference_trainer.density.operations import decay_opacity, densify, prune, refuse_not_finite, reset_opacity
 from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.density.strategy import DensityStrategy
 from reference_trainer.model.optimizer import GaussianOptimizer
@@ -22,8 +24,11 @@ __all__ = ["AdaptiveDensity"]
 class AdaptiveDensity(DensityStrategy):
     """Clones and splits where the gradient of the projected centres is large, prunes what is faint, resets opacities.
 
-    All thresholds and steps are those of `TrainConfig`.
+    All thresholds and steps are those of `TrainConfig`; ``opacity_decay`` below 1 makes it Binocular3DGS's. Dropped
+    Gaussians are not counted in that step; they are pruned, reset and decayed by their plain opacities as all others.
     """
+
+    resets: ClassVar[bool] = True
 
     def reset(self, count: int) -> None:
         """Forget the gradients."""
@@ -32,41 +37,47 @@ class AdaptiveDensity(DensityStrategy):
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Densify, prune, reset and decay as the schedule says for the steps that are done."""
         config = self.config
-        until = config.iterations if config.densify_until is None else config.densify_until
         if config.opacity_decay < 1 and step > config.densify_from:
             decay_opacity(optimizer, config.opacity_decay)
-        every = config.densify_every
-        if every and config.densify_from < step < until and step % every == 0:
-            # The renderer would tell, but only after pruning has taken for faint what is not a number.
-            if not all(bool(x.isfinite().all()) for _, x in optimizer.gaussians.named()):
-                raise TrainingStoppedError(
-                    f"Gaussians became nan or infinite by step {step}: lower the learning rates."
-                )
+        if self.is_due(step):
+            refuse_not_finite(optimizer, step)
             self.densify(optimizer, step)
             if len(optimizer.gaussians) == 0:
                 raise TrainingStoppedError(
                     f"all Gaussians were pruned after step {step}: lower prune_opacity or noise, raise opacity_reset."
                 )
             self.reset(len(optimizer.gaussians))
-        if config.opacity_reset_every and step < until:
+        if config.opacity_reset_every and step < self.until:
             since = step - config.opacity_reset_from
             early = config.opacity_reset_over_white and step == config.densify_from > 0
             if (since >= 0 and since % config.opacity_reset_every == 0) or (early and self.white):
                 reset_opacity(optimizer, config.opacity_reset)
 
     def densify(self, optimizer: GaussianOptimizer, step: int) -> None:
-        """Clone, split and prune once."""
+        """Grow and prune once."""
         config = self.config
         if config.max_gaussians is None or len(optimizer.gaussians) < config.max_gaussians:
-            densify(
-                optimizer,
-                self.statistics.mean_gradient >= config.densify_gradient,
-                size_threshold=config.dense_fraction * self.extent,
-                generator=stream(config.seed, step, "split", self.device),
-            )
+            self.grow(optimizer, step)
         large = config.prune_size is not None and step > config.prune_size_from
         max_scale = config.prune_size * self.extent if large and config.prune_size is not None else None
         prune(optimizer, min_opacity=config.prune_opacity, max_scale=max_scale)
+
+    def grow(self, optimizer: GaussianOptimizer, step: int) -> None:
+        """Clone and split once."""
+        densify(
+            optimizer,
+            self.selected(optimizer),
+            size_threshold=self.config.dense_fraction * self.extent,
+            generator=self.split_generator(step),
+        )
+
+    def selected(self, optimizer: GaussianOptimizer) -> Tensor:
+        """Return which Gaussians are to be cloned if they are small, and split if they are large, shape (N,) bool."""
+        return self.statistics.mean_gradient >= self.config.densify_gradient
+
+    def split_generator(self, step: int) -> torch.Generator:
+        """Return the random numbers of the splits of a step."""
+        return stream(self.config.seed, step, "split", self.device)
 
     def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:
         """Count the gradients of what was drawn."""

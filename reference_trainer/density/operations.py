@@ -11,11 +11,44 @@ from torch import Tensor
 from reference_trainer.model.gaussians import inverse_sigmoid
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.render.eager.projection import rotation_matrices
+from reference_trainer.training.errors import TrainingStoppedError
 
-__all__ = ["decay_opacity", "densify", "prune", "reset_opacity"]
+__all__ = [
+    "clone",
+    "decay_opacity",
+    "densify",
+    "is_large",
+    "prune",
+    "refuse_not_finite",
+    "reset_opacity",
+    "split",
+]
 
 _SPLIT_INTO = 2
 _SPLIT_SHRINK = 0.8 * _SPLIT_INTO  # children of a split are this much smaller, as in the INRIA code
+
+
+def clone(optimizer: GaussianOptimizer, selected: Tensor) -> None:
+    """Add exact copies of the selected Gaussians, (N,) bool, at the end."""
+    optimizer.append(optimizer.gaussians[selected].map(torch.Tensor.detach))
+
+
+def split(optimizer: GaussianOptimizer, selected: Tensor, *, generator: torch.Generator | None = None) -> None:
+    """Replace Gaussians by two smaller ones drawn from each, which stand at the end.
+
+    Args:
+        optimizer: holds the Gaussians; changed.
+        selected: which of them, (N,) bool; it may be shorter and leave those out that have been added since.
+        generator: for the positions of the children.
+    """
+    gaussians = optimizer.gaussians.map(torch.Tensor.detach)
+    selected = torch.nn.functional.pad(selected, (0, len(gaussians) - len(selected)))
+    parents = gaussians[selected].map(lambda x: x.repeat(_SPLIT_INTO, *[1] * (x.ndim - 1)))
+    noise = torch.randn(len(parents), 3, generator=generator, dtype=parents.means.dtype, device=parents.means.device)
+    offsets = (rotation_matrices(parents.quaternions) @ (noise * parents.scales)[:, :, None]).squeeze(-1)
+    smaller = parents.log_scales - math.log(_SPLIT_SHRINK)
+    optimizer.select(~selected)
+    optimizer.append(replace(parents, means=parents.means + offsets, log_scales=smaller))
 
 
 def densify(
@@ -27,26 +60,29 @@ def densify(
 ) -> None:
     """Clone the small and split the large ones of the selected Gaussians (Kerbl et al. 2023, Sec. 5.2).
 
-    A clone is an exact copy. A split Gaussian is replaced by two smaller ones drawn from it.
-
     Args:
         optimizer: holds the Gaussians; changed.
         selected: which Gaussians are to become two, shape (N,) bool.
         size_threshold: Gaussians whose largest standard deviation exceeds it are split, others cloned; world units.
         generator: for the positions of the children.
     """
-    gaussians = optimizer.gaussians.map(torch.Tensor.detach)
-    large = gaussians.scales.amax(dim=1) > size_threshold
-    clones = gaussians[selected & ~large]
-    split = selected & large
-    parents = gaussians[split].map(lambda x: x.repeat(_SPLIT_INTO, *[1] * (x.ndim - 1)))
-    noise = torch.randn(len(parents), 3, generator=generator, dtype=parents.means.dtype, device=parents.means.device)
-    offsets = (rotation_matrices(parents.quaternions) @ (noise * parents.scales)[:, :, None]).squeeze(-1)
-    smaller = parents.log_scales - math.log(_SPLIT_SHRINK)
-    children = replace(parents, means=parents.means + offsets, log_scales=smaller)
-    optimizer.select(~split)
-    optimizer.append(clones)
-    optimizer.append(children)
+    large = is_large(optimizer, size_threshold)
+    clone(optimizer, selected & ~large)
+    split(optimizer, selected & large, generator=generator)
+
+
+def is_large(optimizer: GaussianOptimizer, size: float) -> Tensor:
+    """Return which Gaussians have a standard deviation above ``size``, world units; shape (N,) bool."""
+    return optimizer.gaussians.scales.detach().amax(dim=1) > size
+
+
+def refuse_not_finite(optimizer: GaussianOptimizer, step: int) -> None:
+    """Raise a TrainingStoppedError if a parameter is nan or infinite: the renderer would tell, but too late.
+
+    Pruning takes for faint what is not a number.
+    """
+    if not all(bool(x.isfinite().all()) for _, x in optimizer.gaussians.named()):
+        raise TrainingStoppedError(f"Gaussians became nan or infinite by step {step}: lower the learning rates.")
 
 
 def prune(optimizer: GaussianOptimizer, *, min_opacity: float, max_scale: float | None = None) -> int:

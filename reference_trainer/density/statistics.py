@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["DensityStatistics"]
+__all__ = ["DensityStatistics", "screen_norm"]
+
+
+def screen_norm(gradient: Tensor, width: int, height: int) -> Tensor:
+    """Return the norms (M,) of gradients per pixel (M, 2), per half an image size (INRIA's device coordinates)."""
+    half_size = gradient.new_tensor([0.5 * width, 0.5 * height])
+    norms: Tensor = (gradient * half_size).norm(dim=1)
+    return norms
 
 
 @dataclass
@@ -40,9 +47,12 @@ class DensityStatistics:
             width: image width, pixels.
             height: image height, pixels.
         """
-        half_size = gradient.new_tensor([0.5 * width, 0.5 * height])
-        self.gradient_sum[indices] += (gradient * half_size).norm(dim=1).to(self.gradient_sum)
+        self.gradient_sum[indices] += screen_norm(gradient, width, height).to(self.gradient_sum)
         self.steps[indices] += 1
+
+    def __getitem__(self, index: Tensor) -> DensityStatistics:
+        """Return those of some Gaussians."""
+        return DensityStatistics(self.gradient_sum[index], self.steps[index])
 
     @property
     def mean_gradient(self) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -30,7 +30,14 @@ class DensityStrategy(abc.ABC):
 
     Gaussians that a regularizer dropped are not among those drawn: `observe` must not count them as seen. If they were
     counted with their gradient of zero, a threshold would in effect rise by 1 / (1 - p).
+
+    Attributes:
+        needs: of the renderer: ``"absgrad"`` for ``splats.projection.means.absgrad``, sums of absolute gradients.
+        resets: whether it obeys the ``opacity_reset`` settings.
     """
+
+    needs: ClassVar[frozenset[str]] = frozenset()
+    resets: ClassVar[bool] = False
 
     config: TrainConfig
     extent: float
@@ -48,6 +55,16 @@ class DensityStrategy(abc.ABC):
         """
         self.config, self.extent, self.white, self.device = config, scene.extent, scene.is_white, device
         self.reset(count)
+
+    @property
+    def until(self) -> int:
+        """The step before which densification, pruning and resets end."""
+        return self.config.iterations if self.config.densify_until is None else self.config.densify_until
+
+    def is_due(self, step: int) -> bool:
+        """Whether the schedule densifies before this step."""
+        every = self.config.densify_every
+        return bool(every) and self.config.densify_from < step < self.until and step % every == 0
 
     def reset(self, count: int) -> None:  # noqa: B027 (not every strategy counts)
         """Forget what was counted, for so many Gaussians."""

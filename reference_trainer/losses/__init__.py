@@ -1,16 +1,38 @@
 """The terms of the training loss, one file each, and their registry: what ``--loss`` knows by name."""
 
 from ca_reg.registry import Registry
+from ca_reg.schedules import SCHEDULES
+from reference_trainer.losses.alpha import Alpha
 from reference_trainer.losses.co_adaptation import CoAdaptation
 from reference_trainer.losses.consistency import Consistency
+from reference_trainer.losses.flat import Flat
+from reference_trainer.losses.opacity import Opacity
+from reference_trainer.losses.patch_depth import PatchDepth
+from reference_trainer.losses.pearson import Pearson
 from reference_trainer.losses.photometric import Photometric
+from reference_trainer.losses.scale import Scale
+from reference_trainer.losses.smooth_depth import SmoothDepth
 from reference_trainer.losses.term import LossTerm
+from reference_trainer.losses.views import Views
+from reference_trainer.losses.warp import Warp
 
 __all__ = ["LOSSES", "CoAdaptation", "Consistency", "LossTerm", "Photometric"]
 
-LOSSES: Registry[LossTerm] = Registry("loss term", LossTerm)  # type: ignore[type-abstract]
+LOSSES: Registry[LossTerm] = Registry("loss term", LossTerm, SCHEDULES)  # type: ignore[type-abstract]
 """What can be asked for by name; ``LOSSES.register("name")`` adds a class."""
 
-LOSSES.register("photometric")(Photometric)
-LOSSES.register("co_adaptation")(CoAdaptation)
-LOSSES.register("consistency")(Consistency)
+for _name, _term in {
+    "photometric": Photometric,
+    "views": Views,
+    "pearson": Pearson,
+    "patch_depth": PatchDepth,
+    "warp": Warp,
+    "smooth_depth": SmoothDepth,
+    "alpha": Alpha,
+    "flat": Flat,
+    "scale": Scale,
+    "opacity": Opacity,
+    "co_adaptation": CoAdaptation,
+    "consistency": Consistency,
+}.items():
+    LOSSES.register(_name)(_term)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, ClassVar
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
-from reference_trainer.losses.term import LossTerm
+from ca_reg.schedules import Schedule
+from reference_trainer.losses.term import WeightedTerm
 
 if TYPE_CHECKING:
     from reference_trainer.training.step import Step
@@ -15,14 +16,14 @@ if TYPE_CHECKING:
 __all__ = ["CoAdaptation"]
 
 
-class CoAdaptation(LossTerm):
+class CoAdaptation(WeightedTerm):
     """``weight`` times the mean variance of the colours when each Gaussian is dropped with a rate of its own.
 
     In an analytic step the variance of its expectation is taken, which costs nothing; in others the moments are
     rendered, which takes about as long as the render.
 
     Args:
-        weight: at least 0.
+        weight: at least 0, or a schedule.
         p: drop rate in [0, 1); in an analytic step the regularizer's own draws count instead.
 
     Raises:
@@ -32,15 +33,13 @@ class CoAdaptation(LossTerm):
     needs: ClassVar[frozenset[str]] = frozenset({"moments"})
     analytic: ClassVar[bool] = True
 
-    def __init__(self, weight: float = 1.0, p: float = 0.5) -> None:
-        if not weight >= 0:
-            raise ValueError(f"weight must not be negative, got {weight}.")
-        self.weight = weight
+    def __init__(self, weight: float | Schedule = 1.0, p: float = 0.5) -> None:
+        super().__init__(weight)
         self.multiplier = Multiplier.dropout(p)
 
-    def __call__(self, step: Step) -> Tensor:
-        """Return the weighted variance."""
+    def value(self, step: Step) -> Tensor:
+        """Return the mean variance."""
         variance = step.variance
         if variance is None:
             variance = step.moments(step.view.camera, self.multiplier).variance
-        return self.weight * variance.mean()
+        return variance.mean()

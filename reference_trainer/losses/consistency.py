@@ -8,8 +8,9 @@ from torch import Tensor
 
 from ca_reg import GaussianDropout
 from ca_reg.functional import Multiplier, expected_squared_error
+from ca_reg.schedules import Schedule
 from reference_trainer.losses.photometric import _check_lambda, photometric_loss
-from reference_trainer.losses.term import LossTerm
+from reference_trainer.losses.term import WeightedTerm
 
 if TYPE_CHECKING:
     from reference_trainer.training.step import Step
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["Consistency"]
 
 
-class Consistency(LossTerm):
+class Consistency(WeightedTerm):
     """``weight`` times the difference of the full render to a second one that drops Gaussians (DropoutGS, CVPR 2025).
 
     Both renders are of the view of the step, and both learn. Sampled, as in the source: L1 + D-SSIM to a render with
@@ -27,7 +28,7 @@ class Consistency(LossTerm):
 
     Args:
         p: drop rate in [0, 1). The source has 0.4 on LLFF, 0.3 on DTU, 0.1 to 0.2 on Blender.
-        weight: at least 0. The source has 0.2 on LLFF, 0.5 on DTU.
+        weight: at least 0, or a schedule. The source has 0.2 on LLFF, 0.5 on DTU.
         lambda_dssim: weight of the structural term, in [0, 1]; of the sampled form only.
         exact: take the expected squared error instead of a draw.
 
@@ -43,26 +44,34 @@ class Consistency(LossTerm):
 
     analytic: ClassVar[bool] = True
 
-    def __init__(self, p: float = 0.4, weight: float = 0.2, lambda_dssim: float = 0.2, *, exact: bool = False) -> None:
+    def __init__(
+        self,
+        p: float = 0.4,
+        weight: float | Schedule = 0.2,
+        lambda_dssim: float = 0.2,
+        *,
+        exact: bool = False,
+    ) -> None:
+        super().__init__(weight)
         self.dropout = GaussianDropout(p)
-        if not weight >= 0:
-            raise ValueError(f"weight must not be negative, got {weight}.")
         _check_lambda(lambda_dssim)
-        self.p, self.weight, self.lambda_dssim, self.exact = p, weight, lambda_dssim, exact
+        self.p, self.lambda_dssim, self.exact = p, lambda_dssim, exact
 
-    def __call__(self, step: Step) -> Tensor:
+    def acts(self, number: int) -> bool:
+        """Return whether there is a rate, and a weight at this step."""
+        return self.p > 0 and super().acts(number)
+
+    def value(self, step: Step) -> Tensor:
         """Compare the two renders."""
-        if not (self.p and self.weight):
-            return step.image.new_zeros(())
         camera = step.view.camera
         untouched = step.rendering is not None and step.drawn is step.params
         full = step.image if untouched else step.render(camera).image
         if self.exact:
             moments = step.moments(camera, Multiplier.dropout(self.p))
-            return self.weight * expected_squared_error(moments.mean, moments.variance, full).mean()
+            return expected_squared_error(moments.mean, moments.variance, full).mean()
         params = self.dropout.regularize(step.params, step.generator("consistency"))
         dropped = step.render(camera, params).image
         # The loss is differentiable in its first argument only, and symmetric: once each way, and its value once.
         one = photometric_loss(full, dropped.detach(), self.lambda_dssim)
         other = photometric_loss(dropped, full.detach(), self.lambda_dssim)
-        return self.weight * (one + other - other.detach())
+        return one + other - other.detach()

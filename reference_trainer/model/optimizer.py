@@ -83,9 +83,19 @@ class GaussianOptimizer:
         parameter = self.gaussians.opacity_logits
         with torch.no_grad():
             parameter.copy_(logits)
-        for name, value in self._adam.state[parameter].items():
-            if forget and name != "step":
-                value.zero_()
+        if forget:
+            self._forget(parameter, slice(None))
+
+    def relocate(self, index: Tensor, new: Gaussians) -> None:
+        """Overwrite the Gaussians of ``index``, positions, with as many new ones; their optimizer state stays."""
+        with torch.no_grad():
+            for (_, x), (_, value) in zip(self.gaussians.named(), new.named(), strict=True):
+                x[index] = value
+
+    def forget(self, index: Tensor) -> None:
+        """Clear the optimizer state of the Gaussians of ``index`` (bool mask or positions)."""
+        for _, x in self.gaussians.named():
+            self._forget(x, index)
 
     def state_dict(self) -> dict[str, Any]:
         """Return parameters and moments as plain tensors, for a checkpoint."""
@@ -100,6 +110,11 @@ class GaussianOptimizer:
         self._replace({name: x.detach().clone().requires_grad_() for name, x in state["gaussians"].items()})
         for name, x in self.gaussians.named():
             self._adam.state[x] = {key: value.clone() for key, value in state["moments"][name].items()}
+
+    def _forget(self, parameter: Tensor, index: Tensor | slice) -> None:
+        for name, value in self._adam.state[parameter].items():
+            if name != "step":
+                value[index] = 0
 
     def _group(self, name: str) -> dict[str, Any]:
         return next(group for group in self._adam.param_groups if group["name"] == name)

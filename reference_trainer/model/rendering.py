@@ -24,13 +24,15 @@ def render_gaussians(
     opacities: Tensor | None = None,
     sh_degree: int | None = None,
     depth: bool = False,
+    absgrad: bool = False,
     renderer: Callable[..., Any] = render,
 ) -> Rendering:
     """Render Gaussians, or what is to be rendered of them, such as what a regularizer returned, over a colour (3,).
 
     Opacities (N,), activated, take the place of the model's own; ``sh_degree`` is the highest band to use, by default
-    all; with ``depth`` it is accumulated as well. Another renderer, such as gsplat's, has the arguments of `render`;
-    what it returns is returned.
+    all; with ``depth`` it is accumulated as well; with ``absgrad``, of renderers that are capable of it,
+    ``splats.projection.means.absgrad`` is set at the backward pass. Another renderer, such as gsplat's, has the
+    arguments of `render`; what it returns is returned.
 
     Example:
         >>> import torch
@@ -39,9 +41,8 @@ def render_gaussians(
         >>> render_gaussians(gaussians, camera, torch.zeros(3)).image.shape
         torch.Size([3, 16, 16])
     """
-    out: Rendering = renderer(
-        **arguments(model, opacities), camera=camera, sh_degree=sh_degree, background=background, depth=depth
-    )
+    given = arguments(model, opacities) | ({"absgrad": True} if absgrad else {})
+    out: Rendering = renderer(**given, camera=camera, sh_degree=sh_degree, background=background, depth=depth)
     return out
 
 

@@ -76,10 +76,12 @@ def render_by(
     colors: Tensor | None = None,
     background: Tensor | None = None,
     depth: bool = False,
+    absgrad: bool = False,
 ) -> GsplatRendering:
     """Render 3D Gaussians with ``gsplat.rasterization``, 1.5 or newer; differentiable in all but the background.
 
-    Arguments and conventions are those of `render`.
+    Arguments and conventions are those of `render`; with ``absgrad`` the backward pass leaves absolute gradients (M, 2)
+    in ``projection.means.absgrad``.
 
     Raises:
         TypeError: if the Gaussians are not float32, the only kind that gsplat knows.
@@ -108,6 +110,7 @@ def render_by(
         packed=True,  # the projected means of M Gaussians, as the gradient is wanted, not those of a batch of views
         backgrounds=None if background is None else background.to(means)[None],
         render_mode="RGB+D" if depth else "RGB",
+        absgrad=absgrad,
     )
     if info["means2d"].requires_grad:
         info["means2d"].retain_grad()

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import torch
 
 from ca_reg.registry import Registry
+from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradients
 from reference_trainer.render.gsplat import load_gsplat_render
 from reference_trainer.render.renderer import render
 
@@ -19,7 +20,9 @@ class Renderer(abc.ABC):
 
     Attributes:
         capabilities: beside image and alpha: ``"depth"``; ``"moments"`` if `reference_trainer.render.render_moments`
-            draws the same picture, which analytic training and terms that render moments need.
+            draws the same picture, which analytic training and terms that render moments need; ``"absgrad"`` if it
+            takes ``absgrad=True``, and then leaves the sums of absolute gradients (M, 2) in
+            ``splats.projection.means.absgrad`` at the backward pass.
     """
 
     capabilities: ClassVar[frozenset[str]] = frozenset()
@@ -40,17 +43,21 @@ class Renderer(abc.ABC):
 class OwnRenderer(Renderer):
     """The renderer of this package, by whichever engine is chosen."""
 
-    capabilities = frozenset({"depth", "moments"})
+    capabilities = frozenset({"depth", "moments", "absgrad"})
 
-    def __call__(self, **arguments: Any) -> Any:
+    def __call__(self, *, absgrad: bool = False, **arguments: Any) -> Any:
         """Draw."""
-        return render(**arguments)
+        out = render(**arguments)
+        if absgrad and out.splats.projection.means.requires_grad:
+            sink = absgrad_sink(out.splats.projection.means)
+            return with_absolute_gradients(out, sink, arguments["background"])
+        return out
 
 
 class GsplatRenderer(Renderer):
     """gsplat's CUDA kernels."""
 
-    capabilities = frozenset({"depth"})
+    capabilities = frozenset({"depth", "absgrad"})
 
     def prepare(self, device: torch.device) -> None:
         """Load gsplat."""

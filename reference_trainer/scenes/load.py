@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.scenes.colmap import COLMAP
+from reference_trainer.scenes.depth import true_priors, with_prior
 from reference_trainer.scenes.formats import Capture, find_format, only_default, register_format
 from reference_trainer.scenes.frames import Frame, load_view
 from reference_trainer.scenes.idr import IDR
@@ -86,6 +87,10 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         )
         for kind, frames in (("train", train), ("test", test))
     }
+    if options.depth is not None:
+        views["train"] = tuple(
+            with_prior(view, frame, root, options) for view, frame in zip(views["train"], train, strict=True)
+        )
     return Scene(
         name=root.resolve().name,
         **views,
@@ -103,7 +108,8 @@ def _built_in(options: SceneOptions, seed: int) -> Scene:
     )
     downscale = options.downscale or 1.0
     scene = synthetic_scene(round(160 / downscale), round(120 / downscale), train_views=options.views or 3, seed=seed)
-    return scene if options.test == "auto" else replace(scene, test=())
+    scene = scene if options.test == "auto" else replace(scene, test=())
+    return scene if options.depth is None else true_priors(scene, options.depth)
 
 
 def _split(root: Path, capture: Capture, options: SceneOptions) -> tuple[list[Frame], list[Frame]]:

@@ -48,6 +48,10 @@ class SceneOptions:
     points: str = "auto"
     """Initial points: a COLMAP folder such as sparse_3views/0, a .ply file (points or 3DGS) within the scene, "random"
     or "random:COUNT"; by default the largest cloud made from training views alone, else random ones."""
+    depth: str | None = None
+    """Depth of the training photographs, for terms of the loss that need one: a folder of the scene with .npy or gray
+    .png files named like them, of any scale and shift; FOLDER:inverse if it is larger where nearer, as MiDaS's is;
+    "true" for the built-in scene's own."""
     downscale: float | None = None
     """Make pictures smaller by this factor; by default those above half a megapixel are reduced to that."""
     background: str = "auto"

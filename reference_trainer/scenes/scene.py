@@ -46,12 +46,15 @@ class View(Viewpoint):
         depth: true depth along the camera's z axis, shape (H, W), where it is known, else None; 0 where nothing is hit.
         mask: what an evaluation looks at, in [0, 1], shape (H, W), where the source has one: DTU's object. The
             photograph itself is untouched by it.
+        depth_prior: what a loss may compare depth with, larger where farther, of unknown scale and shift, shape (H, W):
+            a depth, or the negative of an inverse depth; nan where unknown.
     """
 
     image: Tensor
     alpha: Tensor | None = None
     depth: Tensor | None = None
     mask: Tensor | None = None
+    depth_prior: Tensor | None = None
 
 
 @dataclass(frozen=True)

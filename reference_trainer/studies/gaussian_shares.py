@@ -16,18 +16,15 @@ from ca_reg import CAResult, Reason, attribute, total_effects
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
 from reference_trainer.evaluation.pictures import file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.results import machine, markdown_table, write_json
+from reference_trainer.evaluation.shares import blend_weights, share_per_weight
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
 from reference_trainer.model.gaussians import SH_C0, Gaussians
-from reference_trainer.render import render
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.scenes.scene import View
 
-__all__ = [
-    "blend_weights", "colored_by", "concentration", "mean_effects", "mean_shares", "share_per_weight",
-    "study_attribution",
-]  # fmt: skip
+__all__ = ["colored_by", "concentration", "mean_effects", "mean_shares", "study_attribution"]
 
 # Ends of the colour scales in units of the mean. Shares grow with the size of a Gaussian, so that a picture of them
 # shows the large ones; per blend weight they show what the CA map shows, Gaussian by Gaussian.
@@ -78,45 +75,6 @@ def mean_effects(model: TrainedModel, views: Sequence[View], *, drop_rate: float
     """Return the total effects of the Gaussians in the same way as `mean_shares` their shares."""
     score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
     return _mean_over_views(lambda view: total_effects(score, opacities, view), views)[0]
-
-
-def blend_weights(model: TrainedModel, views: Sequence[View]) -> Tensor:
-    """Return the weight with which every Gaussian enters the test-time renders, summed over all pixels and views.
-
-    The image is linear in the colours, so the weights are the gradient of its sum: no approximation.
-
-    Args:
-        model: what to measure.
-        views: on the model's device.
-
-    Returns:
-        Sums of alpha times transmittance, shape (N,), float64.
-    """
-    gaussians, opacities = model.gaussians, model.test_opacities
-    total = torch.zeros_like(opacities, dtype=torch.float64)
-    for view in views:
-        colors = torch.zeros_like(gaussians.means).requires_grad_()
-        out = render(gaussians.means, gaussians.quaternions, gaussians.scales, opacities, view.camera, colors=colors)
-        total += torch.autograd.grad(out.image[0].sum(), colors)[0][:, 0]
-    return total
-
-
-def share_per_weight(shares: Tensor, weights: Tensor) -> Tensor:
-    """Return how much Gaussians co-adapt for what they contribute.
-
-    Args:
-        shares: shape (N,), float64.
-        weights: of `blend_weights`, shape (N,).
-
-    Returns:
-        The quotients, shape (N,): 0 for a Gaussian without a share, infinite for one that only shows where others are
-        dropped.
-
-    Example:
-        >>> share_per_weight(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([4.0, 0.0, 0.0]))
-        tensor([0.2500,    inf, 0.0000])
-    """
-    return torch.where(shares > 0, shares / weights, 0.0)
 
 
 def concentration(shares: Tensor) -> dict[str, float]:

@@ -40,7 +40,8 @@ class TrainConfig:
     loss: str = "photometric"
     """Terms of the loss, such as "photometric(0.2) + co_adaptation(3.0)", or "my_module:MyTerm"."""
     density: str = "adaptive"
-    """Density control, or "my_module:MyStrategy"."""
+    """Density control: "adaptive", "absgrad", "proximity", "mcmc", "share_pruning(every=500)", or
+    "my_module:MyStrategy"."""
 
     renderer: str = "torch"
     """What draws in training: "torch", this package's renderer, "gsplat", which needs it and a CUDA device, or
@@ -122,6 +123,20 @@ class TrainConfig:
         own = [f"{name}({rate!r})" for name, rate in (("dropout", self.dropout), ("noise", self.noise)) if rate]
         return " + ".join([*own, *([self.regularizer] if self.regularizer.strip() else [])])
 
+    def means_rate_at(self, step: int) -> float:
+        """Learning rate of the means at a step, the first being 0, in units of the scene's extent; it falls by powers.
+
+        Example:
+            >>> round(TrainConfig().means_rate_at(1500), 7)  # half way
+            1.6e-05
+        """
+        along = step / self.iterations
+        return math.exp((1 - along) * math.log(self.means_rate) + along * math.log(self.means_rate_final))
+
+    def sh_degree_at(self, number: int) -> int:
+        """Highest band of spherical harmonics of the step with this number, the first being 1."""
+        return min(self.sh_degree, number // self.sh_every)
+
     # What follows imports torch, which the command line does without until it has to.
 
     def make_regularizer(self) -> Chain:
@@ -151,12 +166,17 @@ class TrainConfig:
     def check(self) -> None:
         """Raise a ValueError unless the expressions can be made, and what they make goes together."""
         self.make_regularizer()
-        self.make_density()
+        density = self.make_density()
         renderer, terms = self.make_renderer(), self.make_losses()
         if not terms:
             raise ValueError("loss needs at least one term, such as photometric.")
         if self.analytic and "moments" not in renderer.capabilities:
             raise ValueError("analytic training needs the moments of the torch renderer: leave out renderer.")
+        if self.analytic and "absgrad" in density.needs:
+            raise ValueError(f"analytic training has no absolute gradients, which {self.density} needs: leave it out.")
+        if density.needs - renderer.capabilities:
+            needs = ", ".join(sorted(density.needs))
+            raise ValueError(f"{self.density} needs {needs}, which the renderer {self.renderer} lacks.")
         if lacking := set().union(*(term.needs for term in terms)) - renderer.capabilities:
             raise ValueError(f"the loss needs {', '.join(sorted(lacking))}, which the renderer {self.renderer} lacks.")
         if self.analytic and (drawn := [type(term).__name__ for term in terms if not term.analytic]):

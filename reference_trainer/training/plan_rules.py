@@ -91,6 +91,8 @@ def opacity_reset(scene: Scene, config: TrainConfig) -> Finding:
     if config.opacity_reset_over_white and scene.is_white:
         first = min(first, config.densify_from)
     until = _densify_until(config)
+    if not config.make_density().resets:
+        return Finding(name, "left out", f"by construction: density control by {config.density} has none")
     if config.opacity_reset_every == 0:
         return Finding(name, "left out", "asked for (opacity_reset_every=0)")
     if first >= until:

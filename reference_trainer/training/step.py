@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
@@ -36,6 +37,7 @@ class Step:
         sh_degree: highest band of spherical harmonics of this step.
         seed: of the training.
         renderer: what draws.
+        absgrad: whether density control is to see absolute gradients.
 
     Attributes:
         params: the parameters of the view's camera, activated, as they are without a regularizer.
@@ -56,14 +58,23 @@ class Step:
     sh_degree: int
     seed: int
     renderer: Callable[..., Any]
+    absgrad: bool = False
     image: Tensor = field(init=False)
     drawn: Params = field(init=False)
     variance: Tensor | None = field(default=None, init=False)
     rendering: Rendering | None = field(default=None, init=False)
     observed: list[tuple[Splats | GsplatSplats, Camera]] = field(default_factory=list, init=False)
+    _label: str = field(default="", init=False)
 
     def __post_init__(self) -> None:
         self.params = self.gaussians.params(self.view.camera, step=self.number)
+
+    @property
+    def depth(self) -> Tensor:
+        """Depth of the render of a step with a term that needs it: sum of weight times depth, shape (H, W)."""
+        depth = None if self.rendering is None else self.rendering.depth
+        assert depth is not None, "no term of the loss needs it"
+        return depth
 
     def sample(self, *, depth: bool) -> None:
         """Render the view with one draw of the regularizer."""
@@ -78,6 +89,20 @@ class Step:
         self.drawn, multiplier = multiplied
         moments = self.moments(self.view.camera, multiplier, self.drawn, observed=True)
         self.image, self.variance = moments.mean, moments.variance
+
+    def at(self, view: View) -> Step:
+        """Return the step at another training view, drawn as this one was but with random numbers of its own.
+
+        Density control counts it as it counts the view of the step.
+        """
+        other = copy(self)
+        other.view, other.params = view, self.gaussians.params(view.camera, step=self.number)
+        other._label = f"{view.name}/"
+        if self.rendering is None:
+            other.expect()
+        else:
+            other.sample(depth=False)
+        return other
 
     def render(
         self, camera: Camera, params: Params | None = None, *, depth: bool = False, observed: bool = False
@@ -96,6 +121,7 @@ class Step:
             self.background,
             sh_degree=self.sh_degree,
             depth=depth,
+            absgrad=observed and self.absgrad,
             renderer=self.renderer,
         )
         if observed:
@@ -121,4 +147,4 @@ class Step:
 
     def generator(self, purpose: str) -> torch.Generator:
         """Return random numbers that depend on the seed, the step and a label alone: a resumed training draws them."""
-        return stream(self.seed, self.number, purpose, self.gaussians.means.device)
+        return stream(self.seed, self.number, self._label + purpose, self.gaussians.means.device)

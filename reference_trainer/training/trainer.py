@@ -42,8 +42,8 @@ class Trainer:
         renderer: what draws the draws of the regularizers.
 
     Raises:
-        ValueError: if the scene has no initial points, or the training is to be analytic and a regularizer has no
-            exact expectation.
+        ValueError: if the scene has no initial points, its photographs lack what a term of the loss compares with, or
+            the training is to be analytic and a regularizer has no exact expectation.
         ImportError: if gsplat is to draw, and is missing.
         RuntimeError: if gsplat is to draw on something else than a CUDA device.
 
@@ -68,6 +68,8 @@ class Trainer:
         self.background = scene.background.to(self.device)
         self.regularizer = config.make_regularizer()
         self.losses = config.make_losses()
+        for term in self.losses:
+            term.begin(self.views)
         self.optimizer = GaussianOptimizer(self._start().to(self.device), self._rates())
         self.density = config.make_density()
         self.density.begin(config, scene, self.device, len(self.gaussians))
@@ -82,7 +84,7 @@ class Trainer:
     @property
     def sh_degree(self) -> int:
         """The highest band of spherical harmonics that the last step used."""
-        return self._sh_degree(self.step)
+        return self.config.sh_degree_at(self.step)
 
     @property
     def regularized(self) -> bool:
@@ -132,12 +134,13 @@ class Trainer:
         """Take one step on one view; return the loss and the mean squared error of the (regularized) render."""
         self.density.before_step(self.optimizer, self.step)
         step = self._begin_step()
+        terms = [term for term in self.losses if term.acts(self.step)]
         try:
             if step.regularizer is self.regularizer and self.config.analytic:
                 step.expect()
             else:
-                step.sample(depth=any("depth" in term.needs for term in self.losses))
-            loss = sum((term(step) for term in self.losses), start=step.image.new_zeros(()))
+                step.sample(depth=any("depth" in term.needs for term in terms))
+            loss = sum((term(step) for term in terms), start=step.image.new_zeros(()))
         except NotFiniteError as error:
             raise TrainingStoppedError(f"step {self.step + 1} cannot be rendered: {error}") from error
         value = loss.item()
@@ -249,18 +252,11 @@ class Trainer:
             self.gaussians,
             self.regularizer if begun else Chain(),
             self.background,
-            sh_degree=self._sh_degree(self.step + 1),
+            sh_degree=self.config.sh_degree_at(self.step + 1),
             seed=self.config.seed,
             renderer=self.renderer,
+            absgrad="absgrad" in self.density.needs,
         )
 
-    def _sh_degree(self, number: int) -> int:
-        """Highest band of spherical harmonics of the step with this number, the first being 1."""
-        return min(self.config.sh_degree, number // self.config.sh_every)
-
     def _means_rate(self, step: int) -> float:
-        """Learning rate of the means: falls exponentially over the run, in world units."""
-        config = self.config
-        along = step / config.iterations
-        rate = math.exp((1 - along) * math.log(config.means_rate) + along * math.log(config.means_rate_final))
-        return rate * self.scene.extent
+        return self.config.means_rate_at(step) * self.scene.extent

@@ -16,13 +16,16 @@ import torch
 import tyro
 from torch import Tensor
 
+from reference_trainer.density import DensityStrategy
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import format_mean_std, markdown_table, mean_std
+from reference_trainer.evaluation.shares import blend_weights, share_per_weight
 from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.runs.folder import CONFIG, read_run_settings
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.studies.gaussian_shares import blend_weights, mean_shares, share_per_weight
+from reference_trainer.studies.gaussian_shares import mean_shares
 from reference_trainer.studies.study import Record, Records, Study, checkpoints, run_study
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
@@ -109,7 +112,7 @@ def prune_lowest(trainer: Trainer, values: Tensor, fraction: float) -> None:
 
 
 def train_on(trainer: Trainer, steps: int) -> None:
-    """Train on, without densification, pruning and resets, and with the means at their final learning rate.
+    """Train on, without density control, and with the means at their final learning rate.
 
     Args:
         trainer: changed.
@@ -119,15 +122,16 @@ def train_on(trainer: Trainer, steps: int) -> None:
         TrainingStoppedError: as for `Trainer.train`.
     """
     config = trainer.config
-    trainer.config = dataclasses.replace(
-        config,
-        iterations=trainer.step + steps,
-        densify_every=0,
-        opacity_reset_every=0,
-        means_rate=config.means_rate_final,
-    )
-    trainer.density.begin(trainer.config, trainer.scene, trainer.device, len(trainer.gaussians))
+    trainer.config = dataclasses.replace(config, iterations=trainer.step + steps, means_rate=config.means_rate_final)
+    trainer.density = _LeftAlone()
     trainer.train()
+
+
+class _LeftAlone(DensityStrategy):
+    """Neither adds nor removes Gaussians."""
+
+    def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
+        """Do nothing."""
 
 
 def pruning_study(

@@ -9,12 +9,12 @@ from matplotlib.figure import Figure
 from benchmarks import pruning as pruning_module
 from benchmarks.pruning import CRITERIA, prune_lowest, pruning_order, pruning_study, train_on
 from ca_reg import attribute
-from reference_trainer.density import adaptive as density_module
+from reference_trainer.density import adaptive
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.results import write_json
+from reference_trainer.evaluation.shares import blend_weights
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import model_of
-from reference_trainer.studies.gaussian_shares import blend_weights
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
@@ -86,7 +86,9 @@ def test_the_orders_are_what_their_names_say(trained):
 def test_training_on_changes_no_numbers_and_moves_means_slowly(trained, monkeypatch):
     path, scene, order = trained
     trainer = Trainer.load(path, scene)
-    trainer.config = dataclasses.replace(trainer.config, opacity_reset_every=1, opacity_reset_from=1)
+    trainer.density.config = dataclasses.replace(
+        trainer.config, iterations=99, densify_from=1, densify_every=1, opacity_reset_every=1, opacity_reset_from=1
+    )
     prune_lowest(trainer, order["random"], 0.2)
     count, start = len(trainer.gaussians), trainer.step
     means = trainer.gaussians.means.detach().clone()
@@ -94,7 +96,7 @@ def test_training_on_changes_no_numbers_and_moves_means_slowly(trained, monkeypa
     set_rate = trainer.optimizer.set_means_rate
     monkeypatch.setattr(trainer.optimizer, "set_means_rate", lambda rate: (rates.append(rate), set_rate(rate)))
     for name in ("densify", "prune", "reset_opacity"):
-        monkeypatch.setattr(density_module, name, lambda *args, **rest: pytest.fail("the set was changed"))
+        monkeypatch.setattr(adaptive, name, lambda *args, **rest: pytest.fail("the set was changed"))
     train_on(trainer, 6)
     assert (trainer.step, len(trainer.gaussians)) == (start + 6, count)
     assert rates == pytest.approx([trainer.config.means_rate_final * scene.extent] * 6)

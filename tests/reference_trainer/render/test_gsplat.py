@@ -11,9 +11,11 @@ import torch
 from oracles import random_scene
 from stand_ins.gsplat import centred, rasterization
 
+from reference_trainer.compat.rasterization import make_rasterization
 from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.render import render
 from reference_trainer.render.gsplat import load_gsplat_render, render_by
+from reference_trainer.render.renderers import OwnRenderer
 
 N, WIDTH, HEIGHT = 80, 40, 24
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
@@ -103,6 +105,28 @@ def test_the_constants_are_those_of_the_own_renderer():
     scene = scene_of()
     render_by(spy, *scene[:4], scene.camera, colors=scene.colors)
     assert (given["near_plane"], given["eps2d"], given["packed"]) == (0.2, 0.3, True)
+
+
+def test_absolute_gradients_are_left_where_density_control_looks():
+    """Of gsplat's interface over the own renderer: the sums have a test of their own, here they are passed on."""
+    scene = scene_of()
+
+    def own(means, quaternions, scales, opacities, camera, **options):
+        return OwnRenderer()(
+            means=means, quaternions=quaternions, scales=scales, opacities=opacities, camera=camera, **options
+        )
+
+    def by_interface(**given):
+        images, alphas, info = make_rasterization(rasterization, per_axis=True)(**given)
+        return images, alphas, info | {"tiles_per_gauss": info["radii"].amin(-1)}
+
+    sums = []
+    for renderer in (own, functools.partial(render_by, by_interface)):
+        splats = rendered(renderer, scene, absgrad=True)[0].splats
+        assert (splats.projection.means.absgrad >= splats.projection.means.grad.abs() * (1 - 1e-4) - 1e-6).all()
+        sums.append(torch.zeros(N, 2).index_copy(0, splats.indices, splats.projection.means.absgrad))
+    torch.testing.assert_close(*sums)
+    assert sums[0].any()
 
 
 def test_what_is_missing_is_told(monkeypatch):

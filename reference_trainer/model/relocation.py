@@ -1,4 +1,4 @@
-"""What gsplat's MCMC strategy computes on the GPU: relocated Gaussians, and covariances."""
+"""What 3DGS-MCMC computes: several Gaussians in the place of one, and covariances."""
 
 from __future__ import annotations
 

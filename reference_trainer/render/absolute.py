@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from reference_trainer.render import Rendering, Splats
 from reference_trainer.render.eager.formulas import blend_weights, over
-from reference_trainer.render.eager.walk import blocks, geometry_rows, pad_entries, pixel_offsets, tile
+from reference_trainer.render.eager.walk import Block, blocks, geometry_rows, pad_entries, pixel_offsets, tile
+from reference_trainer.render.splats import Rendering, Splats
 
-__all__ = ["absolute_gradients", "splat_weights", "with_absolute_gradients"]
+__all__ = ["absgrad_sink", "absolute_gradients", "splat_weights", "with_absolute_gradients"]
 
 
 @torch.no_grad()
@@ -26,18 +27,21 @@ def splat_weights(splats: Splats) -> Tensor:
     return sums[:-1]
 
 
-def absolute_gradients(splats: Splats, values: Tensor, gradient: Tensor, background: Tensor) -> Tensor:
+def absolute_gradients(
+    splats: Splats, values: Tensor, gradient: Tensor, background: Tensor, tiles: Iterable[Block] | None = None
+) -> Tensor:
     """Sum the absolute values of the gradients that the pixels give to a splat's position (AbsGS), shape (M, 2).
 
     The values (M, C) of the splats were drawn over the background (C,); ``gradient`` (C + 1, H, W) is that of the loss
-    with respect to their picture and the accumulated alpha. The sums are loss per pixel of displacement in x and y.
+    with respect to their picture and the accumulated alpha; ``tiles`` are the blocks of their lists, if they are known.
+    The sums are loss per pixel of displacement in x and y.
     """
     rows = pad_entries(torch.cat([geometry_rows(splats), values.T]))
     upstream = tile(gradient, splats.lists)
     behind = background.to(gradient)[:, None]
     sums = rows.new_zeros(2, rows.shape[1])
     pixels = pixel_offsets(rows)
-    for block in blocks(splats.lists, rows.device):
+    for block in blocks(splats.lists, rows.device) if tiles is None else tiles:
         entries = rows[:, block.gaussians]
         raw = block.alphas(entries[:6]).requires_grad_()
         with torch.enable_grad():
@@ -58,13 +62,20 @@ class _AbsoluteGradients(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, drawn: Tensor, sink: Tensor, *rest: Any) -> Tensor:
-        ctx.rest = rest
+        ctx.rest = (*rest, list(blocks(rest[0].lists, drawn.device)))  # now: the backward pass is to wait for nothing
         return drawn.view_as(drawn)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        splats, values, background = ctx.rest
-        return gradients[0], absolute_gradients(splats, values, gradients[0], background), None, None, None
+        splats, values, background, tiles = ctx.rest
+        return gradients[0], absolute_gradients(splats, values, gradients[0], background, tiles), None, None, None
+
+
+def absgrad_sink(means: Tensor) -> Tensor:
+    """Return zeros of the shape of ``means``, whose gradient becomes ``means.absgrad``, as gsplat calls it."""
+    sink = torch.zeros_like(means).requires_grad_()
+    sink.register_hook(lambda gradient: setattr(means, "absgrad", gradient))  # type: ignore[no-untyped-call]
+    return sink
 
 
 def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tensor | None = None) -> Rendering:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from reference_trainer.compat.relocation import compute_relocation, quat_scale_to_covar_preci
+from reference_trainer.model.relocation import compute_relocation, quat_scale_to_covar_preci
 
 
 @pytest.mark.parametrize("min_opacity", [0.0, 0.3])

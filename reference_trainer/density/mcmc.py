@@ -1,0 +1,120 @@
+"""3DGS-MCMC's density control: dead Gaussians move to live ones, their number grows, and noise explores."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from reference_trainer.density.operations import refuse_not_finite
+from reference_trainer.density.strategy import DensityStrategy
+from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
+from reference_trainer.model.optimizer import GaussianOptimizer
+from reference_trainer.model.relocation import compute_relocation, quat_scale_to_covar_preci
+from reference_trainer.training.randomness import stream
+
+__all__ = ["MCMCDensity"]
+
+_MOST = 50  # Gaussians that are told apart at one place
+_OPACITIES = 0.005, 1 - torch.finfo(torch.float32).eps  # the least and the most that a copy gets
+
+
+class MCMCDensity(DensityStrategy):
+    """Relocates dead Gaussians, adds some, and moves all by noise (3DGS-MCMC, Kheradmand et al. 2024, Sec. 3).
+
+    When the schedule densifies, every Gaussian with an opacity of at most ``prune_opacity`` becomes a copy of a live
+    one drawn by opacity, and then ``growth`` times as many are drawn among all, up to ``max_gaussians``; the n at one
+    place get the opacity ``1 - (1 - o)^(1/n)`` and the scales of equation 9, so that they look as the one did, and
+    those drawn begin with a cleared optimizer. After every step all centres move by ``Sigma xi``, xi normal with the
+    standard deviation ``noise x (rate of the means) x sigmoid(100 (0.005 - o))``: only the faint feel it.
+
+    Of `TrainConfig` it reads seed, schedule (``densify_from``, ``_until``, ``_every``), ``prune_opacity``,
+    ``max_gaussians`` and the rate of the means; there are no splits, resets or decay. Defaults are the source's
+    (ubc-vision/3dgs-mcmc 7b4fc9f), which also has ``densify_until=25_000`` of 30,000 steps, ``initial_opacity=0.5``,
+    ``initial_scale=0.1``, a limit for every scene, and a loss of 0.01 times the mean opacity and 0.01 times the mean
+    scale, without which few Gaussians die.
+
+    Dropped Gaussians: treated as all others, by their plain opacities; no gradient is looked at. It has no state but
+    the step, on which its random numbers depend.
+
+    Args:
+        noise: at least 0.
+        growth: at least 1.
+
+    Raises:
+        ValueError: if one is out of range.
+    """
+
+    def __init__(self, noise: float = 5e5, growth: float = 1.05) -> None:
+        if not noise >= 0:
+            raise ValueError(f"noise must not be negative, got {noise}: 0 turns it off.")
+        if not growth >= 1:
+            raise ValueError(f"growth must be at least 1, which adds nothing, got {growth}.")
+        self.noise, self.growth = noise, growth
+
+    @torch.no_grad()
+    def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
+        """Relocate and grow as the schedule says for the steps that are done, and move the centres."""
+        if self.is_due(step):
+            refuse_not_finite(optimizer, step)
+            generator = stream(self.config.seed, step, "relocation", self.device)
+            relocate(optimizer, optimizer.gaussians.opacities <= self.config.prune_opacity, generator)
+            n, limit = len(optimizer.gaussians), self.config.max_gaussians
+            target = int(self.growth * n)
+            grow(optimizer, max(0, (target if limit is None else min(limit, target)) - n), generator)
+        if step and self.noise:
+            gaussians = optimizer.gaussians
+            covariances, _ = quat_scale_to_covar_preci(gaussians.quaternions, gaussians.scales, compute_preci=False)
+            assert covariances is not None
+            generator = stream(self.config.seed, step, "exploration", self.device)
+            xi = torch.empty_like(gaussians.means).normal_(generator=generator)
+            xi *= torch.sigmoid(100 * (0.005 - gaussians.opacities))[:, None]
+            xi *= self.noise * self.config.means_rate_at(step - 1) * self.extent
+            gaussians.means.add_((covariances @ xi[:, :, None]).squeeze(-1))
+
+
+def relocate(optimizer: GaussianOptimizer, dead: Tensor, generator: torch.Generator) -> None:
+    """Make dead Gaussians, (N,) bool, copies of live ones; if none is alive, nothing happens."""
+    if bool(dead.any()) and not bool(dead.all()):
+        drawn = _draw(torch.where(dead, 0, optimizer.gaussians.opacities), int(dead.sum()), generator)
+        copies = shared(optimizer.gaussians, drawn)
+        _shrink(optimizer, drawn, copies)
+        optimizer.relocate(dead.nonzero().squeeze(1), copies)
+
+
+def grow(optimizer: GaussianOptimizer, count: int, generator: torch.Generator) -> None:
+    """Add so many copies of Gaussians."""
+    if count:
+        drawn = _draw(optimizer.gaussians.opacities, count, generator)
+        copies = shared(optimizer.gaussians, drawn)
+        _shrink(optimizer, drawn, copies)
+        optimizer.append(copies)
+
+
+def shared(gaussians: Gaussians, drawn: Tensor) -> Gaussians:
+    """Return copies of the Gaussians that were drawn, each with the opacity and scales of its share of the place.
+
+    Args:
+        gaussians: all N.
+        drawn: their numbers, shape (M,), repeated if drawn more than once.
+    """
+    table = [[math.comb(n, k) for k in range(_MOST)] for n in range(_MOST)]
+    copies = gaussians[drawn]
+    at_one_place = drawn.bincount(minlength=len(gaussians))[drawn] + 1
+    binoms = torch.tensor(table, dtype=torch.float64, device=drawn.device)
+    opacities, scales = compute_relocation(copies.opacities, copies.scales, at_one_place, binoms)
+    logits = inverse_sigmoid(opacities.clamp(*_OPACITIES))
+    return replace(copies, opacity_logits=logits, log_scales=scales.log())
+
+
+def _draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Draw numbers of Gaussians in proportion to weights, with replacement, shape (count,)."""
+    return torch.multinomial(weights, count, replacement=True, generator=generator)
+
+
+def _shrink(optimizer: GaussianOptimizer, drawn: Tensor, copies: Gaussians) -> None:
+    """Give those that were drawn the opacity and scales of their copies, and clear their optimizer state."""
+    optimizer.relocate(drawn, copies)  # all else is the same
+    optimizer.forget(drawn)

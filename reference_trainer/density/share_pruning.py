@@ -1,0 +1,74 @@
+"""Density control that removes those who co-adapt most for what they contribute."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ca_reg import attribute
+from reference_trainer.density.adaptive import AdaptiveDensity
+from reference_trainer.evaluation.shares import blend_weights, share_per_weight
+from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.model.optimizer import GaussianOptimizer
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.config import TrainConfig
+
+__all__ = ["SharePruning"]
+
+
+class SharePruning(AdaptiveDensity):
+    """`AdaptiveDensity` that also prunes by the share of the exact score per blend weight.
+
+    Every ``every`` steps between ``densify_from`` and ``densify_until`` the ``fraction`` of the Gaussians goes whose
+    `ca_reg.attribute` shares, summed over the training views, are highest in relation to their blend weights; those
+    without a share stay. No published method: the criterion of docs/results.md that lowered the score most at equal
+    count, applied to a finished model there. It costs an exact score, its shares and a backward pass for every
+    training view each time.
+
+    Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; shares and weights are those of the plain
+    opacities, no draw and no test-time scaling in them.
+
+    Args:
+        every: positive number of steps.
+        fraction: of the Gaussians, in (0, 1).
+        drop_rate: of the score, in (0, 1).
+
+    Raises:
+        ValueError: if one is out of range.
+    """
+
+    def __init__(self, every: int = 500, fraction: float = 0.02, drop_rate: float = 0.5) -> None:
+        if every < 1:
+            raise ValueError(f"every must be at least 1, got {every}: density control without it is 'adaptive'.")
+        for name, value in (("fraction", fraction), ("drop_rate", drop_rate)):
+            if not 0 < value < 1:
+                raise ValueError(f"{name} must be in (0, 1), got {value}.")
+        self.every, self.fraction, self.drop_rate = every, fraction, drop_rate
+
+    def begin(self, config: TrainConfig, scene: Scene, device: torch.device, count: int) -> None:
+        """Remember the training views."""
+        super().begin(config, scene, device, count)
+        self.scene = scene
+
+    def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
+        """Prune by share as well, after all else; the others keep what was counted of them."""
+        super().before_step(optimizer, step)
+        if self.config.densify_from < step < self.until and step % self.every == 0:
+            values = self.shares_per_weight(optimizer, step)
+            first = values.argsort(descending=True, stable=True)[: round(self.fraction * len(values))]
+            keep = torch.ones_like(values, dtype=torch.bool)
+            keep[first[values[first] > 0]] = False
+            optimizer.select(keep)
+            self.statistics = self.statistics[keep]
+
+    def shares_per_weight(self, optimizer: GaussianOptimizer, step: int) -> Tensor:
+        """Return the quotients over the training views of the Gaussians as they are, shape (N,), float64."""
+        model = TrainedModel(
+            optimizer.gaussians.map(torch.Tensor.detach),
+            self.scene.background.to(self.device),
+            sh_degree=self.config.sh_degree_at(step),
+        )
+        views = [view.to(self.device) for view in self.scene.train]
+        score, opacities = model.exact_ca_score(drop_rate=self.drop_rate), model.gaussians.opacities
+        shares = torch.stack([attribute(score, model.shares, opacities, view).shares for view in views]).sum(0)
+        return share_per_weight(shares, blend_weights(model, views))

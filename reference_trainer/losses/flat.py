@@ -1,0 +1,40 @@
+"""A penalty of elongated Gaussians."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from torch import Tensor
+
+from ca_reg.schedules import Schedule
+from reference_trainer.losses.term import WeightedTerm
+
+if TYPE_CHECKING:
+    from reference_trainer.training.step import Step
+
+__all__ = ["Flat"]
+
+
+class Flat(WeightedTerm):
+    """``weight * mean(max(longest / shortest axis - limit, 0))`` over the Gaussians: against needles and flakes.
+
+    Args:
+        weight: at least 0, or a schedule. DNGaussian has 0.002 on LLFF and 0.005 on DTU.
+        limit: ratio that is free, at least 1, which is DNGaussian's but for a constant.
+
+    Raises:
+        ValueError: if one is out of range.
+    """
+
+    analytic: ClassVar[bool] = True
+
+    def __init__(self, weight: float | Schedule = 0.002, limit: float = 1.0) -> None:
+        super().__init__(weight)
+        if not limit >= 1:
+            raise ValueError(f"limit must be at least 1, the ratio of a sphere, got {limit}.")
+        self.limit = limit
+
+    def value(self, step: Step) -> Tensor:
+        """Return the mean excess."""
+        scales = step.gaussians.scales
+        return (scales.amax(1) / scales.amin(1) - self.limit).clamp_min(0).mean()

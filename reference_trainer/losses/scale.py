@@ -1,0 +1,39 @@
+"""A penalty of large Gaussians."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from torch import Tensor
+
+from ca_reg.schedules import Schedule
+from reference_trainer.losses.term import WeightedTerm
+
+if TYPE_CHECKING:
+    from reference_trainer.training.step import Step
+
+__all__ = ["Scale"]
+
+
+class Scale(WeightedTerm):
+    """``weight * mean(max(longest axis - limit, 0)^2)`` over the Gaussians.
+
+    Args:
+        weight: at least 0, or a schedule. DNGaussian has 0.001 on LLFF and 0.005 on DTU, per square of a world unit.
+        limit: standard deviation that is free, at least 0, world units; DNGaussian has none.
+
+    Raises:
+        ValueError: if one is out of range.
+    """
+
+    analytic: ClassVar[bool] = True
+
+    def __init__(self, weight: float | Schedule = 0.001, limit: float = 0.0) -> None:
+        super().__init__(weight)
+        if not limit >= 0:
+            raise ValueError(f"limit must not be negative, got {limit}.")
+        self.limit = limit
+
+    def value(self, step: Step) -> Tensor:
+        """Return the mean squared excess."""
+        return (step.gaussians.scales.amax(1) - self.limit).clamp_min(0).square().mean()

@@ -1,0 +1,111 @@
+"""Depth of the training photographs from files: a network's, a sensor's or a stereo method's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reference_trainer.scenes.frames import ASPECT_TOLERANCE, Frame
+from reference_trainer.scenes.images import path_inside, resize_image
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.scenes.undistort import undistort
+
+__all__ = ["read_depth", "true_priors", "with_prior"]
+
+
+def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> View:
+    """Return a view with the depth prior that belongs to its photograph, resized and undistorted as that is.
+
+    Args:
+        view: as loaded from the frame.
+        frame: the photograph on disk.
+        root: the scene folder.
+        options: those of the scene; `depth` is not None.
+
+    Raises:
+        FileNotFoundError: if there is no file for it.
+        ValueError: if the file is no picture of numbers, is constant, or has another aspect ratio than the photograph.
+    """
+    assert options.depth is not None
+    folder = root / options.depth.removesuffix(":inverse")
+    path = _find(frame, folder)
+    prior = read_depth(path)
+    (rows, columns), camera = prior.shape, view.camera
+    if abs(columns / rows * camera.height / camera.width - 1) > ASPECT_TOLERANCE:
+        raise ValueError(
+            f"{path} is {columns}x{rows}, which is not the shape of its photograph {frame.path} at {camera.width}x"
+            f"{camera.height}: the aspect ratios must agree."
+        )
+    known = prior[prior.isfinite()]
+    low, high = (known.min(), known.max()) if len(known) else (0.0, 0.0)
+    if low == high:
+        raise ValueError(f"{path} holds no depth: it is constant, or unknown everywhere.")
+    unit = resize_image(((prior - low) / (high - low))[None], camera.width, camera.height)
+    if options.undistort and any(frame.distortion):
+        unit, _ = undistort(unit, frame.camera.resized(camera.width, camera.height), frame.distortion)
+    resized = unit[0] * (high - low) + low
+    return replace(view, depth_prior=-resized if options.depth.endswith(":inverse") else resized)
+
+
+def true_priors(scene: Scene, asked: str) -> Scene:
+    """Return the built-in scene with its true depth as prior of the training views, unknown where nothing is hit.
+
+    Raises:
+        ValueError: if anything but ``"true"`` was asked for.
+    """
+    if asked != "true":
+        raise ValueError(f'the built-in scene has no folder of depths: depth must be "true", got {asked!r}.')
+    views = []
+    for view in scene.train:
+        assert view.depth is not None
+        views.append(replace(view, depth_prior=view.depth.where(view.depth > 0, torch.nan)))
+    return replace(scene, train=tuple(views))
+
+
+def read_depth(path: str | Path) -> Tensor:
+    """Read a picture of depths as they are in the file, shape (H, W), float32; nan where they are not finite.
+
+    Args:
+        path: an ``.npy`` file of (H, W) floats or integers, axes of length 1 aside, or a gray PNG of 8 or 16 bits.
+
+    Raises:
+        ValueError: if it is neither.
+    """
+    from PIL import Image
+
+    try:
+        if Path(path).suffix == ".npy":
+            # Mapped, a header that announces more than the file has is refused before anything is allocated.
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+        else:
+            with Image.open(path, formats=("PNG",)) as file:
+                array = np.array(file if file.mode != "P" else file.convert("RGB"))
+    except Exception as error:  # each reader has its own
+        raise ValueError(f"{path} is not a readable .npy file or PNG: {error}") from error
+    picture = np.squeeze(array)
+    if picture.ndim != 2 or picture.dtype.kind not in "fiu":
+        raise ValueError(
+            f"{path} must hold one number for each pixel, shape (H, W), got {array.shape} of {array.dtype}: a coloured "
+            "picture of depth cannot be read back."
+        )
+    depth = torch.from_numpy(picture.astype(np.float32))
+    return depth.where(depth.isfinite(), torch.nan)
+
+
+def _find(frame: Frame, folder: Path) -> Path:
+    """Return the depth file of a photograph."""
+    names = list(dict.fromkeys((str(Path(frame.name).with_suffix("")), frame.path.stem)))
+    for name in names:
+        for suffix in (".npy", ".png"):
+            if (path := path_inside(folder, name + suffix)).is_file():
+                return path
+    there = sorted(path.name for path in folder.iterdir())[:5] if folder.is_dir() else "no such folder"
+    raise FileNotFoundError(
+        f"{folder} has no depth of the photograph {frame.name}: it needs {' or '.join(names)} with .npy or .png; "
+        f"there is: {there}."
+    )

@@ -1,0 +1,116 @@
+"""Depth priors from files: found by name, fitted to the photograph, refused by name."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from reference_trainer.scenes import load_scene
+from reference_trainer.scenes.depth import read_depth
+
+
+@pytest.fixture
+def scene(tmp_path, colmap_text, save_image):
+    """A COLMAP scene of 64 x 48 pixels, two training photographs and a test photograph, with a ramp for depth."""
+    root = tmp_path / "garden"
+    colmap_text(root / "sparse" / "0")
+    rng = np.random.default_rng(0)
+    for name in ("a b", "b", "c"):
+        save_image(root / "images" / f"{name}.png", rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
+    (root / "split.json").write_text(json.dumps({"train": ["b.png", "c.png"], "test": ["a b.png"]}))
+    (root / "mono").mkdir()
+    for name in ("b", "c"):
+        np.save(root / "mono" / f"{name}.npy", RAMP.astype(np.float16))
+    return root
+
+
+RAMP = np.add.outer(np.arange(96), 2 * np.arange(128)) / 8 - 5  # twice the photograph's size, every value a float16
+
+
+def load(root, **options):
+    return load_scene(root, points="random:5", undistort=False, **options)
+
+
+def test_training_views_get_the_depth_of_their_name_at_their_size(scene):
+    loaded = load(scene, depth="mono")
+    expected = RAMP.reshape(48, 2, 64, 2).mean((1, 3))  # a linear ramp, so that every good filter gives this inside
+    for view in loaded.train:
+        assert view.depth_prior.dtype == torch.float32
+        np.testing.assert_allclose(view.depth_prior[3:-3, 3:-3], expected[3:-3, 3:-3], atol=1e-3)
+    assert loaded.test[0].depth_prior is None
+    assert load(scene).train[0].depth_prior is None
+    assert load(scene, depth="mono", downscale=2).train[0].depth_prior.shape == (24, 32)
+
+
+def test_an_inverse_depth_is_turned_so_that_more_is_farther(scene):
+    plain, turned = (load(scene, depth=name).train[0].depth_prior for name in ("mono", "mono:inverse"))
+    assert torch.equal(turned, -plain)
+    assert torch.equal(load(scene, depth=str(scene / "mono")).train[0].depth_prior, plain)
+
+
+def test_the_depth_is_undistorted_as_the_photograph_is(scene):
+    """The photograph's red is made the depth: after both went through the lens they still agree."""
+    smooth = RAMP[::2, ::2] - RAMP.min()
+    smooth = np.round(smooth * 255 / smooth.max()).astype(np.uint8)
+    for name in ("a b", "b", "c"):
+        Image.fromarray(np.stack([smooth] * 3, -1)).save(scene / "images" / f"{name}.png")
+    cameras = (scene / "sparse" / "0" / "cameras.txt").read_text()
+    (scene / "sparse" / "0" / "cameras.txt").write_text(
+        cameras.replace("1 PINHOLE 64 48 50.5 51.25 32 24", "1 SIMPLE_RADIAL 64 48 50.5 32 24 0.2")
+    )
+    for name in ("b", "c"):
+        np.save(scene / "mono" / f"{name}.npy", smooth.astype(np.float32))
+    straight, bent = (load_scene(scene, points="random:5", depth="mono", undistort=on).train[0] for on in (True, False))
+    assert (straight.image - bent.image).abs().max() > 0.01
+    torch.testing.assert_close(straight.depth_prior / 255, straight.image[0], atol=1e-5, rtol=0)
+
+
+def test_kinds_of_files(tmp_path):
+    rng = np.random.default_rng(0)
+    for bits, kind in ((8, np.uint8), (16, np.uint16)):
+        pixels = rng.integers(0, 2**bits, (5, 7)).astype(kind)
+        Image.fromarray(pixels).save(tmp_path / "x.png")
+        np.testing.assert_array_equal(read_depth(tmp_path / "x.png"), pixels)
+    for array in (rng.random((5, 7)), rng.random((1, 5, 7), np.float32), rng.integers(0, 9, (5, 7, 1))):
+        np.save(tmp_path / "x.npy", array)
+        np.testing.assert_array_equal(read_depth(tmp_path / "x.npy"), array.reshape(5, 7).astype(np.float32))
+    np.save(tmp_path / "x.npy", np.array([[1.0, np.inf], [np.nan, -2.0]]))
+    assert read_depth(tmp_path / "x.npy").isnan().tolist() == [[False, True], [True, False]]
+
+
+def test_unreadable_files_are_named(tmp_path):
+    np.save(tmp_path / "color.npy", np.zeros((4, 4, 3)))
+    np.save(tmp_path / "objects.npy", np.array([[None]], dtype=object))
+    (tmp_path / "text.npy").write_text("no array")
+    (tmp_path / "text.png").write_text("no picture")
+    np.save(tmp_path / "cut.npy", np.zeros((50, 50)))
+    (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:500])
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "color.png")
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).convert("P").save(tmp_path / "palette.png")
+    for path in tmp_path.iterdir():
+        with pytest.raises(ValueError, match=path.name):
+            read_depth(path)
+
+
+def test_missing_and_mismatched_files_are_named(scene):
+    (scene / "mono" / "c.npy").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no depth of the photograph c\.png.*b\.npy"):
+        load(scene, depth="mono")
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        load(scene, depth="nothing")
+    for array, message in ((RAMP.T, "96x128, which is not the shape"), (np.ones((48, 64)), "holds no depth")):
+        np.save(scene / "mono" / "c.npy", array)
+        with pytest.raises(ValueError, match=rf"c\.npy.*{message}"):
+            load(scene, depth="mono")
+
+
+def test_the_built_in_scene_has_its_true_depth():
+    scene = load_scene("synthetic", downscale=8, depth="true")
+    for view in scene.train:
+        hit = view.depth > 0
+        assert torch.equal(view.depth_prior[hit], view.depth[hit])
+        assert view.depth_prior[~hit].isnan().all()
+    with pytest.raises(ValueError, match="must be \"true\", got 'mono'"):
+        load_scene("synthetic", downscale=8, depth="mono")
