@@ -65,7 +65,9 @@ def surface_variation(means: Tensor, k: int) -> Tensor:
     [0, 1/3], (N,): 0 on a plane or a line, 1/3 where all directions are alike; 0 if all points coincide.
     """
     _, numbers = neighbors_of(means, k)
-    offsets = torch.cat([torch.zeros_like(means)[:, None], means[numbers] - means[:, None]], dim=1)
+    # In the order of their numbers: Gaussians with the same neighbors then have the same value, and the same rank.
+    members = torch.cat([torch.arange(len(means), device=means.device)[:, None], numbers], dim=1).sort(dim=1).values
+    offsets = means[members] - means[members[:, :1]]
     offsets = offsets - offsets.mean(1, keepdim=True)
     # Relative to the largest offset, so that squares neither vanish nor overflow.
     offsets = offsets / offsets.abs().amax((1, 2), keepdim=True).clamp_min(torch.finfo(means.dtype).tiny)
