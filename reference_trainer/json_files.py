@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from inspect import formatannotation
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -51,6 +52,8 @@ def settings_from(kind: type[T], values: Any, where: str) -> T:
     for name, value in values.items():
         if not _allows(hints[name], value):
             raise ValueError(f"{where}: {name} must be {formatannotation(hints[name])}, got {value!r:.80}.")
+        if type(value) is float and not math.isfinite(value):
+            raise ValueError(f"{where}: {name} must be finite, got {value}.")
         if type(value) is int and value.bit_length() > 63:
             raise ValueError(f"{where}: {name} must fit into 64 bits.")
     try:

@@ -190,8 +190,8 @@ def _train(options: SceneOptions, variant: str, config: TrainConfig, device: str
     start = time.process_time()
     trainer.train()
     seconds, peak = time.process_time() - start, _peak_bytes()
-    found = evaluate(model_of(trainer), dataclasses.replace(scene, train=() if scene.test else scene.train))
     split = "test" if scene.test else "train"
+    found = evaluate(model_of(trainer), {split: getattr(scene, split)})
     return {
         "variant": variant,
         "config": dataclasses.asdict(config),
