@@ -185,7 +185,7 @@ except SystemExit as exit_:
 """
     )
     assert "Engine: torch" in out
-    assert "ca_exact" in out
+    assert "exact CA" in out
     assert "Nothing is left to compile." in out
     assert out.endswith("code 2\n")
 
