@@ -8,6 +8,7 @@ import pickle
 import random
 import re
 import struct
+import time
 import zipfile
 from collections.abc import Callable
 from typing import Any, Literal
@@ -155,7 +156,8 @@ def _foreign(data: bytes, rng: random.Random) -> bytes:
         with zipfile.ZipFile(file, "w") as archive:
             archive.writestr("x", data)
     else:
-        image.save(file, kind)
+        # Pillow writes the present second into a PDF.
+        image.save(file, kind, **({"creationDate": _LONG_AGO, "modDate": _LONG_AGO} if kind == "PDF" else {}))
     return file.getvalue()
 
 
@@ -166,6 +168,7 @@ def _expand(data: bytes, rng: random.Random) -> bytes:
     return data[:at] + word * (100_000 // len(word)) + data[at:]
 
 
+_LONG_AGO = time.gmtime(0)
 _FOREIGN = ("EPS", "PDF", "GIF", "PPM", "TGA", "PCX", "ICO", "NPY", "ZIP", "pickle")  # that no reader takes as they are
 CUT, FOREIGN = "cut", "foreign"
 _BYTES: dict[str, Mutation] = {
