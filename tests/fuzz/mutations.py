@@ -154,7 +154,7 @@ def _foreign(data: bytes, rng: random.Random) -> bytes:
         np.save(file, np.zeros((2, 17)))
     elif kind == "ZIP":
         with zipfile.ZipFile(file, "w") as archive:
-            archive.writestr("x", data)
+            archive.writestr(zipfile.ZipInfo("x"), data)  # of 1980, not of this second
     else:
         # Pillow writes the present second into a PDF.
         image.save(file, kind, **({"creationDate": _LONG_AGO, "modDate": _LONG_AGO} if kind == "PDF" else {}))
