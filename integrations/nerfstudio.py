@@ -1,7 +1,7 @@
 """`splatfacto-ca`, a method of nerfstudio: splatfacto with dropout, opacity noise and the co-adaptation score.
 
 Nothing has to be imported: where both packages are installed, ``ns-train splatfacto-ca --data ...`` trains it, with
-``--pipeline.model.dropout``, ``--pipeline.model.opacity-noise``, ``--pipeline.model.scale-noise`` and
+``--pipeline.model.dropout``, ``--pipeline.model.opacity-noise``, ``--pipeline.model.regularizer`` and
 ``--pipeline.model.ca-samples`` beside the options of splatfacto. Evaluation images are logged with ``ca``,
 ``ca_std_error`` and ``ca_visible``, the share of the pixels that count; where that is 0, ``ca`` is nan.
 

@@ -76,7 +76,7 @@ class AbsGradDensity(AdaptiveDensity):
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Lower opacities as well."""
         super().before_step(optimizer, step)
-        if self.ceiling_every and 0 < step < self.until and step % self.ceiling_every == 0:
+        if self.ceiling_every and 0 < step < self.config.densify_end and step % self.ceiling_every == 0:
             reset_opacity(optimizer, self.opacity_ceiling)
 
     def selected(self, optimizer: GaussianOptimizer) -> Tensor:

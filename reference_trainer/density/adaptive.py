@@ -47,7 +47,7 @@ class AdaptiveDensity(DensityStrategy):
                     f"all Gaussians were pruned after step {step}: lower prune_opacity or noise, raise opacity_reset."
                 )
             self.reset(len(optimizer.gaussians))
-        if config.opacity_reset_every and step < self.until:
+        if config.opacity_reset_every and step < self.config.densify_end:
             since = step - config.opacity_reset_from
             early = config.opacity_reset_over_white and step == config.densify_from > 0
             if (since >= 0 and since % config.opacity_reset_every == 0) or (early and self.white):

@@ -53,7 +53,7 @@ class SharePruning(AdaptiveDensity):
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Prune by share as well, after all else; the others keep what was counted of them."""
         super().before_step(optimizer, step)
-        if self.config.densify_from < step < self.until and step % self.every == 0:
+        if self.config.densify_from < step < self.config.densify_end and step % self.every == 0:
             values = self.shares_per_weight(optimizer, step)
             first = values.argsort(descending=True, stable=True)[: round(self.fraction * len(values))]
             keep = torch.ones_like(values, dtype=torch.bool)

@@ -56,15 +56,10 @@ class DensityStrategy(abc.ABC):
         self.config, self.extent, self.white, self.device = config, scene.extent, scene.is_white, device
         self.reset(count)
 
-    @property
-    def until(self) -> int:
-        """The step before which densification, pruning and resets end."""
-        return self.config.iterations if self.config.densify_until is None else self.config.densify_until
-
     def is_due(self, step: int) -> bool:
         """Whether the schedule densifies before this step."""
         every = self.config.densify_every
-        return bool(every) and self.config.densify_from < step < self.until and step % every == 0
+        return bool(every) and self.config.densify_from < step < self.config.densify_end and step % every == 0
 
     def reset(self, count: int) -> None:  # noqa: B027 (not every strategy counts)
         """Forget what was counted, for so many Gaussians."""

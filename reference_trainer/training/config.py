@@ -123,6 +123,11 @@ class TrainConfig:
         own = [f"{name}({rate!r})" for name, rate in (("dropout", self.dropout), ("noise", self.noise)) if rate]
         return " + ".join([*own, *([self.regularizer] if self.regularizer.strip() else [])])
 
+    @property
+    def densify_end(self) -> int:
+        """The step before which densification, pruning and resets end."""
+        return self.iterations if self.densify_until is None else min(self.densify_until, self.iterations)
+
     def means_rate_at(self, step: int) -> float:
         """Learning rate of the means at a step, the first being 0, in units of the scene's extent; it falls by powers.
 

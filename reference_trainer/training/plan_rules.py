@@ -75,7 +75,7 @@ def distortion(scene: Scene, config: TrainConfig) -> Finding:
 def densification(scene: Scene, config: TrainConfig) -> Finding:
     """Clones and splits."""
     name, points = "densification", _points(scene)
-    until = _densify_until(config)
+    until = config.densify_end
     if config.densify_every == 0:
         return Finding(name, "left out", "asked for (densify_every=0)")
     if until <= config.densify_from:
@@ -90,7 +90,7 @@ def opacity_reset(scene: Scene, config: TrainConfig) -> Finding:
     name, first = "opacity reset", config.opacity_reset_from
     if config.opacity_reset_over_white and scene.is_white:
         first = min(first, config.densify_from)
-    until = _densify_until(config)
+    until = config.densify_end
     if not config.make_density().resets:
         return Finding(name, "left out", f"by construction: density control by {config.density} has none")
     if config.opacity_reset_every == 0:
@@ -174,11 +174,6 @@ def _points(scene: Scene) -> PointCloud:
     """The initial points, which `make_plan` has made sure of."""
     assert scene.points is not None
     return scene.points
-
-
-def _densify_until(config: TrainConfig) -> int:
-    """The step before which densification ends."""
-    return config.iterations if config.densify_until is None else min(config.densify_until, config.iterations)
 
 
 def _views_per_point(scene: Scene) -> Tensor:
