@@ -45,9 +45,10 @@ class ViewScores:
 
     ``ca`` is the paper's protocol; ``ca_half`` the same at a drop rate of 0.5 for every model, which compares models of
     different dropout rates on equal terms; ``ca_exact`` the limit for infinitely many samples, at the drop rate of
-    ``ca`` and over the pixels whose expected alpha is above 0.8; ``ca_neutral`` the same with every pixel over its own
-    expected colour, which the background has no part in; ``visible`` the share of pixels that ``ca`` covers;
-    ``covered`` the mean alpha of the test-time image; ``ca_reason`` why ``ca`` is nan, if it is.
+    ``ca`` and over the pixels whose expected alpha is above 0.8; ``ca_exact_half`` the same at a drop rate of 0.5;
+    ``ca_neutral`` that of ``ca_exact`` with every pixel over its own expected colour, which the background has no part
+    in; ``visible`` the share of pixels that ``ca`` covers; ``covered`` the mean alpha of the test-time image;
+    ``ca_reason`` why ``ca`` is nan, if it is.
     """
 
     name: str
@@ -59,6 +60,7 @@ class ViewScores:
     ca_std_error: float
     ca_half: float
     ca_exact: float
+    ca_exact_half: float
     ca_neutral: float
     visible: float
     covered: float
@@ -138,6 +140,7 @@ def evaluate(
         model.ca_score(samples=samples, seed=seed, render_fn=renders),
         model.ca_score(samples=samples, seed=seed, render_fn=renders, drop_rate=0.5),
         model.exact_ca_score(),
+        model.exact_ca_score(drop_rate=0.5),
         model.exact_ca_score(neutral=True),
     )
     members = [(split, *each) for split, group in views.items() for each in enumerate(group)]
@@ -180,11 +183,13 @@ def _measure(
     if isinstance(view, View):
         pair = on_white(image, view.mask), on_white(view.image, view.mask)
         quality = psnr(image, view.image, view.mask), ssim(*pair), math.nan if perceptual is None else perceptual(*pair)
-    protocol, at_half, *limits = scores
-    ca, exact, neutral = (score(opacities, view, index=index) for score in (protocol, *limits))
-    half = ca if protocol.settings == at_half.settings else at_half(opacities, view, index=index)
+    found: dict[Any, CAResult] = {}
+    for score in scores:  # those of dropout at 1/2 are the same twice
+        if score.settings not in found:
+            found[score.settings] = score(opacities, view, index=index)
+    ca, half, exact, exact_half, neutral = (found[score.settings] for score in scores)
     variance, covered = color_variance_map(out.splats)
-    found = ViewScores(
+    measured = ViewScores(
         name=view.name,
         split=split,
         psnr=quality[0],
@@ -194,6 +199,7 @@ def _measure(
         ca_std_error=ca.std_error,
         ca_half=half.value,
         ca_exact=exact.value,
+        ca_exact_half=exact_half.value,
         ca_neutral=neutral.value,
         visible=ca.visible.double().mean().item(),
         covered=out.alpha.double().mean().item(),
@@ -201,7 +207,7 @@ def _measure(
         ca_reason=str(ca.reason),
     )
     if files:
-        render = {"render" if photograph is None else f"render {found.psnr:.2f} dB": image}
+        render = {"render" if photograph is None else f"render {measured.psnr:.2f} dB": image}
         if photograph is None:
             panels = render | _maps({"CA": ca, "exact": exact, "neutral": neutral})
         else:
@@ -209,7 +215,7 @@ def _measure(
             panels = {"photograph": photograph} | render | {"error": error} | _maps({"CA": ca})
         save_png(files[0], image)
         save_png(files[1], side_by_side([*panels.values()], [*panels]))
-    return found
+    return measured
 
 
 def _maps(results: Mapping[str, CAResult]) -> dict[str, Tensor]:

@@ -268,6 +268,7 @@ def _measure(
         "scene": trainer.scene.name,
         "config": dataclasses.asdict(trainer.config),
         "seconds": trainer.seconds,
+        "processor_seconds": trainer.processor_seconds,
         **evaluation.as_dict(),
         "machine": machine(),
     }

@@ -18,7 +18,8 @@ from reference_trainer.training.config import TrainConfig
 
 __all__ = ["TrainingState", "read_state"]
 
-_ENTRIES = ("config", "scene", "train_views", "step", "seconds", "statistics", "regularizer", "gaussians", "moments")
+_TIMES = ("seconds", "processor_seconds")
+_ENTRIES = ("config", "scene", "train_views", "step", *_TIMES, "statistics", "regularizer", "gaussians", "moments")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
@@ -29,6 +30,7 @@ class TrainingState(NamedTuple):
         config: all settings.
         step: number of steps taken.
         seconds: time that they took.
+        processor_seconds: of all threads.
         statistics: of density control.
         regularizer: what the regularizers found so far.
         optimizer: what `GaussianOptimizer.state_dict` returned.
@@ -37,6 +39,7 @@ class TrainingState(NamedTuple):
     config: TrainConfig
     step: int
     seconds: float
+    processor_seconds: float
     statistics: dict[str, Tensor]
     regularizer: dict[str, Tensor]
     optimizer: dict[str, Any]
@@ -69,11 +72,11 @@ def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
     if state["train_views"] != names:
         raise ValueError(f"{where} was trained on the views {state['train_views']!r:.400}, the scene has {names}.")
     config = _config(state["config"], where)
-    step, seconds = state["step"], state["seconds"]
+    step, times = state["step"], (state["seconds"], state["processor_seconds"])
     if type(step) is not int or not 0 <= step <= config.iterations:
         raise ValueError(f"{where}: step must be a whole number from 0 to {config.iterations}, got {step!r:.80}.")
-    if type(seconds) is not float or not 0 <= seconds < math.inf:
-        raise ValueError(f"{where}: seconds must be a positive number, got {seconds!r:.80}.")
+    if not all(type(x) is float and 0 <= x < math.inf for x in times):
+        raise ValueError(f"{where}: {' and '.join(_TIMES)} must be positive numbers, got {times!r:.80}.")
     tensors, moments = state["gaussians"], state["moments"]
     parameters = [*PARAMETERS, *config.make_regularizer().learns]
     _refuse_other_entries(tensors, parameters, f"{where}, gaussians")
@@ -102,7 +105,7 @@ def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
     if type(found) is not dict or not all(isinstance(x, Tensor) and bool(x.isfinite().all()) for x in found.values()):
         raise ValueError(f"{where}, regularizer: expected finite tensors by name; the checkpoint is damaged.")
     plain = {name: {key: x.detach() for key, x in of.items()} for name, of in moments.items()}
-    return TrainingState(config, step, seconds, statistics, found, {"gaussians": tensors, "moments": plain})
+    return TrainingState(config, step, *times, statistics, found, {"gaussians": tensors, "moments": plain})
 
 
 def _config(text: Any, where: Path) -> TrainConfig:

@@ -26,6 +26,7 @@ from reference_trainer.training.config import TrainConfig
 __all__ = ["Outcome", "Settings", "differences", "inspect", "run", "start"]
 
 _USED_BY_RUNS = ("matplotlib", "torch._dynamo", "torch.utils.tensorboard", "PIL.PngImagePlugin", "kornia.core.check")
+_TIMES = {"seconds": 0, "processor_seconds": 0}
 _NO_RESULTS = ("events.out.tfevents", LOCK)  # TensorBoard's own files, and who was at work there
 
 
@@ -145,10 +146,10 @@ def differences(run: Path, whole: Path) -> list[str]:
         one, other = run / name, whole / name
         if name == CHECKPOINT:
             left, right = load_checkpoint(one), load_checkpoint(other)
-            same = _same({**left, "seconds": 0}, {**right, "seconds": 0})
+            same = _same({**left, **_TIMES}, {**right, **_TIMES})
         elif name == RESULTS:
             left, right = read_json(one), read_json(other)
-            same = {**left, "seconds": 0} == {**right, "seconds": 0}
+            same = {**left, **_TIMES} == {**right, **_TIMES}
         else:
             same = one.is_dir() or one.read_bytes() == other.read_bytes()
         found += [] if same else [name]

@@ -73,7 +73,7 @@ def test_a_reset_to_one_percent_under_strong_noise_kills_nobody(scene):
 
 def test_what_stays_below_is_pruned_at_the_next_densification(scene):
     """Nothing invisible is carried along."""
-    _, trainer = lowered(scene, 0.02, 3, densify_every=4, densify_from=1, densify_until=5, densify_gradient=1e9)
+    _, trainer = lowered(scene, 0.02, 6, densify_every=4, densify_from=1, densify_gradient=1e9)
     logits = trainer.gaussians.opacity_logits.detach().clone()
     logits[:40] = math.log(BELOW / (1 - BELOW))
     trainer.optimizer.set_opacity_logits(logits, forget=True)

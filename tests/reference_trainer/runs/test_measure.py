@@ -89,7 +89,8 @@ def test_the_seed_decides_the_masks(run, tmp_path):
 
 def test_the_table_has_one_row_per_view_and_the_means():
     views = [
-        ViewScores(f"v{i}", "test", 20.0 + i, 0.5, 0.25, 2e-3, 1e-4, 3e-3, 4e-3, 5e-3, 0.9, 0.7, 0.04) for i in range(2)
+        ViewScores(f"v{i}", "test", 20.0 + i, 0.5, 0.25, 2e-3, 1e-4, 3e-3, 4e-3, 4.5e-3, 5e-3, 0.9, 0.7, 0.04)
+        for i in range(2)
     ]
     lines = evaluation_table(Evaluation(views, 9, "vgg")).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]

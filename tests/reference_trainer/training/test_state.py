@@ -12,7 +12,18 @@ from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
-KEYS = ["config", "scene", "train_views", "step", "seconds", "statistics", "regularizer", "gaussians", "moments"]
+KEYS = [
+    "config",
+    "scene",
+    "train_views",
+    "step",
+    "seconds",
+    "processor_seconds",
+    "statistics",
+    "regularizer",
+    "gaussians",
+    "moments",
+]
 Change = Callable[[dict[str, Any]], object]
 
 
@@ -51,7 +62,7 @@ def test_a_missing_entry(saved, tiny_scene, tmp_path, key):
         (lambda s: s.update(step=2.0), "step must be a whole number from 0 to 5, got 2.0"),
         (lambda s: s.update(step=True), "step must be a whole number"),
         (lambda s: s.update(step=6), "step must be a whole number from 0 to 5, got 6"),
-        (lambda s: s.update(seconds=math.nan), "seconds must be a positive number, got nan"),
+        (lambda s: s.update(seconds=math.nan), "seconds and processor_seconds must be positive numbers, got .nan"),
         (lambda s: s.update(config="{"), "damaged checkpoint: config is not JSON: Expecting"),
         (lambda s: s.update(config=3), "damaged checkpoint: "),
         (lambda s: s.update(config=json.dumps({"dropuot": 0.2})), r"unknown settings \['dropuot'\]"),
@@ -184,7 +195,7 @@ def test_the_next_steps_do_not_depend_on_how_tensors_were_stored(saved, tiny_sce
         trainer = Trainer.load(tmp_path / name, tiny_scene)
         trainer.train()
         trainer.save(tmp_path / f"after_{name}")
-        found.append({**load_checkpoint(tmp_path / f"after_{name}"), "seconds": 0})
+        found.append({**load_checkpoint(tmp_path / f"after_{name}"), "seconds": 0, "processor_seconds": 0})
     one, other = (dict(tensors(state)) for state in found)
     assert one.keys() == other.keys()
     assert all(torch.equal(x, other[name]) for name, x in one.items())
