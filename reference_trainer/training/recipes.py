@@ -97,9 +97,9 @@ RECIPES: dict[str, Recipe] = {
         "each view once an epoch; pictures with masks need the term alpha, and a world in other units a shift of warp",
     ),
     "mvgs": Recipe(
-        dataclasses.replace(_INRIA, loss="photometric + views(3)"),
+        dataclasses.replace(_INRIA, loss="photometric + views(3)", density="ray_boxes"),
         "MVGS (2024), xiaobiaodu/MVGS ec9b30e, three views a step",
-        "density control counts all views of a step, not the last alone; no clones in ray boxes; no coarse to fine",
+        "density control counts all views of a step, not the last alone; no coarse to fine",
     ),
     "absgs": Recipe(
         dataclasses.replace(_INRIA, density="absgrad"),
