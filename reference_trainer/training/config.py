@@ -39,8 +39,8 @@ class TrainConfig:
     loss: str = "photometric"
     """Terms of the loss, such as "photometric(0.2) + co_adaptation(3.0)", or "my_module:MyTerm"."""
     density: str = "adaptive"
-    """Density control: "adaptive", "absgrad", "proximity", "mcmc", "share_pruning(every=500)", or
-    "my_module:MyStrategy"."""
+    """Density control: "adaptive", "absgrad", "proximity", "ray_boxes", "mcmc", "share_pruning(every=500)",
+    or "my_module:MyStrategy"."""
 
     renderer: str = "torch"
     """What draws in training: "torch", this package's renderer, "gsplat", which needs it and a CUDA device, or
