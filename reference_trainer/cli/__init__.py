@@ -14,12 +14,12 @@ from typing import Any
 import tyro
 
 from reference_trainer.cli.drawing import Warmup
-from reference_trainer.cli.names import Names
+from reference_trainer.cli.names import Names, Recipes
 from reference_trainer.cli.ply import Bake
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
 from reference_trainer.devices import check_device
-from reference_trainer.training.config import PRESETS
+from reference_trainer.training.recipes import RECIPES, with_recipe
 
 __all__ = ["main"]
 
@@ -47,19 +47,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _parse(arguments: Sequence[str]) -> Any:
     """Return the command with its options; exits where they cannot be understood."""
     peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
-    peek.add_argument("--preset", choices=list(PRESETS), default="fsgs")
-    preset = peek.parse_known_args(arguments)[0].preset
-    config, given = PRESETS[preset], given_fields(arguments)
+    peek.add_argument("--recipe", choices=list(RECIPES))
+    peek.add_argument("--iterations", type=int, default=argparse.SUPPRESS)
+    peeked = vars(peek.parse_known_args(arguments)[0])
+    recipe, given = peeked.pop("recipe"), given_fields(arguments)
+    config = with_recipe(recipe, **peeked) if recipe else RECIPES["3dgs"].config
     defaults: dict[str, Any] = {
         "demo": Demo(),
-        "plan": Plan(config=config, preset=preset, given=given),
-        "train": Train(config=config, preset=preset, given=given),
+        "plan": Plan(config=config, recipe=recipe, given=given),
+        "train": Train(config=config, recipe=recipe, given=given),
         "evaluate": Evaluate(),
         "bake": Bake(ply=tyro.MISSING),
         "render": Render(run=Path("runs/train")),
-        "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
+        "compare": Compare(out=Path("runs/compare"), config=config, recipe=recipe),
         "study": Study(tyro.MISSING),
         "names": Names(),
+        "recipes": Recipes(),
         "warmup": Warmup(),
     }
     # In the list of the commands the first paragraph of each; the command's own help has all of it.

@@ -1,4 +1,4 @@
-"""What can be asked for by name."""
+"""What can be asked for by name, and the recipes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-__all__ = ["Names"]
+__all__ = ["Names", "Recipes"]
 
 
 @dataclass(frozen=True)
@@ -39,3 +39,15 @@ class Names:
                 arguments = inspect.signature(made)
                 bare = [each.replace(annotation=each.empty) for each in arguments.parameters.values()]
                 print(f"  {name}{arguments.replace(parameters=bare, return_annotation=arguments.empty)}\n      {about}")
+
+
+@dataclass(frozen=True)
+class Recipes:
+    """List what --recipe knows by name: source, what it needs, what differs from the original; trains nothing."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.training.recipes import RECIPES
+
+        for name, recipe in RECIPES.items():
+            print(f"{name}: {recipe.source}. Needs {recipe.needs}. Differs: {recipe.differs}.")

@@ -15,7 +15,8 @@ import tyro
 from reference_trainer.cli.drawing import Device, Draw, Drawing, DrawingOfSweep, DrawOfSweep
 from reference_trainer.runs.engines.choice import EngineName
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
-from reference_trainer.training.config import PRESETS, TrainConfig, with_preset
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.recipes import RECIPES
 
 __all__ = ["Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
 
@@ -25,9 +26,13 @@ Folder = Annotated[
 ]
 Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="")]
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
-Preset = Annotated[
-    Literal["fsgs", "inria", "binocular"],
-    tyro.conf.arg(help="Schedule of a published code base; other options override it."),
+Recipe = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="{" + ",".join(RECIPES) + "}",
+        help="Settings of a published method, whose steps scale with --iterations; other options override it, and "
+        "`ca-reg recipes` says more. By default the settings as they are listed here, at which nothing scales.",
+    ),
 ]
 Lpips = Annotated[
     str | None,
@@ -80,7 +85,7 @@ class Demo:
 
         self.drawing.begin("cpu", trains=True)
         steps = self.iterations
-        config = with_preset("fsgs", iterations=steps, opacity_reset_every=0, densify_from=min(500, steps // 4))
+        config = TrainConfig(iterations=steps, opacity_reset_every=0, densify_from=min(500, steps // 4))
         chosen = strategies(["baseline", "dropout", "noise", "both"], config)
         what = f"the built-in scene (3 views) with {', '.join(chosen)}"
         print(f"Training {what}: {steps} steps each, {self.jobs} at a time.")
@@ -103,10 +108,10 @@ class Train:
     out: Path = Path("runs/train")
     """Folder of the run."""
     scene: Scene = field(default_factory=SceneOptions)
-    config: Config = field(default_factory=lambda: PRESETS["fsgs"])
-    preset: Preset = "fsgs"
+    config: Config = RECIPES["3dgs"].config
+    recipe: Recipe = None
     auto: bool = True
-    """Leave out what the scene does not need, as `ca-reg plan` says; what other options or the preset set stays."""
+    """Leave out what the scene does not need, as `ca-reg plan` says; what other options or the recipe set stays."""
     given: Given = frozenset()
     device: Device = "cpu"
     drawing: Draw = field(default_factory=Drawing)
@@ -152,8 +157,8 @@ class Plan:
 
     folder: Folder = None
     scene: Scene = field(default_factory=SceneOptions)
-    config: Config = field(default_factory=lambda: PRESETS["fsgs"])
-    preset: Preset = "fsgs"
+    config: Config = RECIPES["3dgs"].config
+    recipe: Recipe = None
     given: Given = frozenset()
     out: Path | None = None
     """JSON file for the plan; by default none is written."""
@@ -283,8 +288,8 @@ class Compare:
     path: tuple[str, ...] = ("synthetic",)
     """Scene folders, or "synthetic"; the other options hold for all of them."""
     scene: Annotated[EveryScene, tyro.conf.arg(name="")] = field(default_factory=EveryScene)
-    config: Config = field(default_factory=lambda: PRESETS["fsgs"])
-    preset: Preset = "fsgs"
+    config: Config = RECIPES["3dgs"].config
+    recipe: Recipe = None
     strategies: tuple[str, ...] = ("baseline", "dropout", "noise", "both")
     """What to compare: these, "analytic-dropout", "analytic-noise", whose rates --dropout and --noise give (0.2 and 0.8
     if they are 0), or regularizers as of --regularizer, such as "d2gs"."""

@@ -5,6 +5,7 @@ from reference_trainer.density.absgrad import AbsGradDensity
 from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.density.mcmc import MCMCDensity
 from reference_trainer.density.proximity import ProximityDensity
+from reference_trainer.density.ray_boxes import RayBoxDensity
 from reference_trainer.density.share_pruning import SharePruning
 from reference_trainer.density.strategy import DensityStrategy
 
@@ -15,6 +16,7 @@ __all__ = [
     "DensityStrategy",
     "MCMCDensity",
     "ProximityDensity",
+    "RayBoxDensity",
     "SharePruning",
 ]
 
@@ -25,4 +27,5 @@ DENSITY.register("adaptive")(AdaptiveDensity)
 DENSITY.register("absgrad")(AbsGradDensity)
 DENSITY.register("proximity")(ProximityDensity)
 DENSITY.register("mcmc")(MCMCDensity)
+DENSITY.register("ray_boxes")(RayBoxDensity)
 DENSITY.register("share_pruning")(SharePruning)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ca_reg import CAResult, CAScore
 from reference_trainer.evaluation.kept import KeptRecords
-from reference_trainer.evaluation.metrics import on_white, psnr, ssim
+from reference_trainer.evaluation.metrics import depth_errors, on_white, psnr, ssim
 from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.results import machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
@@ -48,6 +48,7 @@ class ViewScores:
     ``ca`` and over the pixels whose expected alpha is above 0.8; ``ca_exact_half`` the same at a drop rate of 0.5;
     ``ca_neutral`` that of ``ca_exact`` with every pixel over its own expected colour, which the background has no part
     in; ``visible`` the share of pixels that ``ca`` covers; ``covered`` the mean alpha of the test-time image;
+    ``depth_abs_rel`` and ``depth_rmse`` the `depth_errors` of the test-time image where the true depth is known;
     ``ca_reason`` why ``ca`` is nan, if it is.
     """
 
@@ -65,6 +66,8 @@ class ViewScores:
     visible: float
     covered: float
     cv: float
+    depth_abs_rel: float = math.nan
+    depth_rmse: float = math.nan
     ca_reason: str = ""
 
 
@@ -177,9 +180,12 @@ def _measure(
 ) -> ViewScores:
     """Measure one view, and write its picture and its panel if there are files for them."""
     opacities = model.gaussians.opacities
-    out = model.test_rendering(view)
+    truth = view.depth if isinstance(view, View) else None
+    out = model.test_rendering(view, depth=truth is not None)
     image, photograph = out.image.clamp(0, 1), view.image if isinstance(view, View) else None
-    quality = (math.nan,) * 3
+    quality, depth = (math.nan,) * 3, (math.nan,) * 2
+    if truth is not None and out.depth is not None:
+        depth = depth_errors(out.depth / out.alpha.clamp_min(1e-6), truth)
     if isinstance(view, View):
         pair = on_white(image, view.mask), on_white(view.image, view.mask)
         quality = psnr(image, view.image, view.mask), ssim(*pair), math.nan if perceptual is None else perceptual(*pair)
@@ -204,6 +210,8 @@ def _measure(
         visible=ca.visible.double().mean().item(),
         covered=out.alpha.double().mean().item(),
         cv=variance[covered].double().mean().item() if bool(covered.any()) else math.nan,
+        depth_abs_rel=depth[0],
+        depth_rmse=depth[1],
         ca_reason=str(ca.reason),
     )
     if files:

@@ -1,4 +1,4 @@
-"""Image quality against a photograph: PSNR and SSIM, one number per image, in float64."""
+"""Image quality against a photograph, PSNR and SSIM, and depth against the truth: numbers per image, in float64."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 from torch.nn.functional import pad
 
-__all__ = ["on_white", "psnr", "ssim"]
+__all__ = ["depth_errors", "on_white", "psnr", "ssim"]
 
 _WINDOW = 11
 
@@ -65,6 +65,29 @@ def ssim(image: Tensor, target: Tensor) -> float:
     x, y = (pad(z[None], (_WINDOW // 2,) * 4) for z in _checked(image, target))
     # eps would shift every value by 1e-12 / denominator; the constants already keep the denominator positive.
     return float(kornia_ssim(x, y, _WINDOW, max_val=1.0, eps=0.0, padding="valid").mean().item())
+
+
+def depth_errors(depth: Tensor, truth: Tensor) -> tuple[float, float]:
+    """Return AbsRel, mean |d - t| / t, and RMSE of a depth where the truth is known (Eigen et al. 2014).
+
+    No scale or shift is fitted: rendered depth has the units of the scene.
+
+    Args:
+        depth: d, along the camera's z axis, world units, shape (H, W): of a render, depth over alpha.
+        truth: t, the same; 0 where it is not known.
+
+    Returns:
+        Both in float64; nan if the truth is known nowhere.
+
+    Example:
+        >>> import torch
+        >>> depth_errors(torch.tensor([[3.0, 5.0]]), torch.tensor([[2.0, 0.0]]))
+        (0.5, 1.0)
+    """
+    known = truth > 0
+    t = truth[known].double()
+    error = depth[known].double() - t
+    return (error.abs() / t).mean().item(), error.square().mean().sqrt().item()
 
 
 def on_white(image: Tensor, mask: Tensor | None) -> Tensor:

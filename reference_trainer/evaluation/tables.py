@@ -24,16 +24,18 @@ _TITLES = {
     "visible": "visible",
     "covered": "covered",
     "cv": "CV",
+    "depth_abs_rel": "depth AbsRel",
+    "depth_rmse": "depth RMSE",
     "gaussians": "Gaussians",
 }
-_OF_PHOTOGRAPHS = ("psnr", "ssim", "lpips")
+_NOT_EVERYWHERE = ("psnr", "ssim", "lpips", "depth_abs_rel", "depth_rmse")
 
 
 def evaluation_table(result: Evaluation) -> str:
-    """Return one row per view and the means of the splits; what needs photographs only if there are some."""
+    """Return one row per view and the means of the splits; what only some views have only if one has it."""
     rows = {f"{view.split} {view.name}": asdict(view) for view in result.views}
     rows |= {f"mean {split}": mean for split, mean in result.as_dict()["mean"].items()}
-    left_out = {name for name in _OF_PHOTOGRAPHS if all(row[name] != row[name] for row in rows.values())}
+    left_out = {name for name in _NOT_EVERYWHERE if all(row[name] != row[name] for row in rows.values())}
     return _table(
         "view", rows, [name for name in _TITLES if name not in {*left_out, "ca_half", "ca_exact_half", "gaussians"}]
     )
@@ -55,7 +57,7 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     Args:
         runs: for every strategy the content of ``results.json`` of each seed.
     """
-    shown = {"test": ["psnr", "ssim", "lpips", "ca", "ca_exact_half", "cv"], "train": ["psnr", "ca"]}
+    shown = {"test": ["psnr", "ssim", "lpips", "ca", "ca_exact_half", "cv", "depth_abs_rel"], "train": ["psnr", "ca"]}
     if not any("test" in run["mean"] for of in runs.values() for run in of):
         shown = {"train": ["psnr", "ca", "ca_exact"], "between": ["ca_exact"], "around": ["ca_exact"]}
     columns = {f"{split} {_TITLES[name]}": (split, name) for split, names in shown.items() for name in names}

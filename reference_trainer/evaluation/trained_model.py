@@ -84,10 +84,10 @@ class TrainedModel:
     def _tested(self, x: Params) -> Params:
         return x if self.for_rendering else self.chain.expected(x)
 
-    def test_rendering(self, view: Viewpoint) -> Rendering:
-        """Render a view as at test time; co-adaptation is measured on the plain opacities."""
+    def test_rendering(self, view: Viewpoint, *, depth: bool = False) -> Rendering:
+        """Render a view as at test time, with its depth or without; co-adaptation goes by the plain opacities."""
         tested = self._tested(self.gaussians.params(view.camera, step=self.step))
-        return render_gaussians(tested, view.camera, self.background, sh_degree=self.sh_degree)
+        return render_gaussians(tested, view.camera, self.background, sh_degree=self.sh_degree, depth=depth)
 
     def render(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
         """Render a view with given opacities (N,): the render callable of `CAScore`; image (3, H, W), alpha (H, W)."""

@@ -1,8 +1,7 @@
-"""Everything that decides a training run, and the presets of published code bases."""
+"""Everything that decides a training run."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,12 +13,12 @@ if TYPE_CHECKING:
     from reference_trainer.losses import LossTerm
     from reference_trainer.render.renderers import Renderer
 
-__all__ = ["PRESETS", "TrainConfig", "with_preset"]
+__all__ = ["TrainConfig"]
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of one training run. The defaults are those of the ``fsgs`` preset with 3,000 iterations."""
+    """Settings of one training run. The defaults are those of the recipe ``3dgs``, but 3,000 iterations."""
 
     iterations: int = 3_000
     """Optimization steps, one view each."""
@@ -40,8 +39,8 @@ class TrainConfig:
     loss: str = "photometric"
     """Terms of the loss, such as "photometric(0.2) + co_adaptation(3.0)", or "my_module:MyTerm"."""
     density: str = "adaptive"
-    """Density control: "adaptive", "absgrad", "proximity", "mcmc", "share_pruning(every=500)", or
-    "my_module:MyStrategy"."""
+    """Density control: "adaptive", "absgrad", "proximity", "ray_boxes", "mcmc", "share_pruning(every=500)",
+    or "my_module:MyStrategy"."""
 
     renderer: str = "torch"
     """What draws in training: "torch", this package's renderer, "gsplat", which needs it and a CUDA device, or
@@ -205,45 +204,3 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("opacity_decay",), lambda x: 0 < x <= 1, "in (0, 1]", ": 1 turns it off"),
 )  # fmt: skip
 """Fields, what their values must satisfy, and how to say so."""
-
-PRESETS: dict[str, TrainConfig] = {
-    "fsgs": TrainConfig(iterations=10_000),
-    "inria": TrainConfig(
-        iterations=30_000,
-        sh_every=1_000,
-        densify_until=15_000,
-        densify_gradient=2e-4,
-        prune_size=0.1,
-        opacity_reset=0.01,
-        opacity_reset_from=3_000,
-        opacity_reset_over_white=True,
-    ),
-    "binocular": TrainConfig(
-        iterations=30_000,
-        sh_degree=1,
-        sh_every=1_000,
-        densify_gradient=2e-4,
-        opacity_reset_every=0,
-        opacity_decay=0.995,
-    ),
-}
-"""Schedules of FSGS, of the INRIA 3DGS of 2023, and of Binocular3DGS; docs/presets.md says what differs from them."""
-
-
-def with_preset(name: str, **changes: object) -> TrainConfig:
-    """Return a preset with some fields changed.
-
-    Args:
-        name: a key of `PRESETS`.
-        changes: fields of `TrainConfig`.
-
-    Raises:
-        ValueError: if there is no such preset.
-
-    Example:
-        >>> with_preset("binocular", iterations=3000).opacity_decay
-        0.995
-    """
-    if name not in PRESETS:
-        raise ValueError(f"there is no preset {name!r}; choose one of {', '.join(PRESETS)}.")
-    return dataclasses.replace(PRESETS[name], **changes)  # type: ignore[arg-type]

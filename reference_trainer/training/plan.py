@@ -83,7 +83,7 @@ class Plan:
 def make_plan(scene: Scene, config: TrainConfig, *, given: Collection[str] = ()) -> Plan:
     """Look at a scene and decide what its training needs.
 
-    A choice of the user always wins: fields of ``config`` that differ from the defaults of `TrainConfig` (a preset's
+    A choice of the user always wins: fields of ``config`` that differ from the defaults of `TrainConfig` (a recipe's
     among them) and the fields in ``given`` are never changed.
 
     Args:

@@ -60,7 +60,7 @@ def background(scene: Scene, config: TrainConfig) -> Finding:
 
 def depth_output(scene: Scene, config: TrainConfig) -> Finding:
     """No loss looks at depth."""
-    asking = [type(term).__name__ for term in config.make_losses() if "depth" in term.needs]
+    asking = dict.fromkeys(type(term).__name__ for term in config.make_losses() if "depth" in term.needs)
     if asking:
         return Finding("depth output", "used", f"asked for: {', '.join(asking)} looks at it")
     return Finding("depth output", "left out", "by construction: no term of the loss looks at depth")

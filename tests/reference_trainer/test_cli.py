@@ -21,7 +21,8 @@ from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.studies import error_runtime as error_runtime_module
 from reference_trainer.studies import gaussian_shares as shares_module
 from reference_trainer.studies import study as study_module
-from reference_trainer.training.config import PRESETS
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.recipes import RECIPES, with_recipe
 
 SMALL = ["--downscale", "8", "--iterations", "3", "--monitor-every", "2"]
 
@@ -59,7 +60,7 @@ def trained(tmp_path_factory):
                 "--out",
                 "--path",
                 "--views",
-                "--preset",
+                "--recipe",
                 "--dropout",
                 "--noise",
                 "--opacity-decay",
@@ -270,8 +271,8 @@ def test_training_again_says_that_nothing_is_to_be_done(trained, capsys):
     assert "| test |" in out
 
 
-@pytest.mark.parametrize("preset", sorted(PRESETS))
-def test_options_override_the_preset(preset, monkeypatch, tmp_path):
+@pytest.mark.parametrize("recipe", [None, *RECIPES])
+def test_options_override_the_recipe(recipe, monkeypatch, tmp_path):
     asked: dict = {}
 
     def fake(scene, config, out, **keywords):
@@ -280,19 +281,28 @@ def test_options_override_the_preset(preset, monkeypatch, tmp_path):
 
     monkeypatch.setattr(run_module, "run_experiment", fake)
     monkeypatch.setattr(tables, "summary", lambda results: "")
-    main(["train", "--preset", preset, "--iterations", "3", "--noise", "0.8", "--path", "fern", "--images", "images_8",
-          "--views", "5", "--out", str(tmp_path)])  # fmt: skip
-    expected = PRESETS[preset]
-    assert asked["config"] == type(expected)(**vars(expected) | {"iterations": 3, "noise": 0.8})
+    chosen = ["--recipe", recipe] if recipe else []
+    main(["train", *chosen, "--iterations", "3000", "--densify-from", "70", "--noise", "0.8", "--path", "fern",
+          "--images", "images_8", "--views", "5", "--out", str(tmp_path)])  # fmt: skip
+    given = {"iterations": 3_000, "densify_from": 70, "noise": 0.8}
+    expected = with_recipe(recipe, **given) if recipe else TrainConfig(**given)  # at which nothing scales
+    assert asked["config"] == expected
     assert asked["scene"] == SceneOptions("fern", images="images_8", views=5)
     assert asked["out"] == tmp_path
 
 
-def test_the_preset_of_binocular_decays_opacities(monkeypatch, tmp_path):
+def test_recipes_are_listed(capsys):
+    main(["recipes"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines] == list(RECIPES)
+    assert all("Needs" in line and "Differs" in line for line in lines)
+
+
+def test_the_recipe_of_binocular_decays_opacities(monkeypatch, tmp_path):
     asked = []
     monkeypatch.setattr(run_module, "run_experiment", lambda scene, config, out, **rest: asked.append(config))
     monkeypatch.setattr(tables, "summary", lambda results: "")
-    main(["train", "--iterations", "3", "--preset=binocular", "--out", str(tmp_path)])
+    main(["train", "--iterations", "3", "--recipe=binocular", "--out", str(tmp_path)])
     assert (asked[0].opacity_decay, asked[0].iterations) == (0.995, 3)
 
 
@@ -411,7 +421,12 @@ def test_mistakes(arguments, message, capsys, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["train", "--preset", "gsplat"], "gsplat"), (["fly"], "fly"), (["train", "--dropuot", "0.2"], "--dropuot")],
+    [
+        (["train", "--recipe", "gsplat"], "gsplat"),
+        (["train", "--recipe", "fsgs", "--iterations", "few"], "few"),
+        (["fly"], "fly"),
+        (["train", "--dropuot", "0.2"], "--dropuot"),
+    ],
 )
 def test_what_cannot_be_parsed(arguments, message, capsys):
     assert message in refused(arguments, capsys)

@@ -66,7 +66,7 @@ def test_an_option_at_its_default_is_still_the_users(capsys):
         ([], True, set()),
         (["--no-auto"], False, set()),
         (["--auto", "--sh_degree=3", "--no-analytic"], True, {"sh_degree", "analytic"}),
-        (["--preset", "binocular", "--seed", "4"], True, {"seed"}),
+        (["--recipe", "binocular", "--seed", "4"], True, {"seed"}),
     ],
 )
 def test_train_passes_on_what_was_given(asked, options, auto, given):

@@ -2,15 +2,19 @@
 
 import dataclasses
 import math
+from itertools import combinations
 
+import numpy as np
 import pytest
 import torch
 from devices import CARD, DEVICES
 from scipy.spatial.transform import Rotation
 
 from ca_reg import CAScore
-from reference_trainer.density import DENSITY, DensityStrategy
+from reference_trainer.camera import Camera
+from reference_trainer.density import DENSITY, DensityStrategy, RayBoxDensity
 from reference_trainer.density.mcmc import relocate
+from reference_trainer.density.ray_boxes import ray_box
 from reference_trainer.evaluation.shares import blend_weights
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians, inverse_sigmoid
@@ -26,6 +30,7 @@ ALL = {
     "absgrad": "absgrad(1e-5, 2e-5, 0.05, ceiling_every=7)",
     "proximity": "proximity(distance=0.001, split_distance=0.01)",
     "mcmc": "mcmc(growth=1.2)",
+    "ray_boxes": "ray_boxes(height=5, width=8)",
     "share_pruning": "share_pruning(every=3, fraction=0.1)",
 }
 
@@ -106,6 +111,8 @@ def test_all_work_on_a_device(tiny_scene, busy, expression, device):
         ("proximity(distance=0.0)", "distance and split_distance must be positive"),
         ("mcmc(noise=-1)", "noise must not be negative"),
         ("mcmc(growth=0.9)", "growth must be at least 1"),
+        ("ray_boxes(views=1)", "views must be at least 2"),
+        ("ray_boxes(height=0)", "height and width must be positive"),
         ("share_pruning(every=0)", "every must be at least 1"),
         ("share_pruning(fraction=1.0)", "fraction must be in"),
         ("share_pruning(drop_rate=0.0)", "drop_rate must be in"),
@@ -249,6 +256,102 @@ def test_proximity_looks_at_neighbors_only_if_there_are_three(tiny_scene):
     strategy = begun("proximity(distance=1e-9)", tiny_scene, 3, prune_opacity=0.0)
     strategy.densify(optimizer, 1)
     assert len(optimizer.gaussians) == 3
+
+
+# MVGS
+
+
+def closest(o1, d1, o2, d2):
+    """The middle between two lines, by least squares for the two distances along them."""
+    d1, d2 = d1 / np.linalg.norm(d1), d2 / np.linalg.norm(d2)
+    (t, s), *_ = np.linalg.lstsq(np.stack([d1, -d2], 1), o2 - o1, rcond=None)
+    return (o1 + t * d1 + o2 + s * d2) / 2
+
+
+def boxes(views, images, height: int, width: int):
+    """Lower and upper corners of the boxes of all pairs of views, pixel by pixel."""
+    regions = []
+    for view, image in zip(views, images, strict=True):
+        error, worst = (image - view.image).abs().double().numpy(), (0.0, 0, 0)
+        for i in range(0, error.shape[1] - height, height):
+            for j in range(0, error.shape[2] - width, width):
+                mean = error[:, i : i + height, j : j + width].mean()
+                worst = max(worst, (mean, -i, -j))
+        _, i, j = worst
+        k = np.array([[view.camera.fx, 0, view.camera.cx], [0, view.camera.fy, view.camera.cy], [0, 0, 1]])
+        rotation = view.camera.world_to_camera[:3, :3].double().numpy()
+        rays = [
+            rotation.T @ np.linalg.inv(k) @ np.array([x + 0.5, y + 0.5, 1.0])
+            for y in (-i, height - i) for x in (-j, width - j)
+        ]  # fmt: skip
+        regions.append((view.camera.position.double().numpy(), rays))
+    for (o1, rays1), (o2, rays2) in combinations(regions, 2):
+        meets = np.stack([closest(o1, d1, o2, d2) for d1, d2 in zip(rays1, rays2, strict=True)])
+        yield meets.min(0), meets.max(0)
+
+
+@pytest.mark.parametrize("distance", [0.0, 10.0])
+def test_ray_boxes_clones_inside_and_halves_the_threshold_of_cameras_far_apart(tiny_scene, distance):
+    """Cameras around the origin of the world are far apart in the source's measure, those far from it are not."""
+    shift = torch.tensor([0.0, 0.0, distance])
+    away = torch.eye(4)
+    away[:3, 3] = -shift
+    views = tuple(
+        dataclasses.replace(
+            view, camera=dataclasses.replace(view.camera, world_to_camera=view.camera.world_to_camera @ away)
+        )
+        for view in tiny_scene.train
+    )
+    scene = dataclasses.replace(tiny_scene, train=views)
+    start = some(1000, size=0.05)
+    start.means[:] = 2 * start.means.tanh() + torch.tensor([0.0, 0.0, 3.0]) + shift
+    optimizer = stepped(start)
+    old = optimizer.gaussians.map(torch.Tensor.detach).map(torch.clone)
+    small, large = int(old.scales.amax(1).argmin()), int(old.scales.amax(1).argmax())
+    size = 0.999 * old.scales[large].max().item() / scene.extent
+    strategy = begun("ray_boxes(height=10, width=15)", scene, 1000, dense_fraction=size, prune_opacity=0.0)
+    seen_at = torch.zeros(1000)
+    seen_at[[small, large]] = 3e-4  # of 5e-4, or half of it
+    strategy.load_state_dict({"gradient_sum": seen_at, "steps": torch.ones(1000)})
+    images = [render_gaussians(old, view.camera, scene.background, sh_degree=0).image for view in views]
+    inside = torch.zeros(1000, dtype=torch.bool)
+    for low, high in boxes(views, images, 10, 15):
+        inside |= torch.from_numpy(((old.means.double().numpy() > low) & (old.means.double().numpy() < high)).all(1))
+    assert 10 < inside.sum() < 900
+    centers = [view.camera.position / view.camera.position.norm() for view in views]
+    far = any((one - other).norm() > 1 for one, other in combinations(centers, 2))
+    assert bool(far) is (distance == 0)
+    strategy.densify(optimizer, 100)
+    cloned = inside.clone()
+    cloned[small] |= far
+    new = optimizer.gaussians.means
+    if far:  # the large one is split, and cloned as well if it is inside
+        kept = torch.arange(1000) != large
+        assert torch.equal(new[: 999 + cloned.sum()], torch.cat([old.means[kept], old.means[cloned]]))
+        assert len(new) == 999 + cloned.sum() + 2
+    else:
+        assert torch.equal(new, torch.cat([old.means, old.means[cloned]]))
+
+
+def test_ray_boxes_draws_views_that_depend_on_the_step_alone(tiny_scene, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(RayBoxDensity, "_inside", lambda self, optimizer, views, step: drawn.append(views) or False)
+    strategy = begun("ray_boxes(2)", tiny_scene, 4)
+    for step in (*range(12), 3):
+        strategy.grow(stepped(some(4)), step)
+    names = [tuple(view.name for view in views) for views in drawn]
+    assert names[3] == names[-1]
+    assert all(len({*pair}) == 2 for pair in names)
+    assert len({*names}) > 1
+
+
+def test_ray_boxes_of_parallel_rays_are_none():
+    camera = Camera(torch.eye(4), 10.0, 10.0, 4.0, 3.0, 8, 6)
+    pose = torch.eye(4)
+    pose[0, 3] = -1.0
+    beside = dataclasses.replace(camera, world_to_camera=pose)
+    corners = torch.tensor([[1.5, 1.5], [6.5, 4.5]])
+    assert ray_box(camera, corners, beside, corners) is None
 
 
 # 3DGS-MCMC

@@ -53,6 +53,31 @@ def test_scores_are_those_of_the_rendered_views(tiny_scene, gaussians):
     assert result.perceptual_metric is None
 
 
+def test_depth_is_held_against_the_truth_where_it_is_known(tiny_scene, gaussians):
+    """Against a render whose colors are the depths of the centers, at every fifth pixel."""
+    view = tiny_scene.test[0]
+    known = torch.zeros_like(view.depth)
+    known[::5, ::5] = view.depth[::5, ::5]
+    model = TrainedModel(gaussians, tiny_scene.background, "dropout(0.2)")
+    found, without = evaluate(
+        model, {"test": [dataclasses.replace(view, depth=known), dataclasses.replace(view, depth=None)]}
+    ).views
+    lit = render(
+        gaussians.means, gaussians.quaternions, gaussians.scales, 0.8 * gaussians.opacities, view.camera,
+        colors=(gaussians.means @ view.camera.world_to_camera[2, :3] + view.camera.world_to_camera[2, 3])[:, None]
+        .expand(-1, 3), background=torch.zeros(3),
+    )  # fmt: skip
+    pairs = [
+        (lit.image[0, i, j].item() / lit.alpha[i, j].item() if lit.alpha[i, j] > 0 else 0.0, view.depth[i, j].item())
+        for i in range(0, 24, 5) for j in range(0, 32, 5) if view.depth[i, j] > 0
+    ]  # fmt: skip
+    assert len(pairs) > 20
+    assert found.depth_abs_rel == pytest.approx(sum(abs(d - t) / t for d, t in pairs) / len(pairs), rel=1e-4)
+    assert found.depth_rmse == pytest.approx((sum((d - t) ** 2 for d, t in pairs) / len(pairs)) ** 0.5, rel=1e-4)
+    assert math.isnan(without.depth_abs_rel)
+    assert math.isnan(without.depth_rmse)
+
+
 def test_outside_of_its_mask_a_view_does_not_count(tiny_scene, gaussians):
     view = tiny_scene.test[0]
     mask = torch.zeros(view.image.shape[1:])
@@ -195,7 +220,7 @@ def test_no_gradient_and_no_global_random_number(tiny_scene, gaussians):
 
 
 def of(name: str, split: str, value: float) -> ViewScores:
-    return ViewScores(name, split, *[value] * 12)
+    return ViewScores(name, split, *[value] * 14)
 
 
 def test_means_leave_out_what_does_not_exist():
@@ -271,9 +296,10 @@ def test_photographs_are_not_needed_for_co_adaptation(tiny_scene, gaussians):
     bare = evaluate(model, {"orbit": [Viewpoint("v", view.camera) for view in tiny_scene.train]}, samples=4, seed=3)
     full = evaluate(model, {"orbit": tiny_scene.train}, samples=4, seed=3, perceptual=Brightness())
     for one, other in zip(bare.views, full.views, strict=True):
-        assert all(math.isnan(x) for x in (one.psnr, one.ssim, one.lpips))
-        assert all(math.isfinite(x) for x in (other.psnr, other.ssim, other.lpips))
-        same = dataclasses.replace(other, name="v", psnr=one.psnr, ssim=one.ssim, lpips=one.lpips)
+        needing = {name: getattr(one, name) for name in ("psnr", "ssim", "lpips", "depth_abs_rel", "depth_rmse")}
+        assert all(math.isnan(x) for x in needing.values())
+        assert all(math.isfinite(getattr(other, name)) for name in needing)
+        same = dataclasses.replace(other, name="v", **needing)
         assert repr(one) == repr(same)  # where nan is nan
 
 

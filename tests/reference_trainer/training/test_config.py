@@ -3,23 +3,25 @@ import math
 
 import pytest
 
-from reference_trainer.training.config import PRESETS, TrainConfig, with_preset
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.recipes import RECIPES, with_recipe
 
 
-def test_the_defaults_are_the_fsgs_preset():
-    assert dataclasses.replace(PRESETS["fsgs"], iterations=3_000) == TrainConfig()
+def test_the_defaults_are_the_recipe_3dgs():
+    assert dataclasses.replace(RECIPES["3dgs"].config, iterations=3_000) == TrainConfig()
 
 
-@pytest.mark.parametrize("name", sorted(PRESETS))
-def test_presets_accept_changes_and_keep_the_rest(name):
-    changed = with_preset(name, iterations=7, dropout=0.2)
-    assert (changed.iterations, changed.dropout) == (7, 0.2)
-    assert dataclasses.replace(changed, iterations=PRESETS[name].iterations, dropout=0.0) == PRESETS[name]
+@pytest.mark.parametrize("name", RECIPES)
+def test_recipes_accept_changes_and_keep_the_rest(name):
+    changed = with_recipe(name, sh_degree=2, dropout=0.2)
+    assert (changed.sh_degree, changed.dropout) == (2, 0.2)
+    whole = RECIPES[name].config
+    assert dataclasses.replace(changed, sh_degree=whole.sh_degree, dropout=0.0) == whole
 
 
-def test_an_unknown_preset_names_the_known_ones():
-    with pytest.raises(ValueError, match=r"no preset 'gsplat'.*fsgs, inria, binocular"):
-        with_preset("gsplat")
+def test_an_unknown_recipe_names_the_known_ones():
+    with pytest.raises(ValueError, match=r"no recipe 'gsplat'.*3dgs, inria, fsgs"):
+        with_recipe("gsplat")
 
 
 @pytest.mark.parametrize(

@@ -25,9 +25,10 @@ from reference_trainer.model.rendering import render_gaussians, render_moments_o
 from reference_trainer.render import render, renderers
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import PointCloud, Scene, View
-from reference_trainer.training.config import PRESETS, TrainConfig
+from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.determinism import deterministic
 from reference_trainer.training.randomness import stream
+from reference_trainer.training.recipes import RECIPES
 from reference_trainer.training.trainer import Trainer
 
 P, SIGMA, WEIGHT = 0.4, 0.8, 3.0
@@ -44,11 +45,12 @@ OPTIONS: dict[str, dict[str, object]] = {
     "renderer": {"renderer": "gsplat"},
     "white": {},  # the scene's background
     "deterministic": {},  # of the command
-    "preset inria": {"preset": "inria"},
-    "preset binocular": {"preset": "binocular"},
+    "recipe inria": {"recipe": "inria"},
+    "recipe binocular": {"recipe": "binocular"},
 }
 NEEDS = {"compensate": "dropout", "clip": "noise", "scale": "noise"}
 REFUSED = {
+    ("analytic", "recipe binocular"): "analytic training has no draw, which Warp needs",
     ("analytic", "renderer"): "analytic training needs the moments of the torch renderer",
     ("loss", "renderer"): "the loss needs moments, which the renderer gsplat lacks",
 }
@@ -62,7 +64,7 @@ SCHEDULE = {  # what decides when and how fast, and enters no single step
 
 
 def test_every_setting_is_an_option_here_or_a_matter_of_the_schedule():
-    named = {field for settings in OPTIONS.values() for field in settings} - {"preset"}
+    named = {field for settings in OPTIONS.values() for field in settings} - {"recipe"}
     assert named | SCHEDULE | {"regularizer"} == {field.name for field in dataclasses.fields(TrainConfig)}
     assert not named & SCHEDULE
 
@@ -88,9 +90,9 @@ def together(pair: tuple[str, ...]) -> tuple[TrainConfig, Draws, bool]:
         terms.append(f"dropout({settings.pop('dropout')}, compensate=True)")
     if draws.sigma and (draws.compensate or names & {"clip", "scale"}):  # in the order of the draws
         terms.append(f"noise({settings.pop('noise')}, clip={draws.clip}, scale={'scale' in names})")
-    preset = PRESETS[settings.pop("preset", "fsgs")]
+    recipe = RECIPES[settings.pop("recipe", "3dgs")].config
     short = {"iterations": 2, "sh_degree": 0, "sh_every": 1, "regularizer": " + ".join(terms)}
-    return dataclasses.replace(preset, **{**short, **settings}), draws, "scale" in names
+    return dataclasses.replace(recipe, **{**short, **settings}), draws, "scale" in names
 
 
 # Two Gaussians in front of a camera of 6 x 6 pixels. At every pixel both falloffs are between 0.4 and 0.99, so that the

@@ -7,8 +7,9 @@ import torch
 
 from reference_trainer.scenes.scene import PointCloud, Scene
 from reference_trainer.training import step as step_module
-from reference_trainer.training.config import PRESETS, TrainConfig, with_preset
+from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import Plan, PlanItem, make_plan
+from reference_trainer.training.recipes import RECIPES, with_recipe
 from reference_trainer.training.trainer import Trainer
 
 SHORT = TrainConfig(iterations=400)  # ends before the first band of spherical harmonics begins
@@ -51,9 +52,9 @@ def test_a_stored_plan_yields_to_what_is_given_later(tiny_scene):
     assert plan.applied(SHORT, given=["sh_degree"]) == SHORT
 
 
-@pytest.mark.parametrize("preset", sorted(PRESETS))
-def test_what_a_preset_sets_stays(tiny_scene, preset):
-    config = with_preset(preset, iterations=400)
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_what_a_recipe_sets_stays(tiny_scene, recipe):
+    config = with_recipe(recipe, iterations=400)
     applied = make_plan(tiny_scene, config).applied(config)
     default = vars(TrainConfig())
     for name, value in vars(config).items():

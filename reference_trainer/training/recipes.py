@@ -1,0 +1,150 @@
+"""Published methods as data: the settings of each, where they come from, and what differs from the original."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from dataclasses import dataclass
+
+from reference_trainer.training.config import TrainConfig
+
+__all__ = ["RECIPES", "Recipe", "with_recipe"]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A published method in the settings of this package; docs/recipes.md has more on each.
+
+    Args:
+        config: at the method's own number of iterations; loss and density by the names of their registries. Whole
+            numbers from 100 on in these are steps, see `with_recipe`.
+        source: paper, repository and commit, or what it is made of.
+        differs: what differs from the original, and why.
+        needs: what a scene must have beside photographs, cameras and points.
+    """
+
+    config: TrainConfig
+    source: str
+    differs: str
+    needs: str = "nothing"
+
+
+_INRIA = TrainConfig(
+    iterations=30_000,
+    sh_every=1_000,
+    densify_until=15_000,
+    densify_gradient=2e-4,
+    prune_size=0.1,
+    opacity_reset=0.01,
+    opacity_reset_from=3_000,
+    opacity_reset_over_white=True,
+)
+_LOUDER = 1.2  # DNGaussian's L1 + 0.2 (1 - SSIM) over (1 - l) L1 + l (1 - SSIM) with l = 0.2 / 1.2
+
+RECIPES: dict[str, Recipe] = {
+    "3dgs": Recipe(
+        TrainConfig(iterations=10_000),
+        "3DGS (Kerbl et al. 2023) with the schedule that FSGS a536a64 and CoR-GS 1db13a4 have for few views",
+        "as fsgs without depth and unpooling; the source of the paper's own row 3DGS is not public",
+    ),
+    "inria": Recipe(
+        _INRIA,
+        "3DGS (Kerbl et al. 2023), graphdeco-inria/gaussian-splatting 82bc469",
+        "no pruning by pixels on the screen, which has no effect there",
+    ),
+    "fsgs": Recipe(
+        TrainConfig(
+            iterations=10_000,
+            loss="photometric + pearson(between(0.05, 0, 9_500)) + pearson(between(0.001, 9_500))",
+            density="proximity(until=2_000)",
+        ),
+        "FSGS (ECCV 2024), VITA-Group/FSGS a536a64",
+        "no correlation at pseudo views, which needs its depth network in training; new Gaussians stand between "
+        "neighbors, as in its paper",
+        "a depth prior (--depth)",
+    ),
+    "dngaussian": Recipe(
+        TrainConfig(
+            iterations=6_000,
+            sh_every=1_000,
+            loss=f"photometric({0.2 / _LOUDER:.6f})"
+            ' + patch_depth(0.01, which="hard") + patch_depth(between(0.01, 1_000), which="soft")'
+            f" + flat({0.002 / _LOUDER:.6f}) + scale({0.001 / _LOUDER:.6f})"
+            f" + opacity({0.001 / _LOUDER:.6f}, split=0.2)",
+            means_rate=1.6e-2,
+            means_rate_final=1.6e-4,
+            scales_rate=3e-3,
+            densify_gradient=1.3e-3 / _LOUDER,
+            prune_opacity=0.01,
+            opacity_reset_every=0,
+        ),
+        "DNGaussian (CVPR 2024) on LLFF, Fictionarry/DNGaussian 13ecf60",
+        "spherical harmonics for neural colors; one loss with a depth weight of 0.01 for its three optimizer steps; no "
+        "smoothness of the depth, no removal of near or unseen Gaussians, splits at any opacity",
+        "a depth prior (--depth); there random points",
+    ),
+    "binocular": Recipe(
+        TrainConfig(
+            iterations=30_000,
+            sh_degree=1,
+            sh_every=1_000,
+            loss="photometric + warp(between(1.0, 20_000))",
+            densify_gradient=2e-4,
+            opacity_reset_every=0,
+            opacity_decay=0.995,
+        ),
+        "Binocular3DGS (NeurIPS 2024), hanl2010/Binocular3DGS 2b3b7a4",
+        "each view once an epoch; pictures with masks need the term alpha, and a world in other units a shift of warp",
+    ),
+    "mvgs": Recipe(
+        dataclasses.replace(_INRIA, loss="photometric + views(3)", density="ray_boxes"),
+        "MVGS (2024), xiaobiaodu/MVGS ec9b30e, three views a step",
+        "density control counts all views of a step, not the last alone; no coarse to fine",
+    ),
+    "absgs": Recipe(
+        dataclasses.replace(_INRIA, density="absgrad"),
+        "AbsGS (ACM MM 2024), TY424/AbsGS 87d7a5a",
+        "no pruning by pixels on the screen, which has no effect there",
+    ),
+}
+"""All recipes, by the name that ``--recipe`` knows."""
+
+_MARKS = "sh_every", "densify_from", "densify_until", "prune_size_from", "opacity_reset_from"
+
+
+def with_recipe(name: str, **changes: object) -> TrainConfig:
+    """Return the settings of a recipe with some fields changed.
+
+    With other ``iterations`` the steps at which something begins or ends are scaled in proportion: ``sh_every``,
+    ``densify_from``, ``densify_until``, ``prune_size_from``, ``opacity_reset_from``, and in loss and density the whole
+    numbers from 100 on. Rates and the steps between two densifications or resets stay: after either the optimizer needs
+    its time. What is given in ``changes`` is taken as it is.
+
+    Args:
+        name: a key of `RECIPES`.
+        changes: fields of `TrainConfig`.
+
+    Raises:
+        ValueError: if there is no such recipe, or a value is out of range.
+
+    Example:
+        >>> short = with_recipe("binocular", iterations=3_000, sh_every=500)
+        >>> short.loss, short.sh_every, short.densify_from
+        ('photometric + warp(between(1.0, 2000))', 500, 50)
+    """
+    if name not in RECIPES:
+        raise ValueError(f"there is no recipe {name!r}; choose one of {', '.join(RECIPES)}.")
+    config = RECIPES[name].config
+    times = TrainConfig(iterations=changes.get("iterations", config.iterations)).iterations / config.iterations  # type: ignore[arg-type]
+    scaled: dict[str, object] = {
+        mark: max(int(mark == "sh_every"), round(times * at))
+        for mark in _MARKS
+        if (at := getattr(config, mark)) is not None
+    }
+    for field in ("loss", "density"):
+        scaled[field] = re.sub(
+            r"(?<![\w.])[1-9][\d_]{2,}(?![\w.])",
+            lambda at: str(round(times * int(at[0]))) if times != 1 else at[0],
+            getattr(config, field),
+        )
+    return dataclasses.replace(config, **{**scaled, **changes})  # type: ignore[arg-type]
