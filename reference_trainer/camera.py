@@ -74,6 +74,17 @@ class Camera:
         local = torch.cat([across, torch.ones_like(across[..., :1])], -1) * depth[..., None]
         return (local - pose[:3, 3]) @ pose[:3, :3]
 
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return pixels (..., 2) and depths (...) of world points (..., 3); what `lift` undoes.
+
+        Behind the camera the depth is negative and the pixel has no meaning, at depth 0 it is not finite.
+        """
+        pose = self.world_to_camera.to(points)
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        depth = local[..., 2]
+        across = local[..., :2] / depth[..., None]
+        return across * depth.new_tensor([self.fx, self.fy]) + depth.new_tensor([self.cx, self.cy]), depth
+
     def resized(self, width: int, height: int) -> Camera:
         """Return the camera of the same picture resized to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height

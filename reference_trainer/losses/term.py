@@ -95,5 +95,5 @@ class PriorTerm(WeightedTerm):
         if lacking := [view.name for view in views if view.depth_prior is None]:
             raise ValueError(
                 f"{type(self).__name__} compares with a depth of every training photograph, which {lacking} lack: name "
-                'a folder of PNG or NPY files with --depth, or "true" for the built-in scene.'
+                'a folder of PNG or NPY files with --depth, or "points" for what the initial points tell.'
             )

@@ -1,4 +1,4 @@
-"""Depth of the training photographs from files: a network's, a sensor's or a stereo method's."""
+"""Depth of the training photographs: from files, a network's, a sensor's or a stereo method's, or from the points."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch import Tensor
 from reference_trainer.scenes.frames import ASPECT_TOLERANCE, Frame
 from reference_trainer.scenes.images import path_inside, resize_image
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.scenes.undistort import undistort
 
-__all__ = ["read_depth", "true_priors", "with_prior"]
+__all__ = ["point_prior", "read_depth", "true_priors", "with_prior"]
 
 
 def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> View:
@@ -55,16 +55,51 @@ def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> V
 def true_priors(scene: Scene, asked: str) -> Scene:
     """Return the built-in scene with its true depth as prior of the training views, unknown where nothing is hit.
 
+    With ``"points"`` it is that of `point_prior`.
+
     Raises:
-        ValueError: if anything but ``"true"`` was asked for.
+        ValueError: if anything else but ``"true"`` was asked for.
     """
+    if asked == "points" and scene.points is not None:
+        return replace(scene, train=tuple(point_prior(view, scene.points) for view in scene.train))
     if asked != "true":
-        raise ValueError(f'the built-in scene has no folder of depths: depth must be "true", got {asked!r}.')
+        raise ValueError(
+            f'the built-in scene has no folder of depths: depth must be "true" or "points", got {asked!r}.'
+        )
     views = []
     for view in scene.train:
         assert view.depth is not None
         views.append(replace(view, depth_prior=view.depth.where(view.depth > 0, torch.nan)))
     return replace(scene, train=tuple(views))
+
+
+def point_prior(view: View, cloud: PointCloud) -> View:
+    """Return a view with a depth prior that needs no file: the depth of the initial points, and what lies between them.
+
+    Of the points of a pixel the nearest counts; between pixels with points the inverse depth is linear over Delaunay
+    triangles, which is exact on a plane. Outside their hull the prior is unknown. Points that are hidden from the view
+    count as well, for nobody says which those are.
+
+    Raises:
+        ValueError: if there is no cloud that was reconstructed, or the view sees none of it.
+        ImportError: if SciPy is missing.
+    """
+    from scipy.interpolate import LinearNDInterpolator
+
+    if cloud.source == "random":
+        raise ValueError('depth "points" needs points of the scene, and these are random: name a cloud with --points.')
+    camera = view.camera
+    pixels, depths = camera.project(cloud.positions.double())
+    size = pixels.new_tensor([camera.width, camera.height])
+    seen = (depths > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+    from_near = depths[seen].argsort()
+    places, inverse = pixels[seen][from_near].numpy(), 1 / depths[seen][from_near].numpy()
+    first = np.unique(places.astype(int), axis=0, return_index=True)[1]
+    if len(first) < 4:
+        raise ValueError(f'depth "points" needs points in every training view, and {view.name} sees {len(first)}.')
+    between = LinearNDInterpolator(places[first], inverse[first])
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return replace(view, depth_prior=torch.from_numpy(1 / between(columns, rows)).float())
 
 
 def read_depth(path: str | Path) -> Tensor:

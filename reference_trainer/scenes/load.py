@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.scenes.colmap import COLMAP
-from reference_trainer.scenes.depth import true_priors, with_prior
+from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
 from reference_trainer.scenes.formats import Capture, find_format, only_default, register_format
 from reference_trainer.scenes.frames import Frame, load_view
 from reference_trainer.scenes.idr import IDR
@@ -87,7 +87,9 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         )
         for kind, frames in (("train", train), ("test", test))
     }
-    if options.depth is not None:
+    if options.depth == "points":
+        views["train"] = tuple(point_prior(view, cloud) for view in views["train"])
+    elif options.depth is not None:
         views["train"] = tuple(
             with_prior(view, frame, root, options) for view, frame in zip(views["train"], train, strict=True)
         )

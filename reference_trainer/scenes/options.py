@@ -51,7 +51,7 @@ class SceneOptions:
     depth: str | None = None
     """Depth of the training photographs, for terms of the loss that need one: a folder of the scene with .npy or gray
     .png files named like them, of any scale and shift; FOLDER:inverse if it is larger where nearer, as MiDaS's is;
-    "true" for the built-in scene's own."""
+    "points" for the depth of the initial points, interpolated; "true" for the built-in scene's own."""
     downscale: float | None = None
     """Make pictures smaller by this factor; by default those above half a megapixel are reduced to that."""
     background: str = "auto"

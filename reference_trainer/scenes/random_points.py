@@ -34,11 +34,9 @@ def random_points(train: Sequence[Frame], count: int, generator: torch.Generator
 def _looks_at_box(frame: Frame) -> bool:
     """Whether the camera stands outside the NeRF-synthetic box and has its centre, the origin, in the picture."""
     camera = frame.camera
-    x, y, z = camera.world_to_camera[:3, 3].tolist()
-    if float(camera.position.abs().max()) <= BLENDER_BOX or z <= 0:
-        return False
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    return bool(0 <= u <= camera.width and 0 <= v <= camera.height)
+    (u, v), depth = camera.project(torch.zeros(3))
+    outside = float(camera.position.abs().max()) > BLENDER_BOX and depth > 0
+    return bool(outside and 0 <= u <= camera.width and 0 <= v <= camera.height)
 
 
 def random_points_in_box(count: int, half_size: float, *, generator: torch.Generator | None = None) -> PointCloud:

@@ -62,10 +62,9 @@ def drawn_by_any(gaussians: Gaussians, views: tuple[View, ...]) -> Tensor:
 
 def pixels_of(positions: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     """Return column and row of the pixel of every point, clamped to the picture, and whether the picture holds it."""
-    pose = camera.world_to_camera.to(positions)
-    x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    within = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    pixels, depth = camera.project(positions)
+    column, row = pixels.unbind(1)
+    within = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     return (
         column.nan_to_num().clamp(0, camera.width - 1).long(),
         row.nan_to_num().clamp(0, camera.height - 1).long(),

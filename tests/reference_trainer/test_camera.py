@@ -39,6 +39,9 @@ def test_a_point_lands_where_the_hand_puts_it():
     torch.testing.assert_close(projected.means, torch.tensor([[33 + 60 * 2 / 5, 23 + 50 * 1 / 5]]).double())
     assert projected.depths.item() == pytest.approx(5.0)
     torch.testing.assert_close(camera(world_to_camera=quarter_turn()).lift(projected.means, projected.depths), point)
+    pixels, depths = camera(world_to_camera=quarter_turn()).project(point)
+    torch.testing.assert_close(pixels, projected.means)
+    torch.testing.assert_close(depths, projected.depths)
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.3, 2.0, 1e-3])

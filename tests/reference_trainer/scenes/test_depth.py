@@ -7,8 +7,10 @@ import pytest
 import torch
 from PIL import Image
 
+from reference_trainer.camera import Camera
 from reference_trainer.scenes import load_scene
-from reference_trainer.scenes.depth import read_depth
+from reference_trainer.scenes.depth import point_prior, read_depth
+from reference_trainer.scenes.scene import PointCloud, View
 
 
 @pytest.fixture
@@ -112,5 +114,38 @@ def test_the_built_in_scene_has_its_true_depth():
         hit = view.depth > 0
         assert torch.equal(view.depth_prior[hit], view.depth[hit])
         assert view.depth_prior[~hit].isnan().all()
-    with pytest.raises(ValueError, match="must be \"true\", got 'mono'"):
+    with pytest.raises(ValueError, match='must be "true" or "points", got \'mono\''):
         load_scene("synthetic", downscale=8, depth="mono")
+
+
+def test_between_points_on_a_plane_the_prior_is_the_plane_and_what_is_behind_it_hides():
+    """The inverse depth of a plane is linear over the picture: interpolated linearly it is exact."""
+    camera = Camera(torch.eye(4), fx=50.0, fy=55.0, cx=21.0, cy=15.0, width=40, height=30)
+    view = View("v", camera, torch.zeros(3, 30, 40))
+    generator = torch.Generator().manual_seed(0)
+    pixels = torch.rand(60, 2, generator=generator, dtype=torch.float64) * torch.tensor([40.0, 30.0])
+
+    def inverse_depth(pixels):
+        return 0.2 + 0.004 * pixels[..., 0] - 0.003 * pixels[..., 1]
+
+    points = camera.lift(pixels, 1 / inverse_depth(pixels))
+    hidden = camera.lift(pixels, 9 / inverse_depth(pixels))
+    behind = -points
+    cloud = PointCloud(torch.cat([hidden, points, behind]).float(), torch.zeros(180, 3), source="a model")
+    prior = point_prior(view, cloud).depth_prior
+    centers = torch.stack(torch.meshgrid(torch.arange(40) + 0.5, torch.arange(30) + 0.5, indexing="xy"), -1)
+    inside = prior.isfinite()
+    assert 0.6 < inside.float().mean() < 1
+    torch.testing.assert_close(prior[inside], (1 / inverse_depth(centers))[inside].float(), rtol=1e-5, atol=0)
+    with pytest.raises(ValueError, match="these are random"):
+        point_prior(view, PointCloud(points.float(), torch.zeros(60, 3), source="random"))
+    with pytest.raises(ValueError, match="v sees 0"):
+        point_prior(view, PointCloud(behind.float(), torch.zeros(60, 3), source="a model"))
+
+
+def test_the_built_in_scene_has_points_to_make_a_prior_of():
+    """Triangles that span an edge of an object are off; half of the pixels are within five percent of the truth."""
+    for view in load_scene("synthetic", downscale=2, depth="points").train:
+        known = view.depth_prior.isfinite() & (view.depth > 0)
+        assert known.float().mean() > 0.5
+        assert (view.depth_prior / view.depth - 1)[known].abs().median() < 0.05
