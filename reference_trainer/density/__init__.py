@@ -3,8 +3,10 @@
 from ca_reg.registry import Registry
 from reference_trainer.density.absgrad import AbsGradDensity
 from reference_trainer.density.adaptive import AdaptiveDensity
+from reference_trainer.density.co_pruning import CoPruning
 from reference_trainer.density.mcmc import MCMCDensity
 from reference_trainer.density.proximity import ProximityDensity
+from reference_trainer.density.self_ensembling import SelfEnsembling
 from reference_trainer.density.share_pruning import SharePruning
 from reference_trainer.density.strategy import DensityStrategy
 
@@ -12,9 +14,11 @@ __all__ = [
     "DENSITY",
     "AbsGradDensity",
     "AdaptiveDensity",
+    "CoPruning",
     "DensityStrategy",
     "MCMCDensity",
     "ProximityDensity",
+    "SelfEnsembling",
     "SharePruning",
 ]
 
@@ -26,3 +30,5 @@ DENSITY.register("absgrad")(AbsGradDensity)
 DENSITY.register("proximity")(ProximityDensity)
 DENSITY.register("mcmc")(MCMCDensity)
 DENSITY.register("share_pruning")(SharePruning)
+DENSITY.register("co_pruning")(CoPruning)
+DENSITY.register("self_ensembling")(SelfEnsembling)
