@@ -45,6 +45,8 @@ class TrainConfig:
 
     fields: int = 1
     """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
+    random_background: bool = False
+    """Train over a color drawn anew at each step, which makes what is transparent an error (CoR-GS, SE-GS)."""
     renderer: str = "torch"
     """What draws in training: "torch", this package's renderer, "gsplat", which needs it and a CUDA device, or
     "my_module:MyRenderer"."""

@@ -20,7 +20,7 @@ from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.field import Field
 from reference_trainer.training.interruption import hold_interrupts
-from reference_trainer.training.randomness import view_order
+from reference_trainer.training.randomness import stream, view_order
 from reference_trainer.training.state import read_state
 from reference_trainer.training.step import Step
 
@@ -47,7 +47,8 @@ class Trainer:
 
     Raises:
         ValueError: if the scene has no initial points, its photographs lack what a term of the loss compares with, or
-            the training is to be analytic and a regularizer has no exact expectation.
+            show a background where it is to be random, or the training is to be analytic and a regularizer has no
+            exact expectation.
         ImportError: if gsplat is to draw, and is missing.
         RuntimeError: if gsplat is to draw on something else than a CUDA device.
 
@@ -76,6 +77,8 @@ class Trainer:
         self.losses = config.make_losses()
         for term in self.losses:
             term.begin(scene)
+        if config.random_background and any(view.alpha is not None for view in scene.train):
+            raise ValueError(f"the photographs of {scene.name!r} lie on a background already: leave random_background.")
         if config.analytic:
             self._refuse_draws_without_multiplier()
 
@@ -237,7 +240,10 @@ class Trainer:
 
     def _begin_steps(self) -> list[Step]:
         """Choose the view of the step, and what regularizes it: one for every field."""
-        begun, steps = self.step >= self.config.regularize_from, list[Step]()
+        begun, steps, background = self.step >= self.config.regularize_from, list[Step](), self.background
+        if self.config.random_background:
+            generator = stream(self.config.seed, self.step, "background", self.device)
+            background = torch.rand(3, generator=generator, device=self.device)
         for field in self.fields:
             step = Step(
                 self.step,
@@ -245,7 +251,7 @@ class Trainer:
                 self.views,
                 field.gaussians,
                 field.regularizer if begun else Chain(),
-                self.background,
+                background,
                 sh_degree=self.config.sh_degree_at(self.step + 1),
                 seed=self.config.seed,
                 renderer=self.renderer,

@@ -97,3 +97,23 @@ def test_what_compares_fields_needs_two(settings):
     TrainConfig(**settings, fields=2).check()
     with pytest.raises(ValueError, match="fields must be at least 1, got 0"):
         TrainConfig(fields=0)
+
+
+def test_all_fields_train_over_one_random_background(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=9, fields=2, random_background=True))
+    colors = []
+    for _ in range(3):
+        steps = trainer._begin_steps()
+        assert torch.equal(steps[0].background, steps[1].background)
+        colors.append(steps[0].background)
+        steps[0].sample(depth=False)
+        behind = (1 - steps[0].rendering.alpha) * colors[-1][:, None, None]
+        over_black = steps[0].render(steps[0].view.camera).image - behind
+        dark = dataclasses.replace(steps[0], background=torch.zeros(3))
+        torch.testing.assert_close(dark.render(dark.view.camera).image, over_black, rtol=0, atol=1e-5)
+        trainer.train_step()
+    assert len({tuple(color.tolist()) for color in colors}) == 3
+    assert torch.equal(model_of(trainer).background, tiny_scene.background)
+    views = tuple(dataclasses.replace(view, alpha=torch.ones(24, 32)) for view in tiny_scene.train)
+    with pytest.raises(ValueError, match="lie on a background already"):
+        Trainer(dataclasses.replace(tiny_scene, train=views), trainer.config)
