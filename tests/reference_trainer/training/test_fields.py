@@ -1,6 +1,7 @@
 """A training of two fields: what they share, what is their own, and what is saved of them."""
 
 import dataclasses
+import gc
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ import torch
 from reference_trainer.runs.run import model_of
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.step import Step
 from reference_trainer.training.trainer import Trainer
 
 SEGS = "self_ensembling(1.0, every=3, start=6, stop=20, views=2)"
@@ -117,3 +119,16 @@ def test_all_fields_train_over_one_random_background(tiny_scene):
     views = tuple(dataclasses.replace(view, alpha=torch.ones(24, 32)) for view in tiny_scene.train)
     with pytest.raises(ValueError, match="lie on a background already"):
         Trainer(dataclasses.replace(tiny_scene, train=views), trainer.config)
+
+
+@pytest.mark.parametrize("fields", [1, 2])
+def test_nothing_of_a_step_outlives_it(tiny_scene, fields):
+    loss = "photometric + views(2)" + " + co_regularization" * (fields == 2)
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, fields=fields, loss=loss))
+    gc.collect()
+    gc.disable()
+    try:
+        trainer.train_step()
+        assert not [x for x in gc.get_objects() if type(x) is Step]
+    finally:
+        gc.enable()
