@@ -7,7 +7,7 @@ from contextlib import suppress
 import torch
 from torch import Tensor
 
-__all__ = ["mean_neighbor_distance", "nearest_neighbors"]
+__all__ = ["mean_neighbor_distance", "nearest_distance", "nearest_neighbors"]
 
 SMALLEST_SQUARED_DISTANCE = 1e-7  # INRIA's clamp: coinciding points still get a Gaussian of some size
 TREE_FROM = 4_000  # points; below that the other search takes less time than to import SciPy
@@ -89,6 +89,32 @@ def _search(ordered: Tensor, start: int, stop: int, low: int, high: int, count: 
     distances.square_().diagonal(start - low).fill_(torch.inf)
     nearest = distances.topk(count, dim=1, largest=False)
     return nearest.values, nearest.indices + low
+
+
+@torch.no_grad()
+def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
+    """Return how far the nearest of other points is from every point; shapes (N, D), (M, D) and (N,).
+
+    On a CPU SciPy's tree finds it among many points, as in `nearest_neighbors`; otherwise all distances are computed.
+
+    Raises:
+        ValueError: if a shape is wrong, or there are no other points.
+
+    Example:
+        >>> nearest_distance(torch.tensor([[0.0, 0, 0], [5.0, 0, 0]]), torch.tensor([[1.0, 0, 0]])).tolist()
+        [1.0, 4.0]
+    """
+    if points.ndim != 2 or others.ndim != 2 or points.shape[1] != others.shape[1] or len(others) < 1:
+        shapes = f"{tuple(points.shape)} and {tuple(others.shape)}"
+        raise ValueError(f"expected points (N, D) and at least one other, (M, D), got {shapes}.")
+    if points.device.type == "cpu" and len(others) >= TREE_FROM:
+        with suppress(ImportError):
+            from scipy.spatial import cKDTree
+
+            found = cKDTree(others.double().numpy()).query(points.double().numpy(), workers=torch.get_num_threads())
+            return torch.from_numpy(found[0]).to(points.dtype)
+    rows = torch.split(points, max(1, CHUNK_ELEMENTS // len(others)))
+    return torch.cat([torch.cdist(x, others, compute_mode="donot_use_mm_for_euclid_dist").amin(1) for x in rows])
 
 
 def mean_neighbor_distance(positions: Tensor) -> Tensor:

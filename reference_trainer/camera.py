@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-__all__ = ["Camera"]
+__all__ = ["Camera", "pixels_of"]
 
 
 @dataclass(frozen=True)
@@ -95,3 +95,15 @@ class Camera:
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """Return the camera with its view matrix on another device or in another dtype."""
         return replace(self, world_to_camera=self.world_to_camera.to(device=device, dtype=dtype))
+
+
+def pixels_of(positions: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Return column and row of the pixel of every point, clamped to the picture, and whether the picture holds it."""
+    pixels, depth = camera.project(positions)
+    column, row = pixels.unbind(1)
+    within = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return (
+        column.nan_to_num().clamp(0, camera.width - 1).long(),
+        row.nan_to_num().clamp(0, camera.height - 1).long(),
+        within,
+    )

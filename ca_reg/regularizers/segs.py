@@ -27,10 +27,10 @@ class SEGSNoise(Regularizer):
     made a rotation again by Gram-Schmidt. ``eval()`` changes nothing, as the source renders its unperturbed field.
 
     What differs: the source trains two fields and perturbs the second, every 500 steps, for good, and only those
-    Gaussians that lie under pixels which its first field has drawn differently over time. With one field there is no
-    such selection: all Gaussians are perturbed, at each step anew, and the training sees the perturbed ones. There is
-    no exact multiplier, because the draws are no factors of the opacities. The floor of 1 on the mean makes the noise
-    of the centers depend on the unit of the world.
+    Gaussians that lie under pixels which its first field has drawn differently over time, as the trainer's density
+    control ``self_ensembling`` does. With one field there is no such selection: all Gaussians are perturbed, at each
+    step anew, and the training sees the perturbed ones. There is no exact multiplier, because the draws are no factors
+    of the opacities. The floor of 1 on the mean makes the noise of the centers depend on the unit of the world.
 
     Args:
         first: the ratio at ``start``, above 0.

@@ -3,9 +3,11 @@
 from ca_reg.registry import Registry
 from reference_trainer.density.absgrad import AbsGradDensity
 from reference_trainer.density.adaptive import AdaptiveDensity
+from reference_trainer.density.co_pruning import CoPruning
 from reference_trainer.density.mcmc import MCMCDensity
 from reference_trainer.density.proximity import ProximityDensity
 from reference_trainer.density.ray_boxes import RayBoxDensity
+from reference_trainer.density.self_ensembling import SelfEnsembling
 from reference_trainer.density.share_pruning import SharePruning
 from reference_trainer.density.strategy import DensityStrategy
 
@@ -13,10 +15,12 @@ __all__ = [
     "DENSITY",
     "AbsGradDensity",
     "AdaptiveDensity",
+    "CoPruning",
     "DensityStrategy",
     "MCMCDensity",
     "ProximityDensity",
     "RayBoxDensity",
+    "SelfEnsembling",
     "SharePruning",
 ]
 
@@ -29,3 +33,5 @@ DENSITY.register("proximity")(ProximityDensity)
 DENSITY.register("mcmc")(MCMCDensity)
 DENSITY.register("ray_boxes")(RayBoxDensity)
 DENSITY.register("share_pruning")(SharePruning)
+DENSITY.register("co_pruning")(CoPruning)
+DENSITY.register("self_ensembling")(SelfEnsembling)

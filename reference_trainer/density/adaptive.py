@@ -75,6 +75,11 @@ class AdaptiveDensity(DensityStrategy):
         """Return which Gaussians are to be cloned if they are small, and split if they are large, shape (N,) bool."""
         return self.statistics.mean_gradient >= self.config.densify_gradient
 
+    def select(self, optimizer: GaussianOptimizer, keep: Tensor) -> None:
+        """Keep some Gaussians, (N,) bool, with what was counted of them."""
+        optimizer.select(keep)
+        self.statistics = self.statistics[keep]
+
     def split_generator(self, step: int) -> torch.Generator:
         """Return the random numbers of the splits of a step."""
         return stream(self.config.seed, step, "split", self.device)

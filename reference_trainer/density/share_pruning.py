@@ -58,8 +58,7 @@ class SharePruning(AdaptiveDensity):
             first = values.argsort(descending=True, stable=True)[: round(self.fraction * len(values))]
             keep = torch.ones_like(values, dtype=torch.bool)
             keep[first[values[first] > 0]] = False
-            optimizer.select(keep)
-            self.statistics = self.statistics[keep]
+            self.select(optimizer, keep)
 
     def shares_per_weight(self, optimizer: GaussianOptimizer, step: int) -> Tensor:
         """Return the quotients over the training views of the Gaussians as they are, shape (N,), float64."""

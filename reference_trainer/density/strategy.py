@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
@@ -17,6 +18,7 @@ from reference_trainer.scenes.scene import Scene
 
 if TYPE_CHECKING:
     from reference_trainer.training.config import TrainConfig
+    from reference_trainer.training.field import Field
 
 __all__ = ["DensityStrategy"]
 
@@ -32,12 +34,15 @@ class DensityStrategy(abc.ABC):
     counted with their gradient of zero, a threshold would in effect rise by 1 / (1 - p).
 
     Attributes:
-        needs: of the renderer: ``"absgrad"`` for ``splats.projection.means.absgrad``, sums of absolute gradients.
+        needs: of the renderer: ``"absgrad"`` for ``splats.projection.means.absgrad``, sums of absolute gradients; of
+            the training: ``"fields"``, at least two.
         resets: whether it obeys the ``opacity_reset`` settings.
+        field: the number of the field that it controls, if a training has several.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset()
     resets: ClassVar[bool] = False
+    field: int = 0
 
     config: TrainConfig
     extent: float
@@ -53,7 +58,8 @@ class DensityStrategy(abc.ABC):
             device: of the Gaussians.
             count: their number.
         """
-        self.config, self.extent, self.white, self.device = config, scene.extent, scene.is_white, device
+        self.config = replace(config, seed=config.seed + (self.field << 32))  # every field splits by its own numbers
+        self.extent, self.white, self.device = scene.extent, scene.is_white, device
         self.reset(count)
 
     def is_due(self, step: int) -> bool:
@@ -74,6 +80,9 @@ class DensityStrategy(abc.ABC):
         Raises:
             TrainingStoppedError: if the Gaussians are not finite, or none is left.
         """
+
+    def together(self, fields: Sequence[Field], step: int) -> None:  # noqa: B027 (most look at one field alone)
+        """Change what depends on other fields, after each has had its `before_step`; the first one's is called."""
 
     def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:  # noqa: B027
         """Look at a render whose gradients have been computed.

@@ -4,6 +4,7 @@ from ca_reg.registry import Registry
 from ca_reg.schedules import SCHEDULES
 from reference_trainer.losses.alpha import Alpha
 from reference_trainer.losses.co_adaptation import CoAdaptation
+from reference_trainer.losses.co_regularization import CoRegularization
 from reference_trainer.losses.consistency import Consistency
 from reference_trainer.losses.flat import Flat
 from reference_trainer.losses.opacity import Opacity
@@ -34,5 +35,6 @@ for _name, _term in {
     "opacity": Opacity,
     "co_adaptation": CoAdaptation,
     "consistency": Consistency,
+    "co_regularization": CoRegularization,
 }.items():
     LOSSES.register(_name)(_term)

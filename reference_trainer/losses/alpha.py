@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -12,7 +11,7 @@ from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import WeightedTerm
 
 if TYPE_CHECKING:
-    from reference_trainer.scenes.scene import View
+    from reference_trainer.scenes.scene import Scene
     from reference_trainer.training.step import Step
 
 __all__ = ["Alpha", "dark_background"]
@@ -38,9 +37,9 @@ class Alpha(WeightedTerm):
             raise ValueError(f"dark must be in (0, 1], got {dark}.")
         self.dark = dark
 
-    def begin(self, views: Sequence[View]) -> None:
+    def begin(self, scene: Scene) -> None:
         """Refuse photographs of which nothing tells the background."""
-        if self.dark is None and (lacking := [view.name for view in views if view.alpha is None]):
+        if self.dark is None and (lacking := [view.name for view in scene.train if view.alpha is None]):
             raise ValueError(
                 f"{lacking} have no alpha channel, which alpha compares with: write alpha(dark=0.118) if the "
                 "background is black."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,7 +11,7 @@ from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import PriorTerm
 
 if TYPE_CHECKING:
-    from reference_trainer.scenes.scene import View
+    from reference_trainer.scenes.scene import Scene
     from reference_trainer.training.step import Step
 
 __all__ = ["Pearson"]
@@ -37,11 +36,11 @@ class Pearson(PriorTerm):
         super().__init__(weight)
         self.offset = offset
 
-    def begin(self, views: Sequence[View]) -> None:
+    def begin(self, scene: Scene) -> None:
         """Refuse priors that are missing or that the offset does not exceed."""
-        super().begin(views)
+        super().begin(scene)
         if self.offset is not None:
-            for view in views:
+            for view in scene.train:
                 assert view.depth_prior is not None
                 if (largest := view.depth_prior.nan_to_num(-torch.inf).max().item()) >= self.offset:
                     raise ValueError(

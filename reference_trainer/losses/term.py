@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
@@ -11,7 +10,7 @@ from torch import Tensor
 from ca_reg.schedules import Schedule, as_schedule
 
 if TYPE_CHECKING:
-    from reference_trainer.scenes.scene import View
+    from reference_trainer.scenes.scene import Scene
     from reference_trainer.training.step import Step
 
 __all__ = ["LossTerm", "PriorTerm", "WeightedTerm"]
@@ -22,15 +21,15 @@ class LossTerm(abc.ABC):
 
     Attributes:
         needs: of the renderer, beside image and alpha: ``"depth"``, which the render of the step then has, or
-            ``"moments"``.
+            ``"moments"``; of the training: ``"fields"``, at least two.
         analytic: whether the term knows what to do with an expected image and its variance, without a draw.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset()
     analytic: ClassVar[bool] = False
 
-    def begin(self, views: Sequence[View]) -> None:  # noqa: B027
-        """Look at the training views before the first step.
+    def begin(self, scene: Scene) -> None:  # noqa: B027
+        """Look at the training views and the initial points before the first step.
 
         Raises:
             ValueError: if they lack what the term compares with.
@@ -90,9 +89,9 @@ class PriorTerm(WeightedTerm):
 
     needs: ClassVar[frozenset[str]] = frozenset({"depth"})
 
-    def begin(self, views: Sequence[View]) -> None:
+    def begin(self, scene: Scene) -> None:
         """Raise a ValueError, which names them, if photographs have no prior."""
-        if lacking := [view.name for view in views if view.depth_prior is None]:
+        if lacking := [view.name for view in scene.train if view.depth_prior is None]:
             raise ValueError(
                 f"{type(self).__name__} compares with a depth of every training photograph, which {lacking} lack: name "
                 'a folder of PNG or NPY files with --depth, or "points" for what the initial points tell.'

@@ -92,10 +92,11 @@ class GaussianOptimizer:
             for (_, x), (_, value) in zip(self.gaussians.named(), new.named(), strict=True):
                 x[index] = value
 
-    def forget(self, index: Tensor) -> None:
-        """Clear the optimizer state of the Gaussians of ``index`` (bool mask or positions)."""
-        for _, x in self.gaussians.named():
-            self._forget(x, index)
+    def forget(self, index: Tensor | slice, *names: str) -> None:
+        """Clear the optimizer state of the Gaussians of ``index`` (bool mask or positions), of all or some names."""
+        for name, x in self.gaussians.named():
+            if not names or name in names:
+                self._forget(x, index)
 
     def state_dict(self) -> dict[str, Any]:
         """Return parameters and moments as plain tensors, for a checkpoint."""

@@ -7,11 +7,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from reference_trainer.camera import Camera
+from reference_trainer.camera import Camera, pixels_of
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.training.initial import pixels_of
 
 __all__ = ["check_frame"]
 

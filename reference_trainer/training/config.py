@@ -40,8 +40,12 @@ class TrainConfig:
     """Terms of the loss, such as "photometric(0.2) + co_adaptation(3.0)", or "my_module:MyTerm"."""
     density: str = "adaptive"
     """Density control: "adaptive", "absgrad", "proximity", "ray_boxes", "mcmc", "share_pruning(every=500)",
-    or "my_module:MyStrategy"."""
+    "co_pruning(5.0)", "self_ensembling", or "my_module:MyStrategy"."""
 
+    fields: int = 1
+    """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
+    random_background: bool = False
+    """Train over a color drawn anew at each step, which makes what is transparent an error (CoR-GS, SE-GS)."""
     renderer: str = "torch"
     """What draws in training: "torch", this package's renderer, "gsplat", which needs it and a CUDA device, or
     "my_module:MyRenderer"."""
@@ -155,11 +159,13 @@ class TrainConfig:
 
         return LOSSES.make(self.loss)
 
-    def make_density(self) -> DensityStrategy:
-        """Make the density control."""
+    def make_density(self, field: int = 0) -> DensityStrategy:
+        """Make the density control of a field."""
         from reference_trainer.density import DENSITY
 
-        return DENSITY.make_one(self.density)
+        density = DENSITY.make_one(self.density)
+        density.field = field
+        return density
 
     def make_renderer(self) -> Renderer:
         """Make the renderer."""
@@ -174,14 +180,17 @@ class TrainConfig:
         renderer, terms = self.make_renderer(), self.make_losses()
         if not terms:
             raise ValueError("loss needs at least one term, such as photometric.")
+        if self.fields < 2 and "fields" in density.needs.union(*(term.needs for term in terms)):
+            raise ValueError(f"{self.loss} with {self.density} compares fields, of which there is one: set fields=2.")
         if self.analytic and "moments" not in renderer.capabilities:
             raise ValueError("analytic training needs the moments of the torch renderer: leave out renderer.")
         if self.analytic and "absgrad" in density.needs:
             raise ValueError(f"analytic training has no absolute gradients, which {self.density} needs: leave it out.")
-        if density.needs - renderer.capabilities:
+        capabilities = renderer.capabilities | {"fields"}
+        if density.needs - capabilities:
             needs = ", ".join(sorted(density.needs))
             raise ValueError(f"{self.density} needs {needs}, which the renderer {self.renderer} lacks.")
-        if lacking := set().union(*(term.needs for term in terms)) - renderer.capabilities:
+        if lacking := set().union(*(term.needs for term in terms)) - capabilities:
             raise ValueError(f"the loss needs {', '.join(sorted(lacking))}, which the renderer {self.renderer} lacks.")
         if self.analytic and (drawn := [type(term).__name__ for term in terms if not term.analytic]):
             raise ValueError(
@@ -190,7 +199,7 @@ class TrainConfig:
 
 
 _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
-    (("iterations",), lambda x: x >= 1, "at least 1", ""),
+    (("iterations", "fields"), lambda x: x >= 1, "at least 1", ""),
     (("dropout",), lambda x: 0 <= x < 1, "in [0, 1)", ": 0 turns it off"),
     (("noise",), lambda x: x >= 0, "at least 0", ": 0 turns it off"),
     (("seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from"),

@@ -6,13 +6,12 @@ import torch
 from torch import Tensor
 
 from ca_reg.neighbors import mean_neighbor_distance
-from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["drawn_by_any", "initial_gaussians", "pixels_of"]
+__all__ = ["drawn_by_any", "initial_gaussians"]
 
 
 def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
@@ -58,15 +57,3 @@ def drawn_by_any(gaussians: Gaussians, views: tuple[View, ...]) -> Tensor:
         splats = render_gaussians(gaussians, view.camera, torch.zeros(3), sh_degree=0).splats
         drawn[splats.indices[splats.lists.touched]] = True
     return drawn
-
-
-def pixels_of(positions: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Return column and row of the pixel of every point, clamped to the picture, and whether the picture holds it."""
-    pixels, depth = camera.project(positions)
-    column, row = pixels.unbind(1)
-    within = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    return (
-        column.nan_to_num().clamp(0, camera.width - 1).long(),
-        row.nan_to_num().clamp(0, camera.height - 1).long(),
-        within,
-    )

@@ -9,10 +9,11 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from reference_trainer.camera import pixels_of
 from reference_trainer.losses import Photometric
 from reference_trainer.scenes.scene import PointCloud, Scene
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.initial import drawn_by_any, initial_gaussians, pixels_of
+from reference_trainer.training.initial import drawn_by_any, initial_gaussians
 
 __all__ = ["RULES", "Finding"]
 

@@ -39,6 +39,14 @@ _INRIA = TrainConfig(
     opacity_reset_from=3_000,
     opacity_reset_over_white=True,
 )
+_CORGS = TrainConfig(
+    iterations=10_000,
+    fields=2,
+    random_background=True,
+    opacity_reset_from=501,
+    loss="photometric + co_regularization(between(1.0, 500))",
+    density="co_pruning(5.0)",
+)
 _LOUDER = 1.2  # DNGaussian's L1 + 0.2 (1 - SSIM) over (1 - l) L1 + l (1 - SSIM) with l = 0.2 / 1.2
 
 RECIPES: dict[str, Recipe] = {
@@ -95,6 +103,19 @@ RECIPES: dict[str, Recipe] = {
         ),
         "Binocular3DGS (NeurIPS 2024), hanl2010/Binocular3DGS 2b3b7a4",
         "each view once an epoch; pictures with masks need the term alpha, and a world in other units a shift of warp",
+    ),
+    "corgs": Recipe(
+        _CORGS,
+        "CoR-GS (ECCV 2024) on LLFF, jiaw-z/CoR-GS 1db13a4",
+        "pseudo views between near and far of the initial points, drawn at each step; the fields' splits are seeded "
+        "apart",
+        "initial points, cameras that look to one side, a world in LLFF's units",
+    ),
+    "segs": Recipe(
+        dataclasses.replace(_CORGS, density="self_ensembling(start=2_000, stop=9_500)", means_rate_final=1.6e-4),
+        "SE-GS (ICCV 2025) on LLFF, sailor-z/SE-GS 43668d7",
+        "as corgs; what is uncertain is seen over the scene's background, Gaussians below 1/255 are not perturbed",
+        "as corgs",
     ),
     "mvgs": Recipe(
         dataclasses.replace(_INRIA, loss="photometric + views(3)", density="ray_boxes"),

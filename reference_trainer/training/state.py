@@ -19,7 +19,8 @@ from reference_trainer.training.config import TrainConfig
 __all__ = ["TrainingState", "read_state"]
 
 _TIMES = ("seconds", "processor_seconds")
-_ENTRIES = ("config", "scene", "train_views", "step", *_TIMES, "statistics", "regularizer", "gaussians", "moments")
+_ENTRIES = ("format", "config", "scene", "train_views", "step", *_TIMES)
+_OF_A_FIELD = ("statistics", "regularizer", "gaussians", "moments")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
@@ -31,18 +32,14 @@ class TrainingState(NamedTuple):
         step: number of steps taken.
         seconds: time that they took.
         processor_seconds: of all threads.
-        statistics: of density control.
-        regularizer: what the regularizers found so far.
-        optimizer: what `GaussianOptimizer.state_dict` returned.
+        fields: what `Field.state_dict` returned of each.
     """
 
     config: TrainConfig
     step: int
     seconds: float
     processor_seconds: float
-    statistics: dict[str, Tensor]
-    regularizer: dict[str, Tensor]
-    optimizer: dict[str, Any]
+    fields: list[dict[str, Any]]
 
 
 def read_state(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
@@ -65,7 +62,8 @@ def read_state(state: dict[str, Any], scene: Scene, where: Path) -> TrainingStat
 
 def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
     """Read a state; what is of a type that is not checked for is a TypeError, an AttributeError or a LookupError."""
-    _refuse_other_entries(state, ("format", *_ENTRIES), f"{where}")
+    others = ["others"] if "others" in state else []
+    _refuse_other_entries(state, (*_ENTRIES, *_OF_A_FIELD, *others), f"{where}")
     names = [view.name for view in scene.train]
     if state["scene"] != scene.name:
         raise ValueError(f"{where} was trained on the scene {state['scene']!r:.80}, this one is {scene.name!r}.")
@@ -77,6 +75,21 @@ def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
         raise ValueError(f"{where}: step must be a whole number from 0 to {config.iterations}, got {step!r:.80}.")
     if not all(type(x) is float and 0 <= x < math.inf for x in times):
         raise ValueError(f"{where}: {' and '.join(_TIMES)} must be positive numbers, got {times!r:.80}.")
+    fields = [{name: state[name] for name in _OF_A_FIELD}, *(state["others"] if others else ())]
+    if len(fields) != config.fields:
+        raise ValueError(f"{where}: expected {config.fields} fields, got {len(fields)}; the checkpoint is damaged.")
+    read = [
+        _read_field(field, config, scene, step, number, f"{where}{f', field {number}' if number else ''}")
+        for number, field in enumerate(fields)
+    ]
+    return TrainingState(config, step, *times, read)
+
+
+def _read_field(
+    state: dict[str, Any], config: TrainConfig, scene: Scene, step: int, number: int, where: str
+) -> dict[str, Any]:
+    """Read the state of one of the fields."""
+    _refuse_other_entries(state, _OF_A_FIELD, where)
     tensors, moments = state["gaussians"], state["moments"]
     parameters = [*PARAMETERS, *config.make_regularizer().learns]
     _refuse_other_entries(tensors, parameters, f"{where}, gaussians")
@@ -93,7 +106,7 @@ def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
         _check(x, tuple(x.shape), f"{where}, {name}")
         if moments[name] != {}:  # as before the first step
             _check_moments(moments[name], tuple(x.shape), step, f"{where}, moments of {name}")
-    counts = config.make_density()
+    counts = config.make_density(number)
     counts.begin(config, scene, gaussians.means.device, len(gaussians))
     expected = counts.state_dict()
     _refuse_other_entries(state["statistics"], expected, f"{where}, statistics")
@@ -105,7 +118,7 @@ def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
     if type(found) is not dict or not all(isinstance(x, Tensor) and bool(x.isfinite().all()) for x in found.values()):
         raise ValueError(f"{where}, regularizer: expected finite tensors by name; the checkpoint is damaged.")
     plain = {name: {key: x.detach() for key, x in of.items()} for name, of in moments.items()}
-    return TrainingState(config, step, *times, statistics, found, {"gaussians": tensors, "moments": plain})
+    return {"statistics": statistics, "regularizer": found, "gaussians": tensors, "moments": plain}
 
 
 def _config(text: Any, where: Path) -> TrainConfig:

@@ -38,6 +38,8 @@ class Step:
         seed: of the training.
         renderer: what draws.
         absgrad: whether density control is to see absolute gradients.
+        label: of the random numbers.
+        fields: the steps of all fields at this view, the first one's first.
 
     Attributes:
         params: the parameters of the view's camera, activated, as they are without a regularizer.
@@ -59,12 +61,13 @@ class Step:
     seed: int
     renderer: Callable[..., Any]
     absgrad: bool = False
+    label: str = ""
+    fields: Sequence[Step] = ()
     image: Tensor = field(init=False)
     drawn: Params = field(init=False)
     variance: Tensor | None = field(default=None, init=False)
     rendering: Rendering | None = field(default=None, init=False)
     observed: list[tuple[Splats | GsplatSplats, Camera]] = field(default_factory=list, init=False)
-    _label: str = field(default="", init=False)
 
     def __post_init__(self) -> None:
         self.params = self.gaussians.params(self.view.camera, step=self.number)
@@ -97,7 +100,7 @@ class Step:
         """
         other = copy(self)
         other.view, other.params = view, self.gaussians.params(view.camera, step=self.number)
-        other._label = f"{view.name}/"
+        other.label += f"{view.name}/"
         if self.rendering is None:
             other.expect()
         else:
@@ -147,4 +150,4 @@ class Step:
 
     def generator(self, purpose: str) -> torch.Generator:
         """Return random numbers that depend on the seed, the step and a label alone: a resumed training draws them."""
-        return stream(self.seed, self.number, self._label + purpose, self.gaussians.means.device)
+        return stream(self.seed, self.number, self.label + purpose, self.gaussians.means.device)

@@ -13,15 +13,14 @@ import torch
 
 from ca_reg import Chain
 from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
 from reference_trainer.render import NotFiniteError
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
-from reference_trainer.training.initial import initial_gaussians
+from reference_trainer.training.field import Field
 from reference_trainer.training.interruption import hold_interrupts
-from reference_trainer.training.randomness import view_order
+from reference_trainer.training.randomness import stream, view_order
 from reference_trainer.training.state import read_state
 from reference_trainer.training.step import Step
 
@@ -41,10 +40,15 @@ class Trainer:
         seconds: wall-clock time that they took.
         processor_seconds: what all threads of the processor spent on them: the fairer figure beside other work.
         renderer: what draws the draws of the regularizers.
+        fields: the models; the first is the one that is measured and written.
+        optimizer: of the first.
+        density: likewise.
+        regularizer: likewise.
 
     Raises:
         ValueError: if the scene has no initial points, its photographs lack what a term of the loss compares with, or
-            the training is to be analytic and a regularizer has no exact expectation.
+            show a background where it is to be random, or the training is to be analytic and a regularizer has no
+            exact expectation.
         ImportError: if gsplat is to draw, and is missing.
         RuntimeError: if gsplat is to draw on something else than a CUDA device.
 
@@ -67,19 +71,20 @@ class Trainer:
         self.seconds = self.processor_seconds = 0.0
         self.views = [view.to(self.device) for view in scene.train]
         self.background = scene.background.to(self.device)
-        self.regularizer = config.make_regularizer()
+        self.fields = [Field(scene, config, self.device, number) for number in range(config.fields)]
+        first = self.fields[0]
+        self.optimizer, self.density, self.regularizer = first.optimizer, first.density, first.regularizer
         self.losses = config.make_losses()
         for term in self.losses:
-            term.begin(self.views)
-        self.optimizer = GaussianOptimizer(self._start().to(self.device), self._rates())
-        self.density = config.make_density()
-        self.density.begin(config, scene, self.device, len(self.gaussians))
+            term.begin(scene)
+        if config.random_background and any(view.alpha is not None for view in scene.train):
+            raise ValueError(f"the photographs of {scene.name!r} lie on a background already: leave random_background.")
         if config.analytic:
             self._refuse_draws_without_multiplier()
 
     @property
     def gaussians(self) -> Gaussians:
-        """The model as it stands."""
+        """The model as it stands, of the first field."""
         return self.optimizer.gaussians
 
     @property
@@ -133,16 +138,23 @@ class Trainer:
             stop_if_interrupted()  # also after the last step
 
     def train_step(self) -> tuple[float, float]:
-        """Take one step on one view; return the loss and the mean squared error of the (regularized) render."""
-        self.density.before_step(self.optimizer, self.step)
-        step = self._begin_step()
+        """Take one step on one view.
+
+        Returns:
+            The loss, of all fields together, and the mean squared error of the first one's (regularized) render.
+        """
+        for field in self.fields:
+            field.density.before_step(field.optimizer, self.step)
+        self.density.together(self.fields, self.step)
+        steps = self._begin_steps()
         terms = [term for term in self.losses if term.acts(self.step)]
         try:
-            if step.regularizer is self.regularizer and self.config.analytic:
-                step.expect()
-            else:
-                step.sample(depth=any("depth" in term.needs for term in terms))
-            loss = sum((term(step) for term in terms), start=step.image.new_zeros(()))
+            for step in steps:
+                if self.config.analytic and len(step.regularizer):
+                    step.expect()
+                else:
+                    step.sample(depth=any("depth" in term.needs for term in terms))
+            loss = sum((term(step) for step in steps for term in terms), start=steps[0].image.new_zeros(()))
         except NotFiniteError as error:
             raise TrainingStoppedError(f"step {self.step + 1} cannot be rendered: {error}") from error
         value = loss.item()
@@ -150,14 +162,16 @@ class Trainer:
             raise TrainingStoppedError(f"the loss became {value} at step {self.step + 1}: lower the learning rates.")
         if loss.requires_grad:
             loss.backward()  # type: ignore[no-untyped-call]
-            for splats, camera in step.observed:
-                if splats.projection.means.grad is not None:  # it has none if nothing was drawn, or no term saw it
-                    self.density.observe(splats, camera)
-            self.optimizer.set_means_rate(self._means_rate(self.step))
-            self.optimizer.step()
+            for field, step in zip(self.fields, steps, strict=True):
+                for splats, camera in step.observed:
+                    if splats.projection.means.grad is not None:  # none if nothing was drawn, or no term saw it
+                        field.density.observe(splats, camera)
+                field.optimizer.set_means_rate(self.config.means_rate_at(self.step) * self.scene.extent)
+                field.optimizer.step()
         self.step += 1
         with torch.no_grad():
-            mse = torch.mean((step.image.clamp(0, 1) - step.view.image) ** 2).item()
+            mse = torch.mean((steps[0].image.clamp(0, 1) - steps[0].view.image) ** 2).item()
+        steps.clear()  # each step knows all of them: in a cycle their graphs would wait for the garbage collector
         return value, mse
 
     def save(self, path: Path) -> None:
@@ -168,9 +182,9 @@ class Trainer:
                 replace a good one.
             OSError: if it cannot be written; what was there before is kept.
         """
-        optimizer = self.optimizer.state_dict()
-        tensors = [*optimizer["gaussians"].values(), *(x for of in optimizer["moments"].values() for x in of.values())]
-        if not all(bool(x.isfinite().all()) for x in tensors):
+        first, *others = [field.state_dict() for field in self.fields]
+        moved = [x for field in (first, *others) for x in (field["gaussians"], *field["moments"].values())]
+        if not all(bool(x.isfinite().all()) for tensors in moved for x in tensors.values()):
             raise TrainingStoppedError(
                 f"Gaussians became nan or infinite by step {self.step}, which is not saved: lower the learning rates."
             )
@@ -181,9 +195,8 @@ class Trainer:
             "step": self.step,
             "seconds": self.seconds,
             "processor_seconds": self.processor_seconds,
-            "statistics": self.density.state_dict(),
-            "regularizer": dict(self.regularizer.state_dict()),
-            **optimizer,
+            **first,
+            **({"others": others} if others else {}),
         }
         save_checkpoint(path, state)
 
@@ -208,32 +221,12 @@ class Trainer:
             raise ValueError(f"{path}, config: {error}") from error
         trainer.step = state.step
         trainer.seconds, trainer.processor_seconds = state.seconds, state.processor_seconds
-        trainer.optimizer.load_state_dict(state.optimizer)
-        trainer.density.reset(len(trainer.gaussians))
-        trainer.density.load_state_dict(state.statistics)
         try:
-            trainer.regularizer.load_state_dict(state.regularizer)
-        except (RuntimeError, ValueError) as error:
+            for field, of_field in zip(trainer.fields, state.fields, strict=True):
+                field.load_state_dict(of_field)
+        except ValueError as error:
             raise ValueError(f"{path}, regularizer: {error}") from error
         return trainer
-
-    def _rates(self) -> LearningRates:
-        config = self.config
-        return LearningRates(
-            means=self._means_rate(0),
-            log_scales=config.scales_rate,
-            quaternions=config.quaternions_rate,
-            opacity_logits=config.opacity_rate,
-            sh_dc=config.color_rate,
-            sh_rest=config.color_rate / 20,
-            learned={name: learned.rate for name, learned in self.regularizer.learns.items()},
-        )
-
-    def _start(self) -> Gaussians:
-        """Return the Gaussians to start from, with what the regularizers learn of each."""
-        start = initial_gaussians(self.scene, self.config)
-        learned = {name: torch.full((len(start),), x.start) for name, x in self.regularizer.learns.items()}
-        return dataclasses.replace(start, learned=learned)
 
     def _refuse_draws_without_multiplier(self) -> None:
         """Raise a ValueError if a regularizer has no exact expectation."""
@@ -246,21 +239,26 @@ class Trainer:
                 f"{', '.join(names)} are not: leave out analytic."
             )
 
-    def _begin_step(self) -> Step:
-        """Choose the view of the step, and what regularizes it."""
-        begun = self.step >= self.config.regularize_from
-        return Step(
-            self.step,
-            self.views[view_order(self.config.seed, self.step, len(self.views))],
-            self.views,
-            self.gaussians,
-            self.regularizer if begun else Chain(),
-            self.background,
-            sh_degree=self.config.sh_degree_at(self.step + 1),
-            seed=self.config.seed,
-            renderer=self.renderer,
-            absgrad="absgrad" in self.density.needs,
-        )
-
-    def _means_rate(self, step: int) -> float:
-        return self.config.means_rate_at(step) * self.scene.extent
+    def _begin_steps(self) -> list[Step]:
+        """Choose the view of the step, and what regularizes it: one for every field."""
+        begun, steps, background = self.step >= self.config.regularize_from, list[Step](), self.background
+        if self.config.random_background:
+            generator = stream(self.config.seed, self.step, "background", self.device)
+            background = torch.rand(3, generator=generator, device=self.device)
+        for field in self.fields:
+            step = Step(
+                self.step,
+                self.views[view_order(self.config.seed, self.step, len(self.views))],
+                self.views,
+                field.gaussians,
+                field.regularizer if begun else Chain(),
+                background,
+                sh_degree=self.config.sh_degree_at(self.step + 1),
+                seed=self.config.seed,
+                renderer=self.renderer,
+                absgrad="absgrad" in self.density.needs,
+                label=field.label,
+                fields=steps,
+            )
+            steps.append(step)
+        return steps

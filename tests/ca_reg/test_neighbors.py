@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ca_reg import neighbors
-from ca_reg.neighbors import mean_neighbor_distance, nearest_neighbors
+from ca_reg.neighbors import mean_neighbor_distance, nearest_distance, nearest_neighbors
 
 
 def _points(kind: str, n: int) -> torch.Tensor:
@@ -113,3 +113,26 @@ def test_duplicates_get_the_floor():
 def test_neighbor_distance_refuses_other_shapes(shape):
     with pytest.raises(ValueError, match="shape"):
         mean_neighbor_distance(torch.zeros(shape))
+
+
+@pytest.mark.parametrize("tree", [True, False])
+@pytest.mark.parametrize("chunk", [4_000_000, 1800, 1])
+@pytest.mark.parametrize(("n", "m", "d"), [(50, 601, 3), (601, 7, 2), (3, 1, 3), (0, 5, 3)])
+def test_the_nearest_of_other_points_equal_to_the_full_matrix(monkeypatch, tree, chunk, n, m, d):
+    if tree:
+        pytest.importorskip("scipy")
+    monkeypatch.setattr(neighbors, "TREE_FROM", 0 if tree else 10**9)
+    monkeypatch.setattr(neighbors, "CHUNK_ELEMENTS", chunk)
+    g = torch.Generator().manual_seed(n)
+    points, others = torch.randn(n, d, generator=g), torch.randn(m, d, generator=g)
+    points[: n // 2] = others[torch.arange(n // 2) % m]  # some at one place
+    expected = (points.double()[:, None] - others.double()).square().sum(-1).amin(1).sqrt()
+    found = nearest_distance(points, others)
+    assert found.dtype == points.dtype
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("shapes", [((4, 3), (5, 2)), ((4, 3), (0, 3)), ((4,), (4, 3))])
+def test_other_points_of_a_wrong_shape_are_refused(shapes):
+    with pytest.raises(ValueError, match=r"expected points \(N, D\) and at least one other"):
+        nearest_distance(*(torch.zeros(shape) for shape in shapes))

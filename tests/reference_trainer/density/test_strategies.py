@@ -32,6 +32,8 @@ ALL = {
     "mcmc": "mcmc(growth=1.2)",
     "ray_boxes": "ray_boxes(height=5, width=8)",
     "share_pruning": "share_pruning(every=3, fraction=0.1)",
+    "co_pruning": "co_pruning(0.5, every=3)",
+    "self_ensembling": "self_ensembling(2.0, every=2, start=4, stop=13, views=2)",
 }
 
 
@@ -59,6 +61,12 @@ def begun(expression: str, scene, count: int, **settings) -> DensityStrategy:
     return strategy
 
 
+def short(config: TrainConfig, expression: str, iterations: int) -> TrainConfig:
+    """Settings with this density control, and as many fields as it compares."""
+    fields = 2 if "fields" in DENSITY.make_one(expression).needs else 1
+    return dataclasses.replace(config, density=expression, iterations=iterations, prune_size=None, fields=fields)
+
+
 # All of them
 
 
@@ -68,7 +76,7 @@ def test_all_are_tested():
 
 @pytest.mark.parametrize("expression", ALL.values(), ids=ALL)
 def test_a_resumed_training_is_identical(tiny_scene, busy, tmp_path, expression):
-    config = dataclasses.replace(busy, density=expression, iterations=14, prune_size=None)
+    config = short(busy, expression, 14)
     whole = Trainer(tiny_scene, config)
     whole.train()
     assert len(whole.gaussians) != 150  # or nothing would have happened
@@ -78,20 +86,14 @@ def test_a_resumed_training_is_identical(tiny_scene, busy, tmp_path, expression)
         part.save(tmp_path / "checkpoint.pt")
         again = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
         again.train()
-        states = [(x.optimizer.state_dict(), x.density.state_dict()) for x in (whole, again)]
-        for name, x in states[0][0]["gaussians"].items():
-            assert torch.equal(x, states[1][0]["gaussians"][name]), name
-            for key, moment in states[0][0]["moments"][name].items():
-                assert torch.equal(moment, states[1][0]["moments"][name][key]), (name, key)
-        assert states[0][1].keys() == states[1][1].keys()
-        for name, x in states[0][1].items():
-            assert torch.equal(x, states[1][1][name]), name
+        for one, other in zip(whole.fields, again.fields, strict=True):
+            torch.testing.assert_close(other.state_dict(), one.state_dict(), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("device", [pytest.param(CARD, marks=pytest.mark.slow), DEVICES[2]], indirect=True)
 @pytest.mark.parametrize("expression", ALL.values(), ids=ALL)
 def test_all_work_on_a_device(tiny_scene, busy, expression, device):
-    trainer = Trainer(tiny_scene, dataclasses.replace(busy, density=expression, iterations=10), device)
+    trainer = Trainer(tiny_scene, short(busy, expression, 10), device)
     trainer.train()
     assert len(trainer.gaussians) != 150
     assert all(bool(x.isfinite().all()) for _, x in trainer.gaussians.named())
@@ -116,6 +118,13 @@ def test_all_work_on_a_device(tiny_scene, busy, expression, device):
         ("share_pruning(every=0)", "every must be at least 1"),
         ("share_pruning(fraction=1.0)", "fraction must be in"),
         ("share_pruning(drop_rate=0.0)", "drop_rate must be in"),
+        ("co_pruning(0)", "distance must be positive"),
+        ("co_pruning(every=0)", "every must be at least 1"),
+        ("self_ensembling(first=0.0)", "above 0|positive"),
+        ("self_ensembling(views=0)", "views >= 1"),
+        ("self_ensembling(share=1.0)", "share in"),
+        ("self_ensembling(least=-0.1)", "least >= 0"),
+        ("co_pruning", "compares fields, of which there is one: set fields=2"),
     ],
 )
 def test_bad_arguments_are_refused(expression, message):
@@ -155,7 +164,7 @@ def test_absgrad_counts_sums_of_absolute_values_of_what_was_drawn(tiny_scene):
     trainer = Trainer(tiny_scene, config)
     expected, counts = torch.zeros(150, dtype=torch.float64), torch.zeros(150)
     for _ in range(3):
-        step = trainer._begin_step()
+        step = trainer._begin_steps()[0]
         drawn = step.regularizer.regularize(step.params, step.generator("regularizer"))
         with torch.no_grad():
             out = render_gaussians(drawn, step.view.camera, trainer.background, sh_degree=step.sh_degree)

@@ -48,11 +48,11 @@ def test_gradients(assert_gradients_of_differences):
     assert_gradients_of_differences(Alpha(0.7), "means", "opacity_logits", "log_scales")
 
 
-def test_arguments_and_photographs(three_views):
+def test_arguments_and_photographs(three_views, tiny_scene):
     for text, message in (("alpha(-1.0)", "weight must"), ("alpha(dark=0.0)", r"dark must be in \(0, 1\]")):
         with pytest.raises(ValueError, match=message):
             LOSSES.make(text)
     opaque = dataclasses.replace(three_views[1], alpha=None)
     with pytest.raises(ValueError, match=r"\['b'\] have no alpha.*dark"):
-        Alpha().begin([three_views[0], opaque])
-    Alpha(dark=0.1).begin([opaque])
+        Alpha().begin(dataclasses.replace(tiny_scene, train=(three_views[0], opaque)))
+    Alpha(dark=0.1).begin(dataclasses.replace(tiny_scene, train=(opaque,)))

@@ -52,13 +52,13 @@ def test_gradients(assert_gradients_of_differences):
     assert_gradients_of_differences(Pearson(0.7, 1.1), "means", "opacity_logits", "log_scales")
 
 
-def test_arguments_and_priors(three_views):
+def test_arguments_and_priors(three_views, tiny_scene):
     with pytest.raises(ValueError, match="weight must not be negative, got -1"):
         LOSSES.make("pearson(-1.0)")
     bare = dataclasses.replace(three_views[1], depth_prior=None)
     with pytest.raises(ValueError, match=r"\['b'\] lack.*--depth"):
-        Pearson().begin([three_views[0], bare])
+        Pearson().begin(dataclasses.replace(tiny_scene, train=(three_views[0], bare)))
     metric = dataclasses.replace(bare, depth_prior=torch.tensor([[torch.nan, 750.0]]))
     with pytest.raises(ValueError, match=r"prior of b reaches 750.*got 200.*offset=None"):
-        Pearson().begin([three_views[0], metric])
-    Pearson(offset=None).begin([three_views[0], metric])
+        Pearson().begin(dataclasses.replace(tiny_scene, train=(three_views[0], metric)))
+    Pearson(offset=None).begin(dataclasses.replace(tiny_scene, train=(three_views[0], metric)))

@@ -3,11 +3,11 @@ import dataclasses
 import pytest
 import torch
 
-from reference_trainer.camera import Camera
+from reference_trainer.camera import Camera, pixels_of
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.initial import drawn_by_any, initial_gaussians, pixels_of
+from reference_trainer.training.initial import drawn_by_any, initial_gaussians
 from reference_trainer.training.trainer import Trainer
 
 BEHIND = torch.tensor([[0.0, 0.0, -40.0]])

@@ -65,6 +65,15 @@ def dngaussian(white: bool) -> Iterator[Event]:  # scripts/run_llff.sh; its rese
             yield iteration, "prune", None
 
 
+def corgs(white: bool) -> Iterator[Event]:  # and SE-GS, by their LLFF scripts
+    for iteration in range(1, 10_001):
+        if iteration < 10_000 and iteration > 500 and iteration % 100 == 0:
+            yield iteration, "densify", 5e-4
+            yield iteration, "prune", None
+        if (iteration - 500 - 1) % 3_000 == 0 and iteration > 500:
+            yield iteration, "reset", 0.05
+
+
 def absgs(white: bool) -> Iterator[Event]:
     of = {iteration: list(events) for iteration, events in groupby(inria(white), lambda event: event[0])}
     for iteration in range(1, 30_001):
@@ -75,7 +84,7 @@ def absgs(white: bool) -> Iterator[Event]:
 
 CODE_BASES = {
     "3dgs": fsgs, "inria": inria, "fsgs": fsgs, "dngaussian": dngaussian, "binocular": binocular, "mvgs": inria,
-    "absgs": absgs,
+    "absgs": absgs, "corgs": corgs, "segs": corgs,
 }  # fmt: skip
 
 
@@ -154,7 +163,8 @@ def test_rates_and_thresholds(scene, name):
     assert all(group["eps"] == 1e-15 and group["betas"] == (0.9, 0.999) for group in groups.values())
     # DNGaussian's L1 + 0.2 (1 - SSIM) is this but for a factor.
     dssim = pytest.approx(0.2 / 1.2, abs=1e-6) if far > 1 else 0.2
-    assert (config.means_rate_final, config.make_losses()[0].lambda_dssim) == (pytest.approx(far * 1.6e-6), dssim)
+    last = 1.6e-4 if name == "segs" else far * 1.6e-6
+    assert (config.means_rate_final, config.make_losses()[0].lambda_dssim) == (pytest.approx(last), dssim)
     assert (config.prune_opacity, config.initial_opacity) == (0.01 if far > 1 else 0.005, 0.1)
     assert (config.dense_fraction, config.initial_scale) == (0.01, 1.0)
 
@@ -170,6 +180,8 @@ WEIGHTS = {
         "Opacity": lambda i: 0.001 / 1.2,
     },
     "mvgs": {"Views": lambda i: 1.0},
+    "corgs": {"CoRegularization": lambda i: float(i > 500)},
+    "segs": {"CoRegularization": lambda i: float(i > 500)},
 }
 
 

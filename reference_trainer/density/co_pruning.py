@@ -1,0 +1,62 @@
+"""CoR-GS's density control: what has no counterpart in the other field goes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+
+from ca_reg.neighbors import nearest_distance
+from reference_trainer.density.adaptive import AdaptiveDensity
+from reference_trainer.training.errors import TrainingStoppedError
+
+if TYPE_CHECKING:
+    from reference_trainer.training.field import Field
+
+__all__ = ["CoPruning"]
+
+
+class CoPruning(AdaptiveDensity):
+    """`AdaptiveDensity` that also prunes where the fields disagree (CoR-GS, Zhang et al. 2024, Sec. 3.3).
+
+    Every ``every`` steps after ``densify_from``, to the end of the training, a Gaussian goes that has no other field's
+    Gaussian nearer than a distance; all fields are compared as they were before one is pruned. It needs ``fields=2``.
+    Defaults are the source's for LLFF (jiaw-z/CoR-GS 1db13a4, train.py, lines 284-301).
+
+    Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; neighbors are looked for among all.
+
+    Args:
+        distance: world units, positive: 5 in the worlds of LLFF, 10 in those of DTU.
+        every: positive number of steps.
+
+    Raises:
+        ValueError: if one is out of range.
+    """
+
+    needs: ClassVar[frozenset[str]] = frozenset({"fields"})
+
+    def __init__(self, distance: float = 5.0, every: int = 500) -> None:
+        if not distance > 0:
+            raise ValueError(f"distance must be positive, got {distance}.")
+        if every < 1:
+            raise ValueError(f"every must be at least 1, got {every}: density control without it is 'adaptive'.")
+        self.distance, self.every = distance, every
+
+    def together(self, fields: Sequence[Field], step: int) -> None:
+        """Prune all fields."""
+        if not (step > self.config.densify_from and step % self.every == 0):
+            return
+        means = [field.gaussians.means.detach() for field in fields]
+        keeps = [
+            torch.stack([nearest_distance(own, other) < self.distance for other in means if other is not own]).all(0)
+            for own in means
+        ]
+        for field, keep in zip(fields, keeps, strict=True):
+            if not bool(keep.any()):
+                raise TrainingStoppedError(
+                    f"no Gaussian has one of another field within {self.distance:g} after step {step}: raise distance, "
+                    "which is in world units."
+                )
+            assert isinstance(field.density, AdaptiveDensity)
+            field.density.select(field.optimizer, keep)

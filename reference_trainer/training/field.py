@@ -1,0 +1,85 @@
+"""One model in training: its Gaussians, and all that changes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.initial import initial_gaussians
+
+__all__ = ["Field"]
+
+
+class Field:
+    """Gaussians with an optimizer, density control and regularizers of their own; a training has one, or several.
+
+    All fields of a training start from the same points. They become different by their random numbers: every field has
+    its own for the splits of density control and for the draws of regularizers and loss terms.
+
+    Args:
+        scene: with the points to start from.
+        config: all settings.
+        device: where to train.
+        number: of the field; the first, 0, is the one that is measured and written.
+
+    Attributes:
+        label: of the field's random numbers.
+
+    Raises:
+        ValueError: as `initial_gaussians`.
+
+    Example:
+        >>> from reference_trainer.scenes import synthetic_scene
+        >>> field = Field(synthetic_scene(width=16, height=12, points=50), TrainConfig(), "cpu")
+        >>> len(field.gaussians)
+        50
+    """
+
+    def __init__(self, scene: Scene, config: TrainConfig, device: torch.device | str, number: int = 0) -> None:
+        self.label = f"field {number}/" if number else ""
+        self.regularizer = config.make_regularizer()
+        learns, start = self.regularizer.learns, initial_gaussians(scene, config)
+        start = replace(start, learned={name: torch.full((len(start),), x.start) for name, x in learns.items()})
+        rates = LearningRates(
+            means=config.means_rate_at(0) * scene.extent,
+            log_scales=config.scales_rate,
+            quaternions=config.quaternions_rate,
+            opacity_logits=config.opacity_rate,
+            sh_dc=config.color_rate,
+            sh_rest=config.color_rate / 20,
+            learned={name: learned.rate for name, learned in learns.items()},
+        )
+        self.optimizer = GaussianOptimizer(start.to(device), rates)
+        self.density = config.make_density(number)
+        self.density.begin(config, scene, torch.device(device), len(start))
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The model as it stands."""
+        return self.optimizer.gaussians
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the next step depends on, as nested dicts of tensors."""
+        found = {"statistics": self.density.state_dict(), "regularizer": dict(self.regularizer.state_dict())}
+        return found | self.optimizer.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            ValueError: if the regularizers do not know their part.
+        """
+        self.optimizer.load_state_dict(dict(state))
+        self.density.reset(len(self.gaussians))
+        self.density.load_state_dict(state["statistics"])
+        try:
+            self.regularizer.load_state_dict(state["regularizer"])
+        except RuntimeError as error:
+            raise ValueError(str(error)) from error

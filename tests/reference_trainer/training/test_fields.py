@@ -1,0 +1,134 @@
+"""A training of two fields: what they share, what is their own, and what is saved of them."""
+
+import dataclasses
+import gc
+
+import pytest
+import torch
+
+from reference_trainer.runs.run import model_of
+from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.step import Step
+from reference_trainer.training.trainer import Trainer
+
+SEGS = "self_ensembling(1.0, every=3, start=6, stop=20, views=2)"
+
+
+def trained(scene, config: TrainConfig, until: int | None = None) -> Trainer:
+    trainer = Trainer(scene, config)
+    trainer.train(until=until)
+    return trainer
+
+
+@pytest.mark.parametrize("changes", [{}, {"analytic": True}, {"density": "mcmc(growth=1.2)", "regularizer": "d2gs"}])
+def test_the_first_of_two_that_are_not_compared_is_the_only_one(tiny_scene, busy, tmp_path, changes):
+    config = dataclasses.replace(busy, iterations=14, loss="photometric + views(2) + consistency", **changes)
+    if config.analytic:
+        config = dataclasses.replace(config, loss="photometric + views(2)")
+    alone, both = (trained(tiny_scene, dataclasses.replace(config, fields=n)) for n in (1, 2))
+    torch.testing.assert_close(both.fields[0].state_dict(), alone.fields[0].state_dict(), rtol=0, atol=0)
+    assert model_of(both).gaussians.means.data_ptr() == both.fields[0].gaussians.means.data_ptr()
+    for trainer in (alone, both):
+        trainer.save(tmp_path / "checkpoint.pt")
+        assert len(load_checkpoint(tmp_path / "checkpoint.pt").get("others", [])) == len(trainer.fields) - 1
+
+
+def test_fields_start_alike_and_draw_on_their_own(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, dropout=0.3, fields=3))
+    starts = [field.gaussians for field in trainer.fields]
+    assert all(torch.equal(starts[0].means, each.means) for each in starts)
+    assert len({each.means.data_ptr() for each in starts}) == 3
+    steps = trainer._begin_steps()
+    for step in steps:
+        step.sample(depth=False)
+    assert len({step.view.name for step in steps}) == 1
+    keeps = [field.regularizer.keep for field in trainer.fields]
+    assert not torch.equal(keeps[0], keeps[1])
+    assert not torch.equal(keeps[1], keeps[2])
+    random = [field.density.split_generator(7).initial_seed() for field in trainer.fields]
+    assert len(set(random)) == 3
+
+
+def test_a_training_of_two_fields_is_resumed_to_the_identical_result(tiny_scene, busy, tmp_path):
+    loss = "photometric + co_regularization(between(1.0, 4))"
+    config = dataclasses.replace(busy, iterations=16, loss=loss, density=SEGS, fields=2, regularizer="concrete")
+    whole = trained(tiny_scene, config)
+    assert len({len(field.gaussians) for field in whole.fields}) == 2
+    for at in (5, 8, 12):
+        part = trained(tiny_scene, config, until=at)
+        part.save(tmp_path / "checkpoint.pt")
+        again = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
+        again.train()
+        for one, other in zip(whole.fields, again.fields, strict=True):
+            torch.testing.assert_close(other.state_dict(), one.state_dict(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda s: s.pop("others"), "expected 2 fields, got 1"),
+        (lambda s: s["others"].clear(), "expected 2 fields, got 1"),
+        (lambda s: s["others"].append({}), "expected 2 fields, got 3"),
+        (lambda s: s.update(others=3), "damaged checkpoint"),
+        (lambda s: s["others"][0].pop("moments"), "field 1: it lacks 'moments'"),
+        (lambda s: s["others"][0].update(step=3), "field 1: unknown entry 'step'"),
+        (lambda s: s["others"][0]["gaussians"]["means"].fill_(torch.nan), "field 1, means: holds nan"),
+        (lambda s: s["others"][0]["statistics"].update(pictures=torch.zeros(1)), "field 1, statistics: unknown entry"),
+        (
+            lambda s: s["statistics"].update(pictures=torch.zeros(2, 3)),
+            "pictures: expected float32 of shape",
+        ),
+        (lambda s: s["statistics"].pop("pictures"), "statistics: it lacks 'pictures'"),
+    ],
+)
+def test_a_damaged_second_field_is_refused(tiny_scene, tmp_path, change, said):
+    path = tmp_path / "checkpoint.pt"
+    Trainer(tiny_scene, TrainConfig(iterations=30, density=SEGS, fields=2)).save(path)
+    state = load_checkpoint(path)
+    change(state)
+    save_checkpoint(path, state)
+    with pytest.raises(ValueError, match=said):
+        Trainer.load(path, tiny_scene)
+
+
+@pytest.mark.parametrize("settings", [{"loss": "photometric + co_regularization"}, {"density": "co_pruning"}])
+def test_what_compares_fields_needs_two(settings):
+    with pytest.raises(ValueError, match="compares fields, of which there is one: set fields=2"):
+        TrainConfig(**settings).check()
+    TrainConfig(**settings, fields=2).check()
+    with pytest.raises(ValueError, match="fields must be at least 1, got 0"):
+        TrainConfig(fields=0)
+
+
+def test_all_fields_train_over_one_random_background(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=9, fields=2, random_background=True))
+    colors = []
+    for _ in range(3):
+        steps = trainer._begin_steps()
+        assert torch.equal(steps[0].background, steps[1].background)
+        colors.append(steps[0].background)
+        steps[0].sample(depth=False)
+        behind = (1 - steps[0].rendering.alpha) * colors[-1][:, None, None]
+        over_black = steps[0].render(steps[0].view.camera).image - behind
+        dark = dataclasses.replace(steps[0], background=torch.zeros(3))
+        torch.testing.assert_close(dark.render(dark.view.camera).image, over_black, rtol=0, atol=1e-5)
+        trainer.train_step()
+    assert len({tuple(color.tolist()) for color in colors}) == 3
+    assert torch.equal(model_of(trainer).background, tiny_scene.background)
+    views = tuple(dataclasses.replace(view, alpha=torch.ones(24, 32)) for view in tiny_scene.train)
+    with pytest.raises(ValueError, match="lie on a background already"):
+        Trainer(dataclasses.replace(tiny_scene, train=views), trainer.config)
+
+
+@pytest.mark.parametrize("fields", [1, 2])
+def test_nothing_of_a_step_outlives_it(tiny_scene, fields):
+    loss = "photometric + views(2)" + " + co_regularization" * (fields == 2)
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, fields=fields, loss=loss))
+    gc.collect()
+    gc.disable()
+    try:
+        trainer.train_step()
+        assert not [x for x in gc.get_objects() if type(x) is Step]
+    finally:
+        gc.enable()
