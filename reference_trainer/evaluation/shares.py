@@ -9,12 +9,12 @@ from torch import Tensor
 
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.render import render
-from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.scene import Viewpoint
 
 __all__ = ["blend_weights", "share_per_weight"]
 
 
-def blend_weights(model: TrainedModel, views: Sequence[View]) -> Tensor:
+def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:
     """Return the weight with which every Gaussian enters the test-time renders, summed over all pixels and views.
 
     The image is linear in the colours, so the weights are the gradient of its sum: no approximation.
