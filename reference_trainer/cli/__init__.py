@@ -16,6 +16,7 @@ import tyro
 from reference_trainer.cli.drawing import Warmup
 from reference_trainer.cli.names import Names
 from reference_trainer.cli.ply import Bake
+from reference_trainer.cli.report import Report
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
 from reference_trainer.devices import check_device
@@ -57,6 +58,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "evaluate": Evaluate(),
         "bake": Bake(ply=tyro.MISSING),
         "render": Render(run=Path("runs/train")),
+        "report": Report(runs=tyro.MISSING),
         "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),
         "study": Study(tyro.MISSING),
         "names": Names(),
