@@ -16,7 +16,7 @@ from torch import Tensor
 from reference_trainer.files import replacing
 from reference_trainer.scenes.images import IMAGE_SUFFIXES
 
-__all__ = ["PANEL", "as_pillow", "file_names", "heat_map", "save_gif", "save_png", "side_by_side"]
+__all__ = ["PANEL", "as_pillow", "file_names", "heat_colors", "heat_map", "save_gif", "save_png", "side_by_side"]
 
 PANEL = "_panel"
 """What is appended to the name of a view's render to make that of its panel."""
@@ -108,6 +108,18 @@ def heat_map(values: Tensor, vmax: float) -> Tensor:
     index = (torch.where(defined, values, 0) / vmax).clamp(0, 1).mul(255).round().long()
     colours = torch.where(defined[..., None], table[index], torch.tensor(_UNDEFINED))
     return colours.permute(2, 0, 1).contiguous()
+
+
+def heat_colors(values: Tensor, low: float, high: float) -> Tensor:
+    """Return a colour per value, shape (N, 3), in [0, 1] on the CPU.
+
+    Args:
+        values: at least 0, may be infinite, shape (N,).
+        low: the value that gets the darkest colour, as do all below it; positive.
+        high: the value that gets the brightest colour, as do all above it. In between the scale is logarithmic.
+    """
+    along = (values.clamp(low, high) / low).log() / math.log(high / low)
+    return heat_map(along[None], 1.0)[:, 0].T
 
 
 def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: int | None = None) -> Tensor:

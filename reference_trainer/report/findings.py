@@ -13,14 +13,14 @@ from torch import Tensor
 from ca_reg import CAResult, Reason
 from reference_trainer.evaluation.evaluate import ca_picture, error_picture
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.shares import blend_weights, share_per_weight
+from reference_trainer.evaluation.pictures import heat_colors
+from reference_trainer.evaluation.shares import blend_weights, concentration, mean_shares, share_per_weight
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.render.eager.projection import rotation_matrices
 from reference_trainer.report.packing import jpeg, numbers
 from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
-from reference_trainer.studies.gaussian_shares import concentration, heat_colors, mean_shares
 
 __all__ = ["DROP_RATE", "Findings", "find"]
 

@@ -18,6 +18,7 @@ from ca_reg.dynamics import read_dynamics
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ERROR_PICTURE_RANGE
 from reference_trainer.evaluation.pictures import heat_map
 from reference_trainer.evaluation.results import markdown_table
+from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE
 from reference_trainer.evaluation.tables import comparison_table, evaluation_table
 from reference_trainer.files import write_text
 from reference_trainer.report.findings import Findings, find
@@ -25,7 +26,6 @@ from reference_trainer.report.packing import data_uri, jpeg
 from reference_trainer.runs.figures import dynamics_figure
 from reference_trainer.runs.folder import CONFIG, RESULTS, read_results, read_run_settings
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies.gaussian_shares import PER_WEIGHT_SCALE
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["labels", "write_report"]
