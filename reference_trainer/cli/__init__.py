@@ -15,7 +15,7 @@ import tyro
 
 from reference_trainer.cli.drawing import Warmup
 from reference_trainer.cli.names import Names
-from reference_trainer.cli.ply import Bake
+from reference_trainer.cli.ply import Bake, Clean
 from reference_trainer.cli.report import Report
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
@@ -57,6 +57,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "train": Train(config=config, preset=preset, given=given),
         "evaluate": Evaluate(),
         "bake": Bake(ply=tyro.MISSING),
+        "clean": Clean(ply=tyro.MISSING),
         "render": Render(run=Path("runs/train")),
         "report": Report(runs=tyro.MISSING),
         "compare": Compare(out=Path("runs/compare"), config=config, preset=preset),

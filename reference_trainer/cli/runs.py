@@ -17,7 +17,7 @@ from reference_trainer.runs.engines.choice import EngineName
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.training.config import PRESETS, TrainConfig, with_preset
 
-__all__ = ["Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
+__all__ = ["Compare", "Demo", "Evaluate", "Orbit", "Plan", "PlyScene", "Render", "Train", "given_fields"]
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
 Folder = Annotated[
