@@ -143,7 +143,7 @@ class Train:
                 say=print,
             )
         print(summary(results))
-        print(f"Everything is in {self.out}; curves: tensorboard --logdir {self.out}")
+        print(f"Everything is in {self.out}; a page: ca-reg report {self.out}; curves: tensorboard --logdir {self.out}")
 
 
 @dataclass(frozen=True)
