@@ -78,10 +78,13 @@ class Model {
       gl.attachShader(program, shader);
     }
     gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
     gl.useProgram(program);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     this.geometry = new Float32Array(bytes(run.geometry));
     const height = Math.ceil(run.count / ROW), bands = (run.degree + 1) ** 2;
+    const most = ROW * gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    if (run.count > most) throw new Error(`${run.label} has ${run.count} Gaussians; this browser draws up to ${most}.`);
     const texture = (unit, name, kind, format, type, width, values) => {
       const whole = new values.constructor(width * height * (format === gl.RGB ? 3 : 4));
       whole.set(values);
