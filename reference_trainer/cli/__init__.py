@@ -15,7 +15,8 @@ import tyro
 
 from reference_trainer.cli.drawing import Warmup
 from reference_trainer.cli.names import Names, Recipes
-from reference_trainer.cli.ply import Bake
+from reference_trainer.cli.ply import Bake, Clean
+from reference_trainer.cli.report import Report
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
 from reference_trainer.devices import check_device
@@ -58,7 +59,9 @@ def _parse(arguments: Sequence[str]) -> Any:
         "train": Train(config=config, recipe=recipe, given=given),
         "evaluate": Evaluate(),
         "bake": Bake(ply=tyro.MISSING),
+        "clean": Clean(ply=tyro.MISSING),
         "render": Render(run=Path("runs/train")),
+        "report": Report(runs=tyro.MISSING),
         "compare": Compare(out=Path("runs/compare"), config=config, recipe=recipe),
         "study": Study(tyro.MISSING),
         "names": Names(),

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-__all__ = ["Bake"]
+from reference_trainer.cli.drawing import Device, Draw, Drawing
+from reference_trainer.cli.runs import Orbit, PlyScene
+from reference_trainer.scenes.options import OrbitOptions
+
+__all__ = ["Bake", "Clean"]
 
 
 @dataclass(frozen=True)
@@ -32,3 +36,44 @@ class Bake:
         out = self.out or self.ply.with_name(f"{self.ply.stem}_for_viewers.ply")
         regularizer = bake_ply(self.ply, out, regularizer=self.regularizer)
         print(f"{out}: opacities are those of the test after {regularizer}, and marked so")
+
+
+@dataclass(frozen=True)
+class Clean:
+    """Take out of a PLY the Gaussians that co-adapt most for what they contribute, and refine; before and after.
+
+    On the photographs of its scene a few training steps close the holes; without a scene, on an orbit, they stay. For
+    models that were trained without a regularizer: after dropout there is little to take out.
+    """
+
+    ply: Annotated[Path, tyro.conf.Positional]
+    """A standard 3DGS PLY, opacities plain."""
+    scene: Annotated[PlyScene, tyro.conf.arg(name="")] = field(default_factory=PlyScene)
+    orbit: Orbit = field(default_factory=OrbitOptions)
+    fraction: float = 0.1
+    """Of the Gaussians to take out."""
+    refine: int = 100
+    """Training steps afterwards; 0 for none."""
+    regularizer: str | None = None
+    """What it was trained with, such as "dropout(0.2)"; PLYs of `ca-reg train` say so themselves."""
+    out: Path | None = None
+    """The file to write; by default <ply>_clean.ply."""
+    device: Device = "cpu"
+    drawing: Draw = field(default_factory=Drawing)
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.runs.clean import clean_ply
+
+        orbit = self.scene.path == "orbit"
+        self.drawing.begin(self.device, trains=not orbit)
+        clean_ply(
+            self.ply,
+            self.orbit if orbit else self.scene,
+            self.out or self.ply.with_name(f"{self.ply.stem}_clean.ply"),
+            fraction=self.fraction,
+            refine=self.refine,
+            background="black" if self.scene.background == "auto" else self.scene.background,
+            regularizer=self.regularizer,
+            device=self.device,
+        )

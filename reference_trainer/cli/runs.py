@@ -18,7 +18,7 @@ from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES
 
-__all__ = ["Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
+__all__ = ["Compare", "Demo", "Evaluate", "Orbit", "Plan", "PlyScene", "Render", "Train", "given_fields"]
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
 Folder = Annotated[
@@ -148,7 +148,7 @@ class Train:
                 say=print,
             )
         print(summary(results))
-        print(f"Everything is in {self.out}; curves: tensorboard --logdir {self.out}")
+        print(f"Everything is in {self.out}; a page: ca-reg report {self.out}; curves: tensorboard --logdir {self.out}")
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedMod
 from reference_trainer.render.statistics import color_variance_map
 from reference_trainer.scenes.scene import View, Viewpoint
 
-__all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "evaluate"]
+__all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "ca_picture", "error_picture", "evaluate"]
 
 CA_PICTURE_RANGE = 0.02
 """Variance that gets the brightest colour in CA heat maps."""
@@ -219,7 +219,7 @@ def _measure(
         if photograph is None:
             panels = render | _maps({"CA": ca, "exact": exact, "neutral": neutral})
         else:
-            error = heat_map((image - photograph).abs().mean(0), ERROR_PICTURE_RANGE)
+            error = error_picture(image, photograph)
             panels = {"photograph": photograph} | render | {"error": error} | _maps({"CA": ca})
         save_png(files[0], image)
         save_png(files[1], side_by_side([*panels.values()], [*panels]))
@@ -227,10 +227,15 @@ def _measure(
 
 
 def _maps(results: Mapping[str, CAResult]) -> dict[str, Tensor]:
-    """Return the variance of scores as pictures, grey where a pixel does not count, by name and value."""
-    return {
-        f"{name} {r.value * 1e3:.2f}e-3": heat_map(
-            r.variance.masked_fill(~r.visible, math.nan).float(), CA_PICTURE_RANGE
-        )
-        for name, r in results.items()
-    }
+    """Return the pictures of scores by name and value."""
+    return {f"{name} {result.value * 1e3:.2f}e-3": ca_picture(result) for name, result in results.items()}
+
+
+def ca_picture(result: CAResult) -> Tensor:
+    """Return the variance of a score as a picture (3, H, W), grey where a pixel does not count."""
+    return heat_map(result.variance.masked_fill(~result.visible, math.nan).float(), CA_PICTURE_RANGE)
+
+
+def error_picture(image: Tensor, photograph: Tensor) -> Tensor:
+    """Return the absolute difference of two pictures (3, H, W), mean of the channels, as a picture."""
+    return heat_map((image - photograph).abs().mean(0), ERROR_PICTURE_RANGE)

@@ -16,7 +16,7 @@ from torch import Tensor
 from reference_trainer.files import replacing
 from reference_trainer.scenes.images import IMAGE_SUFFIXES
 
-__all__ = ["PANEL", "file_names", "heat_map", "save_gif", "save_png", "side_by_side"]
+__all__ = ["PANEL", "as_pillow", "file_names", "heat_colors", "heat_map", "save_gif", "save_png", "side_by_side"]
 
 PANEL = "_panel"
 """What is appended to the name of a view's render to make that of its panel."""
@@ -59,19 +59,19 @@ def save_png(path: str | Path, image: Tensor) -> None:
 
     Raises ValueError if the shape is another or a value is NaN, and OSError if the file cannot be written.
     """
-    picture = _picture(image)
+    picture = as_pillow(image)
     with replacing(path) as place:
         picture.save(place, format="PNG")
 
 
 def save_gif(path: str | Path, images: Sequence[Tensor], *, fps: int = 20) -> None:
     """Write pictures, at least one, as an endless animation at ``fps`` pictures per second; else as `save_png`."""
-    frames = [_picture(image) for image in images]
+    frames = [as_pillow(image) for image in images]
     with replacing(path) as place:
         frames[0].save(place, "GIF", save_all=True, append_images=frames[1:], duration=1000 // fps, loop=0)
 
 
-def _picture(image: Tensor) -> Any:
+def as_pillow(image: Tensor) -> Any:
     """Return an image (3, H, W) as Pillow has it."""
     from PIL import Image
 
@@ -110,6 +110,18 @@ def heat_map(values: Tensor, vmax: float) -> Tensor:
     return colours.permute(2, 0, 1).contiguous()
 
 
+def heat_colors(values: Tensor, low: float, high: float) -> Tensor:
+    """Return a colour per value, shape (N, 3), in [0, 1] on the CPU.
+
+    Args:
+        values: at least 0, may be infinite, shape (N,).
+        low: the value that gets the darkest colour, as do all below it; positive.
+        high: the value that gets the brightest colour, as do all above it. In between the scale is logarithmic.
+    """
+    along = (values.clamp(low, high) / low).log() / math.log(high / low)
+    return heat_map(along[None], 1.0)[:, 0].T
+
+
 def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: int | None = None) -> Tensor:
     """Lay pictures (3, H, W) in [0, 1] of one size out in a grid, a label above each and a thin white gap between them.
 
@@ -130,7 +142,7 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
 
     if not images or len(images) != len(labels):
         raise ValueError(f"expected one label for each of at least one image, got {len(images)} and {len(labels)}.")
-    pictures = [_picture(image) for image in images]
+    pictures = [as_pillow(image) for image in images]
     if len({picture.size for picture in pictures}) != 1:
         raise ValueError(f"the images must have one size, got {[tuple(image.shape) for image in images]}.")
     columns = min(len(images), len(images) if columns is None else columns)

@@ -1,20 +1,26 @@
-"""What Gaussians contribute to the renders, and how much they co-adapt for it."""
+"""What Gaussians contribute to the renders, how much of the score is theirs, and how much they co-adapt for it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
+from ca_reg import CAResult, Reason, attribute, total_effects
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.render import render
-from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.scene import Viewpoint
 
-__all__ = ["blend_weights", "share_per_weight"]
+__all__ = ["PER_WEIGHT_SCALE", "blend_weights", "concentration", "mean_effects", "mean_shares", "share_per_weight"]
+
+PER_WEIGHT_SCALE = (0.1, 10.0)
+"""Ends of the colour scale of shares per blend weight, in units of the mean."""
+
+_TOP = (0.001, 0.01, 0.1)
 
 
-def blend_weights(model: TrainedModel, views: Sequence[View]) -> Tensor:
+def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:
     """Return the weight with which every Gaussian enters the test-time renders, summed over all pixels and views.
 
     The image is linear in the colours, so the weights are the gradient of its sum: no approximation.
@@ -51,3 +57,70 @@ def share_per_weight(shares: Tensor, weights: Tensor) -> Tensor:
         tensor([0.2500,    inf, 0.0000])
     """
     return torch.where(shares > 0, shares / weights, 0.0)
+
+
+def mean_shares(
+    model: TrainedModel, views: Sequence[Viewpoint], *, drop_rate: float = 0.5
+) -> tuple[Tensor, list[CAResult]]:
+    """Split the exact score of several views over the Gaussians.
+
+    Args:
+        model: what to measure.
+        views: on the model's device.
+        drop_rate: of the score.
+
+    Returns:
+        Shares, mean over the views that have a score, shape (N,), float64, which add up to the mean of these scores;
+        and the result of every view.
+
+    Raises:
+        ValueError: if no view has a score.
+    """
+    score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
+    return _mean_over_views(lambda view: attribute(score, model.shares, opacities, view), views)
+
+
+def mean_effects(model: TrainedModel, views: Sequence[Viewpoint], *, drop_rate: float = 0.5) -> Tensor:
+    """Return the total effects of the Gaussians in the same way as `mean_shares` their shares."""
+    score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
+    return _mean_over_views(lambda view: total_effects(score, opacities, view), views)[0]
+
+
+def concentration(shares: Tensor) -> dict[str, float]:
+    """Return how few Gaussians hold how much of the score.
+
+    Args:
+        shares: at least 0, not all 0, shape (N,).
+
+    Returns:
+        Under ``"top 1%"`` and the like the part of the score that this part of the Gaussians holds, the largest shares
+        first; under ``"half"`` the smallest part of the Gaussians that holds half of the score.
+
+    Example:
+        >>> shares = torch.ones(1000)
+        >>> shares[:10] = 100.0
+        >>> {name: round(part, 3) for name, part in concentration(shares).items()}
+        {'top 0.1%': 0.05, 'top 1%': 0.503, 'top 10%': 0.548, 'half': 0.01}
+    """
+    held = shares.double().sort(descending=True).values.cumsum(0)
+    held, n = held / held[-1], len(shares)
+    found = {f"top {part:.1%}".replace(".0%", "%"): held[max(1, round(part * n)) - 1].item() for part in _TOP}
+    return {**found, "half": (int((held < 0.5).sum()) + 1) / n}
+
+
+def _mean_over_views(
+    measure: Callable[[Viewpoint], tuple[Tensor, CAResult]], views: Sequence[Viewpoint]
+) -> tuple[Tensor, list[CAResult]]:
+    """Measure every view; return the mean over those that have a score, and all results."""
+    total, results = torch.zeros(()), []
+    for view in views:
+        values, result = measure(view)
+        results.append(result)
+        total = total.to(values) + values  # all 0 without a score
+    count = sum(result.reason is Reason.OK for result in results)
+    if count == 0:
+        raise ValueError(
+            f"none of the {len(views)} views has a score to attribute, because no pixel has an expected alpha above "
+            "the threshold: choose the other split, or a lower drop rate."
+        )
+    return total / count, results

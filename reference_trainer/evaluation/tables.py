@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
-from reference_trainer.evaluation.evaluate import Evaluation
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
 
 __all__ = ["comparison_table", "evaluation_table", "summary"]
@@ -31,11 +30,16 @@ _TITLES = {
 _NOT_EVERYWHERE = ("psnr", "ssim", "lpips", "depth_abs_rel", "depth_rmse")
 
 
-def evaluation_table(result: Evaluation) -> str:
-    """Return one row per view and the means of the splits; what only some views have only if one has it."""
-    rows = {f"{view.split} {view.name}": asdict(view) for view in result.views}
-    rows |= {f"mean {split}": mean for split, mean in result.as_dict()["mean"].items()}
-    left_out = {name for name in _NOT_EVERYWHERE if all(row[name] != row[name] for row in rows.values())}
+def evaluation_table(data: Mapping[str, Any]) -> str:
+    """Return one row per view and the means of the splits; what only some views have only if one has it.
+
+    The data are those of `Evaluation.as_dict`, or of a file that holds them, such as ``results.json``.
+    """
+    rows = {f"{view['split']} {view['name']}": view for view in data["views"]}
+    rows |= {f"mean {split}": mean for split, mean in data["mean"].items()}
+    left_out = {
+        name for name in _NOT_EVERYWHERE if all(row[name] is None or math.isnan(row[name]) for row in rows.values())
+    }
     return _table(
         "view", rows, [name for name in _TITLES if name not in {*left_out, "ca_half", "ca_exact_half", "gaussians"}]
     )

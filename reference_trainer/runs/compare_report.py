@@ -85,4 +85,5 @@ def _report(comparison: Comparison, out: Path, say: Callable[[str], None]) -> No
         for name in file_names([view["name"] for view in views if view["split"] == split]):
             comparison_figure(first, out / f"{split}_{name}.png", view=name, split=split)
             say(f"the pictures of each strategy: {out / f'{split}_{name}.png'}")
+    say(f"a page about the first seed of each: ca-reg report {' '.join(map(str, first.values()))}")
     say(f"table and all numbers: {out / TABLE}, {out / REPORT}; curves: tensorboard --logdir {out}")

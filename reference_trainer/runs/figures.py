@@ -22,7 +22,7 @@ __all__ = ["comparison_figure", "dynamics_figure", "new_figure"]
 
 @contextmanager
 def new_figure(path: Path) -> Iterator[Figure]:
-    """Give an empty figure to draw into, which becomes a PNG at ``path``."""
+    """Give an empty figure to draw into, which becomes a PNG or what else the name of ``path`` ends in, such as SVG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -30,7 +30,7 @@ def new_figure(path: Path) -> Iterator[Figure]:
     FigureCanvasAgg(figure)
     yield figure
     with replacing(path) as place:
-        figure.savefig(place, dpi=110, format="png")
+        figure.savefig(place, dpi=110, format=path.suffix[1:])
 
 
 def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
@@ -38,7 +38,7 @@ def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
 
     Args:
         runs: folder of each run by label.
-        path: the PNG to write.
+        path: the PNG or SVG to write.
     """
     with new_figure(path) as figure:
         figure.set_size_inches(9, 5)

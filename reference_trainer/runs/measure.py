@@ -91,7 +91,7 @@ def measure(
         "machine": computed_on,
     }
     write_json(out / "evaluation.json", data)
-    table = evaluation_table(result)
+    table = evaluation_table(data)
     write_text(out / "evaluation.md", table + "\n")
     keep.unlink(missing_ok=True)
     say(table)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,7 +25,7 @@ from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.scenes.orbit import bounding_sphere
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 
-__all__ = ["PlyFacts", "of_plain_ply", "of_ply", "score_ply"]
+__all__ = ["Placed", "PlyFacts", "of_plain_ply", "of_ply", "place", "scaled", "score_ply"]
 
 SMALLEST_RADIUS = 0.25
 """Smaller models are enlarged to this: the near plane of the renderer, at 0.2, would cut into them."""
@@ -121,6 +122,50 @@ def of_plain_ply(ply: Path, *, regularizer: str | None = None, device: str = "cp
     return model, facts
 
 
+@dataclass(frozen=True)
+class Placed:
+    """A model and where it is looked at from.
+
+    Args:
+        model: enlarged by a factor, if it is tiny and there is no scene.
+        enlarged: the factor.
+        views: by split; ``"orbit"`` without a scene.
+        scene: None for an orbit.
+        about: what a file of results says of all this.
+    """
+
+    model: TrainedModel
+    enlarged: float
+    views: Mapping[str, Sequence[Viewpoint]]
+    scene: Scene | None
+    about: dict[str, object]
+
+
+def place(
+    ply: Path,
+    where: SceneOptions | OrbitOptions,
+    *,
+    background: str = "black",
+    regularizer: str | None = None,
+    device: str = "cpu",
+    say: Say = print,
+) -> Placed:
+    """Load the model of a PLY and the views of a scene, or cameras on an orbit; arguments and errors of `score_ply`."""
+    scene = where.load() if isinstance(where, SceneOptions) else None
+    if scene is None and background not in BACKGROUNDS:
+        raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {background!r}.")
+    color = torch.tensor(BACKGROUNDS[background]) if scene is None else scene.background
+    model, facts = of_ply(ply, background=color, regularizer=regularizer, device=device)
+    say(f"{ply}: {facts}")
+    about: dict[str, object] = {"ply": asdict(facts)}
+    if isinstance(where, OrbitOptions):
+        return _on_orbit(model, where, about, say)
+    assert scene is not None
+    for doubt in check_frame(model.gaussians, scene, ply):
+        say(doubt)
+    return Placed(model, 1.0, measured_views(scene, say), scene, about | {"scene": scene.name})
+
+
 def score_ply(
     ply: Path,
     where: SceneOptions | OrbitOptions,
@@ -152,22 +197,10 @@ def score_ply(
         ValueError: as `of_ply`, `check_frame` and `OrbitOptions.views`, or if there is no such background.
         FileNotFoundError: if the PLY or the scene is missing.
     """
-    scene = where.load() if isinstance(where, SceneOptions) else None
-    if scene is None and background not in BACKGROUNDS:
-        raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {background!r}.")
-    color = torch.tensor(BACKGROUNDS[background]) if scene is None else scene.background
-    model, facts = of_ply(ply, background=color, regularizer=regularizer, device=device)
-    say(f"{ply}: {facts}")
-    about: dict[str, object] = {"ply": asdict(facts)}
-    views: Mapping[str, Sequence[Viewpoint]]
-    if isinstance(where, OrbitOptions):
-        model, views, about["orbit"] = _on_orbit(model, where, say)
-    elif scene is not None:
-        for doubt in check_frame(model.gaussians, scene, ply):
-            say(doubt)
-        views, about["scene"] = measured_views(scene, say), scene.name
-    folder = out or ply.with_name(ply.stem + "_evaluation")
-    result = measure(model, views, folder, about=about, samples=samples, seed=seed, perceptual=perceptual, say=say)
+    placed = place(ply, where, background=background, regularizer=regularizer, device=device, say=say)
+    folder, scene = out or ply.with_name(ply.stem + "_evaluation"), placed.scene
+    shared: dict[str, Any] = {"samples": samples, "seed": seed, "perceptual": perceptual, "say": say}
+    result = measure(placed.model, placed.views, folder, about=placed.about, **shared)
     if scene is None:
         say(
             "An orbit sees the model from where no photograph may have been taken: compare these scores with others "
@@ -181,10 +214,8 @@ def score_ply(
     return result
 
 
-def _on_orbit(
-    model: TrainedModel, orbit: OrbitOptions, say: Say
-) -> tuple[TrainedModel, dict[str, list[Viewpoint]], dict[str, object]]:
-    """Return the model, enlarged if it is tiny, the viewpoints around it, and what the JSON file says of them."""
+def _on_orbit(model: TrainedModel, orbit: OrbitOptions, about: dict[str, object], say: Say) -> Placed:
+    """Return the model, enlarged if it is tiny, and the viewpoints around it."""
     sphere = bounding_sphere(model.gaussians.means, model.gaussians.opacities)
     if sphere.surroundings and orbit.arc > 180:
         say(
@@ -192,11 +223,11 @@ def _on_orbit(
             "its photographs (--path), or the side that was photographed (--arc 40)."
         )
     enlarged = max(1.0, SMALLEST_RADIUS / sphere.radius)
-    model = replace(model, gaussians=_scaled(model.gaussians, enlarged))
+    model = replace(model, gaussians=scaled(model.gaussians, enlarged))
     cameras = orbit.views(model.gaussians.means, model.gaussians.opacities)
     views = [Viewpoint(f"{index:03d}", camera) for index, camera in enumerate(cameras)]
-    about = {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged}
-    return model, {"orbit": views}, asdict(orbit) | about
+    found = {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged}
+    return Placed(model, enlarged, {"orbit": views}, None, about | {"orbit": asdict(orbit) | found})
 
 
 def _band(gaussians: Gaussians, degree: int) -> Tensor:
@@ -204,7 +235,7 @@ def _band(gaussians: Gaussians, degree: int) -> Tensor:
     return gaussians.sh_rest[:, degree**2 - 1 : (degree + 1) ** 2 - 1]
 
 
-def _scaled(gaussians: Gaussians, factor: float) -> Gaussians:
+def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
     """Return the model in a world that is larger by a factor; its pictures from larger orbits are the same."""
     return replace(
         gaussians, means=gaussians.means * factor, log_scales=gaussians.log_scales + torch.tensor(factor).log().item()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,26 +11,30 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ca_reg import CAResult, Reason, attribute, total_effects
-from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
-from reference_trainer.evaluation.pictures import file_names, heat_map, save_png, side_by_side
+from ca_reg import CAResult, Reason
+from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ca_picture
+from reference_trainer.evaluation.pictures import file_names, heat_colors, save_png, side_by_side
 from reference_trainer.evaluation.results import machine, markdown_table, write_json
-from reference_trainer.evaluation.shares import blend_weights, share_per_weight
+from reference_trainer.evaluation.shares import (
+    PER_WEIGHT_SCALE,
+    blend_weights,
+    concentration,
+    mean_effects,
+    mean_shares,
+    share_per_weight,
+)
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import save_for_viewers
-from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.scene import View, Viewpoint
 
-__all__ = ["colored_by", "concentration", "mean_effects", "mean_shares", "study_attribution"]
+__all__ = ["colored_by", "study_attribution"]
 
-# Ends of the colour scales in units of the mean. Shares grow with the size of a Gaussian, so that a picture of them
+# Ends of the colour scale in units of the mean. Shares grow with the size of a Gaussian, so that a picture of them
 # shows the large ones; per blend weight they show what the CA map shows, Gaussian by Gaussian.
 _SHARE_SCALE = (1.0, 100.0)
-_PER_WEIGHT_SCALE = (0.1, 10.0)
-
-_TOP = (0.001, 0.01, 0.1)
 
 _README = """\
 # Which Gaussians hold the co-adaptation
@@ -52,64 +55,9 @@ model: they show where its co-adaptation lives. How much there is, the score tel
 """
 
 
-def mean_shares(model: TrainedModel, views: Sequence[View], *, drop_rate: float = 0.5) -> tuple[Tensor, list[CAResult]]:
-    """Split the exact score of several views over the Gaussians.
-
-    Args:
-        model: what to measure.
-        views: on the model's device.
-        drop_rate: of the score.
-
-    Returns:
-        Shares, mean over the views that have a score, shape (N,), float64, which add up to the mean of these scores;
-        and the result of every view.
-
-    Raises:
-        ValueError: if no view has a score.
-    """
-    score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
-    return _mean_over_views(lambda view: attribute(score, model.shares, opacities, view), views)
-
-
-def mean_effects(model: TrainedModel, views: Sequence[View], *, drop_rate: float = 0.5) -> Tensor:
-    """Return the total effects of the Gaussians in the same way as `mean_shares` their shares."""
-    score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
-    return _mean_over_views(lambda view: total_effects(score, opacities, view), views)[0]
-
-
-def concentration(shares: Tensor) -> dict[str, float]:
-    """Return how few Gaussians hold how much of the score.
-
-    Args:
-        shares: at least 0, not all 0, shape (N,).
-
-    Returns:
-        Under ``"top 1%"`` and the like the part of the score that this part of the Gaussians holds, the largest shares
-        first; under ``"half"`` the smallest part of the Gaussians that holds half of the score.
-
-    Example:
-        >>> shares = torch.ones(1000)
-        >>> shares[:10] = 100.0
-        >>> {name: round(part, 3) for name, part in concentration(shares).items()}
-        {'top 0.1%': 0.05, 'top 1%': 0.503, 'top 10%': 0.548, 'half': 0.01}
-    """
-    held = shares.double().sort(descending=True).values.cumsum(0)
-    held, n = held / held[-1], len(shares)
-    found = {f"top {part:.1%}".replace(".0%", "%"): held[max(1, round(part * n)) - 1].item() for part in _TOP}
-    return {**found, "half": (int((held < 0.5).sum()) + 1) / n}
-
-
 def colored_by(gaussians: Gaussians, values: Tensor, low: float, high: float) -> Gaussians:
-    """Return the same Gaussians with a colour that tells a value, the same from every direction.
-
-    Args:
-        gaussians: the model.
-        values: at least 0, may be infinite, shape (N,).
-        low: the value that gets the darkest colour, as do all below it; positive.
-        high: the value that gets the brightest colour, as do all above it. In between the scale is logarithmic.
-    """
-    along = (values.clamp(low, high) / low).log() / math.log(high / low)
-    colors = heat_map(along[None], 1.0)[:, 0].T.to(gaussians.sh_dc)
+    """Return the same Gaussians with a colour that tells a value, see `heat_colors`, the same from every direction."""
+    colors = heat_colors(values, low, high).to(gaussians.sh_dc)
     return dataclasses.replace(
         gaussians, sh_dc=((colors - 0.5) / SH_C0)[:, None], sh_rest=torch.zeros_like(gaussians.sh_rest)
     )
@@ -155,7 +103,7 @@ def study_attribution(
     per_weight = (shares.sum() / weights.sum()).item()
     scales = {
         "share": [end * shares.mean().item() for end in _SHARE_SCALE],
-        "share_per_weight": [end * per_weight for end in _PER_WEIGHT_SCALE],
+        "share_per_weight": [end * per_weight for end in PER_WEIGHT_SCALE],
     }
     data: dict[str, Any] = {
         "scene": scene.name,
@@ -191,26 +139,8 @@ def study_attribution(
     return data
 
 
-def _mean_over_views(
-    measure: Callable[[View], tuple[Tensor, CAResult]], views: Sequence[View]
-) -> tuple[Tensor, list[CAResult]]:
-    """Measure every view; return the mean over those that have a score, and all results."""
-    total, results = torch.zeros(()), []
-    for view in views:
-        values, result = measure(view)
-        results.append(result)
-        total = total.to(values) + values  # all 0 without a score
-    count = sum(result.reason is Reason.OK for result in results)
-    if count == 0:
-        raise ValueError(
-            f"none of the {len(views)} views has a score to attribute, because no pixel has an expected alpha above "
-            "the threshold: choose the other split, or a lower drop rate."
-        )
-    return total / count, results
-
-
 def _correlations(
-    model: TrainedModel, views: Sequence[View], shares: Tensor, weights: Tensor
+    model: TrainedModel, views: Sequence[Viewpoint], shares: Tensor, weights: Tensor
 ) -> dict[str, float | None]:
     """Spearman's rank correlation of the share with what else is known of a Gaussian; None where all are equal."""
     from scipy.stats import spearmanr  # a second to import
@@ -229,12 +159,11 @@ def _correlations(
 def _picture(model: TrainedModel, colored: Iterable[Gaussians], view: View, result: CAResult) -> Tensor:
     """Lay the render, the CA map and the render in other colours side by side."""
     opacities = model.test_opacities
-    ca_map = heat_map(result.variance.masked_fill(~result.visible, math.nan).float(), CA_PICTURE_RANGE)
     models = [model, *(dataclasses.replace(model, gaussians=gaussians) for gaussians in colored)]
     plain, *others = [each.rendering(opacities, view).image for each in models]
-    texts = [f"{low:g} to {high:g} x mean" for low, high in (_SHARE_SCALE, _PER_WEIGHT_SCALE)]
+    texts = [f"{low:g} to {high:g} x mean" for low, high in (_SHARE_SCALE, PER_WEIGHT_SCALE)]
     labels = ["render", f"exact CA {result.value * 1e3:.2f}e-3", f"share, {texts[0]}", f"share per weight, {texts[1]}"]
-    return side_by_side([plain, ca_map, *others], labels)
+    return side_by_side([plain, ca_picture(result), *others], labels)
 
 
 def _table(data: dict[str, Any]) -> str:

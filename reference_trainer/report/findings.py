@@ -1,0 +1,166 @@
+"""What a report shows of one run: its pictures, and how much every Gaussian co-adapts for what it contributes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from ca_reg import CAResult, Reason
+from reference_trainer.evaluation.evaluate import ca_picture, error_picture
+from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.pictures import heat_colors
+from reference_trainer.evaluation.shares import blend_weights, concentration, mean_shares, share_per_weight
+from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.evaluation.trajectory import measured_views
+from reference_trainer.render.eager.projection import rotation_matrices
+from reference_trainer.report.packing import jpeg, numbers
+from reference_trainer.runs.measure import of_run
+from reference_trainer.scenes.scene import Scene, View, Viewpoint
+
+__all__ = ["DROP_RATE", "Findings", "find"]
+
+DROP_RATE = 0.5
+"""Of the exact score, whatever the models were trained with."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found of a run.
+
+    Args:
+        label: what the page calls it.
+        model: at its last checkpoint.
+        opacities: that it is drawn with, (N,).
+        scene: what it was trained on.
+        views: what it is looked at from, by split; those that were not trained on come first.
+        pictures: per view, by ``"render"``, ``"error"`` and ``"co-adaptation"``, and a ``"caption"``.
+        shares: of the exact score, mean over these views, (N,); None if no view has a score.
+        weights: of `blend_weights` over these views, (N,).
+        notes: what is missing, and why.
+    """
+
+    label: str
+    model: TrainedModel
+    opacities: Tensor
+    scene: Scene
+    views: Mapping[str, Sequence[Viewpoint]]
+    pictures: list[dict[str, str]]
+    shares: Tensor | None
+    weights: Tensor
+    notes: list[str]
+
+    @property
+    def share_per_weight(self) -> float:
+        """The mean: the score over the sum of the blend weights; nan without a score."""
+        return float("nan") if self.shares is None else (self.shares.sum() / self.weights.sum()).item()
+
+    def packed(self, low: float, high: float) -> dict[str, Any]:
+        """Return the model as the page draws it: arrays of little-endian numbers in base64.
+
+        ``geometry`` holds 16 float32 per Gaussian: position (3), opacity, covariance (xx, xy, xz, yy, yz, zz), rank by
+        share per weight in [0, 1), 0, colour of the heat (3), 0. ``colors`` holds the coefficients of the spherical
+        harmonics, (N, (degree + 1)^2, 3) in float16. ``held`` is the part of the score that the highest ranks hold, for
+        0, 1, ... 100 % of the Gaussians.
+
+        Args:
+            low: share per weight that gets the darkest colour.
+            high: the one that gets the brightest.
+        """
+        gaussians, n = self.model.gaussians, len(self.model.gaussians)
+        axes = rotation_matrices(gaussians.quaternions) * gaussians.scales[:, None]
+        covariances = (axes @ axes.transpose(1, 2)).flatten(1)[:, [0, 1, 2, 4, 5, 8]]
+        rank, heat, held = torch.zeros(n), torch.full((n, 3), 0.5), []
+        if self.shares is not None:
+            values = share_per_weight(self.shares, self.weights)
+            order = values.argsort()
+            rank[order.cpu()] = torch.arange(n) / n
+            heat = heat_colors(values, low, high)
+            along = self.shares[order.flip(0)].cumsum(0)
+            along = torch.cat([along.new_zeros(1), along / along[-1]])
+            held = [round(along[percent * n // 100].item(), 4) for percent in range(101)]
+        columns = [gaussians.means, self.opacities[:, None], covariances, rank[:, None], torch.zeros(n, 1)]
+        columns += [heat, torch.zeros(n, 1)]
+        degree = gaussians.sh_degree if self.model.sh_degree is None else self.model.sh_degree
+        return {
+            "label": self.label,
+            "background": self.model.background.tolist(),
+            "count": n,
+            "degree": degree,
+            "geometry": numbers(torch.cat([column.float().cpu() for column in columns], 1), "<f4"),
+            "colors": numbers(gaussians.sh[:, : (degree + 1) ** 2], "<f2"),
+            "held": held,
+        }
+
+    def attribution(self) -> dict[str, object]:
+        """Return how few Gaussians hold how much of the score; empty without one."""
+        if self.shares is None:
+            return {}
+        held = concentration(self.shares)
+        half = held.pop("half")
+        found = {f"held by the {name}": f"{part:.1%}" for name, part in held.items()}
+        score = f"{self.shares.sum().item() * 1e3:.3f}"
+        return {"run": self.label, "exact CA at 1/2 x1e-3": score, **found, "half is held by": f"{half:.2%}"}
+
+
+@torch.no_grad()
+def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
+    """Draw a run's last checkpoint from its views, and split the exact score over its Gaussians.
+
+    Args:
+        run: its folder.
+        label: what the page calls it.
+        views: how many of each split, evenly chosen.
+        device: where to render.
+
+    Raises:
+        FileNotFoundError: if the folder holds no run.
+    """
+    model, scene, _ = of_run(run, device)
+    notes: list[str] = []
+    drawn = model
+    if model.depends_on_camera:
+        drawn = replace(model, regularizer="")
+        notes.append(f"{label}: its test-time opacities depend on the camera; the model is drawn with the plain ones.")
+    found = sorted(measured_views(scene, lambda text: None).items(), key=lambda item: item[0] == "train")
+    chosen = {split: [view.to(device) for view in _evenly(of, views)] for split, of in found}
+    flat = [view for of in chosen.values() for view in of]
+    results: Sequence[CAResult | None] = [None] * len(flat)
+    shares = None
+    try:
+        shares, results = mean_shares(model, flat, drop_rate=DROP_RATE)
+    except ValueError as error:
+        notes.append(f"{label}: no co-adaptation: {error}")
+    if shares is not None and not shares.any():
+        shares = None
+        notes.append(f"{label}: its score is 0, so that there is nothing to attribute.")
+    with torch.enable_grad():
+        weights = blend_weights(drawn, flat)
+    pictures = [_pictures(model, view, result) for view, result in zip(flat, results, strict=True)]
+    return Findings(label, model, drawn.test_opacities, scene, chosen, pictures, shares, weights, notes)
+
+
+def _pictures(model: TrainedModel, view: Viewpoint, result: CAResult | None) -> dict[str, str]:
+    """Return the pictures of a view and what stands below them."""
+    image = model.test_rendering(view).image.clamp(0, 1)
+    found, said = {"render": jpeg(image)}, []
+    if isinstance(view, View):
+        found["error"] = jpeg(error_picture(image, view.image))
+        said.append(f"PSNR {psnr(image, view.image, view.mask):.2f} dB")
+    if result is not None and result.reason is Reason.OK:
+        found["co-adaptation"] = jpeg(ca_picture(result))
+        said.append(f"exact CA at 1/2 {result.value * 1e3:.2f}e-3")
+    return found | {"caption": ", ".join(said)}
+
+
+def _evenly(items: Sequence[T], count: int) -> Sequence[T]:
+    """Return so many items, evenly chosen, the first and the last among them; all if there are not more."""
+    if len(items) <= count:
+        return items
+    return [items[round(i * (len(items) - 1) / max(1, count - 1))] for i in range(count)]

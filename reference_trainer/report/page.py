@@ -1,0 +1,190 @@
+"""The page: what was found of every run, and what the runs left in their folders, as one HTML file."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import torch
+
+from ca_reg.dynamics import read_dynamics
+from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ERROR_PICTURE_RANGE
+from reference_trainer.evaluation.pictures import heat_map
+from reference_trainer.evaluation.results import markdown_table
+from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE
+from reference_trainer.evaluation.tables import comparison_table, evaluation_table
+from reference_trainer.files import write_text
+from reference_trainer.report.findings import Findings, find
+from reference_trainer.report.packing import data_uri, jpeg
+from reference_trainer.runs.figures import dynamics_figure
+from reference_trainer.runs.folder import CONFIG, RESULTS, read_results, read_run_settings
+from reference_trainer.scenes.scene import View
+from reference_trainer.training.config import TrainConfig
+
+__all__ = ["labels", "write_report"]
+
+
+def write_report(
+    runs: Sequence[Path],
+    out: Path | None = None,
+    *,
+    views: int = 8,
+    device: str = "cpu",
+    say: Callable[[str], None] = print,
+) -> Path:
+    """Write a page about runs on one scene that opens without a server and without a network.
+
+    It shows what was trained on what, the scores, CA and PSNR against the step, every model to turn around (all
+    together) in its colours or in the heat of its co-adaptation, the views as photograph, render, error and CA map, and
+    how few Gaussians hold how much of the score. The heat is the share of the exact score at drop rate 1/2 per blend
+    weight, over the views of the page, on one logarithmic scale for all runs around the mean of the first. What a run
+    lacks is left out, and the page says so.
+
+    Args:
+        runs: their folders, finished or not.
+        out: the file; by default ``report.html`` in the folder of the run, or in the one that all of them are in.
+        views: how many views of each split are shown and looked from, evenly chosen.
+        device: where to render.
+        say: receives the progress.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: if there is no run, one is given twice, their scenes differ, or a file is damaged.
+        FileNotFoundError: if a folder holds no run.
+    """
+    if views < 1:
+        raise ValueError(f"expected at least 1 view of each split, got {views}.")
+    names, found = labels(runs), list[Findings]()
+    for run, label in zip(runs, names, strict=True):
+        say(f"[{len(found) + 1}/{len(runs)}] {run}")
+        found.append(find(run, label, views=views, device=device))
+        if found[-1].scene.name != found[0].scene.name:
+            raise ValueError(
+                f"a report is about one scene, whose models turn together, but {runs[0]} was trained on "
+                f"{found[0].scene.name} and {run} on {found[-1].scene.name}: write a report for each."
+            )
+    data = _data(dict(zip(names, runs, strict=True)), found)
+    page = Template(_part("page.html")).substitute(
+        title=f"{found[0].scene.name}: {', '.join(names)}".replace("&", "&amp;").replace("<", "&lt;"),
+        style=_part("page.css"),
+        data=json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c"),  # nothing ends the script
+        script=_part("models.js") + _part("page.js"),
+    )
+    out = out or Path(os.path.commonpath([run.absolute() for run in runs])) / "report.html"
+    write_text(out, page)
+    say(f"The report is {out} ({out.stat().st_size / 1e6:.1f} MB): open it in a browser")
+    return out
+
+
+def labels(runs: Sequence[Path]) -> list[str]:
+    """Return what each run is called: its folder, as far down from the others as needed to tell them apart.
+
+    Raises:
+        ValueError: if there is no run, or one is given twice.
+
+    Example:
+        >>> labels([Path("runs/fern/baseline/seed_0"), Path("runs/fern/dropout/seed_0")])
+        ['baseline/seed_0', 'dropout/seed_0']
+    """
+    folders = [run.resolve() for run in runs]
+    if not runs or len(set(folders)) < len(runs):
+        raise ValueError(f"expected the folders of at least 1 run, each once, got {[str(run) for run in runs]}.")
+    common = folders[0].parent if len(runs) == 1 else Path(os.path.commonpath(folders))
+    return [folder.relative_to(common).as_posix() for folder in folders]
+
+
+def _part(name: str) -> str:
+    """Return a file that the page is made of."""
+    return (files(__package__) / name).read_text("utf-8")
+
+
+def _data(runs: dict[str, Path], found: Sequence[Findings]) -> dict[str, Any]:
+    """Return all that the page shows, as plain data."""
+    results = {label: read_results(run) for label, run in runs.items() if (run / RESULTS).exists()}
+    notes = [note for each in found for note in each.notes]
+    notes += [f"{label}: no scores, it has not been trained to its end." for label in runs.keys() - results.keys()]
+    dynamics, missing = _dynamics(runs)
+    middle = next((x for each in found if (x := each.share_per_weight) > 0), 1.0)
+    low, high = (end * middle for end in PER_WEIGHT_SCALE)
+    attribution = [row for each in found if (row := each.attribution())]
+    return {
+        "about": [str(found[0].scene), *_trained(found)],
+        "notes": notes + missing,
+        "scores": comparison_table({label: [of] for label, of in results.items()}) if results else "",
+        "settings": _settings(runs),
+        "dynamics": dynamics,
+        "perView": {label: evaluation_table(of) for label, of in results.items()},
+        "attribution": markdown_table(attribution, list(attribution[0])) if attribution else "",
+        "legend": jpeg(heat_map(torch.linspace(0, 1, 256)[None].expand(8, -1), 1.0)),
+        "ends": {"heat": [f"{low:.2g}", f"{high:.2g}"], "error": ERROR_PICTURE_RANGE, "ca": CA_PICTURE_RANGE},
+        "views": _views(found),
+        "runs": [each.packed(low, high) for each in found],
+    }
+
+
+def _trained(found: Sequence[Findings]) -> list[str]:
+    """Return a line per run about what it was trained with."""
+    return [
+        f"{each.label}: {each.model.step:,} steps with {each.model.regularizer or 'no regularizer'}; "
+        f"{len(each.model.gaussians):,} Gaussians"
+        for each in found
+    ]
+
+
+def _settings(runs: dict[str, Path]) -> str:
+    """Return the settings that differ between the runs, or from the defaults, as a table."""
+    configs = {label: dataclasses.asdict(read_run_settings(run / CONFIG)[1]) for label, run in runs.items()}
+    rows: list[dict[str, object]] = []
+    for name, usual in dataclasses.asdict(TrainConfig()).items():
+        values = {label: config[name] for label, config in configs.items()}
+        if set(values.values()) != {usual}:
+            rows.append({"setting": name, **{label: str(value) for label, value in values.items()}})
+    return markdown_table(rows, ["setting", *configs]) if rows else ""
+
+
+def _dynamics(runs: dict[str, Path]) -> tuple[str, list[str]]:
+    """Return the figure of CA and PSNR against the step as an address, empty without any, and what is missing."""
+    logged, missing = {}, []
+    for label, run in runs.items():
+        try:
+            read_dynamics(run)
+            logged[label] = run
+        except (FileNotFoundError, ValueError):
+            missing.append(f"{label}: no CA and PSNR against the step, because nothing was measured while it trained.")
+    if not logged:
+        return "", missing
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "dynamics.svg")
+        dynamics_figure(logged, path)
+        return data_uri(path.read_bytes(), "image/svg+xml"), missing
+
+
+def _views(found: Sequence[Findings]) -> list[dict[str, Any]]:
+    """Return every view with its camera, its photograph, and its pictures of every run that was measured there."""
+    views: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for number, each in enumerate(found):
+        pictures = iter(each.pictures)
+        for split, group in each.views.items():
+            for view in group:
+                camera = view.camera
+                pose = camera.world_to_camera[:3].flatten().tolist()
+                entry = views.setdefault((split, view.name, str(pose)), {
+                    "name": f"{split} {view.name}",
+                    "photograph": jpeg(view.image) if isinstance(view, View) else "",
+                    "pose": pose,
+                    "focal": [camera.fx, camera.fy],
+                    "center": [camera.cx, camera.cy],
+                    "size": [camera.width, camera.height],
+                    "pictures": [{}] * len(found),
+                })  # fmt: skip
+                entry["pictures"][number] = next(pictures)
+    return list(views.values())

@@ -1,0 +1,342 @@
+import dataclasses
+import json
+import re
+from base64 import b64decode
+from html.parser import HTMLParser
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import CHROMIUM, Page
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from reference_trainer.evaluation.results import write_json
+from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
+from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.report import page as page_module
+from reference_trainer.report.findings import find
+from reference_trainer.report.page import write_report
+from reference_trainer.runs.folder import CHECKPOINT, CONFIG, claim
+from reference_trainer.runs.measure import of_run
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.studies.gaussian_shares import colored_by
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.trainer import Trainer
+
+
+class Parsed(HTMLParser):
+    """A page: its tags with their attributes, and the texts inside of them."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict]] = []
+        self.texts, self._open = dict[str, str](), ""
+        self.text = path.read_text("utf-8")
+        self.feed(self.text)
+        self.data = json.loads(self.texts["data"], parse_constant=pytest.fail)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        self._open = dict(attributes).get("id", tag)
+
+    def handle_data(self, text):
+        self.texts[self._open] = self.texts.get(self._open, "") + text
+
+
+def array(text: str, kind: str, *shape: int) -> np.ndarray:
+    return np.frombuffer(b64decode(text), kind).reshape(shape)
+
+
+def two_of_each(scene: Scene) -> list[View]:
+    """The views of a page that shows two of each split."""
+    return [scene.test[0], scene.test[-1], scene.train[0], scene.train[-1]]
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory, run, scaled):
+    """Two finished runs, of which only the second was measured while it trained, and the page about both."""
+    runs, out = [run[0], scaled[0]], tmp_path_factory.mktemp("pair") / "report.html"
+    said: list[str] = []
+    assert write_report(runs, out, views=2, say=said.append) == out
+    assert str(out) in said[-1]
+    return runs, Parsed(out)
+
+
+@pytest.fixture(scope="module")
+def found(run):
+    """What a page shows of a run."""
+    return find(run[0], "a run", views=1)
+
+
+def test_a_page_holds_all_that_it_shows(pair):
+    _, page = pair
+    addresses = [x for _, of in page.tags for name, x in of.items() if name in ("src", "href", "action", "data")]
+    assert not addresses
+    assert not {tag for tag, _ in page.tags} & {"link", "iframe", "object", "base"}
+    assert not re.findall(r"https?:|@import|url\(|\bfetch\(|XMLHttp|WebSocket|import\(", page.text)
+    (policy,) = [of["content"] for tag, of in page.tags if of.get("http-equiv") == "Content-Security-Policy"]
+    assert policy.startswith("default-src 'none'; img-src data:;")
+
+
+def test_the_tables_are_those_of_the_runs(pair):
+    runs, page = pair
+    for run in runs:
+        results = json.loads((run / "results.json").read_text())
+        for view in results["views"]:
+            assert f"| {view['split']} {view['name']} | {view['psnr']:.4g} |" in page.data["perView"][run.name]
+        assert f"| {run.name} | 1 | {results['mean']['test']['psnr']:.4g} |" in page.data["scores"]
+        assert f"{run.name}: 11 steps with dropout(0.2) + noise(0.3" in " ".join(page.data["about"])
+        assert f"| {run.name} | " in page.data["attribution"]
+    assert "| noise | 0.3 | 0.0 |" in page.data["settings"]
+    assert "\n| sh_rate |" not in page.data["settings"]  # the default in both
+
+
+def test_the_curves_are_those_that_were_measured(pair):
+    (without, with_), page = pair
+    assert page.data["dynamics"].startswith("data:image/svg+xml;base64,")
+    figure = b64decode(page.data["dynamics"].partition(",")[2])
+    assert f"{with_.name} test".encode() in figure  # the legend
+    assert without.name.encode() not in figure
+    assert [note for note in page.data["notes"] if "against the step" in note] == [
+        f"{without.name}: no CA and PSNR against the step, because nothing was measured while it trained."
+    ]
+
+
+def test_the_views_come_with_their_pictures(pair):
+    runs, page = pair
+    names = [view["name"] for view in page.data["views"]]
+    assert names == [
+        "test test_0",
+        "test test_outside",
+        "train train_0",
+        "train train_2",
+    ]
+    model, scene, _ = of_run(runs[1])
+    for view, entry in zip(two_of_each(scene), page.data["views"], strict=True):
+        pose = np.array(entry["pose"]).reshape(3, 4)
+        np.testing.assert_array_equal(pose, view.camera.world_to_camera[:3].numpy())
+        render = model.test_rendering(view).image
+        for uri, expected in ((entry["photograph"], view.image), (entry["pictures"][1]["render"], render)):
+            with Image.open(BytesIO(b64decode(uri.partition(",")[2]))) as file:
+                drawn = np.asarray(file).transpose(2, 0, 1) / 255
+            assert np.abs(drawn - expected.clamp(0, 1).numpy()).mean() < 0.02  # a JPEG
+        assert set(entry["pictures"][1]) == {"render", "error", "co-adaptation", "caption"}
+
+
+def test_the_models_are_those_of_the_runs(pair):
+    runs, page = pair
+    for run, packed in zip(runs, page.data["runs"], strict=True):
+        model, scene, _ = of_run(run)
+        gaussians, n = model.gaussians, len(model.gaussians)
+        table = array(packed["geometry"], "<f4", n, 16)
+        np.testing.assert_array_equal(table[:, :3], gaussians.means)
+        np.testing.assert_allclose(table[:, 3], model.test_opacities, rtol=1e-6)
+        rotations = Rotation.from_quat(gaussians.quaternions.double().numpy(), scalar_first=True).as_matrix()
+        squares = gaussians.scales.double().numpy()[:, None] ** 2
+        covariances = (rotations * squares) @ rotations.transpose(0, 2, 1)
+        upper = covariances[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        np.testing.assert_allclose(table[:, 4:10], upper, rtol=1e-4, atol=1e-6 * upper.max())
+        bands = (packed["degree"] + 1) ** 2
+        assert packed["degree"] == 2
+        colors = array(packed["colors"], "<f2", n, bands, 3)
+        np.testing.assert_allclose(colors, gaussians.sh[:, :bands], rtol=1e-3, atol=1e-4)
+
+        views = two_of_each(scene)
+        shares = mean_shares(model, views)[0]
+        values = share_per_weight(shares, blend_weights(model, views)).numpy()
+        ordered = values[table[:, 10].argsort()]
+        assert (ordered[1:] >= ordered[:-1]).all()
+        held, tenth = packed["held"], table[:, 10] >= 1 - (n // 10) / n - 1e-6
+        assert (held[0], held[100]) == (0, 1)
+        assert held[10] == pytest.approx(shares.numpy()[tenth].sum() / shares.sum().item(), abs=1e-3)
+
+
+def unfinished(folder: Path, options: SceneOptions, config: TrainConfig) -> Trainer:
+    """Train a run for some steps and leave it."""
+    trainer = Trainer(options.load(), config)
+    trainer.train(until=4)
+    trainer.save(folder / CHECKPOINT)
+    write_json(folder / CONFIG, claim(options, config))
+    return trainer
+
+
+@pytest.mark.parametrize("opacity", [0.9, 0.005])  # with a score, and too faint for one
+def test_what_a_run_lacks_is_left_out_with_a_word(tmp_path, options, short, opacity):
+    none = dataclasses.replace(options, test="none")
+    unfinished(tmp_path / "mine", none, dataclasses.replace(short, initial_opacity=opacity))
+    out = write_report([tmp_path / "mine"], say=lambda text: None)
+    assert out == tmp_path / "mine" / "report.html"
+    page = Parsed(out)
+    assert page.data["scores"] == page.data["dynamics"] == ""
+    assert page.data["perView"] == {}
+    notes = " ".join(page.data["notes"])
+    assert "mine: no scores, it has not been trained to its end." in notes
+    assert "mine: no CA and PSNR against the step" in notes
+    assert {view["name"].split()[0] for view in page.data["views"]} == {"between", "around", "train"}
+    for view in page.data["views"]:
+        trained = view["name"].startswith("train")
+        assert bool(view["photograph"]) == ("error" in view["pictures"][0]) == trained
+        assert "render" in view["pictures"][0]
+        assert ("co-adaptation" in view["pictures"][0]) == (opacity == 0.9)
+    assert bool(page.data["attribution"]) == (opacity == 0.9)
+    assert ("mine: no co-adaptation: none of the" in notes) == (opacity != 0.9)
+
+
+def test_opacities_that_depend_on_the_camera_are_drawn_plain(tmp_path, options, short):
+    config = dataclasses.replace(short, initial_opacity=0.9, regularizer="depth(0.4, scale=True)")
+    trainer = unfinished(tmp_path, options, config)
+    page = Parsed(write_report([tmp_path], views=1, say=lambda text: None))
+    assert "opacities depend on the camera" in page.data["notes"][0]
+    (packed,) = page.data["runs"]
+    drawn = array(packed["geometry"], "<f4", packed["count"], 16)[:, 3]
+    np.testing.assert_allclose(drawn, trainer.gaussians.opacities.detach(), rtol=1e-6)
+
+
+def test_what_is_no_run_or_no_pair_is_refused(run, found, tmp_path, monkeypatch):
+    with pytest.raises(FileNotFoundError, match="holds no run"):
+        write_report([tmp_path])
+    for runs in ([], [run[0], tmp_path, run[0]]):
+        with pytest.raises(ValueError, match="at least 1 run, each once"):
+            write_report(runs)
+    with pytest.raises(ValueError, match="at least 1 view"):
+        write_report([run[0]], views=0)
+    elsewhere = dataclasses.replace(found, scene=dataclasses.replace(found.scene, name="elsewhere"))
+    monkeypatch.setattr(page_module, "find", lambda folder, *_, **__: found if folder == run[0] else elsewhere)
+    with pytest.raises(ValueError, match=r"a report is about one scene.*synthetic.*elsewhere"):
+        write_report([run[0], tmp_path], tmp_path / "page.html", say=lambda text: None)
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_text_from_files_cannot_end_the_data(run, found, tmp_path, monkeypatch):
+    bad = "</script><script>alert(1)</script>"
+    monkeypatch.setattr(page_module, "find", lambda *_, **__: dataclasses.replace(found, label=bad))
+    monkeypatch.setattr(page_module, "labels", lambda runs: [bad])
+    page = Parsed(write_report([run[0]], tmp_path / "page.html", say=lambda text: None))
+    assert sum(tag == "script" for tag, _ in page.tags) == 2
+    assert page.data["runs"][0]["label"] == bad
+
+
+# In a browser.
+
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium, such as Debian's package chromium")
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory, short):
+    """Two runs with ellipsoids of all shapes, in colours that depend on the direction, and the page about both."""
+    folder = tmp_path_factory.mktemp("turned")
+    options, runs = SceneOptions("synthetic", downscale=2), [folder / "baseline", folder / "dropout"]
+    spreads = {"sh_rest": 0.2, "log_scales": 0.7, "quaternions": 1.0, "opacity_logits": 2.0}
+    for run, rate in zip(runs, (0.0, 0.2), strict=True):
+        trainer = unfinished(run, options, dataclasses.replace(short, dropout=rate, sh_every=1, initial_opacity=0.9))
+        generator = torch.Generator().manual_seed(0)
+        with torch.no_grad():
+            for name, spread in spreads.items():
+                part = getattr(trainer.gaussians, name)
+                part += spread * torch.randn(part.shape, generator=generator)
+            trainer.gaussians.log_scales[::2] -= 2.0  # some are as thin as a pixel
+        trainer.save(run / CHECKPOINT)
+    return runs, write_report(runs, views=2, say=lambda text: None)
+
+
+@pytest.fixture(scope="module")
+def opened(turned):
+    """The page in a browser."""
+    with Page(turned[1]) as page:
+        page.run("for (const { canvas } of models) canvas.style.width = '80px'")  # as the photographs
+        yield page
+
+
+def shown(page: Page, script: str) -> list[np.ndarray]:
+    """Run a script; return what every canvas shows after it, (3, H, W) in [0, 1]."""
+    pictures = []
+    for uri in page.run(f"{script}; draw(); models.map(model => model.canvas.toDataURL())"):
+        with Image.open(BytesIO(b64decode(uri.partition(",")[2]))) as file:
+            pictures.append(np.asarray(file.convert("RGB")).transpose(2, 0, 1) / 255)
+    return pictures
+
+
+def assert_drawn(picture: np.ndarray, model: TrainedModel, view: View) -> None:
+    """A browser's picture is what the renderer draws, but for the roundings: every blend is rounded to 8 bits."""
+    expected = model.test_rendering(view).image.clamp(0, 1).numpy()
+    assert expected.mean() > 0.1
+    error = np.abs(picture - expected) * 255
+    assert error.mean() < 1.5
+    assert np.quantile(error, 0.99) < 8
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_browser_shows_what_the_renderer_draws(turned, opened):
+    runs, _ = turned
+    found = [of_run(run) for run in runs]
+    for number, view in enumerate(two_of_each(found[0][1])):
+        drawn = shown(opened, f"$('from').value = {number}; $('from').onchange()")
+        for (model, _, _), picture in zip(found, drawn, strict=True):
+            assert_drawn(picture, model, view)
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_browser_shows_the_heat_and_hides_what_co_adapts_most(turned, opened):
+    runs, path = turned
+    data, found = Parsed(path).data, [of_run(run) for run in runs]
+    views = two_of_each(found[0][1])
+    low, high = (float(end) for end in data["ends"]["heat"])
+    plain = shown(opened, "$('from').value = 0; $('from').onchange(); $('color').click()")
+    for hidden in (0, 30):
+        drawn = shown(opened, f"$('heat').click(); $('hide').value = {hidden}")
+        for (model, _, _), picture, color in zip(found, drawn, plain, strict=True):
+            values = share_per_weight(mean_shares(model, views)[0], blend_weights(model, views))
+            kept = values.argsort().argsort() < len(values) - len(values) * hidden // 100
+            assert int(kept.sum()) == pytest.approx((1 - hidden / 100) * len(values), abs=1)
+            heat = colored_by(model.gaussians, values, low, high)[kept]
+            assert_drawn(picture, dataclasses.replace(model, gaussians=heat), views[0])
+            assert np.abs(picture - color).mean() > 0.1
+    text = opened.run("document.getElementById('models').textContent")
+    assert f"{100 * data['runs'][1]['held'][30]:.1f} % of the co-adaptation" in text
+    shown(opened, "$('color').click(); $('hide').value = 0")
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_drag_turns_all_models_about_one_point(turned, opened):
+    before = shown(opened, "$('from').value = 0; $('from').onchange()")
+    at = opened.run("scrollTo(0, 0); (({ x, y }) => ({ x, y }))(models[1].canvas.getBoundingClientRect())")
+    start = {"x": at["x"] + 20, "y": at["y"] + 20}
+    opened("Input.dispatchMouseEvent", type="mousePressed", button="left", **start)
+    moved = {"x": start["x"] + 40, "y": start["y"] - 15}
+    opened("Input.dispatchMouseEvent", type="mouseMoved", button="left", buttons=1, **moved)
+    opened("Input.dispatchMouseEvent", type="mouseReleased", button="left", **moved)
+    for picture, after in zip(before, shown(opened, ""), strict=True):
+        assert np.abs(picture - after).mean() > 0.02
+    state = opened.run("({ ...camera, depth })")
+    rotation, shift = np.array(state["rotation"]).reshape(3, 3), np.array(state["translation"])
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+    pose = np.array(Parsed(turned[1]).data["views"][0]["pose"]).reshape(3, 4)
+    point = pose[:, :3].T @ (np.array([0, 0, state["depth"]]) - pose[:, 3])
+    np.testing.assert_allclose(rotation @ point + shift, [0, 0, state["depth"]], atol=1e-5)
+    angle = np.arccos((np.trace(rotation @ pose[:, :3].T) - 1) / 2)
+    assert angle == pytest.approx(np.hypot(40, 15) / 200, rel=0.01)  # two small turns, one after the other
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_slider_reveals_one_picture_after_the_other(opened):
+    clips = "[...document.querySelector('.stack').children].map(image => image.style.clipPath)"
+    for value, hidden in ((0, [0, 100, 100, 100]), (1.5, [0, 0, 50, 100]), (3, [0, 0, 0, 0])):
+        assert opened.run(f"$('kind').value = {value}; $('kind').oninput(); {clips}") == [
+            f"inset(0px {part}% 0px 0px)" for part in hidden
+        ]
+
+
+@pytest.mark.slow
+@needs_browser
+def test_no_request_leaves_the_page(turned, opened):
+    assert opened.requests[0] == turned[1].as_uri()
+    assert all(address.startswith("data:") for address in opened.requests[1:])
+    assert not opened.complaints

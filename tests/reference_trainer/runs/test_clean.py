@@ -1,0 +1,68 @@
+import dataclasses
+
+import pytest
+import torch
+
+from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
+from reference_trainer.model.ply import load_ply, save_ply
+from reference_trainer.runs.clean import clean_ply
+from reference_trainer.runs.folder import BAKED_PLY, PLY
+from reference_trainer.runs.measure import of_run
+from reference_trainer.scenes.options import OrbitOptions
+
+
+def rows(means: torch.Tensor) -> list[tuple[float, ...]]:
+    return [tuple(row) for row in means.tolist()]
+
+
+def test_those_that_co_adapt_most_for_what_they_contribute_go(run, options, tmp_path):
+    model, scene, _ = of_run(run[0])
+    said: list[str] = []
+    found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.3, refine=0, say=said.append)
+    cleaned = load_ply(tmp_path / "c.ply")
+    n = len(model.gaussians)
+    values = share_per_weight(mean_shares(model, scene.train)[0], blend_weights(model, scene.train))
+    left = set(rows(cleaned.gaussians.means))
+    stay = torch.tensor([row in left for row in rows(model.gaussians.means)])
+    assert len(cleaned.gaussians) == int(stay.sum()) == n - round(0.3 * n)
+    assert values[~stay].min() >= values[stay].max()
+    assert cleaned.regularizer == model.regularizer
+    assert [of.gaussians for of in found.values()] == [n, int(stay.sum())]
+    table = next(text for text in said if "| as it was |" in text)
+    assert f"| {found['as it was'].mean('test', 'psnr'):.4g} |" in table
+
+
+def test_refining_closes_the_holes(run, options, tmp_path):
+    found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.3, refine=20, say=lambda text: None)
+    holes, closed = found["taken out"], found["after 20 steps"]
+    assert closed.gaussians == holes.gaussians == len(load_ply(tmp_path / "c.ply").gaussians)
+    assert closed.mean("train", "psnr") > holes.mean("train", "psnr")
+
+
+def test_without_a_scene_a_model_is_cleaned_as_large_as_it_was(run, tmp_path):
+    gaussians = load_ply(run[0] / PLY).gaussians
+    small = dataclasses.replace(gaussians, means=gaussians.means / 100, log_scales=gaussians.log_scales - 4.6)
+    small = dataclasses.replace(small, opacity_logits=small.opacity_logits + 4)  # a score from everywhere
+    save_ply(small, tmp_path / "small.ply")
+    said: list[str] = []
+    orbit = OrbitOptions(cameras=2, size=32)
+    found = clean_ply(tmp_path / "small.ply", orbit, tmp_path / "c.ply", say=said.append)
+    assert list(found) == ["as it was", "taken out"]
+    assert any("nothing can close the holes" in text for text in said)
+    assert "orbit exact CA at 1/2 x1e-3" in said[-2]
+    assert "PSNR" not in said[-2]
+    means = load_ply(tmp_path / "c.ply").gaussians.means
+    assert len(means) == len(small) - round(0.1 * len(small))
+    assert torch.cdist(means.double(), small.means.double()).amin(1).max() < 1e-5 * small.means.abs().max()
+
+
+def test_what_cannot_be_cleaned_is_refused(run, scaled, options, tmp_path):
+    ply, out = run[0] / PLY, tmp_path / "c.ply"
+    for wrong in ({"fraction": 0.0}, {"fraction": 1.0}, {"refine": -1}):
+        with pytest.raises(ValueError, match="fraction must be in"):
+            clean_ply(ply, options, out, **wrong)
+    with pytest.raises(ValueError, match="those of the test"):
+        clean_ply(scaled[0] / BAKED_PLY, options, out, say=lambda text: None)
+    with pytest.raises(FileExistsError, match="exists already"):
+        clean_ply(ply, options, ply)
+    assert not out.exists()
