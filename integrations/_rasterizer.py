@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
+from collections.abc import Iterable
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
@@ -15,12 +16,12 @@ from torch import Tensor
 from ._call import Call
 
 __all__ = [
-    "MODULES", "ForwardCall", "check_installed", "forward_signature", "hide_dropped", "rasterizer_class",
-    "rasterizer_classes", "white_alpha",
+    "MODULES", "RASTERIZERS", "ForwardCall", "check_installed", "class_in", "forward_signature", "hide_dropped",
+    "is_of_the_family", "rasterizer_classes", "white_alpha",
 ]  # fmt: skip
 
 MODULES = ("diff_gaussian_rasterization", "diff_gaussian_rasterization_abs")
-_CLASS = "GaussianRasterizer"
+RASTERIZERS = tuple(f"{module}:GaussianRasterizer" for module in MODULES)
 
 
 class ForwardCall(Call):
@@ -56,39 +57,51 @@ class ForwardCall(Call):
         super().put(field, value)
 
 
-def check_installed() -> None:
-    """Raise ImportError unless one of the rasterizers is there; does not import it."""
-    if not _installed():
+def check_installed(rasterizers: Iterable[str]) -> None:
+    """Raise ImportError unless the module of one, ``module:Class``, is there; does not import it."""
+    if not _installed(rasterizers):
         raise ImportError(
-            f"none of the rasterizers {', '.join(MODULES)} is installed. Install the one in the submodules of your "
-            "code base (it needs CUDA), pass your own class as rasterizer=..., or run the code base without CUDA: "
-            "python -m ca_reg.integrations.run --cpu train.py ..."
+            f"none of the rasterizers {', '.join(rasterizers)} is installed. Install the one in the submodules of your "
+            "code base (it needs CUDA), pass your own class as rasterizer=..., in the launcher --rasterizer "
+            "module:Class, or run the code base without CUDA: python -m ca_reg.integrations.run --cpu train.py ..."
         )
 
 
-def _installed() -> list[str]:
-    """Return the names of the rasterizers that can be imported."""
-    return [name for name in MODULES if name in sys.modules or find_spec(name) is not None]
+def _installed(rasterizers: Iterable[str]) -> list[str]:
+    """Return the names of the modules that can be imported."""
+    modules = dict.fromkeys(rasterizer.partition(":")[0] for rasterizer in rasterizers)
+    return [name for name in modules if name in sys.modules or find_spec(name.partition(".")[0]) is not None]
 
 
-def rasterizer_class(module: ModuleType) -> type | None:
-    """Return the rasterizer of a module, None if it has none."""
-    found = getattr(module, _CLASS, None)
+def class_in(module: ModuleType, name: str) -> type | None:
+    """Return a class of a module, None if it has none of this name."""
+    found = getattr(module, name, None)
     return found if isinstance(found, type) else None
 
 
 def rasterizer_classes() -> list[type]:
     """Import the installed rasterizers and return their classes; raise ImportError if there are none."""
-    check_installed()
-    found = [rasterizer_class(import_module(name)) for name in _installed()]
+    check_installed(RASTERIZERS)
+    name = RASTERIZERS[0].partition(":")[2]
+    found = [class_in(import_module(module), name) for module in _installed(RASTERIZERS)]
     return list(dict.fromkeys(cls for cls in found if cls is not None))
+
+
+def is_of_the_family(rasterizer: type) -> bool:
+    """Whether the forward of a class has the arguments of the family."""
+    return not _signature(rasterizer)[1]
+
+
+def _signature(rasterizer: type) -> tuple[inspect.Signature, list[str]]:
+    """Return the signature of a forward, and which arguments of the family it lacks."""
+    forward = getattr(rasterizer, "forward", None)
+    signature = inspect.signature(forward) if callable(forward) else inspect.Signature()
+    return signature, [name for name in ("means3D", "opacities") if name not in signature.parameters]
 
 
 def forward_signature(rasterizer: type) -> inspect.Signature:
     """Return the signature of a rasterizer's forward; raise TypeError if it has not the arguments of the family."""
-    forward = getattr(rasterizer, "forward", None)
-    signature = inspect.signature(forward) if callable(forward) else inspect.Signature()
-    missing = [name for name in ("means3D", "opacities") if name not in signature.parameters]
+    signature, missing = _signature(rasterizer)
     if missing:
         raise TypeError(
             f"{rasterizer.__qualname__}.forward{signature} has no argument {' or '.join(missing)}, so it is no "

@@ -2,51 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import runpy
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["imported_packages", "run_script", "set_command_line"]
-
-
-def imported_packages(script: Path | str) -> set[str]:
-    """Return the first names of all modules that a script imports, itself or through files beside it; runs nothing.
-
-    The script is the path of a file, or the name of a module in the present folder; so it is below.
-    """
-    folder = script.resolve().parent if isinstance(script, Path) else Path.cwd()
-    files = [script if isinstance(script, Path) else folder / f"{script.replace('.', '/')}.py"]
-    read: set[Path] = set()
-    found: set[str] = set()
-    while files:
-        path = files.pop().resolve()
-        if path in read or not path.is_file():
-            continue
-        read.add(path)
-        for level, name in _imports(path):
-            if level == 0:
-                found.add(name.partition(".")[0])
-            module = (path.parents[level - 1] if level else folder).joinpath(*name.split("."))
-            files += [module.with_suffix(".py"), module / "__init__.py"]
-    return found
-
-
-def _imports(path: Path) -> Iterator[tuple[int, str]]:
-    """Iterate over the modules that a file may import, each with the number of dots before its name."""
-    try:
-        nodes = list(ast.walk(ast.parse(path.read_bytes())))
-    except SyntaxError:  # Python will say so when it runs it
-        return
-    for node in nodes:
-        if isinstance(node, ast.Import):
-            yield from ((0, alias.name) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            module = [node.module] if node.module else []
-            yield from ((node.level, ".".join([*module, alias.name])) for alias in node.names)
-            yield from ((node.level, name) for name in module)
+__all__ = ["run_script", "set_command_line"]
 
 
 def set_command_line(script: Path | str, arguments: Sequence[str]) -> None:

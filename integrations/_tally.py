@@ -13,7 +13,9 @@ __all__ = ["Skip", "Tally"]
 class Skip(StrEnum):
     """Why a render was left alone."""
 
-    FURTHER_VIEW = "further render in the same iteration (scope main)"
+    FURTHER_VIEW = (
+        "further render in the same iteration (scope main); if it is a training view like the first: --scope all"
+    )
     CONSTANT_OPACITY = "opacities that are not trained, such as a depth render with constant ones"
     DETACHED_MEANS = "positions that are not trained, such as a depth render for the opacities"
     RATE_ZERO = "training render at a step where the rate is 0"

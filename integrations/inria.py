@@ -9,8 +9,7 @@ common: they hand activated opacities to ``GaussianRasterizer``, and take what w
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from types import ModuleType
+from collections.abc import Iterable
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
@@ -19,29 +18,21 @@ from torch import Tensor, nn
 
 from ca_reg.chain import Foreign
 
-from ._after_import import AfterImport
 from ._call import chain_of
 from ._caller import calling_render, find_instance, is_viewer, refuse_a_second_regularizer
 from ._hook import Hook
 from ._iterations import Field, Iterations, Steps, leaf_of
 from ._override import is_overridden
-from ._patch import ClassPatch
-from ._rasterizer import (
-    MODULES,
-    ForwardCall,
-    check_installed,
-    forward_signature,
-    hide_dropped,
-    rasterizer_class,
-)
+from ._rasterizer import RASTERIZERS, ForwardCall, check_installed, hide_dropped
 from ._tally import Skip
+from ._wrapped import Wrapped
 
-__all__ = ["RasterizerHook", "Scope", "Steps"]
+__all__ = ["DEFAULT_MODEL", "RasterizerHook", "Scope", "Steps"]
 
 Scope = Literal["main", "all"]
 """Which training renders of an iteration are regularized: the first of every model, or all with one mask."""
 
-_MODEL_MODULE = "scene.gaussian_model"
+DEFAULT_MODEL = "scene.gaussian_model:GaussianModel"
 _MANY_ZEROS = 1e-3  # share of opacities that are 0 by no rounding
 
 
@@ -53,8 +44,8 @@ class RasterizerHook(Hook):
     Renders under ``no_grad`` and those for a viewer get the test-time opacities. All others are left alone, such as
     depth renders with constant opacities or detached positions; :attr:`tally` counts them with the reason.
 
-    The training step, which schedules and masks follow, is read off ``GaussianModel.update_learning_rate`` in
-    ``scene.gaussian_model``; a code base without it says it with :meth:`step`, or lets the parameters tell. The masks
+    The training step, which schedules and masks follow, is read off the ``update_learning_rate`` of the ``models``; a
+    code base without it says it with :meth:`step`, or lets the parameters tell. The masks
     depend on the seed, the model and the step alone, and the global random numbers are untouched: with and without the
     hook a script picks the same cameras.
 
@@ -68,8 +59,10 @@ class RasterizerHook(Hook):
             leaves second views and pseudo views alone; "all" regularizes all with one mask, for code bases with several
             views in an iteration (MVGS).
         seed: of the masks and the noise.
-        rasterizer: the class to hook; by default those of ``diff_gaussian_rasterization`` and
-            ``diff_gaussian_rasterization_abs``, as soon as they are imported.
+        rasterizer: the class to hook, or its name as ``module:Class``; by default those of
+            ``diff_gaussian_rasterization`` and ``diff_gaussian_rasterization_abs``, as soon as they are imported.
+        candidates: names of classes to hook beside the default, if they turn out to be rasterizers of the family.
+        models: names of the classes of Gaussian models.
         steps: "updates" takes calls of ``update_learning_rate`` for the steps; "parameters" takes the first render
             after a change of the positions or opacities for the beginning of one.
         viewer: name of the class of the cameras that a viewer renders with; None if there is no viewer.
@@ -105,7 +98,9 @@ class RasterizerHook(Hook):
         *,
         scope: Scope = "main",
         seed: int = 0,
-        rasterizer: type | None = None,
+        rasterizer: type | str | None = None,
+        candidates: Iterable[str] = (),
+        models: Iterable[str] = (DEFAULT_MODEL,),
         steps: Steps = "updates",
         viewer: str | None = "MiniCam",
         patience: int = 100,
@@ -128,13 +123,14 @@ class RasterizerHook(Hook):
         self._scope = scope
         self._seed = int(seed)
         self._rasterizer = rasterizer
+        self._rasterizers = RASTERIZERS if rasterizer is None else (rasterizer,)
+        self._candidates = tuple(candidates) if rasterizer is None else ()
+        self._models = tuple(models)
         self._viewer = viewer
         self._allow_zeros = allow_zeros
         self._iterations = Iterations(steps, self.note_lost)
-        self._models: tuple[type, ...] = ()
-        self._patches: list[ClassPatch] = []
+        self._wrapped: Wrapped | None = None
         self._hooked: list[str] = []  # names of the classes, for messages
-        self._imports: AfterImport | None = None
 
     def install(self) -> Self:
         """Wrap the rasterizers, those that are imported and those that will be; return the hook.
@@ -145,16 +141,20 @@ class RasterizerHook(Hook):
             TypeError: if the rasterizer is not one of the INRIA family.
             ValueError: if it does not take what the regularizer needs.
         """
-        if self._imports is not None:
+        if self._wrapped is not None:
             raise RuntimeError("this hook is installed already; uninstall it first.")
         if self._rasterizer is None:
-            check_installed()
-        callbacks = dict.fromkeys(MODULES, self._found_rasterizer) | {_MODEL_MODULE: self._found_model}
-        self._imports = AfterImport(callbacks)
+            check_installed((*self._rasterizers, *self._candidates))
+        self._wrapped = Wrapped(
+            self._rasterizers,
+            self._candidates,
+            self._models,
+            rasterize=self._rasterize,
+            update=self._iterations.update,
+            check=functools.partial(ForwardCall.check, self._chain),
+        )
         try:
-            if self._rasterizer is not None:
-                self._wrap(self._rasterizer)
-            self._imports.start()
+            self._wrapped.start()
             self._watch()
         except BaseException:
             self.uninstall()
@@ -168,77 +168,27 @@ class RasterizerHook(Hook):
             RuntimeError: if the hook is not installed, or someone wrapped the classes again since; nothing is then
                 changed.
         """
-        if self._imports is None:
+        if self._wrapped is None:
             raise RuntimeError("this hook is not installed.")
-        for patch in self._patches:
-            patch.check_removable()
-        self._imports.stop()
-        self._imports = None
+        self._wrapped.check_removable()
+        self._hooked = self._wrapped.names
         self._unwatch()
-        while self._patches:
-            self._patches.pop().remove()
+        self._wrapped.stop()
+        self._wrapped = None
 
     def step(self, step: int) -> None:
         """Say which training step begins, counted from 1; ``update_learning_rate`` is no longer looked at."""
         self._iterations.step(step)
 
     def _explain(self) -> str:
-        hooked = " and ".join(self._hooked) or "nothing, because no known rasterizer was imported"
+        names = self._hooked if self._wrapped is None else self._wrapped.names
+        hooked = " and ".join(names) or "nothing, because no known rasterizer was imported"
         return (
             f"Hooked is {hooked}; so far: {'; '.join(self.tally.lines())}. If the training renders with another class, "
-            "pass it as rasterizer=... to RasterizerHook; if the rates are 0 for longer than the training, let the "
-            "schedule begin earlier (--start); if steps without a regularized render are meant, raise patience "
-            "(--patience; 0 for any number). Without --dropout and --noise the script runs plain."
+            "pass it as rasterizer=... to RasterizerHook (--rasterizer module:Class); if the rates are 0 for longer "
+            "than the training, let the schedule begin earlier (--start); if steps without a regularized render are "
+            "meant, raise patience (--patience; 0 for any number). Without --dropout and --noise the script runs plain."
         )
-
-    def _found_rasterizer(self, module: ModuleType) -> None:
-        """Wrap the rasterizer of a module that was imported, unless another class was asked for."""
-        found = rasterizer_class(module)
-        if found is not None and self._rasterizer is None and all(patch.owner is not found for patch in self._patches):
-            self._wrap(found)
-
-    def _found_model(self, module: ModuleType) -> None:
-        """Listen to the learning rate updates of the models of a code base."""
-        model = getattr(module, "GaussianModel", None)
-        if not isinstance(model, type) or not hasattr(model, "update_learning_rate"):
-            return
-
-        def make(update: Callable[..., Any]) -> Callable[..., Any]:
-            @functools.wraps(update)
-            def update_learning_rate(model: Any, iteration: int, *args: Any, **kwargs: Any) -> Any:
-                self._iterations.update(model, int(iteration))
-                return update(model, iteration, *args, **kwargs)
-
-            return update_learning_rate
-
-        self._models += (model,)
-        self._patches.append(ClassPatch(model, "update_learning_rate", make))
-
-    def _wrap(self, rasterizer: type) -> None:
-        """Wrap the forward of a rasterizer."""
-        signature = forward_signature(rasterizer)
-        ForwardCall.check(self._chain, signature)
-        function: Any = rasterizer.forward  # type: ignore[attr-defined]
-        while function is not None:
-            if isinstance(vars(function).get("ca_reg_hook"), RasterizerHook):
-                raise RuntimeError(
-                    f"{rasterizer.__qualname__} has a RasterizerHook already; Gaussians would be dropped twice. "
-                    "Uninstall that one first, or put both regularizers into one nn.Sequential."
-                )
-            function = getattr(function, "__wrapped__", None)
-
-        def make(forward: Callable[..., Any]) -> Callable[..., Any]:
-            @functools.wraps(forward)
-            def regularized_forward(*args: Any, **kwargs: Any) -> Any:
-                return self._rasterize(ForwardCall(forward, signature.bind(*args, **kwargs)))
-
-            # A compiled render is cut here: what follows reads the variables of its caller.
-            eager: Callable[..., Any] = torch.compiler.disable(regularized_forward)  # type: ignore[no-untyped-call]
-            vars(eager)["ca_reg_hook"] = self
-            return eager
-
-        self._patches.append(ClassPatch(rasterizer, "forward", make))
-        self._hooked.append(f"{rasterizer.__module__}.{rasterizer.__qualname__}")
 
     def _rasterize(self, call: ForwardCall) -> Any:
         """Decide what a call of the rasterizer is for, and make it."""
@@ -246,7 +196,7 @@ class RasterizerHook(Hook):
             return self._leave(call, Skip.SCORE)
         means, opacities = call.arguments["means3D"], call.arguments["opacities"]
         render = calling_render()
-        model = find_instance(render, self._models)
+        model = None if self._wrapped is None else find_instance(render, self._wrapped.models)
         if not torch.is_grad_enabled() or is_viewer(render, self._viewer):
             refuse_a_second_regularizer(render, self._chain)
             return self._evaluate(call, self._iterations.evaluation_step(means if model is None else model))

@@ -29,13 +29,21 @@ from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
 from ._hook import Hook
 from ._rasterizer import MODULES
-from ._script import imported_packages, run_script, set_command_line
+from ._script import run_script, set_command_line
+from ._sources import read_script
 from .gsplat import Installation
-from .inria import RasterizerHook, Scope, Steps
+from .inria import DEFAULT_MODEL, RasterizerHook, Scope, Steps
 
 __all__ = ["main"]
 
-_OF_INRIA = ("scope", "outputs", "steps", "viewer", "allow_zeros")  # options that mean nothing to a script of gsplat's
+_OF_INRIA = (
+    "scope",
+    "rasterizer",
+    "outputs",
+    "steps",
+    "viewer",
+    "allow_zeros",
+)  # options that mean nothing to a script of gsplat's
 
 _REPORTED = ("script", "arguments", "regularizer", "dropout", "noise", "start", "ramp", "scope", "seed", "cpu")
 
@@ -54,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             from reference_trainer.compat import stand_in
 
             root = options.script.resolve().parent if isinstance(options.script, Path) else Path.cwd()
-            undo.enter_context(stand_in() if options.gsplat else stand_in(root, outputs=options.outputs))
+            undo.enter_context(stand_in() if options.gsplat else stand_in(root, options.outputs, options.rasterizer))
         if hook is not None:
             hook.install()
             undo.callback(_uninstall, hook)
@@ -90,14 +98,11 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         action="store_true",
         help="run without CUDA: a stand-in for the rasterizer of the code base, or gsplat's",
     )
-    add(
-        "--outputs",
-        type=lambda text: int(text) if text.isdigit() else text,
-        choices=(2, 3, 4, "depth", "inverse-depth"),
-        help="what the stand-in returns, if the source does not tell: length of the tuple, or the third of three",
-    )
-    add("--steps", choices=get_args(Steps), default="updates", help="what tells the steps: calls of "
-        "update_learning_rate (default), or changes of the parameters")  # fmt: skip
+    add("--rasterizer", metavar="MODULE:CLASS", help="the class that renders, if it is not found in the source")
+    add("--outputs", type=lambda text: tuple(text.split(",")), metavar="NAME,...", help="what the stand-in returns, if "
+        "the script's names for it do not tell, such as image,radii,depth,alpha")  # fmt: skip
+    add("--steps", choices=get_args(Steps), help="what tells the steps: calls of update_learning_rate, or changes of "
+        "the parameters (default: the former if there is a class with that method)")  # fmt: skip
     add("--viewer", default="MiniCam", metavar="CLASS", help="class of a viewer's cameras (default: MiniCam), or none")
     add("--patience", type=int, default=100, metavar="STEPS", help="end the run after so many steps that were not "
         "regularized (default: 100), or fail at its end; 0 for neither")  # fmt: skip
@@ -115,8 +120,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
             parser.error(f"there is no module {options.script}")
     elif options.script is None or not options.script.is_file():
         parser.error(f"there is no script {options.script or ''}".rstrip())
-    packages = imported_packages(options.script)
-    options.gsplat = "gsplat" in packages and packages.isdisjoint(MODULES)
+    options.sources = sources = read_script(options.script)
+    options.gsplat = "gsplat" in sources.packages and not sources.rasterizers and sources.packages.isdisjoint(MODULES)
     meaningless = [name for name in _OF_INRIA if getattr(options, name) != parser.get_default(name)]
     if options.gsplat and meaningless:
         parser.error(
@@ -128,6 +133,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         options.report = options.report.absolute()  # the script may change the folder
         if not options.report.parent.is_dir():
             parser.error(f"there is no folder {options.report.parent} for the report")
+    if options.rasterizer is not None and options.rasterizer.count(":") != 1:
+        parser.error(f"--rasterizer must be module:Class, got {options.rasterizer}")
     if options.outputs is not None and not options.cpu:
         parser.error("--outputs is about the stand-in, which --cpu asks for")
     try:
@@ -158,7 +165,10 @@ def _hook(options: argparse.Namespace) -> Hook | None:
         Chain(*members),
         scope=options.scope,
         seed=options.seed,
-        steps=options.steps,
+        rasterizer=options.rasterizer,
+        candidates=options.sources.classes,
+        models=dict.fromkeys([DEFAULT_MODEL, *options.sources.models]),
+        steps=options.steps or ("updates" if options.sources.models else "parameters"),
         viewer=None if options.viewer == "none" else options.viewer,
         patience=options.patience,
         allow_zeros=options.allow_zeros,

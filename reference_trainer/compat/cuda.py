@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -14,7 +15,9 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-__all__ = ["cuda_on_cpu"]
+__all__ = ["MEMORY", "cuda_on_cpu"]
+
+MEMORY = 2**34  # bytes, all of them free
 
 
 @contextmanager
@@ -23,8 +26,9 @@ def cuda_on_cpu() -> Iterator[None]:
 
     With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
     ``.cuda()`` of tensors and modules, and ``torch.load(map_location="cuda")`` mean the CPU, and ``torch.cuda.Event``,
-    ``synchronize``, ``set_device``, ``current_device`` and ``reset_peak_memory_stats`` are harmless; everything is
-    restored at the end.
+    ``Stream``, ``synchronize``, ``set_device``, ``current_device``, ``current_stream``, ``reset_peak_memory_stats`` and
+    ``nvtx`` are harmless, and ``mem_get_info``, ``get_device_properties`` and ``get_device_name`` speak of a device
+    with `MEMORY` bytes; everything is restored at the end.
     ``torch.cuda.is_available()`` stays False.
 
     A tensor that is moved to "cuda" is the same tensor, as on a real device if it were there already: what is written
@@ -32,7 +36,7 @@ def cuda_on_cpu() -> Iterator[None]:
 
     It holds for this thread and for those that are started within the block, such as a viewer's.
 
-    Not covered: ``torch.Generator("cuda")`` and CUDA streams.
+    Not covered: ``torch.Generator("cuda")``.
 
     Example:
         >>> with cuda_on_cpu():
@@ -125,6 +129,24 @@ class _Event:
     synchronize = wait
 
 
+class _Stream:
+    """The order in which a CPU works, which is the only one."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        pass
+
+    def __enter__(self) -> _Stream:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def _wait(self, *args: Any) -> None:
+        """Wait for nothing."""
+
+    synchronize = wait_stream = wait_event = _wait
+
+
 def _nothing() -> Callable[..., None]:
     """Return a new function that does nothing; dynamo refuses the same object under two names of torch."""
     return lambda *args, **kwargs: None
@@ -132,8 +154,17 @@ def _nothing() -> Callable[..., None]:
 
 _STAND_INS: dict[str, Any] = {
     "Event": _Event,
+    "Stream": _Stream,
     "current_device": lambda: 0,
+    "current_stream": lambda device=None: _Stream(),
+    "get_device_name": lambda device=None: "CPU",
+    "get_device_properties": lambda device=None: SimpleNamespace(
+        name="CPU", major=0, minor=0, total_memory=MEMORY, multi_processor_count=1
+    ),
+    "mem_get_info": lambda device=None: (MEMORY, MEMORY),
+    "nvtx": SimpleNamespace(range_push=_nothing(), range_pop=_nothing(), mark=_nothing(), range=_Stream),
     "reset_peak_memory_stats": _nothing(),
     "set_device": _nothing(),
+    "stream": lambda stream: _Stream(),
     "synchronize": _nothing(),
 }

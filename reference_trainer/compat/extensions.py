@@ -9,9 +9,10 @@ from typing import Any
 from torch import Tensor
 
 from ca_reg.neighbors import nearest_neighbors
+from reference_trainer.compat.unpacking import names_of_results
 from reference_trainer.losses.photometric import ssim_map
 
-__all__ = ["fused_ssim", "make_module", "neighbor_modules"]
+__all__ = ["distCUDA2", "fused_ssim", "make_module"]
 
 BORDER = 5  # pixels that the 11 x 11 window reaches beyond its centre
 
@@ -24,20 +25,13 @@ def make_module(name: str, **members: Any) -> ModuleType:
     return module
 
 
-def neighbor_modules(*, indices: bool) -> dict[str, ModuleType]:
-    """Make the modules ``simple_knn`` and ``simple_knn._C``.
+def distCUDA2(points: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+    """Return mean squared distances to the three nearest neighbours, shape (N,).
 
-    Args:
-        indices: whether ``distCUDA2`` returns the neighbours' numbers too, as the version of FSGS and CoR-GS does.
+    To callers that take the result apart, as those of FSGS and CoR-GS do, their numbers come with it: (N, 3) int32.
     """
-
-    def distCUDA2(points: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        """Return mean squared distances to the three nearest neighbours, shape (N,), and their numbers if so built."""
-        squares, numbers = nearest_neighbors(points, 3)
-        return (squares.mean(1), numbers.int()) if indices else squares.mean(1)
-
-    compiled = make_module("simple_knn._C", distCUDA2=distCUDA2)
-    return {"simple_knn": make_module("simple_knn", _C=compiled), "simple_knn._C": compiled}
+    squares, numbers = nearest_neighbors(points, 3)
+    return squares.mean(1) if names_of_results() is None else (squares.mean(1), numbers.int())
 
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:

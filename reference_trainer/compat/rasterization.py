@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
+from reference_trainer.compat.antialiasing import antialiased
 from reference_trainer.render import Splats, draw, splat
 from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradients
-from reference_trainer.render.constants import DILATION, MIN_ALPHA, NEAR_PLANE
-from reference_trainer.render.eager.projection import project
+from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 
 __all__ = ["make_rasterization"]
 
@@ -159,10 +159,7 @@ def _look(given: SimpleNamespace, number: int, means: Tensor, scales: Tensor, un
     camera = Camera(pose, fx, fy, cx, cy, given.width, given.height)
     splats = splat(means, given.quats, scales, given.opacities, camera, **_colors(given, number))
     if given.rasterize_mode == "antialiased":
-        seen, quats, lengths = (x.index_select(0, splats.indices) for x in (means, given.quats, scales))
-        ellipses = project(seen, quats, lengths, camera.to(means.device, means.dtype))
-        compensation = _compensation(*ellipses.covariances.unbind(-1))
-        splats = splats.engine.masked(splats, splats.opacities * compensation)
+        splats = antialiased(splats, means, given.quats, scales, camera, floor=1e-10)
     projection = splats.projection
     centers, extents = projection.means.detach(), _extents(splats, per_axis)
     size = centers.new_tensor([given.width, given.height])
@@ -180,13 +177,6 @@ def _colors(given: SimpleNamespace, number: int) -> dict[str, Any]:
     shared = given.colors.ndim == (2 if given.sh_degree is None else 3)
     colors = given.colors if shared else given.colors[number]
     return {"colors": colors} if given.sh_degree is None else {"sh": colors, "sh_degree": given.sh_degree}
-
-
-def _compensation(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
-    """Return the root of the share of its area that a splat had before `DILATION` (Mip-Splatting, equation 9)."""
-    dilated = xx * yy - xy * xy
-    before = (xx - DILATION) * (yy - DILATION) - xy * xy
-    return (before / dilated).clamp_min(1e-10).sqrt()  # above 0: the root has a slope
 
 
 @torch.no_grad()

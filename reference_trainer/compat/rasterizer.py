@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from types import ModuleType
+from typing import Any, NoReturn
 
+import torch
 from torch import Tensor, nn
 
+from reference_trainer.compat.antialiasing import antialiased
+from reference_trainer.compat.contributions import contributions
 from reference_trainer.compat.extensions import make_module
+from reference_trainer.compat.outputs import Unknown, kinds_of
 from reference_trainer.compat.radii import in_front, visible_radii
-from reference_trainer.compat.settings import GaussianRasterizationSettings, camera_of
+from reference_trainer.compat.settings import GaussianRasterizationSettings, camera_of, warn_of_ignored
+from reference_trainer.compat.surfels import surfel_planes
+from reference_trainer.compat.unpacking import names_of_results
+from reference_trainer.model.relocation import compute_relocation
 from reference_trainer.render import draw, splat
 from reference_trainer.render.absolute import splat_weights, with_absolute_gradients
 
 __all__ = ["GaussianRasterizer", "rasterizer_module"]
+
+FIELDS = ("antialiasing", "confidence", "pixel_weights")  # of the settings, which tell what the outputs are
+SCORES = ("accum_weights", "accum_count", "accum_blend", "accum_dist", "depths")
+DEPTHS = {"depth", "surfels"}
+FLOOR = 2.5e-5  # INRIA's least share of the area, of antialiasing
 
 
 class GaussianRasterizer(nn.Module):
@@ -30,8 +44,7 @@ class GaussianRasterizer(nn.Module):
         raster_settings: of the view.
     """
 
-    columns = 3
-    members: tuple[str, ...] = ()
+    outputs: tuple[str, ...] | None = None
 
     def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
         super().__init__()
@@ -40,6 +53,13 @@ class GaussianRasterizer(nn.Module):
     def markVisible(self, positions: Tensor) -> Tensor:
         """Say which points (N, 3) lie beyond the near plane; shape (N,) bool."""
         return in_front(positions, camera_of(self.raster_settings))
+
+    def visible_filter(
+        self, means3D: Tensor, scales: Tensor, rotations: Tensor, cov3D_precomp: Tensor | None = None
+    ) -> Tensor:
+        """Return the radii of Gaussians, as `forward` does, without drawing them (Scaffold-GS)."""
+        scales, rotations = self._axes(scales, rotations, cov3D_precomp)
+        return visible_radii(means3D, rotations, scales, camera_of(self.raster_settings))
 
     def forward(
         self,
@@ -51,35 +71,38 @@ class GaussianRasterizer(nn.Module):
         scales: Tensor | None = None,
         rotations: Tensor | None = None,
         cov3D_precomp: Tensor | None = None,
-    ) -> tuple[Tensor, ...]:
+        dc: Tensor | None = None,
+        **further: Any,
+    ) -> tuple[Any, ...]:
         """Render Gaussians: world coordinates (N, 3), opacities (N, 1) or (N,), scales (N, 3), rotations wxyz (N, 4).
 
         ``means2D`` (N, 3), or (N, 4) for AbsGS, receives the screen-space gradients. Colours are spherical-harmonic
-        coefficients ``shs`` (N, K, 3) or ``colors_precomp`` (N, 3).
+        coefficients ``shs`` (N, K, 3), whose first band may stand apart in ``dc`` (N, 1, 3), or ``colors_precomp`` (N,
+        3). Scales (N, 2) are those of surfels (2DGS), which are drawn as flat Gaussians. Further arguments are left
+        out, with a warning unless they are None.
 
         Returns:
-            The image (3, H, W), not clamped; radii in pixels, shape (N,) int32, 0 for what is out of view; and the
-            members. Depth and inverse depth are sums of weight times (inverse) camera depth; they and alpha have shape
-            (1, H, W). Weights are every Gaussian's sum of weights over the pixels, shape (N,), without a gradient.
+            The image (3, H, W), not clamped; radii in pixels, shape (N,) int32, 0 for what is out of view; and what
+            the caller calls the further members, see `kinds_of`. Depth and inverse depth are sums of weight times
+            (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's sum of weights
+            over the pixels, shape (N,), without a gradient; so are the scores of Taming 3DGS, see `contributions`.
+            Surfels are the seven planes of `surfel_planes`.
 
         Raises:
-            ValueError: if ``means2D`` has another shape, or antialiasing or a covariance is asked for.
+            ValueError: if ``means2D`` has another shape, a covariance is given, or the outputs cannot be told.
         """
-        settings, n = self.raster_settings, means3D.shape[0]
-        if cov3D_precomp is not None or scales is None or rotations is None:
+        settings, (n, columns) = self.raster_settings, means2D.shape
+        names = self.outputs or names_of_results()
+        kinds = kinds_of(names, {name for name in FIELDS if getattr(settings, name) is not None})
+        warn_of_ignored("argument", further)
+        if n != len(means3D) or not 2 <= columns <= 4:
             raise ValueError(
-                "the stand-in rasterizer needs scales and rotations, and no cov3D_precomp: the eigenvectors of a "
-                "covariance have no gradient where two axes are equal. Train without --compute_cov3D_python."
+                f"means2D of {type(self).__module__} must have shape ({len(means3D)}, 3), or 4 columns for sums of "
+                f"absolute gradients, got {tuple(means2D.shape)}."
             )
-        if means2D.shape != (n, self.columns):
-            raise ValueError(
-                f"means2D of {type(self).__module__} must have {self.columns} columns, shape ({n}, {self.columns}), "
-                f"got shape {tuple(means2D.shape)}."
-            )
-        if settings.antialiasing:
-            raise ValueError(
-                "antialiasing=True is not supported by the stand-in rasterizer: train with antialiasing=False."
-            )
+        scales, rotations = self._axes(scales, rotations, cov3D_precomp)
+        if dc is not None and shs is not None:
+            shs = torch.cat([dc, shs], dim=1)
         camera = camera_of(settings)
         if settings.confidence is not None:
             weight = settings.confidence.detach().reshape(n, 1)
@@ -87,27 +110,71 @@ class GaussianRasterizer(nn.Module):
             opacities = _weighted(opacities.reshape(n, 1), weight)
             shs = None if shs is None else _weighted(shs, weight[:, None])
             colors_precomp = None if colors_precomp is None else _weighted(colors_precomp, weight)
-        scales = scales * settings.scale_modifier
         splats = splat(
             means3D, rotations, scales, opacities, camera, sh=shs, sh_degree=settings.sh_degree, colors=colors_precomp
         )
+        if settings.antialiasing:
+            splats = antialiased(splats, means3D, rotations, scales, camera, floor=FLOOR)
         # Pixels per unit of normalised device coordinates, for every column.
         half = [0.5 * camera.width, 0.5 * camera.height, 0.5 * camera.width, 0.5 * camera.height]
-        sink = means2D.index_select(0, splats.indices) * means2D.new_tensor(half[: self.columns])
+        sink = means2D.index_select(0, splats.indices) * means2D.new_tensor(half[:columns])
         # Zeros are added, whose gradient is that of the positions.
         projection = splats.projection
-        projection = projection._replace(means=projection.means + (sink - sink.detach())[:, :2])
-        if "inverse_depth" in self.members:
-            # The lists are sorted already, so that the depths are only summed.
-            projection = projection._replace(depths=projection.depths.reciprocal())
-        planes = self.members if self.columns == 3 else ()
-        rendering = draw(splats._replace(projection=projection), background=settings.bg, depth=bool(planes))
+        splats = splats._replace(projection=projection._replace(means=projection.means + (sink - sink.detach())[:, :2]))
+        inverse = "inverse_depth" in kinds
+        depths = projection.depths.reciprocal() if inverse else projection.depths  # sorted already, these are summed
+        rendering = draw(
+            splats._replace(projection=splats.projection._replace(depths=depths)),
+            background=settings.bg,
+            depth=inverse or not DEPTHS.isdisjoint(kinds),
+        )
+        if columns == 4:
+            rendering = with_absolute_gradients(rendering, sink[:, 2:], settings.bg)
+        found: dict[str, Tensor] = {"alpha": rendering.alpha[None]}
+        if rendering.depth is not None:
+            found["inverse_depth" if inverse else "depth"] = rendering.depth[None]
+        if "weights" in kinds:
+            found["weights"] = means3D.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
+        if "surfels" in kinds:
+            found["surfels"] = surfel_planes(rendering._replace(splats=splats), means3D, rotations, camera)
         radii = visible_radii(means3D, rotations, scales, camera)
-        if self.columns == 4:
-            weights = means3D.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
-            return with_absolute_gradients(rendering, sink[:, 2:], settings.bg).image, radii, weights
-        found = {"alpha": rendering.alpha, "depth": rendering.depth, "inverse_depth": rendering.depth}
-        return (rendering.image, radii, *(found[member][None] for member in planes))  # type: ignore[index]
+        if settings.pixel_weights is not None:
+            sums = contributions(splats, settings.pixel_weights.reshape(camera.height, camera.width))
+            table = torch.stack([*sums, projection.depths.detach()])
+            table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
+            found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": radii}
+        labels = names[2:] if names else kinds
+        drawn = rendering.alpha.detach() > 0
+        found = {
+            name: _returned(x, drawn) if x.shape[-2:] == drawn.shape else x
+            for name, x in {**found, "image": rendering.image}.items()
+        }
+        members = [found.get(str(kind), Unknown(str(label))) for kind, label in zip(kinds, labels, strict=True)]
+        return (found["image"], radii, *members)
+
+    def _axes(
+        self, scales: Tensor | None, rotations: Tensor | None, covariances: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return standard deviations (N, 3), those of surfels with a third of 0, and rotations; refuse covariances."""
+        if covariances is not None or scales is None or rotations is None:
+            raise ValueError(
+                "the stand-in rasterizer needs scales and rotations, and no cov3D_precomp: the eigenvectors of a "
+                "covariance have no gradient where two axes are equal. Train without --compute_cov3D_python."
+            )
+        lengths = torch.nn.functional.pad(scales, (0, 3 - scales.shape[1]))
+        return lengths * self.raster_settings.scale_modifier, rotations
+
+
+def _returned(plane: Tensor, drawn: Tensor) -> Tensor:
+    """Return a plane (..., H, W) as CUDA code would.
+
+    It is a copy, which the caller may write over (DNGaussian). Its gradient counts only where something is drawn: that
+    of depth / alpha, say, is nan elsewhere (2DGS).
+    """
+    plane = plane.clone()
+    if plane.requires_grad:
+        plane.register_hook(lambda gradient: torch.where(drawn, gradient, 0.0))  # type: ignore[no-untyped-call]
+    return plane
 
 
 def _weighted(x: Tensor, weight: Tensor) -> Tensor:
@@ -116,18 +183,34 @@ def _weighted(x: Tensor, weight: Tensor) -> Tensor:
     return fixed + (x - fixed) * weight
 
 
-def rasterizer_module(name: str, members: tuple[str, ...]) -> ModuleType:
-    """Make a module with the interface of a rasterizer package, maybe that of AbsGS, ``..._abs``.
+def rasterizer_module(name: str, names: Iterable[str] = (), outputs: tuple[str, ...] | None = None) -> ModuleType:
+    """Make a module with the interface of a rasterizer package.
 
-    Its class is new for every call: a patch of its ``forward`` ends with the module. ``members`` is what the result has
-    after image and radii: ``depth`` or ``inverse_depth``, ``alpha``; for AbsGS ``weights`` alone.
+    Its classes are new for every call: a patch of their ``forward`` ends with the module. ``names`` are those of
+    further classes, of settings if they end with ``Settings``; ``outputs`` names what the result has, by default what
+    its caller calls it. Whatever else is imported from it is refused by name, as an ImportError.
 
     Example:
-        >>> module = rasterizer_module("diff_gaussian_rasterization", ())
+        >>> module = rasterizer_module("diff_gaussian_rasterization")
         >>> module.GaussianRasterizationSettings._fields[:2]
         ('image_height', 'image_width')
     """
-    columns, forward = 4 if name.endswith("_abs") else 3, GaussianRasterizer.forward
-    own = {"members": members, "columns": columns, "forward": forward, "__module__": name}
-    rasterizer = type("GaussianRasterizer", (GaussianRasterizer,), own)
-    return make_module(name, GaussianRasterizationSettings=GaussianRasterizationSettings, GaussianRasterizer=rasterizer)
+
+    def refuse(attribute: str) -> NoReturn:
+        if attribute.startswith("__"):
+            raise AttributeError(attribute)
+        raise ImportError(f"the stand-in for {name} has no {attribute}, which needs CUDA.")
+
+    own = {"outputs": outputs, "forward": GaussianRasterizer.forward, "__module__": name}
+    members: dict[str, Any] = {
+        each: GaussianRasterizationSettings
+        if each.endswith("Settings")
+        else type(each, (GaussianRasterizer,), dict(own))
+        for each in {"GaussianRasterizationSettings", "GaussianRasterizer", *names}
+    }
+    return make_module(name, **members, compute_relocation=_relocation, __getattr__=refuse)
+
+
+def _relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, n_max: int) -> tuple[Tensor, Tensor]:
+    """Return what `compute_relocation` does, for at most ``n_max`` Gaussians (3DGS-MCMC)."""
+    return compute_relocation(opacities, scales, ratios, binoms[:n_max])

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+import warnings
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
 
-__all__ = ["GaussianRasterizationSettings", "camera_of"]
+__all__ = ["GaussianRasterizationSettings", "camera_of", "warn_of_ignored"]
 
 TOLERANCE = 1e-3  # of the entries of a projection matrix that went through single precision twice
 
 
-class GaussianRasterizationSettings(NamedTuple):
-    """What the rasterizers of the INRIA family are told about a view: the fields of all variants.
-
-    Convention: matrices act on row vectors (``x_world @ viewmatrix``), so they are the transposes of the textbook's.
-    ``viewmatrix`` is world to camera, ``projmatrix`` world to clip space, both (4, 4); sizes are in pixels, ``tanfovx``
-    and ``tanfovy`` tangents of half the fields of view. ``confidence`` (N, 1) is a factor on the gradients of every
-    Gaussian (FSGS, CoR-GS). Not read are ``campos``, which the view matrix has too, ``prefiltered`` and ``debug``; of
-    ``antialiasing`` only False is supported.
-    """
-
+class _Fields(NamedTuple):
     image_height: int
     image_width: int
     tanfovx: float
@@ -37,7 +30,42 @@ class GaussianRasterizationSettings(NamedTuple):
     prefiltered: bool = False
     debug: bool = False
     confidence: Tensor | None = None
-    antialiasing: bool = False
+    antialiasing: bool | None = None
+    pixel_weights: Tensor | None = None
+
+
+class GaussianRasterizationSettings(_Fields):
+    """What the rasterizers of the INRIA family are told about a view: the fields of several variants.
+
+    Convention: matrices act on row vectors (``x_world @ viewmatrix``), so they are the transposes of the textbook's.
+    ``viewmatrix`` is world to camera, ``projmatrix`` world to clip space, both (4, 4); sizes are in pixels, ``tanfovx``
+    and ``tanfovy`` tangents of half the fields of view. ``confidence`` (N, 1) is a factor on the gradients of every
+    Gaussian (FSGS, CoR-GS), ``antialiasing`` that of INRIA since October 2024, and ``pixel_weights`` (H, W) asks for
+    the scores of Taming 3DGS. Not read are ``campos``, which the view matrix has too, ``prefiltered`` and ``debug``.
+    Further fields are left out, with a warning unless they are None.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, *values: Any, **fields: Any) -> Self:
+        """Take the fields that the stand-in knows."""
+        further = {name: fields.pop(name) for name in fields.keys() - set(cls._fields)}
+        warn_of_ignored("setting", further)
+        return super().__new__(cls, *values, **fields)
+
+
+def warn_of_ignored(kind: str, values: dict[str, Any]) -> None:
+    """Warn, once each, of values that the stand-in does not know; None is nothing to ignore."""
+    for name in sorted(name for name, value in values.items() if value is not None):
+        _warn(kind, name)
+
+
+@functools.cache
+def _warn(kind: str, name: str) -> None:
+    warnings.warn(
+        f"the stand-in rasterizer does not know the {kind} {name}, and ignores it: what it does on a GPU is missing.",
+        stacklevel=3,
+    )
 
 
 def camera_of(settings: GaussianRasterizationSettings) -> Camera:

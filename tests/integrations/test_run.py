@@ -15,7 +15,7 @@ import torch
 from stand_ins.inria import Model, make_rasterizer, make_render
 
 from ca_reg import Chain
-from ca_reg.integrations._script import imported_packages
+from ca_reg.integrations._sources import read_folder, read_script
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.integrations.run import main
 
@@ -292,8 +292,8 @@ def test_without_cuda_the_stand_in_comes_first(repository, capsys, monkeypatch):
     asked = []
 
     @contextmanager
-    def stand_in(repository: Path, outputs: int | None = None):
-        asked.append((repository, outputs))
+    def stand_in(repository: Path, outputs=None, rasterizer=None):
+        asked.append((repository, outputs, rasterizer))
         from stand_ins.inria import make_rasterizer
 
         module = ModuleType("diff_gaussian_rasterization")
@@ -308,8 +308,8 @@ def test_without_cuda_the_stand_in_comes_first(repository, capsys, monkeypatch):
     fake.stand_in = stand_in
     monkeypatch.setitem(sys.modules, "reference_trainer.compat", fake)
     (repository / "diff_gaussian_rasterization.py").unlink()
-    assert launch("--cpu", "--outputs", 2, "--dropout", 0.5, repository / "train.py", 1) == 0
-    assert asked == [(repository, 2)]
+    assert launch("--cpu", "--outputs", "image,radii", "--dropout", 0.5, repository / "train.py", 1) == 0
+    assert asked == [(repository, ("image", "radii"), None)]
     assert "1 renders regularized" in capsys.readouterr().err
 
 
@@ -372,9 +372,86 @@ def test_what_a_script_imports_is_read_also_through_the_files_beside_it(reposito
     (repository / "broken.py").write_text("import (\n")
     (repository / "other.py").write_text("import numpy.linalg, broken\nfrom scene import views\n")
     expected = {"numpy", "broken", "scene", "stand_ins", "far"}
-    assert imported_packages(repository / "other.py") == expected
-    assert "diff_gaussian_rasterization" in imported_packages(repository / "train.py")
-    assert imported_packages("nowhere.train") == set()
+    assert read_script(repository / "other.py").packages == expected
+    assert "diff_gaussian_rasterization" in read_script(repository / "train.py").packages
+    assert read_script("nowhere.train").packages == set()
+
+
+FORK = {
+    "surfel_rasterization.py": """
+        from stand_ins.inria import make_rasterizer
+
+        SurfelRasterizer = make_rasterizer()
+        SurfelRasterizationSettings = None
+    """,
+    "points/field.py": """
+        from stand_ins.inria import Model
+
+        class Base(Model):
+            def update_learning_rate(self, iteration):
+                self.rate = 1e-3
+
+        class Points(Base):
+            def update_learning_rate(self, iteration):
+                super().update_learning_rate(iteration)
+    """,
+    "fork.py": """
+        import sys
+        import torch
+        from points.field import Points
+        from stand_ins.inria import make_render
+        sys.path.append("packages")
+        from surfel_rasterization import SurfelRasterizer
+
+        points, render = Points(), make_render(SurfelRasterizer)
+        for iteration in range(1, 5):
+            {update}
+            package = render(points.camera, points, None, torch.zeros(3))
+            package["render"].sum().backward()
+            with torch.no_grad():
+                points._opacity.sub_(0.01)
+    """,
+}
+
+
+@pytest.mark.parametrize("update", ["points.update_learning_rate(iteration)", "pass"])
+@pytest.mark.parametrize("found", ["in the source", "by its name"])
+def test_rasterizer_model_and_steps_of_a_fork_are_found(repository, tmp_path, capsys, monkeypatch, update, found):
+    for name, text in FORK.items():
+        path = repository / ("packages" if "raster" in name else "") / name
+        path.parent.mkdir(exist_ok=True)
+        text = text.replace("{update}", update)
+        if update == "pass":
+            text = text.replace("update_learning_rate", "adapt")
+        path.write_text(textwrap.dedent(text))
+    options = ["--dropout", 0.5, "--report", tmp_path / "report.json"]
+    if found == "by its name":
+        path = repository / "fork.py"
+        path.write_text(path.read_text().replace("from surfel_rasterization import SurfelRasterizer",
+            "SurfelRasterizer = __import__('surfel_rasterization').SurfelRasterizer"))  # fmt: skip
+        options += ["--rasterizer", "surfel_rasterization:SurfelRasterizer"]
+    monkeypatch.chdir(repository)
+    main([str(x) for x in [*options, repository / "fork.py"]])
+    renders = json.loads((tmp_path / "report.json").read_text())["renders"]
+    assert (renders["regularized"], renders["first_step"], renders["last_step"]) == (4, 1, 4)
+    for name in ("surfel_rasterization", "points.field", "points"):
+        sys.modules.pop(name, None)
+
+
+def test_the_sources_of_extensions_and_hidden_folders_are_not_read(repository):
+    line = "from {} import GaussianRasterizer, PlaneRasterizationSettings as S, rasterize\n"
+    for folder in ("submodules/a", ".git", "tools", "diff_local"):
+        (repository / folder).mkdir(parents=True)
+        (repository / folder / "x.py").write_text(
+            line.format("diff_" + folder.rpartition("/")[2].strip(".").removeprefix("diff_"))
+        )
+    (repository / "tools" / "y.py").write_text("from diff_local import GaussianRasterizer\nimport (\n")
+    (repository / "diff_local" / "z.py").write_text("from diff_local import OwnRasterizer\n")
+    assert read_folder(repository).rasterizers == {"diff_tools": {"GaussianRasterizer", "PlaneRasterizationSettings"}}
+    assert read_folder(repository).classes == ["diff_tools:GaussianRasterizer"]
+    (repository / "diff_local" / "setup.py").touch()  # an extension that is installed from there
+    assert set(read_folder(repository).rasterizers) == {"diff_tools", "diff_local"}
+    assert read_folder(repository).models == ["scene.gaussian_model:GaussianModel"]
 
 
 @pytest.mark.parametrize(
@@ -385,7 +462,7 @@ def test_what_a_script_imports_is_read_also_through_the_files_beside_it(reposito
         (["-m"], "-m needs the name of a module"),
         (["-m", "nowhere.train"], "there is no module nowhere.train"),
         (["--patience", "-1", "SCRIPT"], "--patience must be at least 0"),
-        (["--cpu", "--outputs", "5", "SCRIPT"], "invalid choice"),
+        (["--rasterizer", "Mine", "SCRIPT"], "--rasterizer must be module:Class, got Mine"),
         (["--regularizer", "dropout(1.5)", "SCRIPT"], r"p must be in \[0, 1\)"),
         (["--regularizer", "nowhere:Mine", "SCRIPT"], "the regularizer nowhere:Mine cannot be had"),
         (["--dropout", "1.5", "SCRIPT"], r"p must be in \[0, 1\)"),

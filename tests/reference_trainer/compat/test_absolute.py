@@ -7,11 +7,12 @@ from reference_trainer.compat.rasterizer import rasterizer_module
 
 
 def _call(settings, scene, screen):
-    rasterizer = rasterizer_module("diff_gaussian_rasterization_abs", ("weights",)).GaussianRasterizer(settings)
-    return rasterizer(
+    rasterizer = rasterizer_module("diff_gaussian_rasterization_abs").GaussianRasterizer(settings)
+    image, radii, gs_w = rasterizer(
         means3D=scene.means, means2D=screen, opacities=scene.opacities, colors_precomp=scene.colors,
         scales=scene.scales, rotations=scene.quaternions,
     )  # fmt: skip
+    return image, radii, gs_w
 
 
 def test_signed_and_absolute_gradients_and_weights(settings_of, moved_brute_force):

@@ -116,3 +116,18 @@ def test_threads_that_are_started_within_the_block_are_covered():
         thread.join()
     assert found == ["cpu"]
     assert threading.Thread.start is start
+
+
+@without_cuda
+def test_what_scripts_ask_a_device_has_an_answer():
+    with cuda_on_cpu():
+        free, total = torch.cuda.mem_get_info()
+        assert 0 < free <= total == torch.cuda.get_device_properties("cuda").total_memory
+        assert torch.cuda.get_device_name(0)
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side), torch.cuda.nvtx.range("a render"):
+            torch.cuda.nvtx.range_push("colours")
+            torch.cuda.nvtx.range_pop()
+            assert torch.ones(2, device="cuda").sum() == 2
+        side.synchronize()

@@ -5,7 +5,7 @@ import torch
 from kornia.metrics import ssim
 from torch.nn.functional import pad
 
-from reference_trainer.compat.extensions import fused_ssim, neighbor_modules
+from reference_trainer.compat.extensions import distCUDA2, fused_ssim
 
 
 @pytest.mark.parametrize("padding", ["same", "valid"])
@@ -31,15 +31,16 @@ def test_both_forms_of_the_extension(generator):
     points = torch.rand(20, 3, generator=generator).requires_grad_()
     squares = (points.detach()[:, None] - points.detach()).square().sum(-1).fill_diagonal_(torch.inf)
     expected = squares.sort(dim=1)
-    alone = neighbor_modules(indices=False)["simple_knn._C"].distCUDA2(points)
-    pair = neighbor_modules(indices=True)["simple_knn._C"].distCUDA2(points)
+    alone = distCUDA2(points)
     torch.testing.assert_close(alone, expected.values[:, :3].mean(1))
     assert not alone.requires_grad
-    assert torch.equal(pair[0], alone)
-    assert torch.equal(pair[1], expected.indices[:, :3].int())
-    assert pair[1].dtype == torch.int32
+    assert torch.equal(distCUDA2(points)[0], alone)
+    distances, numbers = distCUDA2(points)
+    assert torch.equal(distances, alone)
+    assert torch.equal(numbers, expected.indices[:, :3].int())
+    assert numbers.dtype == torch.int32
 
 
 def test_too_few_points_are_refused():
     with pytest.raises(ValueError, match=r"\(N, 3\) with N > 3"):
-        neighbor_modules(indices=False)["simple_knn._C"].distCUDA2(torch.zeros(3, 3))
+        distCUDA2(torch.zeros(3, 3))

@@ -10,7 +10,8 @@ from oracles import random_scene
 
 from reference_trainer.compat import install, stand_in, uninstall
 
-NAMES = ("diff_gaussian_rasterization", "simple_knn", "simple_knn._C")
+NAMES = ("diff_gaussian_rasterization", "simple_knn", "simple_knn._C", "fused_ssim")
+NAMES += ("gridencoder", "shencoder", "freqencoder")
 
 RENDERER = """
 import math
@@ -95,6 +96,55 @@ def test_an_unmodified_script_trains(repository, settings_of):
     assert all(sys.modules.get(name) is module for name, module in before.items())
 
 
+FORK = {
+    "from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer": """
+try:
+    from plane_rasterization import SparseGaussianAdam
+except ImportError:
+    pass
+from plane_rasterization import PlaneRasterizationSettings as GaussianRasterizationSettings
+from plane_rasterization import PlaneRasterizer as GaussianRasterizer
+import subprocess
+memory = subprocess.check_output("nvidia-smi -q -d Memory | grep -A4 GPU | grep Used", shell=True, text=True)
+assert int(memory.split()[2]) >= 0
+from helpers import Rasterizer
+""",
+    "debug=False)": "debug=False, filter_of_the_fork=0.1)",
+    "image, radii = rasterizer(": "image, radii, planes, rendered_alpha = rasterizer(",
+    "cov3D_precomp=None)": "poses_of_the_fork=screen)\n    assert rendered_alpha.shape == (1, 18, 24)",
+}
+
+
+def test_a_fork_with_other_names_settings_arguments_and_outputs_trains(repository, settings_of):
+    path = repository / "gaussian_renderer" / "__init__.py"
+    text = path.read_text()
+    for before, after in FORK.items():
+        assert before in text
+        text = text.replace(before, after)
+    path.write_text(text)
+    (repository / "helpers.py").write_text("class Rasterizer:\n    own = True\n")
+
+    def train():
+        with stand_in(repository) as modules:
+            assert modules == (NAMES[0], "plane_rasterization", *NAMES[1:])
+            result = runpy.run_path(str(repository / "train.py"), init_globals=_given(settings_of), run_name="__main__")
+            assert sys.modules.pop("helpers").Rasterizer.own
+            return result
+
+    with pytest.warns(UserWarning, match="of_the_fork, and ignores it") as warned:
+        result = train()
+    assert result["losses"][-1] < 0.7 * result["losses"][0]
+    assert sum("of_the_fork" in str(w.message) for w in warned) == 2  # a setting and an argument, once each
+
+
+def test_a_rasterizer_that_the_source_does_not_show_can_be_named(repository):
+    with stand_in(repository, rasterizer="hidden_rasterization:HiddenRasterizer") as modules:
+        from hidden_rasterization import HiddenRasterizer
+
+        assert "hidden_rasterization" in modules
+        assert issubclass(HiddenRasterizer, torch.nn.Module)
+
+
 def test_everything_is_restored_after_an_error(repository):
     def fail():
         with stand_in(repository):
@@ -128,7 +178,7 @@ def test_install_and_uninstall(repository):
         uninstall()
     assert not set(NAMES) & set(sys.modules)
     uninstall()
-    assert install(repository, outputs=4) == NAMES
+    assert install(repository, outputs=("image", "radii", "depth", "alpha")) == NAMES
     uninstall()
 
 

@@ -1,8 +1,11 @@
 """The stand-in rasterizer against the brute-force float64 renderer."""
 
+import math
+
 import pytest
 import torch
 from oracles import brute_force, random_scene
+from scipy.spatial.transform import Rotation
 
 from reference_trainer.compat.rasterizer import rasterizer_module
 from reference_trainer.compat.settings import camera_of
@@ -24,7 +27,8 @@ def _call(settings, scene, members=(), *, screen=None, **changes):
         "rotations": scene.quaternions,
         "cov3D_precomp": None,
     }
-    rasterizer = rasterizer_module(NAME, members).GaussianRasterizer(raster_settings=settings)
+    module = rasterizer_module(NAME, outputs=("image", "radii", *members))
+    rasterizer = module.GaussianRasterizer(raster_settings=settings)
     return rasterizer(**{**arguments, **changes})
 
 
@@ -131,7 +135,7 @@ def test_single_precision_as_the_repositories_use_it(settings_of):
 def test_mark_visible_is_the_near_plane(settings_of):
     scene = random_scene(40, 20, 20, seed=3)
     settings = settings_of(scene.camera)
-    visible = rasterizer_module(NAME, ()).GaussianRasterizer(settings).markVisible(scene.means)
+    visible = rasterizer_module(NAME).GaussianRasterizer(settings).markVisible(scene.means)
     camera = camera_of(settings)
     depths = scene.means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     assert torch.equal(visible, depths > 0.2)
@@ -140,7 +144,7 @@ def test_mark_visible_is_the_near_plane(settings_of):
 
 def test_a_patch_of_the_class_ends_with_its_module(settings_of):
     scene = random_scene(5, 8, 8, seed=3)
-    module = rasterizer_module(NAME, ())
+    module = rasterizer_module(NAME, outputs=("image", "radii"))
     plain = module.GaussianRasterizer.__dict__["forward"]
     module.GaussianRasterizer.forward = lambda self, **arguments: plain(self, **arguments)[::-1]
     rasterizer = module.GaussianRasterizer(settings_of(scene.camera))
@@ -154,7 +158,7 @@ def test_a_patch_of_the_class_ends_with_its_module(settings_of):
     ("changes", "words"),
     [
         ({"cov3D_precomp": torch.zeros(4, 6), "scales": None, "rotations": None}, "compute_cov3D_python"),
-        ({"means2D": torch.zeros(4, 4)}, "must have 3 columns"),
+        ({"means2D": torch.zeros(4, 5)}, "or 4 columns"),
         ({"means2D": torch.zeros(3, 3)}, r"\(4, 3\)"),
         ({"colors_precomp": None}, "either sh"),
         ({"shs": torch.zeros(4, 1, 3)}, "either sh"),
@@ -166,7 +170,96 @@ def test_errors_name_the_problem(settings_of, changes, words):
         _call(settings_of(scene.camera), scene, **changes)
 
 
-def test_antialiasing_is_refused(settings_of):
-    scene = random_scene(4, 8, 8, seed=0)
-    with pytest.raises(ValueError, match="antialiasing=False"):
-        _call(settings_of(scene.camera, antialiasing=True), scene)
+def test_antialiasing_makes_up_for_the_blur(settings_of):
+    """Against the covariances of the projections, one by one, with and without the 0.3 square pixels of blur."""
+    scene = random_scene(40, 30, 20, seed=8, size=0.05)
+    camera = scene.camera
+    pose, shares = camera.world_to_camera, []
+    for mean, quaternion, scale in zip(scene.means, scene.quaternions, scene.scales, strict=True):
+        x, y, z = pose[:3, :3] @ mean + pose[:3, 3]
+        x, y = (z * (a / z).clamp(-1.3 * b, 1.3 * b) for a, b in ((x, 15 / camera.fx), (y, 10 / camera.fy)))
+        turn = torch.from_numpy(Rotation.from_quat(quaternion.numpy(), scalar_first=True).as_matrix())
+        lens = pose.new_tensor([[camera.fx / z, 0, -camera.fx * x / z**2], [0, camera.fy / z, -camera.fy * y / z**2]])
+        half = lens @ pose[:3, :3] @ turn @ torch.diag(scale)
+        plain = half @ half.T
+        shares.append((plain.det() / (plain + 0.3 * torch.eye(2).double()).det()).clamp_min(2.5e-5).sqrt())
+    faint = scene._replace(opacities=scene.opacities * torch.stack(shares))
+    plain, blurred = (_call(settings_of(camera, antialiasing=on), scene)[0] for on in (False, True))
+    torch.testing.assert_close(blurred, brute_force(*faint)[0], rtol=0, atol=1e-9)
+    assert (plain - blurred).abs().max() > 0.05
+
+
+def test_the_first_band_may_stand_apart(settings_of):
+    scene = random_scene(30, 20, 16, seed=5)
+    sh = torch.randn(30, 4, 3, generator=torch.Generator().manual_seed(6)).double()
+    settings = settings_of(scene.camera, sh_degree=1)
+    whole = _call(settings, scene, colors_precomp=None, shs=sh)[0]
+    assert torch.equal(_call(settings, scene, colors_precomp=None, dc=sh[:, :1], shs=sh[:, 1:])[0], whole)
+
+
+def test_the_filter_of_scaffold_gs_returns_the_radii(settings_of):
+    scene = random_scene(40, 20, 20, seed=3)
+    settings = settings_of(scene.camera, scale_modifier=0.5)
+    rasterizer = rasterizer_module(NAME).GaussianRasterizer(settings)
+    radii = rasterizer.visible_filter(means3D=scene.means, scales=scene.scales, rotations=scene.quaternions)
+    assert torch.equal(radii, _call(settings, scene)[1])
+    assert 0 < (radii > 0).sum() < 40
+
+
+def test_outputs_may_be_written_over_before_the_backward_pass(settings_of):
+    scene = random_scene(20, 16, 12, seed=4)
+    gradients = []
+    for overwrite in (False, True):
+        colors = scene.colors.clone().requires_grad_()
+        image, _, depth = _call(settings_of(scene.camera), scene._replace(colors=colors), ("depth",))
+        if overwrite:
+            image[:, 3:5], depth[:, 2] = 0.0, 0.0
+            image, depth = image.clone(), depth.clone()
+        mask = torch.ones(1, 12, 16).double()
+        mask[:, 3:5] = 0
+        (image * mask).square().sum().backward()
+        gradients.append(colors.grad)
+    torch.testing.assert_close(*gradients)
+
+
+def test_a_gradient_that_is_nan_where_nothing_is_drawn_does_no_harm(settings_of):
+    scene = random_scene(6, 30, 20, seed=4, size=0.05)
+    gradients = []
+    for divide in (False, True):
+        means = scene.means.clone().requires_grad_()
+        _, _, depth, alpha = _call(settings_of(scene.camera), scene._replace(means=means), DEPTH_ALPHA)
+        drawn = alpha.detach() > 0
+        ratio = depth / alpha if divide else depth / torch.where(drawn, alpha, 1.0)
+        torch.nan_to_num(ratio).sum().backward()
+        gradients.append(means.grad)
+    assert 0 < drawn.sum() < drawn.numel()
+    assert gradients[0].any()
+    torch.testing.assert_close(*gradients)
+
+
+def test_unknown_arguments_are_ignored_with_one_warning(settings_of):
+    scene = random_scene(5, 8, 8, seed=3)
+    with pytest.warns(UserWarning, match="does not know the argument pose_of_the_test, and ignores it") as warned:
+        images = [_call(settings_of(scene.camera), scene, pose_of_the_test=torch.eye(4))[0] for _ in range(2)]
+    assert len(warned) == 1
+    assert torch.equal(*images)
+    assert torch.equal(images[0], _call(settings_of(scene.camera), scene, nothing_of_the_test=None)[0])
+
+
+def test_a_package_has_the_names_that_are_asked_for_and_refuses_others():
+    module = rasterizer_module("my_rasterization", {"PlaneRasterizer", "PlaneRasterizationSettings"})
+    assert issubclass(module.PlaneRasterizer, torch.nn.Module)
+    assert module.PlaneRasterizer is not module.GaussianRasterizer
+    assert module.PlaneRasterizationSettings is module.GaussianRasterizationSettings
+    assert not hasattr(module, "__file__")
+    with pytest.raises(ImportError, match="stand-in for my_rasterization has no SparseGaussianAdam"):
+        module.SparseGaussianAdam  # noqa: B018
+
+
+def test_relocation_takes_the_table_of_3dgs_mcmc():
+    """Four Gaussians of the new opacity at one place are as opaque as the one was; the table may be larger."""
+    table = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)], dtype=torch.float32)
+    relocate = rasterizer_module(NAME).compute_relocation
+    opacity, scales = relocate(torch.tensor([0.8]), torch.ones(1, 3), torch.tensor([4], dtype=torch.int32), table, 51)
+    torch.testing.assert_close(1 - (1 - opacity) ** 4, torch.tensor([0.8]))
+    assert ((scales > 0.4) & (scales < 1)).all()

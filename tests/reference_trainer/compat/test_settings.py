@@ -1,5 +1,7 @@
 """The camera read from a settings tuple, against the INRIA code's own path from the world to a pixel."""
 
+import warnings
+
 import pytest
 import torch
 from oracles import random_scene
@@ -41,3 +43,18 @@ def test_matrices_that_disagree_are_refused(settings_of, mistake):
         settings = settings._replace(tanfovx=1.1 * settings.tanfovx)
     with pytest.raises(ValueError, match="pinhole camera"):
         camera_of(settings)
+
+
+def test_unknown_fields_are_left_out_with_one_warning_each(settings_of):
+    camera = random_scene(1, 40, 24, seed=1).camera
+    changes = {"kernel_of_the_test": 0.1, "offset_of_the_test": torch.zeros(2), "none": None}
+    with pytest.warns(UserWarning, match="does not know the setting .*, and ignores it") as warned:
+        settings = settings_of(camera, **changes)
+    assert ["offset" in str(w.message) for w in warned] == [False, True]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        settings_of(camera, **changes)
+    assert not hasattr(settings, "kernel_of_the_test")
+    changed = settings._replace(bg=torch.ones(3))
+    assert type(changed) is type(settings)
+    assert torch.equal(changed.bg, torch.ones(3))

@@ -1,0 +1,102 @@
+"""What the source of a code base says about itself, read without running it."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+__all__ = ["Sources", "read_folder", "read_script"]
+
+_SUFFIXES = ("Rasterizer", "RasterizationSettings")
+_NOT_READ = {"submodules", "build", "site-packages"}  # extensions and environments within a repository
+
+
+@dataclass
+class Sources:
+    """What the files of a code base say.
+
+    Args:
+        packages: first names of all modules that are imported.
+        rasterizers: of every foreign module that a ``...Rasterizer`` or its ``...RasterizationSettings`` are imported
+            from, those names.
+        models: classes with a method ``update_learning_rate``, as ``module:Class``.
+    """
+
+    packages: set[str] = field(default_factory=set)
+    rasterizers: dict[str, set[str]] = field(default_factory=dict)
+    models: list[str] = field(default_factory=list)
+
+    @property
+    def classes(self) -> list[str]:
+        """The rasterizers as ``module:Class``."""
+        found = self.rasterizers.items()
+        return [f"{module}:{name}" for module, names in found for name in sorted(names) if name.endswith(_SUFFIXES[0])]
+
+    def read(self, path: Path, folder: Path) -> list[tuple[int, str]]:
+        """Read a file of the folder; return the modules that it may import, each with the dots before its name."""
+        try:
+            nodes = list(ast.walk(ast.parse(path.read_bytes())))
+        except SyntaxError:  # Python will say so when it runs it
+            return []
+        modules = list(_imports(nodes))
+        self.packages |= {name.partition(".")[0] for level, name in modules if level == 0}
+        for node in nodes:
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names = {alias.name for alias in node.names if alias.name.endswith(_SUFFIXES)}
+                if names and not _is_own(folder, node.module):
+                    self.rasterizers.setdefault(node.module, set()).update(names)
+            elif isinstance(node, ast.ClassDef) and path.is_relative_to(folder):
+                methods = {part.name for part in node.body if isinstance(part, ast.FunctionDef)}
+                if "update_learning_rate" in methods:
+                    module = ".".join(path.relative_to(folder).with_suffix("").parts).removesuffix(".__init__")
+                    self.models.append(f"{module}:{node.name}")
+        return modules
+
+
+def read_script(script: Path | str) -> Sources:
+    """Read a script, and the files beside it that it imports, itself or through others.
+
+    The script is the path of a file, or the name of a module in the present folder; so it is below.
+    """
+    folder = script.resolve().parent if isinstance(script, Path) else Path.cwd()
+    files = [script if isinstance(script, Path) else folder / f"{script.replace('.', '/')}.py"]
+    read: set[Path] = set()
+    sources = Sources()
+    while files:
+        path = files.pop().resolve()
+        if path in read or not path.is_file():
+            continue
+        read.add(path)
+        for level, name in sources.read(path, folder):
+            module = (path.parents[level - 1] if level else folder).joinpath(*name.split("."))
+            files += [module.with_suffix(".py"), module / "__init__.py"]
+    return sources
+
+
+def read_folder(folder: Path) -> Sources:
+    """Read all files of a folder and of those below, but for the sources of its extensions."""
+    sources = Sources()
+    for path in sorted(folder.rglob("*.py")):
+        inner = path.relative_to(folder).parts
+        if _NOT_READ.isdisjoint(inner) and not any(part.startswith(".") for part in inner):
+            sources.read(path, folder)
+    return sources
+
+
+def _is_own(folder: Path, module: str) -> bool:
+    """Whether a module is a part of the folder, and no extension that is to be installed from there."""
+    place = folder / module.partition(".")[0]
+    return place.with_suffix(".py").is_file() or (place.is_dir() and not (place / "setup.py").is_file())
+
+
+def _imports(nodes: list[ast.AST]) -> Iterator[tuple[int, str]]:
+    """Iterate over the modules that a file may import, each with the number of dots before its name."""
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from ((0, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = [node.module] if node.module else []
+            yield from ((node.level, ".".join([*module, alias.name])) for alias in node.names)
+            yield from ((node.level, name) for name in module)

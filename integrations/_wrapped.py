@@ -1,0 +1,133 @@
+"""The rasterizers and the models of a code base, wrapped as soon as they are imported."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable
+from types import ModuleType
+from typing import Any
+
+import torch
+
+from ._after_import import AfterImport
+from ._patch import ClassPatch
+from ._rasterizer import ForwardCall, class_in, forward_signature, is_of_the_family
+
+__all__ = ["Wrapped"]
+
+
+class Wrapped:
+    """Classes whose methods are wrapped from `start` to `stop`; those named ``module:Class`` once they are imported.
+
+    Args:
+        rasterizers: classes or names, which must be of the INRIA family.
+        candidates: names of further ones, left alone if they are not.
+        models: names of classes with a method ``update_learning_rate``.
+        rasterize: what makes the calls of rasterizers.
+        update: is called with a model and an iteration before its learning rate is updated.
+        check: is called with the signature of a rasterizer, and may raise.
+
+    Attributes:
+        models: those that were imported so far.
+        names: of the rasterizers that were, for messages.
+    """
+
+    def __init__(
+        self,
+        rasterizers: Iterable[type | str],
+        candidates: Iterable[str],
+        models: Iterable[str],
+        *,
+        rasterize: Callable[[ForwardCall], Any],
+        update: Callable[[Any, int], None],
+        check: Callable[[Any], None],
+    ) -> None:
+        self.models: tuple[type, ...] = ()
+        self.names: list[str] = []
+        self._patches: list[ClassPatch] = []
+        self._rasterize, self._update, self._check = rasterize, update, check
+        self._updated: Any = None  # the model within whose update_learning_rate the script is
+        self._given = [x for x in rasterizers if isinstance(x, type)]
+        found: dict[str, Callable[[type], None]] = dict.fromkeys(candidates, self._wrap_candidate)
+        found |= dict.fromkeys((x for x in rasterizers if isinstance(x, str)), self._wrap_rasterizer)
+        found |= dict.fromkeys(models, self._wrap_model)
+        self._wanted: dict[str, list[tuple[str, Callable[[type], None]]]] = {}
+        for place, wrap in found.items():
+            module, _, name = place.partition(":")
+            self._wanted.setdefault(module, []).append((name, wrap))
+        self._imports = AfterImport(dict.fromkeys(self._wanted, self._imported))
+
+    def start(self) -> None:
+        """Wrap what is imported, and watch for the rest; raises what `Wrapped` does for classes."""
+        for rasterizer in self._given:
+            self._wrap_rasterizer(rasterizer)
+        self._imports.start()
+
+    def check_removable(self) -> None:
+        """Raise RuntimeError if someone wrapped a method again."""
+        for patch in self._patches:
+            patch.check_removable()
+
+    def stop(self) -> None:
+        """Put the classes back as they were, and watch no longer."""
+        self._imports.stop()
+        while self._patches:
+            self._patches.pop().remove()
+
+    def _imported(self, module: ModuleType) -> None:
+        for name, wrap in self._wanted[module.__name__]:
+            found = class_in(module, name)
+            if found is not None and all(patch.owner is not found for patch in self._patches):
+                wrap(found)
+
+    def _wrap_candidate(self, rasterizer: type) -> None:
+        if is_of_the_family(rasterizer):
+            self._wrap_rasterizer(rasterizer)
+
+    def _wrap_rasterizer(self, rasterizer: type) -> None:
+        """Wrap the forward of a rasterizer."""
+        signature = forward_signature(rasterizer)
+        self._check(signature)
+        function: Any = rasterizer.forward  # type: ignore[attr-defined]
+        while function is not None:
+            if "ca_reg_hook" in vars(function):
+                raise RuntimeError(
+                    f"{rasterizer.__qualname__} has a RasterizerHook already; Gaussians would be dropped twice. "
+                    "Uninstall that one first, or put both regularizers into one nn.Sequential."
+                )
+            function = getattr(function, "__wrapped__", None)
+
+        def make(forward: Callable[..., Any]) -> Callable[..., Any]:
+            @functools.wraps(forward)
+            def regularized_forward(*args: Any, **kwargs: Any) -> Any:
+                return self._rasterize(ForwardCall(forward, signature.bind(*args, **kwargs)))
+
+            # A compiled render is cut here: what follows reads the variables of its caller.
+            eager: Callable[..., Any] = torch.compiler.disable(regularized_forward)  # type: ignore[no-untyped-call]
+            vars(eager)["ca_reg_hook"] = self
+            return eager
+
+        self._patches.append(ClassPatch(rasterizer, "forward", make))
+        self.names.append(f"{rasterizer.__module__}.{rasterizer.__qualname__}")
+
+    def _wrap_model(self, model: type) -> None:
+        """Listen to the learning rate updates of a model."""
+        if not hasattr(model, "update_learning_rate"):
+            return
+
+        def make(update: Callable[..., Any]) -> Callable[..., Any]:
+            @functools.wraps(update)
+            def update_learning_rate(model: Any, iteration: int, *args: Any, **kwargs: Any) -> Any:
+                if self._updated is model:  # a class that calls that of its base
+                    return update(model, iteration, *args, **kwargs)
+                self._update(model, int(iteration))
+                self._updated = model
+                try:
+                    return update(model, iteration, *args, **kwargs)
+                finally:
+                    self._updated = None
+
+            return update_learning_rate
+
+        self.models += (model,)
+        self._patches.append(ClassPatch(model, "update_learning_rate", make))
