@@ -4,12 +4,35 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import runpy
+import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
-__all__ = ["imported_packages", "run_script", "set_command_line"]
+__all__ = ["find_script", "imported_packages", "require", "run_script", "set_command_line"]
+
+
+def find_script(name: Path) -> Path | None:
+    """Return the file of a script, or of a command that an installed package brings, such as ``ns-train``."""
+    if name.is_file():
+        return name
+    command = shutil.which(name, path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
+    return None if command is None else Path(command)
+
+
+def require(packages: Iterable[str], name: str) -> bool:
+    """Return whether a package is among these, or one of these that is installed is built on it."""
+
+    def requirements(package: str) -> list[str]:
+        try:
+            return requires(package) or []
+        except PackageNotFoundError:
+            return []
+
+    return any(re.match(r"[\w-]+", each)[0] == name for p in packages for each in [p, *requirements(p)])  # type: ignore[index]
 
 
 def imported_packages(script: Path | str) -> set[str]:
@@ -20,7 +43,7 @@ def imported_packages(script: Path | str) -> set[str]:
     folder = script.resolve().parent if isinstance(script, Path) else Path.cwd()
     files = [script if isinstance(script, Path) else folder / f"{script.replace('.', '/')}.py"]
     read: set[Path] = set()
-    found: set[str] = set()
+    found = {script.partition(".")[0]} if isinstance(script, str) else set()
     while files:
         path = files.pop().resolve()
         if path in read or not path.is_file():

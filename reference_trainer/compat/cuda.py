@@ -22,7 +22,7 @@ def cuda_on_cpu() -> Iterator[None]:
     """Let torch functions take the CPU wherever they are told to take a CUDA device.
 
     With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
-    ``.cuda()`` of tensors and modules, and ``torch.load(map_location="cuda")`` mean the CPU, and ``torch.cuda.Event``,
+    ``.cuda()`` of tensors and modules, ``.pin_memory()``, and ``torch.load(map_location="cuda")`` mean the CPU, and ``torch.cuda.Event``,
     ``synchronize``, ``set_device``, ``current_device`` and ``reset_peak_memory_stats`` are harmless; everything is
     restored at the end.
     ``torch.cuda.is_available()`` stays False.
@@ -60,7 +60,7 @@ class _CudaMeansCpu(TorchFunctionMode):
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
-        if func is Tensor.cuda:
+        if func in (Tensor.cuda, Tensor.pin_memory):
             return args[0]
         return func(*map(_on_cpu, args), **{name: _on_cpu(value) for name, value in (kwargs or {}).items()})
 
