@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import os
 import runpy
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["run_script", "set_command_line"]
+__all__ = ["find_script", "run_script", "set_command_line"]
+
+
+def find_script(name: Path) -> Path | None:
+    """Return the file of a script, or of a command that an installed package brings, such as ``ns-train``."""
+    if name.is_file():
+        return name
+    command = shutil.which(name, path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
+    return None if command is None else Path(command)
 
 
 def set_command_line(script: Path | str, arguments: Sequence[str]) -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 __all__ = ["Sources", "read_folder", "read_script"]
@@ -33,6 +36,14 @@ class Sources:
         """The rasterizers as ``module:Class``."""
         found = self.rasterizers.items()
         return [f"{module}:{name}" for module, names in found for name in sorted(names) if name.endswith(_SUFFIXES[0])]
+
+    def need(self, name: str) -> bool:
+        """Whether a package is imported, or one that is built on it, as nerfstudio is on gsplat."""
+        found = set(self.packages)
+        for package in self.packages:
+            with suppress(PackageNotFoundError):
+                found.update(re.split(r"[^\w-]", each)[0] for each in requires(package) or ())
+        return name in found
 
     def read(self, path: Path, folder: Path) -> list[tuple[int, str]]:
         """Read a file of the folder; return the modules that it may import, each with the dots before its name."""
@@ -63,7 +74,7 @@ def read_script(script: Path | str) -> Sources:
     folder = script.resolve().parent if isinstance(script, Path) else Path.cwd()
     files = [script if isinstance(script, Path) else folder / f"{script.replace('.', '/')}.py"]
     read: set[Path] = set()
-    sources = Sources()
+    sources = Sources({script.partition(".")[0]} if isinstance(script, str) else set())
     while files:
         path = files.pop().resolve()
         if path in read or not path.is_file():

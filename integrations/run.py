@@ -29,7 +29,7 @@ from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
 from ._hook import Hook
 from ._rasterizer import MODULES
-from ._script import run_script, set_command_line
+from ._script import find_script, run_script, set_command_line
 from ._sources import read_script
 from .gsplat import Installation
 from .inria import DEFAULT_MODEL, RasterizerHook, Scope, Steps
@@ -118,10 +118,13 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         # Of the package alone: to find a module in it would import it, before the hook is there.
         if find_spec(options.script.partition(".")[0]) is None:
             parser.error(f"there is no module {options.script}")
-    elif options.script is None or not options.script.is_file():
+    elif options.script is None or (script := find_script(options.script)) is None:
         parser.error(f"there is no script {options.script or ''}".rstrip())
+    else:
+        options.script = script
     options.sources = sources = read_script(options.script)
-    options.gsplat = "gsplat" in sources.packages and not sources.rasterizers and sources.packages.isdisjoint(MODULES)
+    of_inria = sources.rasterizers or not sources.packages.isdisjoint(MODULES)
+    options.gsplat = not of_inria and sources.need("gsplat")
     meaningless = [name for name in _OF_INRIA if getattr(options, name) != parser.get_default(name)]
     if options.gsplat and meaningless:
         parser.error(

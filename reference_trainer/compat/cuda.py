@@ -25,10 +25,10 @@ def cuda_on_cpu() -> Iterator[None]:
     """Let torch functions take the CPU wherever they are told to take a CUDA device.
 
     With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
-    ``.cuda()`` of tensors and modules, and ``torch.load(map_location="cuda")`` mean the CPU, and ``torch.cuda.Event``,
-    ``Stream``, ``synchronize``, ``set_device``, ``current_device``, ``current_stream``, ``reset_peak_memory_stats`` and
-    ``nvtx`` are harmless, and ``mem_get_info``, ``get_device_properties`` and ``get_device_name`` speak of a device
-    with `MEMORY` bytes; everything is restored at the end.
+    ``.cuda()`` of tensors and modules, ``.pin_memory()``, and ``torch.load(map_location="cuda")`` mean the CPU, and
+    ``torch.cuda.Event``, ``Stream``, ``synchronize``, ``set_device``, ``current_device``, ``current_stream``,
+    ``reset_peak_memory_stats`` and ``nvtx`` are harmless, and ``mem_get_info``, ``get_device_properties`` and
+    ``get_device_name`` speak of a device with `MEMORY` bytes; everything is restored at the end.
     ``torch.cuda.is_available()`` stays False.
 
     A tensor that is moved to "cuda" is the same tensor, as on a real device if it were there already: what is written
@@ -64,7 +64,7 @@ class _CudaMeansCpu(TorchFunctionMode):
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
-        if func is Tensor.cuda:
+        if func in (Tensor.cuda, Tensor.pin_memory):
             return args[0]
         return func(*map(_on_cpu, args), **{name: _on_cpu(value) for name, value in (kwargs or {}).items()})
 

@@ -15,7 +15,8 @@ import torch
 from stand_ins.inria import Model, make_rasterizer, make_render
 
 from ca_reg import Chain
-from ca_reg.integrations._sources import read_folder, read_script
+from ca_reg.integrations._script import find_script
+from ca_reg.integrations._sources import Sources, read_folder, read_script
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.integrations.run import main
 
@@ -374,7 +375,22 @@ def test_what_a_script_imports_is_read_also_through_the_files_beside_it(reposito
     expected = {"numpy", "broken", "scene", "stand_ins", "far"}
     assert read_script(repository / "other.py").packages == expected
     assert "diff_gaussian_rasterization" in read_script(repository / "train.py").packages
-    assert read_script("nowhere.train").packages == set()
+    assert read_script("nowhere.train").packages == {"nowhere"}
+
+
+def test_a_package_that_is_built_on_another_needs_it():
+    """torchmetrics requires torch, and tells so in what is installed with it."""
+    assert Sources({"torchmetrics", "nowhere"}).need("torch")
+    assert Sources({"gsplat"}).need("gsplat")
+    assert not Sources({"torchmetrics"}).need("gsplat")
+
+
+def test_an_installed_command_is_a_script_as_well(tmp_path, monkeypatch):
+    assert find_script(Path("pytest")).read_text().startswith("#!")
+    assert find_script(Path("no-such-command")) is None
+    (tmp_path / "pytest").write_text("print()")
+    monkeypatch.chdir(tmp_path)
+    assert find_script(Path("pytest")) == Path("pytest")
 
 
 FORK = {
