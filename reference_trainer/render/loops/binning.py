@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from reference_trainer.render.constants import MIN_ALPHA, TILE
-from reference_trainer.render.loops.compiling import inlined, kernel
-from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.splats import Projection, TileLists
 
 __all__ = ["bin_gaussians"]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.render.constants import MIN_TRANSMITTANCE
-from reference_trainer.render.loops.compiling import inlined, kernel
+from reference_trainer.compiled.compiling import inlined, kernel
 from reference_trainer.render.loops.tiles import (
     CHUNK,
     PIXELS,

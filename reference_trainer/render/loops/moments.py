@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.render.loops.compiling import inlined, kernel
+from reference_trainer.compiled.compiling import inlined, kernel
 from reference_trainer.render.loops.tiles import (
     CHUNK,
     PIXELS,

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
-from reference_trainer.render.loops.compiling import inlined, kernel
+from reference_trainer.compiled.compiling import inlined, kernel
 from reference_trainer.render.loops.harmonics import basis, basis_gradient
-from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.splats import Projection
 
 __all__ = ["project", "visible"]

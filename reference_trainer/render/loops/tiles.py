@@ -12,8 +12,8 @@ from numba.extending import intrinsic
 from torch import Tensor
 
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
-from reference_trainer.render.loops.compiling import inlined, kernel
-from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [

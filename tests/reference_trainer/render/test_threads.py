@@ -14,7 +14,7 @@ from reference_trainer.render import draw, masked, render_moments, splat, varian
 from reference_trainer.render.constants import TILE
 
 pytest.importorskip("numba")
-from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.compiled.threads import in_threads
 
 
 @pytest.fixture(autouse=True)
@@ -145,7 +145,7 @@ def test_renders_go_on_after_ctrl_c_at_any_time():
 
 
 def test_no_loop_is_compiled_again_for_views_of_tensors():
-    from reference_trainer.render.loops.compiling import KERNELS
+    from reference_trainer.compiled.compiling import KERNELS
 
     scene = random_scene(40, 3 * TILE, 2 * TILE, seed=1).to(torch.float32)
     everything(scene)
