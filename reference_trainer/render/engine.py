@@ -44,6 +44,9 @@ class Engine(Protocol):
     def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draw splats front to back over a background (3,): image (3, H, W), alpha (H, W), depth (H, W) if asked."""
 
+    def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw splats with K other opacities, (K, M), as in `masked`: images (K, 3, H, W), alphas; no gradients."""
+
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Return mean and variance of every pixel under random factors on the alphas of the full model.
 

@@ -109,7 +109,7 @@ class TileLists:
 
 
 class Splats(NamedTuple):
-    """Gaussians made ready for one camera: M of N are projected, coloured, and listed per tile."""
+    """Gaussians made ready for one camera: M of N are projected, coloured, and listed per tile; nearest first."""
 
     indices: Tensor  # which of the N, (M,)
     projection: Projection
