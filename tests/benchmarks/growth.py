@@ -26,7 +26,7 @@ from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.studies.both_engines import engines_on
-from reference_trainer.studies.clocks import in_turns, now
+from reference_trainer.studies.clocks import in_turns, processor_clock
 
 __all__ = ["extrapolated", "growth", "measure_growth"]
 
@@ -146,7 +146,7 @@ def _measure(spec: WorkloadSpec, *, repeats: int, device: torch.device) -> dict[
         for engine in engines
         for x, call in zip(PASSES, (image, gradients), strict=True)
     }
-    seconds = in_turns({", ".join(name): call for name, call in calls.items()}, repeats, partial(now, device))
+    seconds = in_turns({", ".join(name): call for name, call in calls.items()}, repeats, processor_clock(device))
     return {
         "per_pixel": gaussians_per_pixel(spec),
         "seconds": seconds,
