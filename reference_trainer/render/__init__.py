@@ -9,7 +9,6 @@ from reference_trainer.render.engine import ENGINES, Engine, chosen_engine, desc
 from reference_trainer.render.moments import render_moments, variance_shares
 from reference_trainer.render.renderer import draw, draw_masks, render, splat
 from reference_trainer.render.splats import MomentImages, Rendering, Splats
-from reference_trainer.render.statistics import color_variance_map, first_order_map
 
 __all__ = [
     "ENGINES",
@@ -19,11 +18,9 @@ __all__ = [
     "Rendering",
     "Splats",
     "chosen_engine",
-    "color_variance_map",
     "describe_engine",
     "draw",
     "draw_masks",
-    "first_order_map",
     "render",
     "render_moments",
     "splat",
