@@ -88,14 +88,12 @@ def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tens
 
     The values of the sink do not matter. The background (3,) of the image is black by default.
     """
-    detached = _detached(rendering.splats)
-    planes, values = [*rendering.image], [detached.colors]
-    behind = detached.colors.new_zeros(3) if background is None else background.detach()
-    if rendering.depth is not None:
-        planes.append(rendering.depth)
-        values.append(detached.projection.depths[:, None])
-        behind = torch.cat([behind, behind.new_zeros(1)])
-    drawn = torch.stack([*planes, rendering.alpha])
-    drawn = _AbsoluteGradients.apply(drawn, sink, detached, torch.cat(values, 1), behind)  # type: ignore[no-untyped-call]
-    depth = None if rendering.depth is None else drawn[3]
-    return rendering._replace(image=drawn[:3], alpha=drawn[-1], depth=depth)
+    splats, shown = _detached(rendering.splats), rendering.depth
+    values = torch.cat([splats.colors, splats.projection.depths[:, None]], 1)
+    behind = values.new_zeros(4)
+    if background is not None:
+        behind[:3] = background.detach()
+    depth = torch.zeros_like(rendering.alpha) if shown is None else shown
+    drawn = torch.cat([rendering.image, depth[None], rendering.alpha[None]])
+    drawn = _AbsoluteGradients.apply(drawn, sink, splats, values, behind)  # type: ignore[no-untyped-call]
+    return rendering._replace(image=drawn[:3], alpha=drawn[4], depth=None if shown is None else drawn[3])

@@ -53,7 +53,8 @@ def splat(
     inputs = {name: _working(name, x, means.dtype) for name, x in named.items()}
     # Mixed precision would move means by pixels: its products have 8 bits.
     with torch.autocast(means.device.type, enabled=False):
-        return engine_for(inputs["means"]).splat(inputs, camera.to(means.device, inputs["means"].dtype), degree)
+        dtype = inputs["means"].dtype
+        return engine_for(means.device, dtype).splat(inputs, camera.to(means.device, dtype), degree)
 
 
 def _working(name: str, x: Tensor, dtype: torch.dtype) -> Tensor:

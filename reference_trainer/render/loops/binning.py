@@ -119,11 +119,7 @@ def _ends(counts: Array) -> Array:
 def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
     """List the Gaussians of every tile: those whose 1/255 ellipse meets the rectangle of the tile's pixel centres.
 
-    Args:
-        projection: M projected Gaussians, nearest first.
-        opacities: activated, shape (M,).
-        width: image width, pixels.
-        height: image height, pixels.
+    The M projected Gaussians are in order of depth, the opacities (M,) activated.
     """
     m, f, c, _ = (x.detach().numpy() for x in projection)
     o = opacities.detach().numpy()

@@ -91,8 +91,7 @@ def _make_backward(complete: bool) -> Any:
     """Return the kernel of the gradients.
 
     Args:
-        complete: with those of the accumulated alpha, and of the moments of the factors, and with the shares, that is
-            the gradients of factors of the summands: a quarter slower.
+        complete: with those of the accumulated alpha and of the factors' moments, and the shares: a quarter slower.
     """
     size = 6 if complete else 5
 

@@ -63,13 +63,7 @@ def _nearest_first(depths: Array) -> Any:
 
 
 def visible(means: Tensor, opacities: Tensor, camera: Camera) -> tuple[Tensor, bool]:
-    """Return who can be seen, nearest first, shape (M,), and whether all depths and opacities are finite.
-
-    Args:
-        means: world coordinates, shape (N, 3).
-        opacities: activated, shape (N,).
-        camera: the view.
-    """
+    """Return who of N Gaussians can be seen, nearest first, (M,), and whether all depths and opacities are finite."""
     depths = np.empty(means.shape[0], f4)
     arrays = (x.contiguous().numpy() for x in (means, opacities, camera.world_to_camera))
     finite = all(in_threads(_look, means.shape[0], *arrays, depths, least=32768))
@@ -326,16 +320,9 @@ class _Project(torch.autograd.Function):
 def project(
     means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, indices: Tensor, camera: Camera, degree: int
 ) -> tuple[Projection, Tensor, bool]:
-    """Project some of N Gaussians; return also their colours (M, 3), and whether all numbers are finite.
+    """Project M of N Gaussians; return also their colours (M, 3), and whether all numbers are finite.
 
-    Args:
-        means: world coordinates, shape (N, 3).
-        quaternions: orientation, shape (N, 4).
-        scales: standard deviations along the axes, positive, shape (N, 3).
-        sh: spherical-harmonic coefficients, shape (N, K, 3), or colours, shape (N, 1, 3).
-        indices: which of them, all in front of the camera, shape (M,).
-        camera: the view.
-        degree: highest band of ``sh``; -1 if these are colours.
+    The arguments are those of `reference_trainer.render.render`; ``sh`` may be colours, (N, 1, 3), of degree -1.
     """
     *projection, colors, finite = _Project.apply(  # type: ignore[no-untyped-call]
         means, quaternions, scales, sh, indices, camera, degree

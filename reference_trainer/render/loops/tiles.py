@@ -17,26 +17,10 @@ from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
-    "CHUNK",
-    "PIXELS",
-    "X",
-    "Y",
-    "alpha_at",
-    "clamped",
-    "footprint",
-    "footprint_gradient",
-    "footprint_of",
-    "geometry_gradients",
-    "is_faint",
-    "load",
-    "longest_list",
-    "make_table",
-    "over_tiles",
-    "read_entries",
-    "store",
-    "sum_rows",
-    "whole_tiles",
-]
+    "CHUNK", "PIXELS", "X", "Y", "alpha_at", "clamped", "footprint", "footprint_gradient", "footprint_of",
+    "geometry_gradients", "is_faint", "load", "longest_list", "make_table", "over_tiles", "read_entries", "store",
+    "sum_rows", "whole_tiles",
+]  # fmt: skip
 
 Array = Any
 f4 = np.float32
@@ -224,15 +208,9 @@ def _split(_context: Any, _exponent: Any) -> Any:
 
 @inlined
 def footprint_gradient(table: Any, i: Any, tile: Any, columns: Any, slopes: Any, row: Any) -> None:
-    """Carry the gradient from a splat's ln alpha to its geometry.
+    """Carry gradients of a splat's ln alpha at the pixels of a tile to its geometry.
 
-    Args:
-        table: of the Gaussians.
-        i: the Gaussian.
-        tile: where.
-        columns: of tiles in the image.
-        slopes: gradient of ln alpha at every pixel of the tile.
-        row: receives the gradients of x, y, l11, l21, l22 and ln o.
+    The row receives those of x, y, l11, l21, l22 and ln o.
     """
     s, sx, sy, sxx, sxy, syy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
     for q in range(TILE):  # column by column: x is factored out
