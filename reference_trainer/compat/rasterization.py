@@ -171,8 +171,7 @@ def _look(given: SimpleNamespace, number: int, means: Tensor, scales: Tensor, un
     shown = inside & (extents > given.radius_clip).any(1) & (projection.depths.detach() <= given.far_plane * unit)
     if bool((splats.lists.touched & ~shown).any()):
         splats = splats.engine.masked(splats, splats.opacities * shown)
-    listed = shown.nonzero()[:, 0]
-    return _View(splats, (extents * shown[:, None]).int(), listed[splats.indices[listed].argsort()])
+    return _View(splats, (extents * shown[:, None]).int(), shown.nonzero()[:, 0])
 
 
 def _colors(given: SimpleNamespace, number: int) -> dict[str, Any]:

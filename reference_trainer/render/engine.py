@@ -96,10 +96,7 @@ def chosen_engine() -> str:
 
 
 def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engine:
-    """Return the engine that draws tensors of this device and dtype; raises as `chosen_engine`.
-
-    The loops for float32 on a CPU, unless torch was chosen, which draws everything else.
-    """
+    """Return the loops for float32 on a CPU unless torch was chosen, which draws the rest; as `chosen_engine`."""
     if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
         return _TORCH
     return _loop_engine() or _TORCH

@@ -91,7 +91,7 @@ class TileLists:
 
 
 class Splats(NamedTuple):
-    """Gaussians made ready for one camera: M of N are projected, coloured, and listed per tile; nearest first."""
+    """Gaussians made ready for one camera: M of N are projected, coloured, and listed per tile."""
 
     indices: Tensor  # which of the N, (M,)
     projection: Projection

@@ -62,9 +62,7 @@ def _rasterize(given, *, culls):
         radii = radii.new_zeros(*shape, *radii.shape[1:]).index_put((camera_ids, ids), radii)
     images, alphas = [], []
     for number, (which, part, camera) in enumerate(zip(listed, parts, cameras, strict=True)):
-        order = part.depths.argsort(stable=True)
-        which, projection = which[order], part._replace(means=back[camera_ids == number])
-        projection = type(part)(*(x[order] for x in projection))
+        projection = part._replace(means=back[camera_ids == number])
         colors = a.colors[which]
         if a.sh_degree is not None:
             directions = torch.nn.functional.normalize(a.means[which] - camera.position, dim=-1)

@@ -1,4 +1,4 @@
-"""Which Gaussian touches which tile of the image."""
+"""Which Gaussian touches which tile of the image, in depth order."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ __all__ = ["bin_gaussians"]
 
 
 def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
-    """List the Gaussians of every tile, in their own order.
+    """List the Gaussians of every tile.
 
     A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the rectangle spanned by the
     tile's pixel centres. The test is exact: within a strip of tiles, an ellipse covers an interval of columns.
     """
-    mean_x, mean_y = projection.means.unbind(-1)
-    l11, l21, l22 = projection.factors.unbind(-1)
-    xx, xy, yy = projection.covariances.unbind(-1)
-    squared_radius = 2.0 * torch.log(opacities / MIN_ALPHA).clamp_(min=0.0)
+    device = opacities.device
+    order = torch.argsort(projection.depths, stable=True)
+    mean_x, mean_y = projection.means[order].unbind(-1)
+    l11, l21, l22 = projection.factors[order].unbind(-1)
+    xx, xy, yy = projection.covariances[order].unbind(-1)
+    squared_radius = 2.0 * torch.log(opacities[order] / MIN_ALPHA).clamp_(min=0.0)
 
     reach = torch.sqrt(squared_radius * yy)
     top = torch.ceil(mean_y - reach - 0.5).clamp_(0, height)
@@ -49,15 +51,15 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
 
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     tile = row[strip] * tiles_x + column
+    gaussians = order[entry[strip]]
     tile, permutation = torch.sort(tile.int(), stable=True)
-    gaussians = entry[strip][permutation]
-    touched = torch.zeros_like(opacities, dtype=torch.bool)
+    touched = torch.zeros(order.shape[0], dtype=torch.bool, device=device)
     touched[gaussians] = True
     return TileLists(
         width=width,
         height=height,
         starts=torch.nn.functional.pad(torch.bincount(tile, minlength=tiles_x * tiles_y).cumsum(0), (1, 0)),
-        gaussians=gaussians,
+        gaussians=gaussians[permutation],
         touched=touched,
     )
 

@@ -28,9 +28,10 @@ class TorchEngine:
         with torch.no_grad():
             depths = inputs["means"] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
             culled_by = depths.sum() + inputs["opacities"].sum()
-            seen = torch.nonzero((depths > NEAR_PLANE) & (inputs["opacities"] >= MIN_ALPHA)).squeeze(1)
-            indices = seen[depths[seen].argsort(stable=True)]
-        drawn = {name: x.index_select(0, indices) for name, x in inputs.items()}
+            indices = torch.nonzero((depths > NEAR_PLANE) & (inputs["opacities"] >= MIN_ALPHA)).squeeze(1)
+        drawn = inputs
+        if indices.shape[0] < depths.shape[0]:
+            drawn = {name: x.index_select(0, indices) for name, x in inputs.items()}
         projection = project(drawn["means"], drawn["quaternions"], drawn["scales"], camera)
         if "sh" in drawn:
             directions = torch.nn.functional.normalize(drawn["means"] - camera.position, dim=-1)

@@ -1,7 +1,7 @@
 """Which Gaussian touches which tile, by counting instead of sorting.
 
-Gaussians, which are in order of depth, are each in turn appended to the lists of their tiles: a list is in that order
-because it was written in it.
+Gaussians are put in order of depth by a radix sort, and then each in turn appended to the lists of its tiles: a list
+is in order of depth because it was written in it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ Array = Any
 f4 = np.float32
 _ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
 _MIN, _TILE = f4(MIN_ALPHA), f4(TILE)
-_PARTS = 8  # of the Gaussians, each with a count of its own of every tile, so that they can be filled at once
+_PARTS = 8  # of the order of depth, each with a count of its own of every tile, so that they can be filled at once
+_BITS = 12  # of a digit of the radix sort
 
 
 @inlined
@@ -46,6 +47,30 @@ def _squared_radius(opacity: Any) -> Any:
 
 
 @kernel
+def _nearest_first(depths: Array) -> Any:
+    """Return the order of positive depths, nearest first; equal ones stay in order."""
+    keys, mask, shift = depths.view(np.uint32).copy(), (1 << _BITS) - 1, 0
+    order = np.arange(len(keys)).astype(np.int32)
+    if len(keys):
+        keys -= keys.min()  # the bits of positive floats are in the order of the floats
+    other_keys, other_order = np.empty_like(keys), np.empty_like(order)
+    while len(keys) and keys.max() >> shift > 0:
+        places = np.zeros(mask + 2, np.int64)
+        for key in keys:
+            places[((key >> shift) & mask) + 1] += 1
+        for digit in range(mask):
+            places[digit + 1] += places[digit]
+        for i in range(len(keys)):
+            digit = (keys[i] >> shift) & mask
+            place = places[digit]
+            places[digit] = place + 1
+            other_keys[place], other_order[place] = keys[i], order[i]
+        keys, other_keys, order, other_order = other_keys, keys, other_order, order
+        shift += _BITS
+    return order
+
+
+@kernel
 def _count_strips(
     first: int, last: int, centers: Array, covariances: Array, opacities: Array, height: int, rows: Array, counts: Array
 ) -> None:
@@ -61,50 +86,48 @@ def _count_strips(
 @kernel
 def _find_spans(
     first: int, last: int, centers: Array, factors: Array, covariances: Array, opacities: Array, width: int,
-    height: int, rows: Array, strips: Array, spans: Array, entries: Array, counts: Array,
+    height: int, rows: Array, strips: Array, spans: Array, entries: Array,
 ) -> None:  # fmt: skip
-    """Find the tiles of every strip, in which an ellipse covers an interval; count the entries of every tile."""
+    """Find the tiles of every strip: within one, an ellipse covers an interval of columns."""
     columns = (width + TILE - 1) // TILE
-    for part in range(first, last):
-        count = counts[part]
-        for i in range(part * rows.shape[0] // _PARTS, (part + 1) * rows.shape[0] // _PARTS):
-            x, y = centers[i, 0], centers[i, 1]
-            a, b, c = factors[i, 0], factors[i, 1], factors[i, 2]
-            limit = _squared_radius(opacities[i])
-            tip = covariances[i, 1] * math.sqrt(limit / covariances[i, 0])  # the dy at which it reaches furthest right
-            total = 0
-            for strip in range(strips[i], strips[i + 1]):
-                row = rows[i] + strip - strips[i]
-                upper = f4(row * TILE) + _HALF - y
-                lower = min(f4(row * TILE) + (_TILE - _HALF), f4(height) - _HALF) - y
-                to_left, to_right = min(max(-tip, upper), lower), min(max(tip, upper), lower)
-                half_left = math.sqrt(max(_ZERO, limit - (c * to_left) * (c * to_left)))
-                half_right = math.sqrt(max(_ZERO, limit - (c * to_right) * (c * to_right)))
-                left = _first_pixel(x - (half_left + b * to_left) / a, f4(width))
-                right = _last_pixel(x + (half_right - b * to_right) / a, f4(width))
-                begin = row * columns + np.int32(left) // TILE
-                end = row * columns + np.int32(right) // TILE + 1 if right >= left else begin
-                spans[strip, 0], spans[strip, 1] = begin, end
-                for tile in range(begin, end):
-                    count[tile] += 1
-                total += end - begin
-            entries[i] = total
+    for i in range(first, last):
+        x, y = centers[i, 0], centers[i, 1]
+        a, b, c = factors[i, 0], factors[i, 1], factors[i, 2]
+        limit = _squared_radius(opacities[i])
+        tip = covariances[i, 1] * math.sqrt(limit / covariances[i, 0])  # the dy at which it reaches furthest right
+        total = 0
+        for strip in range(strips[i], strips[i + 1]):
+            row = rows[i] + strip - strips[i]
+            upper = f4(row * TILE) + _HALF - y
+            lower = min(f4(row * TILE) + (_TILE - _HALF), f4(height) - _HALF) - y
+            to_left, to_right = min(max(-tip, upper), lower), min(max(tip, upper), lower)
+            half_left = math.sqrt(max(_ZERO, limit - (c * to_left) * (c * to_left)))
+            half_right = math.sqrt(max(_ZERO, limit - (c * to_right) * (c * to_right)))
+            left = _first_pixel(x - (half_left + b * to_left) / a, f4(width))
+            right = _last_pixel(x + (half_right - b * to_right) / a, f4(width))
+            spans[strip, 0] = row * columns + np.int32(left) // TILE
+            spans[strip, 1] = row * columns + np.int32(right) // TILE + 1 if right >= left else spans[strip, 0]
+            total += spans[strip, 1] - spans[strip, 0]
+        entries[i] = total
 
 
 @kernel
-def _fill_lists(
-    first: int, last: int, strips: Array, spans: Array, offsets: Array, places: Array, gaussians: Array, slots: Array
-) -> None:
-    """Append the Gaussians to the lists of their tiles."""
-    count = strips.shape[0] - 1
+def _walk(
+    first: int, last: int, order: Array, strips: Array, spans: Array, offsets: Array, places: Array, gaussians: Array,
+    slots: Array,
+) -> None:  # fmt: skip
+    """Append the Gaussians to the lists of their tiles; only count them if there are no lists yet."""
+    fill = gaussians.shape[0] > 0
     for part in range(first, last):
         at = places[part]
-        for i in range(part * count // _PARTS, (part + 1) * count // _PARTS):
+        for place in range(part * order.shape[0] // _PARTS, (part + 1) * order.shape[0] // _PARTS):
+            i = order[place]
             slot = offsets[i]
             for strip in range(strips[i], strips[i + 1]):
                 for tile in range(spans[strip, 0], spans[strip, 1]):
-                    gaussians[at[tile]] = i
-                    slots[at[tile]] = slot
+                    if fill:
+                        gaussians[at[tile]] = i
+                        slots[at[tile]] = slot
                     at[tile] += 1
                     slot += 1
 
@@ -119,20 +142,22 @@ def _ends(counts: Array) -> Array:
 def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
     """List the Gaussians of every tile: those whose 1/255 ellipse meets the rectangle of the tile's pixel centres.
 
-    The M projected Gaussians are in order of depth, the opacities (M,) activated.
+    The opacities (M,) are activated.
     """
-    m, f, c, _ = (x.detach().numpy() for x in projection)
+    m, f, c, z = (x.detach().numpy() for x in projection)
     o = opacities.detach().numpy()
-    count, tiles = m.shape[0], -(-width // TILE) * -(-height // TILE)
+    count, tiles, order = m.shape[0], -(-width // TILE) * -(-height // TILE), _nearest_first(z)
     rows, of_rows, entries = (np.empty(count, np.int32) for _ in range(3))
     in_threads(_count_strips, count, m, c, o, height, rows, of_rows, least=8192)
-    strips, of_parts = _ends(of_rows), np.zeros((_PARTS, tiles), np.int64)
+    strips = _ends(of_rows)
     spans = np.empty((strips[-1], 2), np.int32)
+    in_threads(_find_spans, count, m, f, c, o, width, height, rows, strips, spans, entries, least=4096)
+    offsets, of_parts, nothing = _ends(entries), np.zeros((_PARTS, tiles), np.int64), np.empty(0, np.int32)
     least = -(-_PARTS * 4096 // max(1, count))  # parts that are worth a thread
-    in_threads(_find_spans, _PARTS, m, f, c, o, width, height, rows, strips, spans, entries, of_parts, least=least)
-    starts, offsets = _ends(of_parts.sum(0)), _ends(entries)
+    in_threads(_walk, _PARTS, order, strips, spans, offsets, of_parts, nothing, nothing, least=least)
+    starts = _ends(of_parts.sum(0))
     places = starts[:-1] + of_parts.cumsum(0) - of_parts
     gaussians, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
-    in_threads(_fill_lists, _PARTS, strips, spans, offsets, places, gaussians, slots, least=least)
+    in_threads(_walk, _PARTS, order, strips, spans, offsets, places, gaussians, slots, least=least)
     arrays = (torch.from_numpy(x) for x in (starts, gaussians, entries > 0, slots, offsets))
     return TileLists(width, height, *arrays)

@@ -31,7 +31,8 @@ class LoopEngine:
             means, inputs["quaternions"], inputs["scales"], colors, indices, camera, degree
         )
         check_projection(finite and drawable, projection, colors, inputs, camera)
-        opacities = opacities.index_select(0, indices)
+        if indices.shape[0] < opacities.shape[0]:
+            opacities = opacities.index_select(0, indices)
         lists = bin_gaussians(projection, opacities, camera.width, camera.height)
         return Splats(indices, projection, opacities, colors, lists, self)
 

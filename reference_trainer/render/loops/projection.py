@@ -24,50 +24,25 @@ _ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
 _DILATION, _NEAR, _MIN = f4(DILATION), f4(NEAR_PLANE), f4(MIN_ALPHA)
 _INFINITY = f4(np.inf)  # nan and infinity are not below it; math.isfinite is optimized away
 _NO_DIRECTION = f4(1e-30)  # a quaternion well below this is taken for 0
-_BITS = 12  # of a digit of the radix sort
 
 
 @kernel
-def _look(first: int, last: int, means: Array, opacities: Array, view: Array, depths: Array) -> bool:
-    """Note the depths of who can be seen, 0 for the others; return whether all depths and opacities are finite."""
+def _visible(first: int, last: int, means: Array, opacities: Array, view: Array, seen: Array) -> bool:
+    """Note who is in front of the near plane and not too faint; return whether all depths and opacities are finite."""
     finite = True
     for i in range(first, last):
         depth = view[2, 0] * means[i, 0] + view[2, 1] * means[i, 1] + view[2, 2] * means[i, 2] + view[2, 3]
-        depths[i] = depth if depth > _NEAR and opacities[i] >= _MIN else _ZERO
+        seen[i] = depth > _NEAR and opacities[i] >= _MIN
         finite = finite and abs(depth + opacities[i]) < _INFINITY
     return finite
 
 
-@kernel
-def _nearest_first(depths: Array) -> Any:
-    """Return whose depth is not 0, nearest first; equal ones stay in order. A radix sort."""
-    order = np.flatnonzero(depths)
-    keys = depths[order].view(np.uint32)  # the bits of positive floats are in the order of the floats
-    if len(keys):
-        keys -= keys.min()
-    other_keys, other_order, mask, shift = np.empty_like(keys), np.empty_like(order), (1 << _BITS) - 1, 0
-    while len(keys) and keys.max() >> shift > 0:
-        places = np.zeros(mask + 2, np.int64)
-        for key in keys:
-            places[((key >> shift) & mask) + 1] += 1
-        for digit in range(mask):
-            places[digit + 1] += places[digit]
-        for i in range(len(keys)):
-            digit = (keys[i] >> shift) & mask
-            place = places[digit]
-            places[digit] = place + 1
-            other_keys[place], other_order[place] = keys[i], order[i]
-        keys, other_keys, order, other_order = other_keys, keys, other_order, order
-        shift += _BITS
-    return order
-
-
 def visible(means: Tensor, opacities: Tensor, camera: Camera) -> tuple[Tensor, bool]:
-    """Return who of N Gaussians can be seen, nearest first, (M,), and whether all depths and opacities are finite."""
-    depths = np.empty(means.shape[0], f4)
+    """Return who of N Gaussians can be seen, shape (M,), and whether all depths and opacities are finite."""
+    seen = np.empty(means.shape[0], np.bool_)
     arrays = (x.contiguous().numpy() for x in (means, opacities, camera.world_to_camera))
-    finite = all(in_threads(_look, means.shape[0], *arrays, depths, least=32768))
-    return torch.from_numpy(_nearest_first(depths)), finite
+    finite = all(in_threads(_visible, means.shape[0], *arrays, seen, least=32768))
+    return torch.from_numpy(np.flatnonzero(seen)), finite
 
 
 @inlined

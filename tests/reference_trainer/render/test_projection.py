@@ -157,5 +157,4 @@ def test_every_engine_projects_alike(kind, case):
             (mine.double() - other).abs() <= rounding * scale.clamp_min(1.0 if mine.shape[-1:] == (2,) else 0.0)
         ).all()
     depths = scene.means @ scene.camera.world_to_camera[2, :3] + scene.camera.world_to_camera[2, 3]
-    assert torch.equal(splats.indices.sort().values, torch.nonzero(depths > 0.2).squeeze(1))
-    assert (depths[splats.indices].diff() >= -1e-6 * depths.max()).all()
+    assert torch.equal(splats.indices, torch.nonzero(depths > 0.2).squeeze(1))
