@@ -26,29 +26,27 @@ class RenderMoments:
     def __init__(self, groups: int = 1) -> None:
         self.count = 0
         self._groups = groups
-        self._first = self._scratch = torch.empty(0)  # (3, H, W)
-        self._sums: list[Tensor] = []  # (3, H, W)
-        self._squares: list[Tensor] = []  # (H, W)
+        self._first = self._scratch = self._sums = self._squares = torch.empty(0)
 
     def add(self, image: Tensor) -> None:
         """Take in one render (3, H, W)."""
         if self.count == 0:
             self._first = image.to(torch.promote_types(image.dtype, torch.float32), copy=True)
             self._scratch = torch.empty_like(self._first)
+            self._sums = self._first.new_zeros(self._groups, *image.shape)
+            self._squares = self._first.new_zeros(self._groups, *image.shape[1:])
         _check_size(image, self._first)
         group = self.count % self._groups
-        if group == self.count:
-            self._sums.append(image - self._first)
-            self._squares.append(_add_squares(torch.zeros_like(self._first[0]), self._sums[group]))
-        else:
-            deviation = torch.sub(image, self._first, out=self._scratch)
+        is_first = group == self.count
+        deviation = torch.sub(image, self._first, out=self._sums[group] if is_first else self._scratch)
+        if not is_first:
             self._sums[group] += deviation
-            _add_squares(self._squares[group], deviation)
+        _add_squares(self._squares[group], deviation)
         self.count += 1
 
     def variance(self, ddof: int) -> Tensor:
         """Return the variance of every pixel, mean over RGB, (H, W), float64; it divides by ``count - ddof``."""
-        scatter = _scatter(_total(self._squares), _total(self._sums), self.count)
+        scatter = _add_squares(self._squares.sum(0), self._sums.sum(0), -1 / self.count)
         return scatter.clamp_(min=0).to(torch.float64) / (3 * (self.count - ddof))
 
     def jackknife_error(self, visible: Tensor) -> float:
@@ -60,24 +58,21 @@ class RenderMoments:
         """
         if self.count < 3:
             return math.nan
-        weights = visible.to(self._first.dtype) / (3 * visible.sum())
-        squares, sums = _total(self._squares), _total(self._sums)
-
-        def value(squares: Tensor, sums: Tensor, count: int) -> float:
-            return float(_scatter(squares, sums, count).mul_(weights).sum()) / (count - 1)
-
-        ratios, left_out = [], []
-        for group in range(len(self._sums)):
-            rest = self.count - len(range(group, self.count, self._groups))
-            others = torch.sub(sums, self._sums[group], out=self._scratch)
-            left_out.append(value(squares - self._squares[group], others, rest))
-            ratios.append(self.count / (self.count - rest))
-        whole = value(squares, sums, self.count)
-        pseudo = [r * whole - (r - 1) * v for r, v in zip(ratios, left_out, strict=True)]
+        used = min(self.count, self._groups)
+        # Sums over the pixels, in float64 from rows of the image on: of squares, and of the products of groups' sums.
+        squares = (self._squares[:used] * visible).sum(-1).double().sum(-1)
+        rows = (self._sums[:used] * visible).flatten(1, 2).transpose(0, 1)
+        products = torch.bmm(rows, rows.mT).double().sum(0)
+        rest = self.count - torch.tensor([len(range(group, self.count, self._groups)) for group in range(used)])
+        rest, ratios = rest.to(products), (self.count / (self.count - rest)).to(products)
+        others = products.sum() - 2 * products.sum(0) + products.diagonal()
+        left_out = (squares.sum() - squares - others / rest) / (rest - 1)
+        whole = (squares.sum() - products.sum() / self.count) / (self.count - 1)
+        pseudo = ratios * whole - (ratios - 1) * left_out
         # The jackknife value, sum over groups of pseudo-values weighted by the share of their renders.
-        center = sum(x / r for x, r in zip(pseudo, ratios, strict=True))
-        spread = sum((x - center) ** 2 / (r - 1) for x, r in zip(pseudo, ratios, strict=True))
-        return math.sqrt(spread / len(ratios))
+        center = (pseudo / ratios).sum()
+        spread = ((pseudo - center).square() / (ratios - 1)).mean()
+        return float(spread.sqrt()) / (3 * int(visible.sum()))
 
 
 class Deviations:
@@ -119,19 +114,6 @@ def _check_size(image: Tensor, first: Tensor) -> None:
     if image.shape != first.shape:
         sizes = f"{tuple(first.shape)} and then {tuple(image.shape)}"
         raise ValueError(f"the renders of one view must have one size, got {sizes}.")
-
-
-def _total(parts: list[Tensor]) -> Tensor:
-    """Return the sum of tensors, of which there is one at least."""
-    total = parts[0].clone()
-    for part in parts[1:]:
-        total += part
-    return total
-
-
-def _scatter(squares: Tensor, sums: Tensor, count: int) -> Tensor:
-    """Return the sum of squared deviations from the mean, over RGB as well; written over ``squares``."""
-    return _add_squares(squares, sums, -1 / count)
 
 
 def _add_squares(to: Tensor, image: Tensor, factor: float = 1.0) -> Tensor:

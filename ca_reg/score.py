@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -297,8 +298,7 @@ class CAScore:
         assert settings.samples is not None
         assert settings.ddof is not None
         moments, lowest, broken = RenderMoments(min(settings.samples, GROUPS)), torch.tensor(math.inf), False
-        for masked in self._drawn(x, index, settings.samples):
-            image, alpha = self._render(render_fn, masked, view)
+        for image, alpha in self._renders(render_fn, self._drawn(x, index, settings.samples), view):
             lowest = torch.minimum(lowest.to(alpha), alpha)
             image, odd = _finite(image, alpha, lowest, settings.threshold)
             broken |= odd
@@ -327,8 +327,8 @@ class CAScore:
         moments, deviations = RenderMoments(), Deviations(expected, visible)
         del expected, alpha  # they may be a buffer of the renderer, which the next render fills
         result = None
-        for k, masked in enumerate(self._drawn(x, index, settings.max_samples), start=1):
-            image, alpha = self._render(render_fn, masked, view)
+        renders = self._renders(render_fn, self._drawn(x, index, settings.max_samples), view)
+        for k, (image, alpha) in enumerate(renders, start=1):
             image, odd = _finite(image, alpha, visible, 0)
             broken |= odd
             moments.add(image)
@@ -373,6 +373,15 @@ class CAScore:
             drawn = self.regularizer.replay(flat, self.regularizer.draw(flat, generator)).opacities
             yield (drawn.clone() if drawn is flat.opacities else drawn).view_as(x.opacities)
 
+    def _renders(self, render_fn: RenderFn, drawn: Iterator[Tensor], view: Any) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield colours and alpha with one masked opacity after the other, as many at once as the renderer offers."""
+        many = getattr(render_fn, "many", None)
+        if many is None or self.alpha_fn is not None:
+            yield from (self._render(render_fn, opacity, view) for opacity in drawn)
+        else:
+            while some := list(itertools.islice(drawn, ROUND)):
+                yield from (self._read(x) for x in zip(*many(torch.stack(some), view), strict=True))
+
     def _render(self, render_fn: RenderFn, opacity: Tensor, view: Any) -> tuple[Tensor, Tensor]:
         """Render colours (3, H, W) and alpha (H, W) with masked opacities."""
         if self.alpha_fn is not None:
@@ -380,7 +389,11 @@ class CAScore:
             image = read_rendering(render_fn(opacity.clone(), view), layout=self.layout).image.clone()
             alpha = read_alpha_pass(self.alpha_fn(opacity, view), image, layout=self.layout)
             return image, alpha.to(image.device)
-        image, read_alpha = read_rendering(render_fn(opacity, view), layout=self.layout)
+        return self._read(render_fn(opacity, view))
+
+    def _read(self, returned: Any) -> tuple[Tensor, Tensor]:
+        """Read colours (3, H, W) and alpha (H, W) off what a renderer has returned."""
+        image, read_alpha = read_rendering(returned, layout=self.layout)
         if read_alpha is None:
             raise ValueError(
                 "render_fn returned an image without an alpha, which the visible region needs. Do one of three: return "

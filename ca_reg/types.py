@@ -41,6 +41,10 @@ class RenderFn(Protocol):
     floating-point torch tensors or numpy arrays, and a leading batch axis of 1 is dropped. Longer tuples are refused:
     in ``(color, radii, depth, alpha)`` nothing but the position tells depth from alpha.
 
+    A renderer that draws several opacities of one view faster than one after the other offers a method
+    ``many(opacities, view)``: of opacities stacked along a first axis, at most 8, it returns two sequences, images and
+    alphas. A score calls it in place of the renderer.
+
     Example:
         >>> def render_fn(opacity: Tensor, view: str) -> tuple[Tensor, Tensor]:
         ...     alpha = opacity.mean().expand(4, 5)

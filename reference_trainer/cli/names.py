@@ -26,7 +26,7 @@ class Names:
         from ca_reg.regularizers import REGULARIZERS
         from reference_trainer.density import DENSITY
         from reference_trainer.losses import LOSSES
-        from reference_trainer.render.renderers import RENDERERS
+        from reference_trainer.renderers import RENDERERS
 
         known: dict[str, Any] = {"regularizer": REGULARIZERS, "loss": LOSSES, "density": DENSITY, "renderer": RENDERERS}
         for option, registry in known.items():

@@ -9,8 +9,9 @@ from reference_trainer.camera import Camera
 from reference_trainer.render.constants import NEAR_PLANE
 from reference_trainer.render.eager.projection import project
 
-__all__ = ["in_front", "visible_radii"]
+__all__ = ["SMALLEST_SPREAD", "in_front", "longer_radii", "visible_radii"]
 
+SMALLEST_SPREAD = 0.1**0.5  # px^2, of the INRIA code
 CUDA_TILE = 16  # pixels; a Gaussian is visible to the INRIA code if the square around it meets a tile of the picture
 
 
@@ -18,6 +19,21 @@ def in_front(means: Tensor, camera: Camera) -> Tensor:
     """Say which Gaussians, at world coordinates (N, 3), lie beyond the near plane; shape (N,) bool."""
     pose = camera.world_to_camera.to(means)
     return means.detach() @ pose[2, :3] + pose[2, 3] > NEAR_PLANE
+
+
+@torch.no_grad()
+def longer_radii(covariances: Tensor, smallest: float) -> Tensor:
+    """Return three standard deviations of the longer axis of 2D covariances (M, 3), rounded up, pixels, shape (M,).
+
+    More for round splats: half the difference of the variances along the axes is taken for no less than ``smallest``.
+
+    Example:
+        >>> longer_radii(torch.tensor([[1.0, 0.0, 1.0], [9.0, 0.0, 1.0]]), SMALLEST_SPREAD).tolist()  # 3 sqrt(1.32), 9
+        [4.0, 9.0]
+    """
+    xx, xy, yy = covariances.unbind(-1)
+    spread = torch.hypot(0.5 * (xx - yy), xy).clamp_min(smallest)
+    return torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt())
 
 
 @torch.no_grad()
@@ -38,7 +54,8 @@ def visible_radii(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Ca
     splats = project(means[front], quaternions[front], scales[front], camera.to(means.device, means.dtype))
     centre = splats.means - 0.5  # in the INRIA code pixel centres are integers
     tiles = centre.new_tensor([-(-camera.width // CUDA_TILE), -(-camera.height // CUDA_TILE)])
-    first = ((centre - splats.radii[:, None]) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
-    last = ((centre + splats.radii[:, None] + CUDA_TILE - 1) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
-    radii[front] = torch.where((last > first).all(-1), splats.radii, 0.0).to(torch.int32)
+    extents = longer_radii(splats.covariances, SMALLEST_SPREAD)
+    first = ((centre - extents[:, None]) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
+    last = ((centre + extents[:, None] + CUDA_TILE - 1) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
+    radii[front] = torch.where((last > first).all(-1), extents, 0.0).to(torch.int32)
     return radii

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.compat.antialiasing import antialiased
+from reference_trainer.compat.radii import longer_radii
 from reference_trainer.render import Splats, draw, splat
 from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradients
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
@@ -27,7 +28,7 @@ READ = {
 WITHOUT_EFFECT = {"tile_size", "channel_chunk", "segmented", "sparse_grad", "ut_params", "renderer_config"}
 NEAREST = 1e-6  # a nearer near plane is taken for this one
 EXTENT = 3.33  # standard deviations at which an opaque splat has faded to `MIN_ALPHA`
-SMALLEST_SPREAD = 0.1  # px^2, of gsplat 1.4: half the difference of the variances is taken for no less
+SMALLEST_SPREAD = 0.1  # px^2, of gsplat 1.4
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
@@ -182,12 +183,11 @@ def _colors(given: SimpleNamespace, number: int) -> dict[str, Any]:
 @torch.no_grad()
 def _extents(splats: Splats, per_axis: bool) -> Tensor:
     """Return half the sides of the rectangles that gsplat draws splats in, whole pixels, shape (M, 2)."""
-    xx, xy, yy = splats.projection.covariances.unbind(-1)
     if per_axis:
+        xx, _, yy = splats.projection.covariances.unbind(-1)
         extent = (2 * (splats.opacities / MIN_ALPHA).clamp_min(1).log()).sqrt().clamp_max(EXTENT)
         return (extent[:, None] * torch.stack([xx, yy], dim=1).sqrt()).ceil()
-    spread = torch.hypot(0.5 * (xx - yy), xy).clamp_min(SMALLEST_SPREAD)
-    return (3 * (0.5 * (xx + yy) + spread).sqrt()).ceil()[:, None].expand(-1, 2)
+    return longer_radii(splats.projection.covariances, SMALLEST_SPREAD)[:, None].expand(-1, 2)
 
 
 def _check(given: SimpleNamespace) -> None:

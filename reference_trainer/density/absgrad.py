@@ -15,7 +15,7 @@ from reference_trainer.density.operations import is_large, reset_opacity
 from reference_trainer.density.statistics import screen_norm
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.render import Splats
-from reference_trainer.render.gsplat import GsplatSplats
+from reference_trainer.renderers.gsplat import GsplatSplats
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
 

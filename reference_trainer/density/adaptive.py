@@ -14,7 +14,7 @@ from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.density.strategy import DensityStrategy
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.render import Splats
-from reference_trainer.render.gsplat import GsplatSplats
+from reference_trainer.renderers.gsplat import GsplatSplats
 from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.randomness import stream
 

@@ -11,6 +11,7 @@ from torch.nn.functional import avg_pool2d
 
 from ca_reg.neighbors import nearest_distance
 from ca_reg.regularizers.segs import SEGSNoise
+from reference_trainer.compat.radii import SMALLEST_SPREAD, longer_radii
 from reference_trainer.density.co_pruning import CoPruning
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import arguments, render_gaussians
@@ -118,7 +119,8 @@ class SelfEnsembling(CoPruning):
             centers, pixels = splats.projection.means, where.nonzero().flip(1)
             if len(pixels):
                 inside = ((centers >= 0) & (centers < centers.new_tensor([camera.width, camera.height]))).all(1)
-                near = nearest_distance(centers, pixels.to(centers)).square() < splats.projection.radii
+                radii = longer_radii(splats.projection.covariances, SMALLEST_SPREAD)
+                near = nearest_distance(centers, pixels.to(centers)).square() < radii
                 found[splats.indices[inside & near]] = True
         return found
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.render import Splats
-from reference_trainer.render.gsplat import GsplatSplats
+from reference_trainer.renderers.gsplat import GsplatSplats
 from reference_trainer.scenes.scene import Scene
 
 if TYPE_CHECKING:

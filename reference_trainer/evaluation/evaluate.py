@@ -15,11 +15,11 @@ from torch import Tensor
 
 from ca_reg import CAResult, CAScore
 from reference_trainer.evaluation.kept import KeptRecords
+from reference_trainer.evaluation.maps import color_variance_map
 from reference_trainer.evaluation.metrics import depth_errors, on_white, psnr, ssim
 from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.results import machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
-from reference_trainer.render.statistics import color_variance_map
 from reference_trainer.scenes.scene import View, Viewpoint
 
 __all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "ca_picture", "error_picture", "evaluate"]

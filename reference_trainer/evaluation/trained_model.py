@@ -18,8 +18,7 @@ from reference_trainer.render import (
     MomentImages,
     Rendering,
     Splats,
-    draw,
-    masked,
+    draw_masks,
     render_moments,
     splat,
     variance_shares,
@@ -143,8 +142,8 @@ class TrainedModel:
 class MaskedRenders:
     """The render callable of a `CAScore` over a model that does not change.
 
-    Projection, colours, tile lists and their order are made once for a view, for all Gaussians; a mask only takes
-    entries out of the lists. The images are those of `TrainedModel.render`.
+    Projection, colours, tile lists and their order are made once for a view, for all Gaussians, and the masks of a view
+    are drawn in one pass. The images are those of `TrainedModel.render`.
 
     Args:
         model: what to render.
@@ -157,9 +156,14 @@ class MaskedRenders:
 
     def __call__(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
         """Render a view with given opacities (N,); image (3, H, W), alpha (H, W)."""
-        if bool((opacities > self._model.gaussians.opacities).any()):  # the lists would be too short
-            return self._model.render(opacities, view)
+        images, alphas = self.many(opacities[None], view)
+        return images[0], alphas[0]
+
+    def many(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
+        """Render a view with each of some opacities (K, N); images (K, 3, H, W), alphas (K, H, W)."""
+        plain = self._model.gaussians.opacities
+        if bool((opacities > plain).any()):  # the lists would be too short
+            return draw_masks(self._model.splats(opacities.amax(0), view), opacities, background=self._model.background)
         if self._splats is None or view is not self._view:
-            self._view, self._splats = view, self._model.splats(self._model.gaussians.opacities, view)
-        out = draw(masked(self._splats, opacities), background=self._model.background)
-        return out.image, out.alpha
+            self._view, self._splats = view, self._model.splats(plain, view)
+        return draw_masks(self._splats, opacities, background=self._model.background)

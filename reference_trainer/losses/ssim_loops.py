@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.render.loops.compiling import kernel
-from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.compiled.compiling import kernel
+from reference_trainer.compiled.threads import in_threads
 
 __all__ = ["blur", "similarity"]
 

@@ -7,9 +7,8 @@ which the loops are tested against. `use_engine` chooses.
 from reference_trainer.render.checks import NotFiniteError
 from reference_trainer.render.engine import ENGINES, Engine, chosen_engine, describe_engine, use_engine
 from reference_trainer.render.moments import render_moments, variance_shares
-from reference_trainer.render.renderer import draw, masked, render, splat
+from reference_trainer.render.renderer import draw, draw_masks, render, splat
 from reference_trainer.render.splats import MomentImages, Rendering, Splats
-from reference_trainer.render.statistics import color_variance_map, first_order_map
 
 __all__ = [
     "ENGINES",
@@ -19,11 +18,9 @@ __all__ = [
     "Rendering",
     "Splats",
     "chosen_engine",
-    "color_variance_map",
     "describe_engine",
     "draw",
-    "first_order_map",
-    "masked",
+    "draw_masks",
     "render",
     "render_moments",
     "splat",

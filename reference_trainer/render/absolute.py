@@ -10,21 +10,26 @@ from torch import Tensor
 
 from reference_trainer.render.eager.formulas import blend_weights, over
 from reference_trainer.render.eager.walk import Block, blocks, geometry_rows, pad_entries, pixel_offsets, tile
+from reference_trainer.render.renderer import draw
 from reference_trainer.render.splats import Rendering, Splats
 
 __all__ = ["absgrad_sink", "absolute_gradients", "splat_weights", "with_absolute_gradients"]
 
 
-@torch.no_grad()
 def splat_weights(splats: Splats) -> Tensor:
     """Sum every splat's blend weight, alpha times transmittance, over the pixels of the picture; shape (M,)."""
-    rows = pad_entries(geometry_rows(splats))
-    sums = rows.new_zeros(rows.shape[1])
-    inside = tile(splats.colors.new_ones(1, splats.lists.height, splats.lists.width), splats.lists)
-    for block in blocks(splats.lists, rows.device):
-        weights = blend_weights(block.alphas(rows[:, block.gaussians]))
-        sums.index_add_(0, block.gaussians.flatten(), (inside[block.tiles] @ weights).flatten())
-    return sums[:-1]
+    colors = torch.zeros_like(splats.colors).requires_grad_()
+    with torch.enable_grad():
+        red = draw(_detached(splats)._replace(colors=colors)).image[0].sum()
+    return torch.autograd.grad(red, colors)[0][:, 0]
+
+
+def _detached(splats: Splats) -> Splats:
+    return splats._replace(
+        projection=type(splats.projection)(*(x.detach() for x in splats.projection)),
+        opacities=splats.opacities.detach(),
+        colors=splats.colors.detach(),
+    )
 
 
 def absolute_gradients(
@@ -83,19 +88,12 @@ def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tens
 
     The values of the sink do not matter. The background (3,) of the image is black by default.
     """
-    splats = rendering.splats
-    detached = splats._replace(
-        projection=type(splats.projection)(*(x.detach() for x in splats.projection)),
-        opacities=splats.opacities.detach(),
-        colors=splats.colors.detach(),
-    )
-    planes, values = [*rendering.image], [detached.colors]
-    behind = splats.colors.new_zeros(3) if background is None else background.detach()
-    if rendering.depth is not None:
-        planes.append(rendering.depth)
-        values.append(detached.projection.depths[:, None])
-        behind = torch.cat([behind, behind.new_zeros(1)])
-    drawn = torch.stack([*planes, rendering.alpha])
-    drawn = _AbsoluteGradients.apply(drawn, sink, detached, torch.cat(values, 1), behind)  # type: ignore[no-untyped-call]
-    depth = None if rendering.depth is None else drawn[3]
-    return rendering._replace(image=drawn[:3], alpha=drawn[-1], depth=depth)
+    splats, shown = _detached(rendering.splats), rendering.depth
+    values = torch.cat([splats.colors, splats.projection.depths[:, None]], 1)
+    behind = values.new_zeros(4)
+    if background is not None:
+        behind[:3] = background.detach()
+    depth = torch.zeros_like(rendering.alpha) if shown is None else shown
+    drawn = torch.cat([rendering.image, depth[None], rendering.alpha[None]])
+    drawn = _AbsoluteGradients.apply(drawn, sink, splats, values, behind)  # type: ignore[no-untyped-call]
+    return rendering._replace(image=drawn[:3], alpha=drawn[4], depth=None if shown is None else drawn[3])

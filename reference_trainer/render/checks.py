@@ -49,8 +49,7 @@ def check_projection(
 
 def check_background(background: Tensor) -> None:
     """Raise `NotFiniteError` unless the colour behind everything is finite."""
-    if not bool(background.isfinite().all()):
-        count = int((~background.isfinite()).sum())
+    if count := int((~background.isfinite()).sum()):
         raise NotFiniteError(
             f"background must be finite, got nan or infinity in {count} of {background.numel()} numbers."
         )

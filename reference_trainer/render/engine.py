@@ -13,12 +13,14 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
+from reference_trainer.render.eager.engine import TorchEngine
 from reference_trainer.render.splats import MomentImages, Splats
 
 __all__ = ["ENGINES", "Engine", "chosen_engine", "describe_engine", "engine_for", "use_engine"]
 
 ENGINES = ("auto", "torch", "loops")
 _VARIABLE = "CA_REG_ENGINE"
+_TORCH = TorchEngine()
 
 
 class Engine(Protocol):
@@ -43,6 +45,9 @@ class Engine(Protocol):
 
     def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draw splats front to back over a background (3,): image (3, H, W), alpha (H, W), depth (H, W) if asked."""
+
+    def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw splats with K other opacities, (K, M), as in `masked`: images (K, 3, H, W), alphas; no gradients."""
 
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Return mean and variance of every pixel under random factors on the alphas of the full model.
@@ -90,31 +95,19 @@ def chosen_engine() -> str:
     return chosen
 
 
-def engine_for(like: Tensor) -> Engine:
-    """Return the engine that draws tensors of this dtype and device; raises as `chosen_engine`."""
-    return _engine(like.device, like.dtype)
-
-
-def _engine(device: torch.device, dtype: torch.dtype) -> Engine:
-    """Return the loops for float32 on a CPU, unless torch was chosen, which draws everything else."""
+def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engine:
+    """Return the loops for float32 on a CPU unless torch was chosen, which draws the rest; as `chosen_engine`."""
     if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
-        return _torch_engine()
-    return _loop_engine() or _torch_engine()
+        return _TORCH
+    return _loop_engine() or _TORCH
 
 
 def describe_engine(device: torch.device | str) -> str:
     """Return which engine draws a model (float32) on a device, which need not be there, in words for people."""
-    if _engine(torch.device(device), torch.float32).name == "torch":
+    if engine_for(torch.device(device)).name == "torch":
         return "torch"
     count = torch.get_num_threads()
     return f"loops (numba {version('numba')}, {count} thread{'s' if count > 1 else ''})"
-
-
-@functools.cache
-def _torch_engine() -> Engine:
-    from reference_trainer.render.eager.engine import TorchEngine
-
-    return TorchEngine()
 
 
 @functools.cache

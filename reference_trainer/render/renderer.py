@@ -12,7 +12,7 @@ from reference_trainer.render.checks import check_background
 from reference_trainer.render.engine import engine_for
 from reference_trainer.render.splats import Rendering, Splats
 
-__all__ = ["draw", "masked", "render", "splat"]
+__all__ = ["draw", "draw_masks", "render", "splat"]
 
 
 def splat(
@@ -53,7 +53,8 @@ def splat(
     inputs = {name: _working(name, x, means.dtype) for name, x in named.items()}
     # Mixed precision would move means by pixels: its products have 8 bits.
     with torch.autocast(means.device.type, enabled=False):
-        return engine_for(inputs["means"]).splat(inputs, camera.to(means.device, inputs["means"].dtype), degree)
+        dtype = inputs["means"].dtype
+        return engine_for(means.device, dtype).splat(inputs, camera.to(means.device, dtype), degree)
 
 
 def _working(name: str, x: Tensor, dtype: torch.dtype) -> Tensor:
@@ -111,23 +112,35 @@ def render(
 
 
 def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = False) -> Rendering:
-    """Composite what `splat` or `masked` made; other arguments and errors are those of `render`."""
+    """Composite what `splat` made; other arguments and errors are those of `render`."""
     if splats.projection.means.requires_grad:
         splats.projection.means.retain_grad()
-    if background is None:
-        background = splats.colors.new_zeros(3)
-    else:
-        check_background(background)
     with torch.autocast(splats.opacities.device.type, enabled=False):
-        image, alpha, depths = splats.engine.composite(splats, background.to(splats.colors), depth=depth)
+        image, alpha, depths = splats.engine.composite(splats, _behind(background, splats), depth=depth)
     return Rendering(image, alpha, depths, splats)
 
 
-def masked(splats: Splats, opacities: Tensor) -> Splats:
-    """Return the same view of the same Gaussians with lower opacities, without projecting and sorting them again.
+@torch.no_grad()
+def draw_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Draw the same Gaussians K times with lower opacities, without projecting and sorting them again.
 
-    The opacities are activated, of all N Gaussians, (N,) or (N, 1), and nowhere higher than those of the splats; 0
-    leaves a Gaussian out, at no cost.
+    Args:
+        splats: of a view.
+        opacities: activated, of all N Gaussians, (K, N), nowhere higher than those of the splats; 0 leaves a Gaussian
+            out, at no cost.
+        background: as of `render`.
+
+    Returns:
+        Images (K, 3, H, W) and accumulated alphas (K, H, W), without gradients.
     """
-    lower = opacities.reshape(-1)[splats.indices].to(splats.opacities.dtype)
-    return splats.engine.masked(splats, lower)
+    lower = opacities[:, splats.indices].to(splats.opacities.dtype)
+    with torch.autocast(lower.device.type, enabled=False):
+        return splats.engine.composite_masks(splats, lower, _behind(background, splats))
+
+
+def _behind(background: Tensor | None, splats: Splats) -> Tensor:
+    """Return the colour behind everything, (3,)."""
+    if background is None:
+        return splats.colors.new_zeros(3)
+    check_background(background)
+    return background.to(splats.colors)

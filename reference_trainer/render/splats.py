@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["MomentImages", "Projection", "Rendering", "Splats", "TileLists"]
 
-_SMALLEST_SPREAD = 0.1**0.5  # px^2: half the difference of the variances along the axes is taken for no less
-
 
 class Projection(NamedTuple):
     """Projected Gaussians.
@@ -36,22 +34,6 @@ class Projection(NamedTuple):
     factors: Tensor
     covariances: Tensor
     depths: Tensor
-
-    @property
-    def radii(self) -> Tensor:
-        """Three standard deviations of the longer axis, rounded up, pixels, shape (M,); no gradient.
-
-        As in the INRIA code, more for round splats.
-
-        Example:
-            >>> covariances = torch.tensor([[1.0, 0.0, 1.0], [9.0, 0.0, 1.0]])
-            >>> nothing = torch.zeros(2, 0)
-            >>> Projection(nothing, nothing, covariances, nothing).radii.tolist()  # 3 sqrt(1.32), 3 sqrt(9)
-            [4.0, 9.0]
-        """
-        xx, xy, yy = self.covariances.detach().unbind(-1)
-        spread = torch.hypot(0.5 * (xx - yy), xy).clamp_min(_SMALLEST_SPREAD)
-        return torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt())
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ def warm_up(say: Callable[[str], None] = lambda text: None) -> tuple[str, ...]:
         return ()
     from tqdm import tqdm
 
-    from reference_trainer.render.loops.compiling import KERNELS, describe_compilation, reported_to
+    from reference_trainer.compiled.compiling import KERNELS, describe_compilation, reported_to
 
     names: list[str] = []
     with tqdm(delay=1e9, unit="loop", leave=False) as bar:

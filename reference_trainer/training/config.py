@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ca_reg import Chain
     from reference_trainer.density import DensityStrategy
     from reference_trainer.losses import LossTerm
-    from reference_trainer.render.renderers import Renderer
+    from reference_trainer.renderers import Renderer
 
 __all__ = ["TrainConfig"]
 
@@ -169,7 +169,7 @@ class TrainConfig:
 
     def make_renderer(self) -> Renderer:
         """Make the renderer."""
-        from reference_trainer.render.renderers import RENDERERS
+        from reference_trainer.renderers import RENDERERS
 
         return RENDERERS.make_one(self.renderer)
 

@@ -16,7 +16,7 @@ from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
 from reference_trainer.render import MomentImages, Rendering, Splats
-from reference_trainer.render.gsplat import GsplatSplats
+from reference_trainer.renderers.gsplat import GsplatSplats
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.randomness import stream
 

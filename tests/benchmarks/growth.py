@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -26,7 +26,7 @@ from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.studies.both_engines import engines_on
-from reference_trainer.studies.clocks import in_turns, now
+from reference_trainer.studies.clocks import in_turns, processor_clock
 
 __all__ = ["extrapolated", "growth", "measure_growth"]
 
@@ -40,6 +40,7 @@ def growth(
     repeats: int = 3,
     time_limit: float = 300.0,
     device: str = "cpu",
+    engine: Literal["all", "loops", "torch"] = "all",
 ) -> None:
     """Measure time and memory of the engines against Gaussians, pixels, and Gaussians per pixel, with exponents.
 
@@ -49,8 +50,10 @@ def growth(
         repeats: rounds of which the medians are taken.
         time_limit: seconds that one point may take; larger ones are left out, with the reason.
         device: where to render, "cpu" or "cuda".
+        engine: what draws; the limit stops both at what is too slow for one.
     """
-    measure_growth(growth_axes(largest), out, repeats=repeats, time_limit=time_limit, device=device)
+    only = {} if engine == "all" else {"engines": (engine,)}
+    measure_growth(growth_axes(largest), out, repeats=repeats, time_limit=time_limit, device=device, **only)
 
 
 def measure_growth(
@@ -60,6 +63,7 @@ def measure_growth(
     repeats: int = 3,
     time_limit: float = 300.0,
     device: str = "cpu",
+    engines: Sequence[str] = (),
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Measure the workloads of every axis; see `growth`.
@@ -73,7 +77,8 @@ def measure_growth(
     """
     file, place = out / REPORT, torch.device(device)
     measured: dict[str, Any] = read_json(file)["measured"] if file.exists() else {}
-    settings = {"repeats": repeats, "device": str(place), "threads": torch.get_num_threads()}
+    engines = list(engines or engines_on(place))
+    settings = {"repeats": repeats, "device": str(place), "engines": engines, "threads": torch.get_num_threads()}
 
     def once(name: str, spec: WorkloadSpec, expected: float) -> dict[str, Any]:
         """Measure, or take what was measured with the same settings; leave out what is expected to take too long."""
@@ -86,7 +91,7 @@ def measure_growth(
             return {"skipped": reason}
         else:
             say(f"{name}: {spec.gaussians} Gaussians, {spec.width}x{spec.height}")
-            measured[name] = {"settings": wanted, **_measure(spec, repeats=repeats, device=place)}
+            measured[name] = {"settings": wanted, **_measure(spec, engines, repeats=repeats, device=place)}
             write_json(file, {"measured": measured})
         return {key: value for key, value in measured[name].items() if key != "settings"}
 
@@ -138,15 +143,15 @@ def extrapolated(seconds: Mapping[float, float], x: float) -> float:
     return float(seconds[last] * (x / last) ** exponent)
 
 
-def _measure(spec: WorkloadSpec, *, repeats: int, device: torch.device) -> dict[str, Any]:
+def _measure(spec: WorkloadSpec, engines: Sequence[str], *, repeats: int, device: torch.device) -> dict[str, Any]:
     """Measure times and memory of a workload, drawn by every engine."""
-    workload, engines = spec.make().to(device), engines_on(device)
+    workload = spec.make().to(device)
     calls = {
         (engine, x): partial(call, draw_of(engine), workload)
         for engine in engines
         for x, call in zip(PASSES, (image, gradients), strict=True)
     }
-    seconds = in_turns({", ".join(name): call for name, call in calls.items()}, repeats, partial(now, device))
+    seconds = in_turns({", ".join(name): call for name, call in calls.items()}, repeats, processor_clock(device))
     return {
         "per_pixel": gaussians_per_pixel(spec),
         "seconds": seconds,

@@ -26,7 +26,7 @@ def canned(monkeypatch):
     """Workloads that take no time: 1 ms and 3 ms per Gaussian by torch, which alone draws."""
     measured = []
 
-    def measure(spec, *, repeats, device):
+    def measure(spec, engines, *, repeats, device):
         measured.append(spec.gaussians)
         seconds = {"forward": 1e-3 * spec.gaussians, "forward+backward": 3e-3 * spec.gaussians}
         return {"per_pixel": 2.0, "medians": {"torch": seconds}, "memory": {"torch": peaks(spec, "torch", device)}}
@@ -54,10 +54,10 @@ def test_a_tiny_measurement_of_both_engines(tmp_path, monkeypatch):
 def test_every_point_is_written_at_once_and_kept(canned, tmp_path, monkeypatch):
     measure = module._measure
 
-    def fails_at_80(spec, *, repeats, device):
+    def fails_at_80(spec, engines, *, repeats, device):
         if spec.gaussians == 80:
             raise KeyboardInterrupt
-        return measure(spec, repeats=repeats, device=device)
+        return measure(spec, engines, repeats=repeats, device=device)
 
     monkeypatch.setattr(module, "_measure", fails_at_80)
     with pytest.raises(KeyboardInterrupt):

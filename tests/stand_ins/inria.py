@@ -9,6 +9,7 @@ from oracles import random_scene
 from torch import Tensor, nn
 
 from reference_trainer.camera import Camera
+from reference_trainer.compat.radii import SMALLEST_SPREAD, longer_radii
 from reference_trainer.render import render as reference_render
 from reference_trainer.render.constants import NEAR_PLANE
 from reference_trainer.render.eager.projection import project
@@ -93,7 +94,8 @@ def radii_of_all(means, rotations, scales, camera):
     """Radii follow from the covariances alone: a Gaussian of opacity 0 has one, as in the CUDA code."""
     radii = torch.zeros(len(means), dtype=torch.int32, device=means.device)
     front = (means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]) > NEAR_PLANE
-    radii[front] = project(means[front], rotations[front], scales[front], camera).radii.to(torch.int32)
+    covariances = project(means[front], rotations[front], scales[front], camera).covariances
+    radii[front] = longer_radii(covariances, SMALLEST_SPREAD).to(torch.int32)
     return radii
 
 

@@ -12,7 +12,7 @@ from reference_trainer.render.eager import formulas
 from reference_trainer.render.eager.binning import bin_gaussians
 from reference_trainer.render.eager.projection import project
 from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
-from reference_trainer.render.eager.walk import blocks, geometry_rows, pad_entries, tile, walk
+from reference_trainer.render.eager.walk import geometry_rows, walk
 from reference_trainer.render.splats import MomentImages, Splats
 
 __all__ = ["TorchEngine"]
@@ -58,19 +58,26 @@ class TorchEngine:
         sums = walk(formulas.composite, rows, behind, splats.lists, extra=1)
         return sums[:3], sums[-1], sums[3] if depth else None
 
+    def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw one after the other."""
+        drawn = (self.composite(self.masked(splats, row), background, depth=False) for row in opacities)
+        images, alphas, _ = zip(*drawn, strict=True)
+        return torch.stack(images), torch.stack(alphas)
+
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Composite mean and variance back to front."""
-        rows = torch.cat([geometry_rows(splats), multiplier.T, splats.colors.T])
-        images = walk(formulas.moments, rows, behind, splats.lists, extra=4)
-        return MomentImages(images[:3], images[3:6], images[6])
+        one = torch.ones_like(splats.opacities)[None]
+        return self._moments(splats, multiplier, behind, one)
 
     def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
-        """Sum the summands of the variance over the pixels."""
-        rows = pad_entries(torch.cat([geometry_rows(splats), multiplier.T, splats.colors.T]))
-        tiles, per_pixel = tile(behind, splats.lists), tile(weights[None], splats.lists)[:, 0]
-        sums = torch.zeros(rows.shape[1], dtype=torch.float64, device=rows.device)
-        for block in blocks(splats.lists, rows.device):
-            of_block = formulas.summands(block, rows[:, block.gaussians], tiles[block.tiles])
-            of_entries = (of_block * per_pixel[block.tiles]).sum(-1, dtype=torch.float64).T
-            sums.index_add_(0, block.gaussians.flatten(), of_entries.flatten())
-        return sums[:-1]
+        """Return the gradients of the variance in factors of its summands."""
+        with torch.enable_grad():
+            factors = torch.ones_like(splats.opacities)[None].requires_grad_()
+            variance = self._moments(splats, multiplier, behind, factors).variance
+            total = (variance.mean(0) * weights).sum()
+        return torch.autograd.grad(total, factors)[0][0].double()
+
+    def _moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, factors: Tensor) -> MomentImages:
+        rows = torch.cat([geometry_rows(splats), multiplier.T, factors, splats.colors.T])
+        images = walk(formulas.moments, rows, behind, splats.lists, extra=4)
+        return MomentImages(images[:3], images[3:6], images[6])

@@ -1,4 +1,4 @@
-"""The formulas of compositing, tile by tile: what is drawn, its exact moments, their shares, and two statistics.
+"""The formulas of compositing, tile by tile: what is drawn, its exact moments, and their first order.
 
 Each takes a `Block`, the rows of its entries and what is behind its tiles, and is differentiated by PyTorch. There are
 T tiles of 64 pixels with L entries each, nearest first.
@@ -11,11 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ca_reg.functional import color_variance
 from reference_trainer.render.constants import MAX_ALPHA, MIN_TRANSMITTANCE
 from reference_trainer.render.eager.walk import Block
 
-__all__ = ["blend_weights", "color_variances", "composite", "first_order", "moments", "over", "summands"]
+__all__ = ["blend_weights", "composite", "first_order", "moments", "over"]
 
 
 def _clamped(raw: Tensor) -> Tensor:
@@ -89,14 +88,6 @@ def over(weights: Tensor, values: Tensor, behind: Tensor) -> Tensor:
     return torch.cat([shown + (1 - alpha) * behind, alpha], dim=1)
 
 
-def _random(block: Block, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return m alpha, v alpha^2, and (1 - m alpha)^2 + v alpha^2 of every entry at every pixel, (L, T, 1, 64)."""
-    alpha = _clamped(block.alphas(rows[:6])).permute(2, 0, 1)[:, :, None]
-    m, v = rows[6:8].transpose(1, 2)[..., None, None]
-    expected, spread = m * alpha, v * alpha.square()
-    return expected, spread, (1 - expected).square() + spread
-
-
 def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
     """Return mean and variance of C values under random factors, and the expected alpha, (T, 2 C + 1, 64).
 
@@ -104,41 +95,21 @@ def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
     what is behind it, the mean grows by m alpha d, and the variance V becomes ((1 - m alpha)^2 + v alpha^2) V
     + v alpha^2 d^2. Every term is a square times a non-negative weight: nothing cancels.
 
-    The rows are geometry, mean m and variance v of the factor, and values of the entries, (8 + C, T, L).
+    The rows are geometry, mean m and variance v of the factor, a factor of the summand v alpha^2 d^2, whose gradient is
+    its share, and values of the entries, (9 + C, T, L).
     """
-    expected, spread, shrink = _random(block, rows)
-    values = rows[8:].permute(2, 1, 0)[..., None]
+    alpha = _clamped(block.alphas(rows[:6])).permute(2, 0, 1)[:, :, None]
+    m, v, factor = rows[6:9].transpose(1, 2)[..., None, None]
+    expected, spread = m * alpha, v * alpha.square()
+    values = rows[9:].permute(2, 1, 0)[..., None]
+    terms = expected, factor * spread, (1 - expected).square() + spread, values
     mean, variance = behind, torch.zeros_like(behind)
-    terms = [x.unbind(0) for x in (expected, spread, shrink, values)]  # an index each would copy all in the gradient
-    for e, s, kept, value in zip(*(reversed(x) for x in terms), strict=True):
+    entries = zip(*(reversed(x.unbind(0)) for x in terms), strict=True)  # an index each would copy all in the gradient
+    for e, s, kept, value in entries:
         contrast = value - mean
         variance = kept * variance + s * contrast.square()
         mean = mean + e * contrast
     return torch.cat([mean, variance, 1 - (1 - expected).prod(0)], dim=1)
-
-
-def summands(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
-    """Return every entry's summand of the variance, mean over the C values, (L, T, 64); arguments as `moments`."""
-    expected, spread, shrink = _random(block, rows)
-    values = rows[8:].permute(2, 1, 0)[..., None]
-    mean, squares = behind, []
-    for i in reversed(range(values.shape[0])):
-        contrast = values[i] - mean
-        squares.append(contrast.square().mean(1))
-        mean = mean + expected[i] * contrast
-    front = torch.cat([torch.ones_like(shrink[:1]), shrink[:-1]]).cumprod(0)
-    return (front * spread)[:, :, 0] * torch.stack(squares[::-1])
-
-
-def color_variances(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
-    """Return the variance of the colours that are blended, and whether any are, (T, 2, 64) (paper, CV metric).
-
-    The rows are geometry and colours of the entries, (9, T, L); what is behind is one channel of zeros.
-    """
-    weights = blend_weights(block.alphas(rows[:6]))
-    colors = rows[6:].permute(1, 2, 0)[:, None].expand(-1, weights.shape[1], -1, -1)
-    result = color_variance(weights, colors)
-    return torch.stack([result.variance, result.covered.to(behind)], dim=1)
 
 
 def first_order(block: Block, rows: Tensor, behind: Tensor) -> Tensor:

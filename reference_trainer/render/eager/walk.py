@@ -52,7 +52,8 @@ class Block(NamedTuple):
             log_opacity - _HALF * (w1 * w1 + w2 * w2), 2 * _HALF * (l11 * w1), 2 * _HALF * (l21 * w1 + l22 * w2),
             -_HALF * (l11 * l11), -2 * _HALF * (l11 * l21), -_HALF * (l21 * l21 + l22 * l22),
         ]  # fmt: skip
-        exponents = _monomials(geometry) @ torch.stack(polynomial, dim=1)
+        x, y = pixel_offsets(geometry)
+        exponents = torch.cat([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1) @ torch.stack(polynomial, dim=1)
         return torch.nn.functional.threshold(exponents, math.log2(MIN_ALPHA), -math.inf).exp2()
 
 
@@ -61,12 +62,6 @@ def pixel_offsets(like: Tensor) -> Tensor:
     axis = torch.arange(TILE, dtype=like.dtype, device=like.device) - (TILE - 1) / 2
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     return torch.stack([x, y]).view(2, PIXELS, 1)
-
-
-def _monomials(like: Tensor) -> Tensor:
-    """Evaluate 1, x, y, x^2, x y, y^2 at a tile's pixels, measured from its centre, shape (64, 6)."""
-    x, y = pixel_offsets(like)
-    return torch.cat([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
 
 
 def geometry_rows(splats: Splats) -> Tensor:

@@ -1,8 +1,7 @@
 """Which Gaussian touches which tile, by counting instead of sorting.
 
 Gaussians are put in order of depth by a radix sort, and then each in turn appended to the lists of its tiles: a list
-is in order of depth because it was written in it. All that is kept of them on the way stands in that order too, so that
-memory is read from one end to the other.
+is in order of depth because it was written in it.
 """
 
 from __future__ import annotations
@@ -14,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.constants import MIN_ALPHA, TILE
-from reference_trainer.render.loops.compiling import inlined, kernel
-from reference_trainer.render.loops.threads import in_threads
 from reference_trainer.render.splats import Projection, TileLists
 
 __all__ = ["bin_gaussians"]
@@ -26,7 +25,7 @@ f4 = np.float32
 _ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
 _MIN, _TILE = f4(MIN_ALPHA), f4(TILE)
 _PARTS = 8  # of the order of depth, each with a count of its own of every tile, so that they can be filled at once
-_BITS = 11  # of a digit of the radix sort: three make a float32
+_BITS = 12  # of a digit of the radix sort
 
 
 @inlined
@@ -48,23 +47,26 @@ def _squared_radius(opacity: Any) -> Any:
 
 
 @kernel
-def _sort_by_depth(depths: Array) -> Any:
+def _nearest_first(depths: Array) -> Any:
     """Return the order of positive depths, nearest first; equal ones stay in order."""
-    count, mask = depths.shape[0], (1 << _BITS) - 1
-    keys, order = depths.view(np.uint32).copy(), np.arange(count).astype(np.int32)
+    keys, mask, shift = depths.view(np.uint32).copy(), (1 << _BITS) - 1, 0
+    order = np.arange(len(keys)).astype(np.int32)
+    if len(keys):
+        keys -= keys.min()  # the bits of positive floats are in the order of the floats
     other_keys, other_order = np.empty_like(keys), np.empty_like(order)
-    for shift in range(0, 3 * _BITS, _BITS):  # the bits of positive floats are in the order of the floats
+    while len(keys) and keys.max() >> shift > 0:
         places = np.zeros(mask + 2, np.int64)
-        for i in range(count):
-            places[((keys[i] >> shift) & mask) + 1] += 1
+        for key in keys:
+            places[((key >> shift) & mask) + 1] += 1
         for digit in range(mask):
             places[digit + 1] += places[digit]
-        for i in range(count):
+        for i in range(len(keys)):
             digit = (keys[i] >> shift) & mask
             place = places[digit]
             places[digit] = place + 1
             other_keys[place], other_order[place] = keys[i], order[i]
         keys, other_keys, order, other_order = other_keys, keys, other_order, order
+        shift += _BITS
     return order
 
 
@@ -110,82 +112,52 @@ def _find_spans(
 
 
 @kernel
-def _put_in_order(
-    first: int, last: int, order: Array, begins: Array, spans: Array, strips: Array, ordered: Array, slots: Array,
-    counts: Array,
-) -> None:  # fmt: skip
-    """Copy the spans in order of depth, which is random access, once; count the entries of every tile, by parts."""
-    for part in range(first, last):
-        count = counts[part]
-        for place in range(part * order.shape[0] // _PARTS, (part + 1) * order.shape[0] // _PARTS):
-            i = order[place]
-            slots[place] = begins[i, 1]
-            source = begins[i, 0]
-            for strip in range(strips[place], strips[place + 1]):
-                begin, end = spans[source, 0], spans[source, 1]
-                ordered[strip, 0], ordered[strip, 1] = begin, end
-                for tile in range(begin, end):
-                    count[tile] += 1
-                source += 1
-
-
-@kernel
-def _fill_lists(
-    first: int, last: int, order: Array, strips: Array, spans: Array, firsts: Array, places: Array, gaussians: Array,
+def _walk(
+    first: int, last: int, order: Array, strips: Array, spans: Array, offsets: Array, places: Array, gaussians: Array,
     slots: Array,
 ) -> None:  # fmt: skip
-    """Append the Gaussians to the lists of their tiles."""
+    """Append the Gaussians to the lists of their tiles; only count them if there are no lists yet."""
+    fill = gaussians.shape[0] > 0
     for part in range(first, last):
         at = places[part]
         for place in range(part * order.shape[0] // _PARTS, (part + 1) * order.shape[0] // _PARTS):
-            i, slot = order[place], firsts[place]
-            for strip in range(strips[place], strips[place + 1]):
+            i = order[place]
+            slot = offsets[i]
+            for strip in range(strips[i], strips[i + 1]):
                 for tile in range(spans[strip, 0], spans[strip, 1]):
-                    gaussians[at[tile]] = i
-                    slots[at[tile]] = slot
+                    if fill:
+                        gaussians[at[tile]] = i
+                        slots[at[tile]] = slot
                     at[tile] += 1
                     slot += 1
 
 
 def _ends(counts: Array) -> Array:
     """Return where each of consecutive groups starts, and where the last ends."""
-    result = np.zeros((counts.shape[0] + 1, *counts.shape[1:]), np.int64)
-    np.cumsum(counts, axis=0, out=result[1:])
+    result = np.zeros(counts.shape[0] + 1, np.int64)
+    np.cumsum(counts, out=result[1:])
     return result
 
 
 def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
     """List the Gaussians of every tile: those whose 1/255 ellipse meets the rectangle of the tile's pixel centres.
 
-    Args:
-        projection: M projected Gaussians.
-        opacities: activated, shape (M,).
-        width: image width, pixels.
-        height: image height, pixels.
+    The opacities (M,) are activated.
     """
     m, f, c, z = (x.detach().numpy() for x in projection)
     o = opacities.detach().numpy()
-    count, tiles, order = m.shape[0], -(-width // TILE) * -(-height // TILE), _sort_by_depth(z)
-    rows, counts = np.empty(count, np.int32), np.empty((count, 2), np.int32)  # of each the strips, and the entries
-    in_threads(_count_strips, count, m, c, o, height, rows, counts[:, 0], least=8192)
-    strips = _ends(counts[:, 0])
+    count, tiles, order = m.shape[0], -(-width // TILE) * -(-height // TILE), _nearest_first(z)
+    rows, of_rows, entries = (np.empty(count, np.int32) for _ in range(3))
+    in_threads(_count_strips, count, m, c, o, height, rows, of_rows, least=8192)
+    strips = _ends(of_rows)
     spans = np.empty((strips[-1], 2), np.int32)
-    in_threads(_find_spans, count, m, f, c, o, width, height, rows, strips, spans, counts[:, 1], least=4096)
-
-    begins, strips, ordered = _ends(counts), _ends(counts[order, 0]), np.empty_like(spans)
-    firsts, of_parts = np.empty(count, np.int64), np.zeros((_PARTS, tiles), np.int64)
-    parts = -(-_PARTS * 4096 // max(1, count))  # that are worth a thread
-    in_threads(_put_in_order, _PARTS, order, begins, spans, strips, ordered, firsts, of_parts, least=parts)
+    in_threads(_find_spans, count, m, f, c, o, width, height, rows, strips, spans, entries, least=4096)
+    offsets, of_parts, nothing = _ends(entries), np.zeros((_PARTS, tiles), np.int64), np.empty(0, np.int32)
+    least = -(-_PARTS * 4096 // max(1, count))  # parts that are worth a thread
+    in_threads(_walk, _PARTS, order, strips, spans, offsets, of_parts, nothing, nothing, least=least)
     starts = _ends(of_parts.sum(0))
     places = starts[:-1] + of_parts.cumsum(0) - of_parts
     gaussians, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
-    in_threads(_fill_lists, _PARTS, order, strips, ordered, firsts, places, gaussians, slots, least=parts)
-    return TileLists(
-        width=width,
-        height=height,
-        starts=torch.from_numpy(starts),
-        gaussians=torch.from_numpy(gaussians),
-        touched=torch.from_numpy(counts[:, 1] > 0),
-        slots=torch.from_numpy(slots),
-        offsets=torch.from_numpy(begins[:, 1].copy()),
-    )
+    in_threads(_walk, _PARTS, order, strips, spans, offsets, places, gaussians, slots, least=least)
+    arrays = (torch.from_numpy(x) for x in (starts, gaussians, entries > 0, slots, offsets))
+    return TileLists(width, height, *arrays)

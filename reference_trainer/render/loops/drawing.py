@@ -12,32 +12,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.render.constants import MIN_TRANSMITTANCE
-from reference_trainer.render.loops.compiling import inlined, kernel
-from reference_trainer.render.loops.tiles import (
-    CHUNK,
-    PIXELS,
-    alpha_at,
-    clamped,
-    footprint,
-    footprint_gradient,
-    geometry_gradients,
-    get_pixels,
-    is_faint,
-    make_table,
-    over_tiles,
-    put_pixels,
-    read_entries,
-    sum_rows,
-    whole_tiles,
-)
+from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.render.constants import MIN_ALPHA, MIN_TRANSMITTANCE
+from reference_trainer.render.loops import tiles
+from reference_trainer.render.loops.tiles import CHUNK, PIXELS
 from reference_trainer.render.splats import Splats
 
-__all__ = ["composite"]
+__all__ = ["composite", "composite_masks"]
 
 Array = Any
 f4 = np.float32
-_ZERO, _ONE, _LEAST_LIGHT = f4(0), f4(1), f4(MIN_TRANSMITTANCE)
+_ZERO, _ONE, _LEAST_LIGHT, _LEAST = f4(0), f4(1), f4(MIN_TRANSMITTANCE), f4(MIN_ALPHA)
 
 # Places in a tile's state: what is kept of every pixel stands in one array, so that the compiler sees that nothing
 # overlaps. With an array for each it would give up and not use vector instructions: four times slower.
@@ -60,72 +45,127 @@ def _have_ended(state: Any) -> Any:
     return most < _ZERO
 
 
+@inlined
+def _finish(state: Any, background: Any, drawn: Any, tile: Any, columns: Any) -> None:
+    """Put the background behind a tile, and the tile into the picture."""
+    for p in range(PIXELS):
+        through = abs(state[_LIGHT + p])
+        state[_LIGHT + p] = through
+        state[_RED + p] += through * background[0]
+        state[_GREEN + p] += through * background[1]
+        state[_BLUE + p] += through * background[2]
+    tiles.store(state, _LIGHT, drawn, tile, columns)
+
+
 @kernel
 def _forward(
-    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array,
-    image: Array, light: Array,
-) -> None:  # fmt: skip
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array, drawn: Array
+) -> None:
     s, entries = np.empty(4 * PIXELS, f4), np.empty((CHUNK + 1, 9), f4)
     for tile in range(first, last):
         s[:] = _ZERO
         s[_LIGHT : _LIGHT + PIXELS] = _ONE
         for begin in range(starts[tile], starts[tile + 1], CHUNK):
             end = min(begin + CHUNK, starts[tile + 1])
-            count = read_entries(gaussians, begin, end, 1, table, tile, columns, entries)
-            for k in range(0, count, 2):
+            for k in range(0, tiles.read_entries(gaussians, begin, end, 1, table, tile, columns, entries), 2):
                 a, b = entries[k], entries[k + 1]
-                shape_a, shape_b = (a[0], a[1], a[2], a[3], a[4], a[5]), (b[0], b[1], b[2], b[3], b[4], b[5])
+                shape_a, shape_b = tiles.footprint_of(a), tiles.footprint_of(b)
                 red_a, green_a, blue_a, red_b, green_b, blue_b = a[6], a[7], a[8], b[6], b[7], b[8]
                 for p in range(PIXELS):
-                    weight_a, between = _pass(clamped(alpha_at(shape_a, p)), s[_LIGHT + p])
-                    weight_b, rest = _pass(clamped(alpha_at(shape_b, p)), between)
+                    weight_a, between = _pass(tiles.clamped(tiles.alpha_at(shape_a, p)), s[_LIGHT + p])
+                    weight_b, rest = _pass(tiles.clamped(tiles.alpha_at(shape_b, p)), between)
                     s[_RED + p] += weight_a * red_a + weight_b * red_b
                     s[_GREEN + p] += weight_a * green_a + weight_b * green_b
                     s[_BLUE + p] += weight_a * blue_a + weight_b * blue_b
                     s[_LIGHT + p] = rest
             if _have_ended(s):
                 break
-        for p in range(PIXELS):
-            through = abs(s[_LIGHT + p])
-            s[_LIGHT + p] = through
-            s[_RED + p] += through * background[0]
-            s[_GREEN + p] += through * background[1]
-            s[_BLUE + p] += through * background[2]
-        put_pixels(s, _LIGHT, light[0], tile, columns)
-        for c in range(3):
-            put_pixels(s, _RED + c * PIXELS, image[c], tile, columns)
+        _finish(s, background, drawn, tile, columns)
+
+
+@inlined
+def _lowered(alpha: Any, factor: Any) -> Any:
+    """Return an alpha times a factor, cut and clamped as others are."""
+    lower = alpha * factor
+    return tiles.clamped(lower) if lower >= _LEAST else _ZERO
+
+
+@kernel
+def _masked(
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array, drawn: Array
+) -> None:
+    """Draw K pictures of the same lists; what is more in the table are factors of the alphas in each."""
+    count = drawn.shape[0]
+    states, ended, kept = np.empty((count, 4 * PIXELS), f4), np.empty(count, np.bool_), np.empty(CHUNK + 1, np.int64)
+    entries, alphas = np.empty((CHUNK + 1, table.shape[1]), f4), np.empty((CHUNK + 1, PIXELS), f4)
+    for tile in range(first, last):
+        states[:] = _ZERO
+        states[:, _LIGHT : _LIGHT + PIXELS] = _ONE
+        ended[:] = False
+        for begin in range(starts[tile], starts[tile + 1], CHUNK):
+            if ended.all():
+                break
+            end = min(begin + CHUNK, starts[tile + 1])
+            last_entry = tiles.read_entries(gaussians, begin, end, 1, table, tile, columns, entries)
+            for k in range(last_entry + 1):
+                shape, of_entry = tiles.footprint_of(entries[k]), alphas[k]
+                for p in range(PIXELS):
+                    of_entry[p] = tiles.alpha_at(shape, p)
+            for picture in range(count):
+                if ended[picture]:
+                    continue
+                s, shown = states[picture], 0
+                for k in range(last_entry):
+                    kept[shown] = k
+                    shown += entries[k, 9 + picture] > _ZERO
+                kept[shown] = last_entry  # which is nowhere seen
+                for k in range(0, shown, 2):
+                    a, b, alpha_a, alpha_b = (
+                        entries[kept[k]],
+                        entries[kept[k + 1]],
+                        alphas[kept[k]],
+                        alphas[kept[k + 1]],
+                    )
+                    red_a, green_a, blue_a, red_b, green_b, blue_b = a[6], a[7], a[8], b[6], b[7], b[8]
+                    factor_a, factor_b = a[9 + picture], b[9 + picture]
+                    for p in range(PIXELS):
+                        weight_a, between = _pass(_lowered(alpha_a[p], factor_a), s[_LIGHT + p])
+                        weight_b, rest = _pass(_lowered(alpha_b[p], factor_b), between)
+                        s[_RED + p] += weight_a * red_a + weight_b * red_b
+                        s[_GREEN + p] += weight_a * green_a + weight_b * green_b
+                        s[_BLUE + p] += weight_a * blue_a + weight_b * blue_b
+                        s[_LIGHT + p] = rest
+                ended[picture] = _have_ended(s)
+        for picture in range(count):
+            _finish(states[picture], background, drawn[picture], tile, columns)
 
 
 @kernel
 def _backward(
-    first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array, image: Array,
-    light: Array, to_image: Array, to_light: Array, rows: Array,
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array, drawn: Array,
+    upstream: Array, rows: Array,
 ) -> None:  # fmt: skip
-    s, drawn = np.empty(6 * PIXELS, f4), np.empty(4 * PIXELS, f4)
+    s, d = np.empty(6 * PIXELS, f4), np.empty(4 * PIXELS, f4)
     for tile in range(first, last):
-        get_pixels(to_light[0], tile, columns, s, _LIGHT)
-        get_pixels(light[0], tile, columns, drawn, _LIGHT)
-        for c in range(3):
-            get_pixels(to_image[c], tile, columns, s, _RED + c * PIXELS)
-            get_pixels(image[c], tile, columns, drawn, _RED + c * PIXELS)
+        tiles.load(upstream, tile, columns, s, _LIGHT)
+        tiles.load(drawn, tile, columns, d, _LIGHT)
         for p in range(PIXELS):
-            of_colors = s[_RED + p] * drawn[_RED + p] + s[_GREEN + p] * drawn[_GREEN + p]
-            of_colors += s[_BLUE + p] * drawn[_BLUE + p]
-            s[_BEHIND + p] = of_colors + s[_LIGHT + p] * drawn[_LIGHT + p]
+            of_colors = s[_RED + p] * d[_RED + p] + s[_GREEN + p] * d[_GREEN + p] + s[_BLUE + p] * d[_BLUE + p]
+            s[_BEHIND + p] = of_colors + s[_LIGHT + p] * d[_LIGHT + p]
             s[_LIGHT + p] = _ONE
         ended = False
         for e in range(starts[tile], starts[tile + 1]):
             i = gaussians[e]
             row = rows[slots[e]]
-            if ended or is_faint(table, i):
+            if ended or tiles.is_faint(table, i):
                 row[:] = _ZERO
                 continue
-            polynomial = footprint(table, i, tile, columns)
+            polynomial = tiles.footprint(table, i, tile, columns)
             r, g, b = table[i, 6], table[i, 7], table[i, 8]
             to_r, to_g, to_b = _ZERO, _ZERO, _ZERO
             for p in range(PIXELS):
-                raw, now = alpha_at(polynomial, p), s[_LIGHT + p]
-                alpha = clamped(raw)
+                raw, now = tiles.alpha_at(polynomial, p), s[_LIGHT + p]
+                alpha = tiles.clamped(raw)
                 weight, rest = _pass(alpha, now)
                 along = s[_RED + p] * r + s[_GREEN + p] * g + s[_BLUE + p] * b
                 beyond = s[_BEHIND + p] - weight * along
@@ -135,37 +175,45 @@ def _backward(
                 to_r += weight * s[_RED + p]
                 to_g += weight * s[_GREEN + p]
                 to_b += weight * s[_BLUE + p]
-            footprint_gradient(table, i, tile, columns, s[_SLOPE:], row)
+            tiles.footprint_gradient(table, i, tile, columns, s[_SLOPE:], row)
             row[6], row[7], row[8] = to_r, to_g, to_b
             if e % CHUNK == 0:
                 ended = _have_ended(s)
 
 
+def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> Tensor:
+    """Draw splats with K other opacities, (K, M): the light left, and the image, (K, 4, H, W); no gradients."""
+    highest = opacities.amax(0)
+    table = tiles.make_table(splats._replace(opacities=highest), (opacities / highest).T)
+    drawn = tiles.whole_tiles(splats.lists, len(opacities), 4)
+    tiles.over_tiles(_masked, splats.lists, table, background, drawn)
+    return splats.lists.cut(drawn)
+
+
 class _Composite(torch.autograd.Function):
-    """Of a table of splats: their image over the background, and what light is left, (3 and 1, whole tiles)."""
+    """Of a table of splats: what light is left, and their image over the background, (4, whole tiles)."""
 
     @staticmethod
-    def forward(ctx: Any, splats: Splats, background: Tensor, *_differentiable: Tensor) -> tuple[Tensor, Tensor]:
-        table, lists = make_table(splats), splats.lists
-        image, light = whole_tiles(lists, 3), whole_tiles(lists, 1)
-        over_tiles(_forward, lists, table, background, image, light)
-        ctx.lists = lists
-        ctx.save_for_backward(table, image, light)
-        return image, light
+    def forward(ctx: Any, splats: Splats, background: Tensor, *_differentiable: Tensor) -> Tensor:
+        table, ctx.lists = tiles.make_table(splats), splats.lists
+        drawn = tiles.whole_tiles(ctx.lists, 4)
+        tiles.over_tiles(_forward, ctx.lists, table, background, drawn)
+        ctx.save_for_backward(table, drawn)
+        return drawn
 
     @staticmethod
-    def backward(ctx: Any, to_image: Tensor, to_light: Tensor) -> tuple[Tensor | None, ...]:
-        table, image, light = ctx.saved_tensors
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        table, drawn = ctx.saved_tensors
         rows = table.new_empty(ctx.lists.gaussians.shape[0], 9)
-        over_tiles(_backward, ctx.lists, ctx.lists.slots, table, image, light, to_image, to_light, rows)
-        to_background = (to_image * light).sum((1, 2)) if ctx.needs_input_grad[1] else None
-        return None, to_background, *geometry_gradients(table, sum_rows(rows, ctx.lists))
+        tiles.over_tiles(_backward, ctx.lists, ctx.lists.slots, table, drawn, upstream, rows)
+        to_background = (upstream[1:] * drawn[:1]).sum((1, 2)) if ctx.needs_input_grad[1] else None
+        return None, to_background, *tiles.geometry_gradients(table, tiles.sum_rows(rows, ctx.lists))
 
 
-def composite(splats: Splats, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Draw splats over a background (3,): image (3, H, W), and the light left at every pixel, 1 - alpha, (H, W)."""
+def composite(splats: Splats, background: Tensor) -> Tensor:
+    """Draw splats over a background (3,): the light left at every pixel, 1 - alpha, and the image, (4, H, W)."""
     p = splats.projection
-    image, light = _Composite.apply(  # type: ignore[no-untyped-call]
+    drawn: Tensor = _Composite.apply(  # type: ignore[no-untyped-call]
         splats, background, p.means, p.factors, splats.opacities, splats.colors
     )
-    return splats.lists.cut(image), splats.lists.cut(light)[0]
+    return splats.lists.cut(drawn)

@@ -8,10 +8,10 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.render.checks import check_projection
 from reference_trainer.render.loops.binning import bin_gaussians
-from reference_trainer.render.loops.drawing import composite
+from reference_trainer.render.loops.drawing import composite, composite_masks
 from reference_trainer.render.loops.moments import moments, shares
 from reference_trainer.render.loops.projection import project, visible
-from reference_trainer.render.splats import MomentImages, Splats
+from reference_trainer.render.splats import Splats
 
 __all__ = ["LoopEngine"]
 
@@ -42,16 +42,16 @@ class LoopEngine:
 
     def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draw splats front to back; depth as the red of a second picture."""
-        image, light = composite(splats, background)
+        light, image = torch.split(composite(splats, background), [1, 3])
         if not depth:
-            return image, 1 - light, None
+            return image, 1 - light[0], None
         red = torch.nn.functional.pad(splats.projection.depths[:, None], (0, 2))
-        return image, 1 - light, composite(splats._replace(colors=red), torch.zeros_like(background))[0][0]
+        return image, 1 - light[0], composite(splats._replace(colors=red), torch.zeros_like(background))[1]
 
-    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
-        """Composite mean and variance back to front."""
-        return moments(splats, multiplier, behind)
+    def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw all in one pass: what does not depend on the opacity is evaluated once."""
+        drawn = composite_masks(splats, opacities, background)
+        return drawn[:, 1:], 1 - drawn[:, 0]
 
-    def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
-        """Sum the summands of the variance over the pixels."""
-        return shares(splats, multiplier, behind, weights)
+    moments = staticmethod(moments)
+    shares = staticmethod(shares)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from reference_trainer.render.loops.compiling import inlined
+from reference_trainer.compiled.compiling import inlined
 
 __all__ = ["basis", "basis_gradient"]
 

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
+from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
-from reference_trainer.render.loops.compiling import inlined, kernel
 from reference_trainer.render.loops.harmonics import basis, basis_gradient
-from reference_trainer.render.loops.threads import in_threads
 from reference_trainer.render.splats import Projection
 
 __all__ = ["project", "visible"]
@@ -38,21 +38,10 @@ def _visible(first: int, last: int, means: Array, opacities: Array, view: Array,
 
 
 def visible(means: Tensor, opacities: Tensor, camera: Camera) -> tuple[Tensor, bool]:
-    """Return who can be seen, shape (M,), and whether all depths and opacities are finite.
-
-    Args:
-        means: world coordinates, shape (N, 3).
-        opacities: activated, shape (N,).
-        camera: the view.
-    """
+    """Return who of N Gaussians can be seen, shape (M,), and whether all depths and opacities are finite."""
     seen = np.empty(means.shape[0], np.bool_)
-    arguments = (
-        means.contiguous().numpy(),
-        opacities.contiguous().numpy(),
-        camera.world_to_camera.contiguous().numpy(),
-        seen,
-    )
-    finite = all(in_threads(_visible, means.shape[0], *arguments, least=32768))
+    arrays = (x.contiguous().numpy() for x in (means, opacities, camera.world_to_camera))
+    finite = all(in_threads(_visible, means.shape[0], *arrays, seen, least=32768))
     return torch.from_numpy(np.flatnonzero(seen)), finite
 
 
@@ -306,16 +295,9 @@ class _Project(torch.autograd.Function):
 def project(
     means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, indices: Tensor, camera: Camera, degree: int
 ) -> tuple[Projection, Tensor, bool]:
-    """Project some of N Gaussians; return also their colours (M, 3), and whether all numbers are finite.
+    """Project M of N Gaussians; return also their colours (M, 3), and whether all numbers are finite.
 
-    Args:
-        means: world coordinates, shape (N, 3).
-        quaternions: orientation, shape (N, 4).
-        scales: standard deviations along the axes, positive, shape (N, 3).
-        sh: spherical-harmonic coefficients, shape (N, K, 3), or colours, shape (N, 1, 3).
-        indices: which of them, all in front of the camera, shape (M,).
-        camera: the view.
-        degree: highest band of ``sh``; -1 if these are colours.
+    The arguments are those of `reference_trainer.render.render`; ``sh`` may be colours, (N, 1, 3), of degree -1.
     """
     *projection, colors, finite = _Project.apply(  # type: ignore[no-untyped-call]
         means, quaternions, scales, sh, indices, camera, degree

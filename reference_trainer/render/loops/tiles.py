@@ -11,31 +11,16 @@ from numba import types
 from numba.extending import intrinsic
 from torch import Tensor
 
+from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
-from reference_trainer.render.loops.compiling import inlined, kernel
-from reference_trainer.render.loops.threads import in_threads
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
-    "CHUNK",
-    "PIXELS",
-    "X",
-    "Y",
-    "alpha_at",
-    "clamped",
-    "footprint",
-    "footprint_gradient",
-    "geometry_gradients",
-    "get_pixels",
-    "is_faint",
-    "longest_list",
-    "make_table",
-    "over_tiles",
-    "put_pixels",
-    "read_entries",
-    "sum_rows",
-    "whole_tiles",
-]
+    "CHUNK", "PIXELS", "X", "Y", "alpha_at", "clamped", "footprint", "footprint_gradient", "footprint_of",
+    "geometry_gradients", "is_faint", "load", "longest_list", "make_table", "over_tiles", "read_entries", "store",
+    "sum_rows", "whole_tiles",
+]  # fmt: skip
 
 Array = Any
 f4 = np.float32
@@ -65,9 +50,9 @@ def make_table(splats: Splats, *more: Tensor) -> Tensor:
     return torch.cat([projection.means, projection.factors, logarithms, splats.colors, *more], dim=1).detach()
 
 
-def whole_tiles(lists: TileLists, channels: int) -> Tensor:
-    """Return an empty image of whole tiles, (channels, 8 rows, 8 columns): kernels need not look at borders."""
-    return torch.empty(channels, TILE * lists.rows, TILE * lists.columns)
+def whole_tiles(lists: TileLists, *channels: int) -> Tensor:
+    """Return an empty image of whole tiles, (*channels, 8 rows, 8 columns): kernels need not look at borders."""
+    return torch.empty(*channels, TILE * lists.rows, TILE * lists.columns)
 
 
 def over_tiles(kernel: Any, lists: TileLists, *arguments: Tensor) -> None:
@@ -110,19 +95,21 @@ def longest_list(first: Any, last: Any, starts: Any) -> Any:
 
 
 @inlined
-def get_pixels(image: Any, tile: Any, columns: Any, state: Any, place: Any) -> None:
-    """Copy a tile of an image (H, W) to a place of its state."""
+def load(images: Any, tile: Any, columns: Any, state: Any, place: Any) -> None:
+    """Copy a tile of images (C, H, W) to a place of its state."""
     top, left = tile // columns * TILE, tile % columns * TILE
-    for p in range(PIXELS):
-        state[place + p] = image[top + p // TILE, left + p % TILE]
+    for c in range(images.shape[0]):
+        for p in range(PIXELS):
+            state[place + c * PIXELS + p] = images[c, top + p // TILE, left + p % TILE]
 
 
 @inlined
-def put_pixels(state: Any, place: Any, image: Any, tile: Any, columns: Any) -> None:
+def store(state: Any, place: Any, images: Any, tile: Any, columns: Any) -> None:
     """Copy them back."""
     top, left = tile // columns * TILE, tile % columns * TILE
-    for p in range(PIXELS):
-        image[top + p // TILE, left + p % TILE] = state[place + p]
+    for c in range(images.shape[0]):
+        for p in range(PIXELS):
+            images[c, top + p // TILE, left + p % TILE] = state[place + c * PIXELS + p]
 
 
 @inlined
@@ -135,20 +122,10 @@ def is_faint(table: Any, i: Any) -> Any:
 def read_entries(
     gaussians: Any, first: Any, last: Any, step: Any, table: Any, tile: Any, columns: Any, entries: Any
 ) -> Any:
-    """Collect what pixels need of a part of a list, leaving out who cannot be seen.
+    """Collect what pixels need of ``range(first, last, step)`` of a tile's list, leaving out who cannot be seen.
 
-    Args:
-        gaussians: of all lists.
-        first: of them.
-        last: as of `range`.
-        step: 1 for nearest first, -1 for farthest first.
-        table: of the Gaussians.
-        tile: whose list it is.
-        columns: of tiles in the image.
-        entries: receives footprint, colour, and what else is in the table.
-
-    Returns:
-        How many there are; one more that is nowhere seen follows, so that they can be taken in pairs.
+    Rows of ``entries`` receive footprint, colour, and what else is in the table. Returns how many there are; one more
+    that is nowhere seen follows, so that they can be taken in pairs.
     """
     count = 0
     for e in range(first, last, step):
@@ -163,6 +140,12 @@ def read_entries(
     entries[count] = _ZERO
     entries[count, 0] = _ABSENT
     return count
+
+
+@inlined
+def footprint_of(entry: Any) -> Any:
+    """Return the footprint that was read."""
+    return entry[0], entry[1], entry[2], entry[3], entry[4], entry[5]
 
 
 @inlined
@@ -225,15 +208,9 @@ def _split(_context: Any, _exponent: Any) -> Any:
 
 @inlined
 def footprint_gradient(table: Any, i: Any, tile: Any, columns: Any, slopes: Any, row: Any) -> None:
-    """Carry the gradient from a splat's ln alpha to its geometry.
+    """Carry gradients of a splat's ln alpha at the pixels of a tile to its geometry.
 
-    Args:
-        table: of the Gaussians.
-        i: the Gaussian.
-        tile: where.
-        columns: of tiles in the image.
-        slopes: gradient of ln alpha at every pixel of the tile.
-        row: receives the gradients of x, y, l11, l21, l22 and ln o.
+    The row receives those of x, y, l11, l21, l22 and ln o.
     """
     s, sx, sy, sxx, sxy, syy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
     for q in range(TILE):  # column by column: x is factored out

@@ -6,7 +6,7 @@ import pytest
 
 from reference_trainer.losses import LOSSES
 from reference_trainer.losses.term import WeightedTerm
-from reference_trainer.render.renderers import OwnRenderer
+from reference_trainer.renderers import OwnRenderer
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 

@@ -124,7 +124,7 @@ def test_omp_num_threads_decides_for_the_loops(count):
         """
 import threading, time, torch
 from reference_trainer.render import describe_engine
-from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.compiled.threads import in_threads
 used = in_threads(lambda *_: time.sleep(0.05) or threading.get_ident(), 20, least=1)
 print(torch.get_num_threads(), len(set(used)), describe_engine("cpu"))
 """,
@@ -220,7 +220,7 @@ def test_warmup_leaves_nothing_to_compile(tmp_path):
     script = """
 from reference_trainer.cli import main
 main(["warmup"])
-from reference_trainer.render.loops.compiling import KERNELS
+from reference_trainer.compiled.compiling import KERNELS
 assert len(KERNELS) > 10
 print("unused:", [kernel.py_func.__qualname__ for kernel in KERNELS if not kernel.signatures])
 """

@@ -7,7 +7,7 @@ import torch
 from oracles import GaussianScene, brute_force, random_scene
 
 from reference_trainer.camera import Camera
-from reference_trainer.render import draw, masked, render, splat
+from reference_trainer.render import draw, draw_masks, render, splat
 
 
 @functools.cache
@@ -151,7 +151,7 @@ def test_a_mask_draws_what_a_fresh_render_draws(case):
     for lower in (scene.opacities * (torch.rand(150, generator=g) > 0.5), scene.opacities * 0.3, 0 * scene.opacities):
         opacities = lower.clone().requires_grad_()
         fresh = lower.clone().requires_grad_()
-        one = draw(masked(whole, opacities))
+        one = draw(whole.engine.masked(whole, opacities[whole.indices]))
         other = render(*scene[:3], fresh, scene.camera, colors=scene.colors)
         torch.testing.assert_close(one.image, other.image, rtol=0, atol=10 * torch.finfo(case.dtype).eps)
         torch.testing.assert_close(one.alpha, other.alpha, rtol=0, atol=10 * torch.finfo(case.dtype).eps)
@@ -160,6 +160,26 @@ def test_a_mask_draws_what_a_fresh_render_draws(case):
                 out.image.square().sum().backward()
         expected = torch.zeros_like(fresh) if fresh.grad is None else fresh.grad
         torch.testing.assert_close(opacities.grad, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_many_masks_at_once_draw_what_fresh_renders_draw(case):
+    """Dropped, lowered, all, none, and long lists in which some pictures end before others."""
+    scene = random_scene(300, 37, 21, seed=9, size=0.3).to(case.dtype)
+    background = torch.tensor([0.3, 0.6, 0.1], dtype=case.dtype)
+    g = torch.Generator().manual_seed(5)
+    factors = [torch.rand(300, generator=g) > p for p in (0.5, 0.98)]
+    factors += [torch.rand(300, generator=g), torch.ones(300), torch.zeros(300), torch.full((300,), 0.02)]
+    opacities = scene.opacities * torch.stack([x.to(case.dtype) for x in factors])
+    whole = splat(*scene[:4], scene.camera, colors=scene.colors)
+    for some in (opacities, opacities[:2], opacities[1:2]):
+        images, alphas = draw_masks(whole, some, background=background)
+        assert images.shape == (len(some), 3, 21, 37)
+        for image, alpha, opacity in zip(images, alphas, some, strict=True):
+            fresh = render(*scene[:3], opacity, scene.camera, colors=scene.colors, background=background)
+            crossing = (image - fresh.image).abs().amax(0) > 100 * torch.finfo(case.dtype).eps
+            assert crossing.double().mean() <= case.crossing  # at the cut, alphas of lowered opacities round otherwise
+            torch.testing.assert_close(image, fresh.image, rtol=0, atol=case.pixel if not crossing.any() else 1 / 255)
+            torch.testing.assert_close(alpha, fresh.alpha, rtol=0, atol=case.pixel if not crossing.any() else 1 / 255)
 
 
 @pytest.mark.parametrize("shape", [(7,), (7, 1)])

@@ -10,11 +10,11 @@ import torch
 from oracles import random_scene
 
 from ca_reg.functional import Multiplier
-from reference_trainer.render import draw, masked, render_moments, splat, variance_shares
+from reference_trainer.render import draw, draw_masks, render_moments, splat, variance_shares
 from reference_trainer.render.constants import TILE
 
 pytest.importorskip("numba")
-from reference_trainer.render.loops.threads import in_threads
+from reference_trainer.compiled.threads import in_threads
 
 
 @pytest.fixture(autouse=True)
@@ -32,13 +32,16 @@ def everything(scene):
     leaves = [x.clone().requires_grad_() for x in (*scene[:4], sh)]
     splats = splat(*leaves[:4], scene.camera, sh=leaves[4])
     out = draw(splats, depth=True)
-    kept = draw(masked(splats, leaves[3] * (torch.arange(len(sh)) % 2)))
+    kept = draw(splats.engine.masked(splats, splats.opacities * (splats.indices % 2)))
+    masks = draw_masks(
+        splats, scene.opacities * torch.stack([torch.arange(len(sh)) % n for n in (2, 3, 4)]).clamp(max=1)
+    )
     moments = render_moments(splats, Multiplier.dropout(0.4))
     images = (out.image, out.alpha, out.depth, kept.image, moments.mean, moments.variance, moments.alpha_mean)
     sum((x * torch.linspace(-1, 1, x.numel()).view(x.shape)).sum() for x in images).backward()
     shares = variance_shares(splats, Multiplier.dropout(0.4), torch.ones_like(out.alpha))
     lists = splats.lists
-    return [*images, shares, lists.starts, lists.gaussians, lists.slots, *(x.grad for x in leaves)]
+    return [*images, *masks, shares, lists.starts, lists.gaussians, lists.slots, *(x.grad for x in leaves)]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -145,7 +148,7 @@ def test_renders_go_on_after_ctrl_c_at_any_time():
 
 
 def test_no_loop_is_compiled_again_for_views_of_tensors():
-    from reference_trainer.render.loops.compiling import KERNELS
+    from reference_trainer.compiled.compiling import KERNELS
 
     scene = random_scene(40, 3 * TILE, 2 * TILE, seed=1).to(torch.float32)
     everything(scene)
@@ -160,7 +163,8 @@ def test_no_loop_is_compiled_again_for_views_of_tensors():
             splats = splat(*leaves[:3], opacities, scene.camera, colors=leaves[4])
             out = draw(splats, background=strided(torch.rand(3)), depth=True)
             out.image[:, ::2].sum().backward(retain_graph=True) if out.image.requires_grad else None
-            draw(masked(splats, change(0.5 * opacities.detach().reshape(-1))))
+            draw(splats.engine.masked(splats, change(0.5 * splats.opacities.detach())))
+            draw_masks(splats, change(0.5 * opacities.detach().reshape(-1)).expand(2, -1))
             backdrop = torch.rand(2 * TILE, 3 * TILE, 3).permute(2, 0, 1)
             moments = render_moments(splats, Multiplier(strided(torch.rand(40)), 0.2), background=backdrop)
             moments.variance.permute(2, 1, 0).sum().backward()

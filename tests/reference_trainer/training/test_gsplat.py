@@ -7,8 +7,8 @@ import pytest
 import torch
 from stand_ins.gsplat import rasterization
 
-from reference_trainer.render import renderers as module
-from reference_trainer.render.gsplat import render_by
+from reference_trainer.renderers import renderer as module
+from reference_trainer.renderers.gsplat import render_by
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 

@@ -22,7 +22,8 @@ from reference_trainer.camera import Camera
 from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
-from reference_trainer.render import render, renderers
+from reference_trainer.render import render
+from reference_trainer.renderers import renderer as renderers
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.training.config import TrainConfig

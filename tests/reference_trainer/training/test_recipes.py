@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from ca_reg.schedules import as_schedule
+from reference_trainer.compat.radii import SMALLEST_SPREAD, longer_radii
 from reference_trainer.density import absgrad, adaptive
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.depth import true_priors
@@ -269,7 +270,8 @@ def test_large_gaussians_are_removed_by_their_size_in_the_world_only(tiny_scene)
         trainer.gaussians.log_scales[:5, 1] = math.log(0.12 * tiny_scene.extent)
         trainer.gaussians.means.mul_(0.1)
     camera, background = tiny_scene.train[0].camera, tiny_scene.background
-    radii = render_gaussians(trainer.gaussians, camera, background).splats.projection.radii
+    covariances = render_gaussians(trainer.gaussians, camera, background).splats.projection.covariances
+    radii = longer_radii(covariances, SMALLEST_SPREAD)
     assert (radii > 20).sum() > 20
     for step, left in ((3_000, 150), (3_100, 145), (3_200, 145)):
         with torch.no_grad():  # the reset at 3,000 lowers them

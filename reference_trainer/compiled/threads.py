@@ -44,7 +44,7 @@ def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any, least: i
     Nothing is written any more when this returns, or raises: be it what a kernel raised, or KeyboardInterrupt.
 
     Args:
-        kernel: compiled with `reference_trainer.render.loops.compiling.kernel`.
+        kernel: compiled with `reference_trainer.compiled.compiling.kernel`.
         count: of items.
         arguments: of the kernel after the first two.
         least: items worth a range of their own.

@@ -30,8 +30,8 @@ def _digest() -> str:
     numba looks at the file of a kernel alone, and would go on using machine code into which an older version of
     another file was inlined.
     """
-    folder = Path(__file__).parent
-    sources = [path.read_bytes() for path in (folder.parent / "constants.py", *sorted(folder.glob("*.py")))]
+    package = Path(__file__).parents[1]
+    sources = [path.read_bytes() for path in (package / "render/constants.py", *sorted(package.rglob("*.py")))]
     return hashlib.sha256(b"".join([sources[0], *(text for text in sources if b"\n@inlined" in text)])).hexdigest()
 
 

@@ -10,7 +10,7 @@ import pytest
 from engines import subprocess_environment
 
 numba = pytest.importorskip("numba")
-from reference_trainer.render.loops import compiling  # noqa: E402
+from reference_trainer.compiled import compiling  # noqa: E402
 
 SOURCE = """
 def double(first, last, x):
@@ -117,7 +117,7 @@ def test_it_says_so_once(caplog, monkeypatch, folder, loaded):
 SCRIPT = """
 import json, sys
 import numpy as np
-from reference_trainer.render.loops import compiling
+from reference_trainer.compiled import compiling
 sys.path.append(sys.argv[1])
 import doubling
 compiled, x = [], np.arange(5.0)

@@ -3,7 +3,8 @@
 import torch
 from oracles import brute_force, random_scene
 
-from reference_trainer.render import color_variance_map, splat
+from reference_trainer.evaluation.maps import color_variance_map
+from reference_trainer.render import splat
 
 
 def test_color_variance_equals_weighted_sums_of_the_brute_force_renderer(case):

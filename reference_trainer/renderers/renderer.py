@@ -1,4 +1,4 @@
-"""What draws the training views: this package's renderer, gsplat's kernels, or one's own; what ``--renderer`` knows."""
+"""What draws the training views: the base class, this package's renderer, and gsplat's kernels."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from typing import Any, ClassVar
 
 import torch
 
-from ca_reg.registry import Registry
 from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradients
-from reference_trainer.render.gsplat import load_gsplat_render
 from reference_trainer.render.renderer import render
+from reference_trainer.renderers.gsplat import load_gsplat_render
 
-__all__ = ["RENDERERS", "GsplatRenderer", "OwnRenderer", "Renderer"]
+__all__ = ["GsplatRenderer", "OwnRenderer", "Renderer"]
 
 
 class Renderer(abc.ABC):
@@ -66,10 +65,3 @@ class GsplatRenderer(Renderer):
     def __call__(self, **arguments: Any) -> Any:
         """Draw."""
         return self._render(**arguments)
-
-
-RENDERERS: Registry[Renderer] = Registry("renderer", Renderer)  # type: ignore[type-abstract]
-"""What can be asked for by name; ``RENDERERS.register("name")`` adds a class."""
-
-RENDERERS.register("torch")(OwnRenderer)
-RENDERERS.register("gsplat")(GsplatRenderer)

@@ -1,6 +1,6 @@
 """The gsplat renderer against this package's own, through a stand-in for the kernels and, on a GPU, through gsplat.
 
-On a machine with a CUDA device: ``pip install 'gsplat>=1.5' && pytest tests/reference_trainer/render/test_gsplat.py``.
+On a machine with a CUDA device: ``pip install 'gsplat>=1.5'``, then this file.
 """
 
 import functools
@@ -14,8 +14,8 @@ from stand_ins.gsplat import centred, rasterization
 from reference_trainer.compat.rasterization import make_rasterization
 from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.render import render
-from reference_trainer.render.gsplat import load_gsplat_render, render_by
-from reference_trainer.render.renderers import OwnRenderer
+from reference_trainer.renderers import OwnRenderer
+from reference_trainer.renderers.gsplat import load_gsplat_render, render_by
 
 N, WIDTH, HEIGHT = 80, 40, 24
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])

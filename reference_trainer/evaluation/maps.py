@@ -1,7 +1,4 @@
-"""Maps that are drawn beside the picture: how much the blended colours differ, and the paper's form of co-adaptation.
-
-They are looked at once in a while, and always evaluated by the torch engine.
-"""
+"""Maps beside the picture: how much the blended colours differ, and the paper's form of co-adaptation."""
 
 from __future__ import annotations
 
@@ -11,6 +8,7 @@ from torch import Tensor
 from ca_reg.functional import Multiplier
 from reference_trainer.render.eager import formulas
 from reference_trainer.render.eager.walk import geometry_rows, walk
+from reference_trainer.render.renderer import draw
 from reference_trainer.render.splats import Splats
 
 __all__ = ["color_variance_map", "first_order_map"]
@@ -35,10 +33,10 @@ def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
         >>> round(variance[8, 8].item(), 2)  # weights 1/2 and 1/4: (1/3) (2/3)
         0.22
     """
-    rows = torch.cat([geometry_rows(splats), splats.colors.T])
-    behind = rows.new_zeros(1, splats.lists.height, splats.lists.width)
-    variance, covered = walk(formulas.color_variances, rows, behind, splats.lists, extra=1)
-    return variance, covered > 0
+    drawn, squares = draw(splats), draw(splats._replace(colors=splats.colors.square()))
+    covered = drawn.alpha > 0
+    weight = torch.where(covered, drawn.alpha, 1.0)
+    return (squares.image / weight - (drawn.image / weight).square()).mean(0).clamp_min(0.0), covered
 
 
 @torch.no_grad()
@@ -47,7 +45,7 @@ def first_order_map(splats: Splats, multiplier: Multiplier) -> Tensor:
 
     An approximation that knows neither transmittance nor background nor what lies behind a splat: hidden splats count
     like visible ones. `ca_reg.functional.first_order_variance` says when it is right. The arguments are those of
-    `render_moments`, of the multiplier only the variance matters; returns shape (3, H, W).
+    `render_moments`, of the multiplier only the variance matters; returns shape (3, H, W). Always by the torch engine.
 
     Example:
         >>> from reference_trainer.camera import Camera

@@ -1,0 +1,1 @@
+"""Loops over arrays that numba compiles, and the threads that run them."""

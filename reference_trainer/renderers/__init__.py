@@ -1,0 +1,12 @@
+"""What draws the training views, and its registry: what ``--renderer`` knows by name."""
+
+from ca_reg.registry import Registry
+from reference_trainer.renderers.renderer import GsplatRenderer, OwnRenderer, Renderer
+
+__all__ = ["RENDERERS", "GsplatRenderer", "OwnRenderer", "Renderer"]
+
+RENDERERS: Registry[Renderer] = Registry("renderer", Renderer)  # type: ignore[type-abstract]
+"""What can be asked for by name; ``RENDERERS.register("name")`` adds a class."""
+
+RENDERERS.register("torch")(OwnRenderer)
+RENDERERS.register("gsplat")(GsplatRenderer)
