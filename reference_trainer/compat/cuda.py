@@ -159,7 +159,12 @@ _STAND_INS: dict[str, Any] = {
     "current_stream": lambda device=None: _Stream(),
     "get_device_name": lambda device=None: "CPU",
     "get_device_properties": lambda device=None: SimpleNamespace(
-        name="CPU", major=0, minor=0, total_memory=MEMORY, multi_processor_count=1
+        name="CPU",
+        major=0,
+        minor=0,
+        total_memory=MEMORY,
+        multi_processor_count=1,
+        gcnArchName="CPU",  # which torch.compile asks for
     ),
     "mem_get_info": lambda device=None: (MEMORY, MEMORY),
     "nvtx": SimpleNamespace(range_push=_nothing(), range_pop=_nothing(), mark=_nothing(), range=_Stream),

@@ -4,6 +4,7 @@ import threading
 
 import pytest
 import torch
+from torch._inductor.codecache import CacheBase
 
 from reference_trainer.compat.cuda import _STAND_INS, cuda_on_cpu
 
@@ -123,6 +124,7 @@ def test_what_scripts_ask_a_device_has_an_answer():
     with cuda_on_cpu():
         free, total = torch.cuda.mem_get_info()
         assert 0 < free <= total == torch.cuda.get_device_properties("cuda").total_memory
+        assert CacheBase.get_system.__wrapped__()["hash"]  # which torch.compile wants to know before it compiles
         assert torch.cuda.get_device_name(0)
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
