@@ -49,7 +49,7 @@ def warm_up(say: Callable[[str], None] = lambda text: None) -> tuple[str, ...]:
 
 
 def _use_everything() -> None:
-    """Do one training step of each kind and one exact score on a scene of a few pixels."""
+    """Do one training step of each kind and one score of each on a scene of a few pixels."""
     from ca_reg.functional import Multiplier
     from reference_trainer.runs.run import model_of
     from reference_trainer.scenes import synthetic_scene
@@ -65,4 +65,5 @@ def _use_everything() -> None:
     splats, multiplier = model.splats(opacities, view), Multiplier.dropout(0.5)
     moments = render_moments(splats, multiplier)
     (moments.variance.sum() + moments.alpha_mean.sum()).backward()  # type: ignore[no-untyped-call]
+    model.ca_score(samples=2)(model.gaussians.opacities.detach(), view)
     variance_shares(splats, multiplier, torch.ones(splats.lists.height, splats.lists.width))
