@@ -31,6 +31,19 @@ def test_rows_are_settings_with_all_their_seeds(tmp_path):
     assert lines[3].startswith("| `dropout(0.2) + depth` | 1 | 23 |")
 
 
+def test_a_group_has_settings_of_its_own_and_depth_is_shown_where_all_know_it(tmp_path):
+    runs = [a_run(tmp_path / group / "plain" / "seed_0", 20.0, densify_gradient=rate)
+            for group, rate in (("fsgs", 5e-4), ("absgs", 1e-3))]  # fmt: skip
+    runs += [a_run(tmp_path / "absgs" / "dropout" / "seed_0", 21.0, densify_gradient=1e-3, dropout=0.2)]
+    kept = keep(runs, grouped=True)
+    assert list(kept["rows"]) == ["fsgs, none", "absgs, none", "absgs, dropout(0.2)"]
+    assert kept["settings"]["absgs"]["densify_gradient"] == 1e-3
+    assert "AbsRel" not in table(kept)
+    for of in kept["rows"].values():
+        of[0]["depth_abs_rel"] = 0.5
+    assert "| depth AbsRel |" in table(kept)
+
+
 @pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda page: page.name)
 def test_the_pages_show_what_is_kept(page):
     assert write(page, ROOT / "docs" / "data") == page.read_text("utf-8")

@@ -5,7 +5,10 @@ figures of every seed; ``table`` prints the Markdown table of such a file; ``wri
 ``<!-- trained NAME -->`` and ``<!-- end -->``, where NAME is the file without its ending.
 
     PYTHONPATH=tests python -m benchmarks.trained keep docs/data/regularizers.json runs/fern/*/seed_*
+    PYTHONPATH=tests python -m benchmarks.trained keep --grouped docs/data/recipes.json runs/recipes/*/*/seed_*
     PYTHONPATH=tests python -m benchmarks.trained write docs/regularizers.md
+
+With ``--grouped`` every folder of ``ca-reg compare`` is a group with settings of its own: a recipe, named by it.
 """
 
 from __future__ import annotations
@@ -28,32 +31,45 @@ _QUALITY = {
     "ca": ("CA", 1e-3),
     "ca_exact_half": ("exact CA at 1/2", 1e-3),
 }
+_DEPTH = {"depth_abs_rel": ("depth AbsRel", 1.0), "depth_rmse": ("depth RMSE", 1.0)}
 _OWN = {"gaussians": ("Gaussians, k", 1e3), "processor_seconds": ("processor s", 1.0)}
 _MARKS = re.compile(r"(<!-- trained (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def keep(runs: Iterable[Path]) -> dict[str, Any]:
+def keep(runs: Iterable[Path], *, grouped: bool = False) -> dict[str, Any]:
     """Return the figures of finished runs by setting, with the machine of the first.
 
-    A setting is named by its regularizers, and by what else differs from most of the runs.
+    A setting is named by its regularizers, and by what else differs from most of the runs, or of those of its group.
     """
-    found = [json.loads((run / "results.json").read_text("utf-8")) for run in runs]
+    found: dict[str, list[dict[str, Any]]] = {}
+    for run in runs:
+        result = json.loads((run / "results.json").read_text("utf-8"))
+        found.setdefault(run.parents[1].name if grouped else "", []).append(result)
     if not found:
         raise SystemExit("expected folders of finished runs (with a results.json), got none.")
-    configs = [result["config"] for result in found]
-    usual = {name: _most([config[name] for config in configs]) for name in configs[0]}
     rows: dict[str, list[dict[str, Any]]] = {}
-    for result in found:
-        test = result["mean"]["test"]
-        figures = {"seed": result["config"]["seed"]} | {name: test[name] for name in _QUALITY}
-        rows.setdefault(_label(result["config"], usual), []).append(figures | {name: result[name] for name in _OWN})
-    shared = {name: value for name, value in usual.items() if value != getattr(TrainConfig(), name)}
-    return {"scene": found[0]["scene"], "settings": shared, "machine": found[0]["machine"], "rows": rows}
+    settings = {}
+    for group, results in found.items():
+        configs = [result["config"] for result in results]
+        usual = {name: _most([config[name] for config in configs]) for name in configs[0]}
+        settings[group] = {name: value for name, value in usual.items() if value != getattr(TrainConfig(), name)}
+        for result in results:
+            test = result["mean"]["test"]
+            depth = {name: test[name] for name in _DEPTH if test.get(name) is not None}
+            figures = {"seed": result["config"]["seed"]} | {name: test[name] for name in _QUALITY} | depth
+            label = ", ".join([*([group] if group else []), _label(result["config"], usual)])
+            rows.setdefault(label, []).append(figures | {name: result[name] for name in _OWN})
+    first = next(iter(found.values()))[0]
+    shared = settings if grouped else settings[""]
+    return {"scene": first["scene"], "settings": shared, "machine": first["machine"], "rows": rows}
 
 
 def table(kept: Mapping[str, Any]) -> str:
     """Return one row per setting, means and sample standard deviations over its seeds; CA in units of 1e-3."""
-    columns = _QUALITY | _OWN
+    depth = {
+        name: shown for name, shown in _DEPTH.items() if all(name in run for of in kept["rows"].values() for run in of)
+    }
+    columns = _QUALITY | depth | _OWN
     rows = [
         {"setting": f"`{label}`" if label != "none" else label, "seeds": len(of)}
         | {title: format_mean_std([run[name] for run in of], unit=unit) for name, (title, unit) in columns.items()}
@@ -90,13 +106,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     keeping = commands.add_parser("keep")
+    keeping.add_argument("--grouped", action="store_true")
     keeping.add_argument("file", type=Path)
     keeping.add_argument("runs", type=Path, nargs="+")
     commands.add_parser("table").add_argument("file", type=Path)
     commands.add_parser("write").add_argument("page", type=Path)
     args = parser.parse_args()
     if args.command == "keep":
-        write_json(args.file, keep(args.runs))
+        write_json(args.file, keep(args.runs, grouped=args.grouped))
     elif args.command == "table":
         print(table(json.loads(args.file.read_text("utf-8"))), end="")
     else:
