@@ -13,9 +13,9 @@ __all__ = ["Names", "Recipes"]
 
 @dataclass(frozen=True)
 class Names:
-    """List what --regularizer, --loss, --density and --renderer know by name, with arguments; trains nothing.
+    """List regularizers, losses, density control and renderers.
 
-    Classes of your own need no entry: write module:Class.
+    By name and with arguments, for the options. Classes of your own need no entry: write module:Class.
     """
 
     what: Annotated[Literal["all", "regularizer", "loss", "density", "renderer"], tyro.conf.Positional] = "all"
@@ -43,7 +43,10 @@ class Names:
 
 @dataclass(frozen=True)
 class Recipes:
-    """List what --recipe knows by name: source, what it needs, what differs from the original; trains nothing."""
+    """List the published methods that --recipe knows.
+
+    With source, what each needs, and what differs from the original.
+    """
 
     def __call__(self) -> None:
         """Run the command."""

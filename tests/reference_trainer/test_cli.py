@@ -99,18 +99,9 @@ def test_help(command, options, capsys):
 def test_the_list_of_commands_says_what_each_does(capsys):
     with pytest.raises(SystemExit):
         main(["--help"])
-    text = plain(capsys.readouterr().out)
-    for line in (
-        "demo Train the built-in scene",
-        "plan Say what",
-        "train Train one model",
-        "evaluate Measure a run",
-        "bake Give a PLY",
-        "render Render a run",
-        "compare Train baseline",
-        "study Measure something",
-    ):
-        assert f"• {line}" in text  # fmt: skip
+    text = capsys.readouterr().out
+    assert len(re.findall(r"• \w+ +\w[^•\n]*\.[ │]*\n", text)) == text.count("•") > 12  # one sentence, one line
+    assert "Train the built-in scene" in text
     assert "Finished runs are kept" not in text  # which the help of the command says
 
 
