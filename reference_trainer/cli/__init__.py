@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from reference_trainer.cli.drawing import Warmup
-from reference_trainer.cli.names import Names, Recipes
+from reference_trainer.cli.names import Names, Recipes, Version
 from reference_trainer.cli.ply import Bake, Clean
 from reference_trainer.cli.report import Report
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
@@ -67,6 +67,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "names": Names(),
         "recipes": Recipes(),
         "warmup": Warmup(),
+        "version": Version(),
     }
     # In the list of the commands the first paragraph of each; the command's own help has all of it.
     texts = {name: inspect.getdoc(type(command)) or "" for name, command in defaults.items()}

@@ -1,4 +1,4 @@
-"""What can be asked for by name, and the recipes."""
+"""What can be asked for by name, the recipes, and what is installed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-__all__ = ["Names", "Recipes"]
+__all__ = ["Names", "Recipes", "Version"]
 
 
 @dataclass(frozen=True)
@@ -54,3 +54,15 @@ class Recipes:
 
         for name, recipe in RECIPES.items():
             print(f"{name}: {recipe.source}. Needs {recipe.needs}. Differs: {recipe.differs}.")
+
+
+@dataclass(frozen=True)
+class Version:
+    """Print what a bug report should say: versions, processor, engine."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.evaluation.results import machine
+
+        for name, value in machine().items():
+            print(f"{name}: {value}")
