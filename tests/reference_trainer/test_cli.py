@@ -109,7 +109,7 @@ def test_the_list_of_commands_says_what_each_does(capsys):
 def test_version_says_what_a_bug_report_needs(capsys):
     main(["version"])
     lines = dict(line.split(": ", 1) for line in capsys.readouterr().out.splitlines())
-    assert (lines["ca_reg"], lines["torch"]) == (ca_reg.__version__, torch.__version__)
+    assert (lines["ca_reg"], lines["torch"]) == (ca_reg.__version__, str(torch.__version__))
 
 
 def test_help_and_mistakes_need_no_torch():
