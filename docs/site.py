@@ -38,4 +38,6 @@ def on_page_content(content: str, **_: object) -> str:
 
 def _mathml(formula: re.Match[str]) -> str:
     _, bracket, tex = formula.groups()
+    for unknown, known in (("aligned}", "align*}"), (r"\mathrm{E}", r"\operatorname{E}")):  # to latex2mathml 3.81
+        tex = tex.replace(unknown, known)
     return convert(html.unescape(tex), display="block" if bracket == "[" else "inline")
