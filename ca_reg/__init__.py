@@ -31,7 +31,7 @@ from ca_reg.schedules import Constant, LinearRamp, Schedule, StartStop
 from ca_reg.score import CAScore
 from ca_reg.types import MomentsFn, RenderFn, Rendering
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "CAAttribution",

@@ -26,7 +26,7 @@ class PixelLists(NamedTuple):
     Convention: the entries of one pixel are ordered by depth, the nearest first; those of different pixels may come in
     any order, also interleaved. No Gaussian appears twice at a pixel.
 
-    Args:
+    Attributes:
         gaussians: which of the N Gaussians, integers of shape (P,).
         pixels: where, ``row * width + column``, integers of shape (P,).
         alphas: alpha of the Gaussian at the pixel, ``min(0.99, opacity * falloff)`` with the opacities that were passed

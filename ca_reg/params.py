@@ -19,7 +19,7 @@ class Params(NamedTuple):
     Convention: world coordinates; quaternions wxyz, not necessarily of length 1; the view matrix is world to camera,
     OpenCV axes (x right, y down, z forward), applied from the left to column vectors.
 
-    Args:
+    Attributes:
         opacities: in [0, 1], shape (N,).
         means: centres, world units, shape (N, 3).
         scales: standard deviations along the axes, world units, shape (N, 3).
@@ -49,7 +49,7 @@ class Params(NamedTuple):
 class Draw(NamedTuple):
     """One draw of a regularizer, enough to apply it again.
 
-    Args:
+    Attributes:
         value: whatever its ``replay`` reads: a mask, noise, nothing.
         keep: which Gaussians were not dropped, shape (N,) bool; None if none was. Density control must not count the
             others as seen.

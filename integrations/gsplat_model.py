@@ -25,7 +25,7 @@ class GsplatView(NamedTuple):
 
     Convention: OpenCV camera, half-pixel centres.
 
-    Args:
+    Attributes:
         viewmat: world to camera, shape (4, 4).
         K: intrinsics, pixels, shape (3, 3).
         width: of the image.

@@ -18,5 +18,5 @@ def blocks(page: Path, language: str) -> list[str]:
 
 def linked_files(page: Path) -> dict[str, Path]:
     """Return the relative links of a page, without their anchors, and where they lead."""
-    links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
+    links = re.findall(r"(?:\]\(|^\[[\w-]+\]: )([^)#\s]+)", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {link: page.parent / link for link in links if not re.match(r"\w+:", link)}

@@ -1,14 +1,30 @@
-"""What the pages in docs promise: their Python runs and prints what they say, and what they name exists."""
+"""What the pages promise: their Python runs and prints what they say, and what they name exists."""
 
+import ast
 import contextlib
+import importlib
 import io
 import re
+import shlex
 
 import pytest
 from pages import ROOT, blocks, fenced_blocks, linked_files
 
-PAGES = {page.name: page for page in sorted((ROOT / "docs").glob("*.md"))}
-WITH_CODE = [name for name, page in PAGES.items() if blocks(page, "python")]
+from reference_trainer.cli import _parse
+
+PAGES = {page.name: page for page in [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]}
+WITH_CODE = [name for name, page in PAGES.items() if blocks(page, "python") and name != "README.md"]  # see test_readme
+EXCERPTS = [text for page in PAGES.values() for text in blocks(page, "py")]
+COMMANDS = sorted(
+    {
+        " ".join(line.split())
+        for page in PAGES.values()
+        for line in re.findall(
+            r"^ *(?:.*&& )?(ca-reg [^#`\n]+)(?=#|$)", page.read_text("utf-8").replace("\\\n", ""), re.M
+        )
+        if not re.search(r"\.\.\.|[<$]", line)  # what the reader is to fill in
+    }
+)
 
 
 @pytest.mark.parametrize("name", WITH_CODE)
@@ -24,6 +40,19 @@ def test_python_runs_and_prints_what_stands_below_it(name):
             assert text == printed
             printed = ""
     assert not printed
+
+
+@pytest.mark.parametrize("excerpt", EXCERPTS)
+def test_excerpts_import_what_exists(excerpt):
+    for node in ast.walk(ast.parse(excerpt)):
+        if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ("ca_reg", "reference_trainer"):
+            module = importlib.import_module(node.module)
+            assert [name.name for name in node.names if not hasattr(module, name.name)] == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_are_understood(command):
+    assert callable(_parse(shlex.split(command)[1:]))
 
 
 @pytest.mark.parametrize("name", PAGES)

@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from reference_trainer.cli.drawing import Warmup
-from reference_trainer.cli.names import Names, Recipes
+from reference_trainer.cli.names import Names, Recipes, Version
 from reference_trainer.cli.ply import Bake, Clean
 from reference_trainer.cli.report import Report
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
@@ -57,16 +57,17 @@ def _parse(arguments: Sequence[str]) -> Any:
         "demo": Demo(),
         "plan": Plan(config=config, recipe=recipe, given=given),
         "train": Train(config=config, recipe=recipe, given=given),
+        "compare": Compare(out=Path("runs/compare"), config=config, recipe=recipe),
         "evaluate": Evaluate(),
+        "report": Report(runs=tyro.MISSING),
+        "render": Render(run=Path("runs/train")),
+        "study": Study(tyro.MISSING),
         "bake": Bake(ply=tyro.MISSING),
         "clean": Clean(ply=tyro.MISSING),
-        "render": Render(run=Path("runs/train")),
-        "report": Report(runs=tyro.MISSING),
-        "compare": Compare(out=Path("runs/compare"), config=config, recipe=recipe),
-        "study": Study(tyro.MISSING),
         "names": Names(),
         "recipes": Recipes(),
         "warmup": Warmup(),
+        "version": Version(),
     }
     # In the list of the commands the first paragraph of each; the command's own help has all of it.
     texts = {name: inspect.getdoc(type(command)) or "" for name, command in defaults.items()}

@@ -55,7 +55,10 @@ DrawOfSweep = Annotated[DrawingOfSweep, tyro.conf.arg(name="")]
 
 @dataclass(frozen=True)
 class Warmup:
-    """Compile all loops of the renderer now instead of at the first use; needed once per machine and version."""
+    """Compile the renderer's loops now, not at their first use.
+
+    Needed once per machine and version.
+    """
 
     drawing: Draw = field(default_factory=Drawing)
 

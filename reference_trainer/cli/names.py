@@ -1,4 +1,4 @@
-"""What can be asked for by name, and the recipes."""
+"""What can be asked for by name, the recipes, and what is installed."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-__all__ = ["Names", "Recipes"]
+__all__ = ["Names", "Recipes", "Version"]
 
 
 @dataclass(frozen=True)
 class Names:
-    """List what --regularizer, --loss, --density and --renderer know by name, with arguments; trains nothing.
+    """List regularizers, losses, density control and renderers.
 
-    Classes of your own need no entry: write module:Class.
+    By name and with arguments, for the options. Classes of your own need no entry: write module:Class.
     """
 
     what: Annotated[Literal["all", "regularizer", "loss", "density", "renderer"], tyro.conf.Positional] = "all"
@@ -43,7 +43,10 @@ class Names:
 
 @dataclass(frozen=True)
 class Recipes:
-    """List what --recipe knows by name: source, what it needs, what differs from the original; trains nothing."""
+    """List the published methods that --recipe knows.
+
+    With source, what each needs, and what differs from the original.
+    """
 
     def __call__(self) -> None:
         """Run the command."""
@@ -51,3 +54,15 @@ class Recipes:
 
         for name, recipe in RECIPES.items():
             print(f"{name}: {recipe.source}. Needs {recipe.needs}. Differs: {recipe.differs}.")
+
+
+@dataclass(frozen=True)
+class Version:
+    """Print what a bug report should say: versions, processor, engine."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.evaluation.results import machine
+
+        for name, value in machine().items():
+            print(f"{name}: {value}")

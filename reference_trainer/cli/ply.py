@@ -17,9 +17,9 @@ __all__ = ["Bake", "Clean"]
 
 @dataclass(frozen=True)
 class Bake:
-    """Give a PLY its test-time opacities, such as times 1 - p after dropout p, for viewers that know of no regularizer.
+    """Give a PLY its test-time opacities, for other viewers.
 
-    A comment in the file says so.
+    Such as times 1 - p after dropout p, of which viewers know nothing. A comment in the file says so.
     """
 
     ply: Annotated[Path, tyro.conf.Positional]
@@ -40,10 +40,11 @@ class Bake:
 
 @dataclass(frozen=True)
 class Clean:
-    """Take out of a PLY the Gaussians that co-adapt most for what they contribute, and refine; before and after.
+    """Take out of a PLY the Gaussians that co-adapt most; refine.
 
-    On the photographs of its scene a few training steps close the holes; without a scene, on an orbit, they stay. For
-    models that were trained without a regularizer: after dropout there is little to take out.
+    Most for what they contribute, with a table of before and after. On the photographs of its scene a few training
+    steps close the holes; without a scene, on an orbit, they stay. For models that were trained without a regularizer:
+    after dropout there is little to take out.
     """
 
     ply: Annotated[Path, tyro.conf.Positional]

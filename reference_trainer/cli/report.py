@@ -15,9 +15,10 @@ __all__ = ["Report"]
 
 @dataclass(frozen=True)
 class Report:
-    """Write one HTML file about runs: scores, views, and the models to turn around, in colors or co-adaptation heat.
+    """Write one HTML file about runs: scores, views, 3D models.
 
-    It needs nothing but a browser: no server, no network. Several runs on one scene stand side by side.
+    The models turn, in colors or in co-adaptation heat. It needs nothing but a browser: no server, no network. Several
+    runs on one scene stand side by side.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]

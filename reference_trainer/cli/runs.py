@@ -61,9 +61,10 @@ def _chosen(scene: SceneOptions, folder: str | None) -> SceneOptions:
 
 @dataclass(frozen=True)
 class Demo:
-    """Train the built-in scene from three views with and without the regularizers; needs no files, takes minutes.
+    """Train the built-in scene with and without the regularizers.
 
-    Ends with a table of test quality and co-adaptation, a plot of the dynamics, and pictures.
+    From three views; needs no files and takes minutes. Ends with a table of test quality and co-adaptation, a plot of
+    the dynamics, and pictures.
     """
 
     out: Path = Path("runs/demo")
@@ -153,7 +154,10 @@ class Train:
 
 @dataclass(frozen=True)
 class Plan:
-    """Say what training will use of a scene and what it leaves out, with the reasons; trains nothing."""
+    """Say what training will use of a scene, and why.
+
+    And what it leaves out; trains nothing.
+    """
 
     folder: Folder = None
     scene: Scene = field(default_factory=SceneOptions)
@@ -187,10 +191,10 @@ class PlyScene(SceneOptions):
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure a run, or any 3DGS PLY: PSNR, SSIM, LPIPS, CA, CV, per view and mean, on the views of a scene.
+    """Measure a run, or any 3DGS PLY: PSNR, SSIM, LPIPS, CA, CV.
 
-    A PLY without a scene is measured from cameras on an orbit around it: CA (protocol, exact, and exact without the
-    background) and CV.
+    Per view and mean, on the views of a scene. A PLY without a scene is measured from cameras on an orbit around it: CA
+    (protocol, exact, and exact without the background) and CV.
     """
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
@@ -247,7 +251,7 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Render a run's views, or a flight between its training cameras, as PNG (and GIF)."""
+    """Render a run's views as PNG, or a flight as GIF, too."""
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of a run of `ca-reg train`."""
@@ -277,10 +281,11 @@ class EveryScene(SceneOptions):
 
 @dataclass(frozen=True)
 class Compare:
-    """Train baseline, dropout, noise and both on scenes with several seeds; one table per scene with mean and spread.
+    """Train baseline, dropout, noise and both, with several seeds.
 
-    Finished runs are kept: the same command continues an interrupted comparison, or adds seeds. A run that fails is
-    reported at the end and does not stop the others; the exit code is then 1.
+    One table per scene with mean and spread. Finished runs are kept: the same command continues an interrupted
+    comparison, or adds seeds. A run that fails is reported at the end and does not stop the others; the exit code is
+    then 1.
     """
 
     out: Path

@@ -73,7 +73,7 @@ class Stability:
 
 @dataclass(frozen=True)
 class Study:
-    """Measure something about the method itself; see the subcommands."""
+    """Measure something about the method itself."""
 
     what: ErrorRuntime | Attribution | Stability
 

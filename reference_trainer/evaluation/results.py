@@ -8,11 +8,12 @@ import os
 import platform
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 
 import torch
 
+import ca_reg
 from reference_trainer.files import write_text
 from reference_trainer.render import describe_engine
 
@@ -111,7 +112,8 @@ def machine() -> dict[str, str | int]:
         "python": platform.python_version(),
         "platform": platform.platform(),
         "torch": str(torch.__version__),  # with its build, such as +cpu, which an index's metadata may leave out
-        **{name: _version(name) for name in ("kornia", "ca_reg")},
+        "kornia": version("kornia"),
+        "ca_reg": ca_reg.__version__,
         "cpu": _cpu_name(),
         "cores": os.cpu_count() or 0,
         "threads": torch.get_num_threads(),
@@ -145,14 +147,6 @@ def _number(value: float) -> str:
     if not math.isfinite(value):
         return _ABSENT
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
-
-
-def _version(name: str) -> str:
-    """Return the installed version of a distribution."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def _cpu_name() -> str:

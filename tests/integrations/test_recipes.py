@@ -1,7 +1,5 @@
 """The recipes of docs/integrations.md that need other packages or CUDA: what can be checked of them without."""
 
-import ast
-import importlib
 import shlex
 
 import pytest
@@ -10,21 +8,12 @@ from pages import ROOT, blocks
 from ca_reg.integrations.run import _parse
 
 PAGE = ROOT / "docs" / "integrations.md"
-EXCERPTS = blocks(PAGE, "py")
 COMMANDS = [
     shlex.split(line.removeprefix("run "), comments=True)
     for block in blocks(PAGE, "bash")
     for line in block.splitlines()
     if line.startswith("run ")
 ]
-
-
-@pytest.mark.parametrize("excerpt", EXCERPTS)
-def test_excerpts_import_what_exists(excerpt):
-    for node in ast.walk(ast.parse(excerpt)):
-        if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ("ca_reg", "reference_trainer"):
-            module = importlib.import_module(node.module)
-            assert [name.name for name in node.names if not hasattr(module, name.name)] == []
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)

@@ -1,0 +1,43 @@
+"""What the site needs beside MkDocs: docstrings as griffe expects them, and formulas as MathML, without scripts."""
+
+import contextlib
+import html
+import re
+
+import griffe
+from latex2mathml.converter import convert
+
+
+class Docstrings(griffe.Extension):
+    """Turns Sphinx's roles into links, which stay plain code where the site documents nothing by that name."""
+
+    def on_package(self, *, pkg: griffe.Module, loader: griffe.GriffeLoader, **_: object) -> None:
+        """Put the adapters where they are when installed."""
+        if pkg.name == "ca_reg":
+            pkg.set_member("integrations", loader.load("integrations"))
+        self.on_object(obj=pkg)
+
+    def on_object(self, *, obj: griffe.Object, **_: object) -> None:
+        """Rewrite the docstring of an object."""
+        if obj.docstring:
+            text = re.sub(r":\w+:`(~?)([\w.]+)`", lambda role: _link(obj, *role.groups()), obj.docstring.value)
+            obj.docstring.value = text.replace("\nExample:\n", "\nExamples:\n")  # griffe knows the plural alone
+
+
+def _link(obj: griffe.Object, short: str, name: str) -> str:
+    text = name.rpartition(".")[2] if short else name
+    with contextlib.suppress(griffe.NameResolutionError):
+        name = obj.resolve(name)
+    return f'<autoref identifier="{name}" optional><code>{text}</code></autoref>'
+
+
+def on_page_content(content: str, **_: object) -> str:
+    r"""Replace the \(...\) and \[...\] that pymdownx.arithmatex has marked."""
+    return re.sub(r'<(\w+) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', _mathml, content, flags=re.DOTALL)
+
+
+def _mathml(formula: re.Match[str]) -> str:
+    _, bracket, tex = formula.groups()
+    for unknown, known in (("aligned}", "align*}"), (r"\mathrm{E}", r"\operatorname{E}")):  # to latex2mathml 3.81
+        tex = tex.replace(unknown, known)
+    return convert(html.unescape(tex), display="block" if bracket == "[" else "inline")
