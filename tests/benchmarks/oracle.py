@@ -275,7 +275,7 @@ def _draw(records: Records, figure: Any) -> None:
         for ax in (left, *panels):
             ax.grid(linewidth=0.3)
     grid[0][0].legend(fontsize=8)
-    grid[0][2].legend(fontsize=8)
+    figure.legend(*grid[0][1].get_legend_handles_labels(), loc="outside lower center", ncols=len(CRITERIA), fontsize=8)
 
 
 if __name__ == "__main__":
