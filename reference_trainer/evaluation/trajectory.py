@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 
 from reference_trainer.camera import Camera
+from reference_trainer.scenes.pseudo import camera_between
 from reference_trainer.scenes.scene import Scene, Viewpoint
 
 __all__ = ["interpolate_cameras", "measured_views"]
@@ -31,7 +32,7 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     path = []
     for along in torch.linspace(0, len(cameras) - 1, frames).tolist():
         i = min(int(along), len(cameras) - 2)
-        pose = _on_the_way(cameras[i], cameras[i + 1], along - i).world_to_camera
+        pose = camera_between(cameras[i], cameras[i + 1], along - i).world_to_camera
         path.append(replace(cameras[0], world_to_camera=pose))
     return path
 
@@ -56,20 +57,8 @@ def measured_views(scene: Scene, say: Callable[[str], None]) -> dict[str, Sequen
     nearest = torch.cdist(places, places).fill_diagonal_(torch.inf).argmin(1).tolist()
     pairs = sorted({(min(pair), max(pair)) for pair in enumerate(nearest)})
     new = {
-        "between": [_on_the_way(cameras[i], cameras[j], 0.5) for i, j in pairs],
-        "around": [_on_the_way(cameras[i], cameras[j], -0.5) for i, j in enumerate(nearest)],
+        "between": [camera_between(cameras[i], cameras[j], 0.5) for i, j in pairs],
+        "around": [camera_between(cameras[i], cameras[j], -0.5) for i, j in enumerate(nearest)],
     }
     numbered = {split: [Viewpoint(f"{i:03d}", camera) for i, camera in enumerate(of)] for split, of in new.items()}
     return {"train": scene.train, **numbered}
-
-
-def _on_the_way(first: Camera, second: Camera, along: float) -> Camera:
-    """Return the first camera moved and turned towards the second, 0 at the first and 1 at the second."""
-    from kornia.geometry.quaternion import Quaternion
-
-    start, end = (Quaternion.from_matrix(camera.world_to_camera[:3, :3]) for camera in (first, second))
-    rotation = start.slerp(end, along).matrix()
-    pose = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ torch.lerp(first.position, second.position, along)
-    return replace(first, world_to_camera=pose)

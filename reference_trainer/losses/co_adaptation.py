@@ -1,4 +1,4 @@
-"""The exact co-adaptation of the view of a step as a term of the loss."""
+"""The exact co-adaptation of a view, with a photograph or without, as a term of the loss."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from torch import Tensor
 from ca_reg.functional import Multiplier
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import WeightedTerm
+from reference_trainer.scenes.pseudo import VIRTUAL_VIEWS
 
 if TYPE_CHECKING:
+    from reference_trainer.scenes.scene import Scene
     from reference_trainer.training.step import Step
 
 __all__ = ["CoAdaptation"]
@@ -19,27 +21,53 @@ __all__ = ["CoAdaptation"]
 class CoAdaptation(WeightedTerm):
     """``weight`` times the mean variance of the colours when each Gaussian is dropped with a rate of its own.
 
-    In an analytic step the variance of its expectation is taken, which costs nothing; in others the moments are
-    rendered, which takes about as long as the render.
+    The variance needs no photograph, so it may be taken where there is none: at virtual views. In an analytic step that
+    of its expectation at the training view is taken, which costs nothing; else the moments are rendered, which takes
+    about as long as the render.
 
     Args:
         weight: at least 0, or a schedule.
-        p: drop rate in [0, 1); in an analytic step the regularizer's own draws count instead.
+        p: drop rate in [0, 1); in an analytic step the regularizer's own draws count at the training view instead.
+        where: ``"training"``, the view of the step, or a camera drawn anew at each step: between two training cameras
+            on a ``"line"`` or on an ``"arc"`` (`cameras_between`), or in their ``"box"`` (`pseudo_cameras`).
+        every: the term counts at every so many steps, by that factor more, so that ``weight`` is that of all steps.
 
     Raises:
-        ValueError: if one is out of range.
+        ValueError: if one is out of range, or the scene has no such cameras.
+
+    Example:
+        >>> from reference_trainer.losses import LOSSES
+        >>> (term,) = LOSSES.make("co_adaptation(between(3.0, 200), where='arc', every=4)")
+        >>> [number for number in range(190, 210) if term.acts(number)]
+        [200, 204, 208]
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"moments"})
     analytic: ClassVar[bool] = True
 
-    def __init__(self, weight: float | Schedule = 1.0, p: float = 0.5) -> None:
+    def __init__(self, weight: float | Schedule = 1.0, p: float = 0.5, where: str = "training", every: int = 1) -> None:
         super().__init__(weight)
         self.multiplier = Multiplier.dropout(p)
+        if where not in ("training", *VIRTUAL_VIEWS):
+            raise ValueError(f"where must be training, {', '.join(VIRTUAL_VIEWS)}, got {where!r}.")
+        if every < 1:
+            raise ValueError(f"every must be at least 1, got {every}: a term without steps is left out.")
+        self.where, self.every = where, every
+
+    def begin(self, scene: Scene) -> None:
+        """Look where cameras may stand."""
+        if self.where != "training":
+            self.draw = VIRTUAL_VIEWS[self.where](scene)
+
+    def acts(self, number: int) -> bool:
+        """Return whether it is the turn of a step, and its weight is not 0."""
+        return number % self.every == 0 and super().acts(number)
 
     def value(self, step: Step) -> Tensor:
-        """Return the mean variance."""
-        variance = step.variance
+        """Return the mean variance, by the steps that it stands for."""
+        camera, variance = step.view.camera, step.variance
+        if self.where != "training":
+            camera, variance = self.draw(step.generator("co_adaptation")), None
         if variance is None:
-            variance = step.moments(step.view.camera, self.multiplier).variance
-        return variance.mean()
+            variance = step.moments(camera, self.multiplier).variance
+        return self.every * variance.mean()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Literal, get_args
 
 import torch
 from torch.nn.functional import normalize
@@ -12,7 +14,9 @@ from reference_trainer.camera import Camera, pixels_of
 from reference_trainer.scenes.orbit import look_at
 from reference_trainer.scenes.scene import Scene
 
-__all__ = ["depth_bounds", "pseudo_cameras"]
+__all__ = ["VIRTUAL_VIEWS", "CameraPath", "camera_between", "cameras_between", "depth_bounds", "pseudo_cameras"]
+
+CameraPath = Literal["line", "arc"]
 
 
 def pseudo_cameras(scene: Scene) -> Callable[[torch.Generator], Camera]:
@@ -57,6 +61,62 @@ def pseudo_cameras(scene: Scene) -> Callable[[torch.Generator], Camera]:
         return replace(first, world_to_camera=pose.to(generator.device, first.world_to_camera.dtype), cx=cx, cy=cy)
 
     return draw
+
+
+def cameras_between(scene: Scene, path: CameraPath = "arc") -> Callable[[torch.Generator], Camera]:
+    """Return a function that draws cameras between two random training cameras, with the intrinsics of one of them.
+
+    They stand at 0.15 to 0.85 of the way: see `camera_between`.
+
+    Raises:
+        ValueError: if the scene has less than two training cameras.
+
+    Example:
+        >>> from reference_trainer.scenes import synthetic_scene
+        >>> draw = cameras_between(synthetic_scene(width=32, height=24, points=50))
+        >>> draw(torch.Generator().manual_seed(0)).width
+        32
+    """
+    cameras = [view.camera for view in scene.train]
+    if len(cameras) < 2:
+        raise ValueError(f"virtual views lie between two training cameras, and {scene.name!r} has {len(cameras)}.")
+
+    def draw(generator: torch.Generator) -> Camera:
+        first, second = torch.randperm(len(cameras), generator=generator, device=generator.device)[:2].tolist()
+        along = 0.15 + 0.7 * torch.rand((), generator=generator, device=generator.device).item()
+        return camera_between(cameras[first], cameras[second], along, path).to(generator.device)
+
+    return draw
+
+
+@torch.no_grad()
+def camera_between(first: Camera, second: Camera, along: float, path: CameraPath = "line") -> Camera:
+    """Return the first camera moved and turned towards the second, 0 at the first and 1 at the second.
+
+    The orientation takes the great arc. The position takes the straight line, or the ``"arc"`` of the screw motion that
+    leads from one camera to the other: cameras that look at a common point from one distance go around it, facing it.
+
+    Example:
+        >>> pose = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))  # half a turn around the origin, 2 in front of both
+        >>> one, other = (Camera(p, 9, 9, 4, 4, 8, 8) for p in (torch.eye(4), pose))
+        >>> for camera in (one, other):
+        ...     camera.world_to_camera[2, 3] = 2
+        >>> for path in get_args(CameraPath):
+        ...     [round(x, 3) for x in camera_between(one, other, 0.5, path).position.abs().tolist()]
+        [0.0, 0.0, 0.0]
+        [2.0, 0.0, 0.0]
+    """
+    from kornia.geometry.liegroup import Se3
+
+    start, end = (Se3.from_matrix(camera.world_to_camera.double()) for camera in (first, second))
+    pose = (Se3.exp(along * (end * start.inverse()).log()) * start).matrix()
+    if path == "line":
+        pose[:3, 3] = -pose[:3, :3] @ torch.lerp(first.position, second.position, along).to(pose)
+    return replace(first, world_to_camera=pose.to(first.world_to_camera))
+
+
+VIRTUAL_VIEWS = {"box": pseudo_cameras} | {path: partial(cameras_between, path=path) for path in get_args(CameraPath)}
+"""Where cameras without a photograph may stand, by name: functions of a scene that return one that draws them."""
 
 
 def depth_bounds(scene: Scene) -> tuple[float, float]:
