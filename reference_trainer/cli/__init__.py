@@ -16,7 +16,7 @@ import tyro
 from reference_trainer.cli.drawing import Warmup
 from reference_trainer.cli.names import Names, Recipes
 from reference_trainer.cli.ply import Bake, Clean
-from reference_trainer.cli.report import Report
+from reference_trainer.cli.report import Report, View
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
 from reference_trainer.devices import check_device
@@ -62,6 +62,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "clean": Clean(ply=tyro.MISSING),
         "render": Render(run=Path("runs/train")),
         "report": Report(runs=tyro.MISSING),
+        "view": View(run=tyro.MISSING),
         "compare": Compare(out=Path("runs/compare"), config=config, recipe=recipe),
         "study": Study(tyro.MISSING),
         "names": Names(),
