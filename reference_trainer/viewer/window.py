@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import os
 import socket
 import threading
 import time
@@ -73,7 +74,8 @@ class Viewer:
         try:
             socket.create_server((HOST, port)).close()  # viser would take another port
         except (OSError, OverflowError) as error:
-            raise OSError(f"port {port} cannot be used for the viewer ({error}): give another one.") from error
+            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else error
+            raise OSError(f"port {port} cannot be used for the viewer ({reason}): give another one.") from error
         with contextlib.redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(HOST, port, label="ca_reg", verbose=False)
         self._subject: Subject | None = None

@@ -1,5 +1,6 @@
 import json
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -64,12 +65,15 @@ def trained(tmp_path_factory):
                 "--dropout",
                 "--noise",
                 "--opacity-decay",
+                "--monitor-pictures",
+                "--viewer",
                 "--device",
             ],
         ),
         (["evaluate"], ["--ply", "--path", "--scene", "--regularizer", "--samples", "--lpips"]),
         (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
         (["bake"], ["PATH", "--regularizer", "--out"]),
+        (["view"], ["PATH", "--scene", "--arc", "--regularizer", "--port", "--device"]),
         (["render"], ["--what", "--frames", "{test,train,flight}"]),
         (
             ["compare"],
@@ -107,6 +111,7 @@ def test_the_list_of_commands_says_what_each_does(capsys):
         "evaluate Measure a run",
         "bake Give a PLY",
         "render Render a run",
+        "view Turn a run",
         "compare Train baseline",
         "study Measure something",
     ):
@@ -118,7 +123,7 @@ def test_help_and_mistakes_need_no_torch():
     code = """if True:
         import contextlib, io, sys
         from reference_trainer.cli import main
-        commands = ("demo", "plan", "train", "evaluate", "bake", "render", "compare", "study", "warmup")
+        commands = ("demo", "plan", "train", "evaluate", "bake", "render", "view", "compare", "study", "warmup")
         for words in ([], *(command.split() for command in commands), ["train", "--nonsense"]):
             with contextlib.suppress(SystemExit), contextlib.redirect_stderr(io.StringIO()):
                 main([*words, "--help"])
@@ -133,6 +138,22 @@ def test_a_card_that_is_not_there(command, capsys, monkeypatch):
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     text = refused([*command.split(), "--device", "cuda"], capsys)
     assert re.fullmatch(r"ca-reg: --device cuda: PyTorch \S+ finds 0 CUDA devices; take cpu.", text)
+
+
+@pytest.mark.parametrize("command", ["view runs/none", "train --viewer"])
+def test_without_viser(command, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert refused(command.split(), capsys) == "ca-reg: the viewer needs viser: pip install 'ca_reg[viewer]'."
+
+
+def test_a_port_that_is_not_free(capsys):
+    pytest.importorskip("viser")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        text = refused(["train", "--viewer", str(port)], capsys)
+    assert text.startswith(f"ca-reg: port {port} cannot be used for the viewer (")
+    assert text.endswith("in use): give another one.")
+    assert "0-65535" in refused(["view", "runs/none", "--port", "65536"], capsys)
 
 
 @pytest.mark.parametrize(
