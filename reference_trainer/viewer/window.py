@@ -64,6 +64,7 @@ class Viewer:
     Raises:
         ImportError: if viser is missing.
         OSError: if the port is not free.
+        ValueError: if it is no port.
     """
 
     def __init__(self, port: int) -> None:
@@ -71,10 +72,12 @@ class Viewer:
             import viser
         except ImportError as error:
             raise ImportError("the viewer needs viser: pip install 'ca_reg[viewer]'.") from error
+        if not 0 <= port < 65536:
+            raise ValueError(f"a port is a number from 0 to 65535, got {port}.")
         try:
             socket.create_server((HOST, port)).close()  # viser would take another port
-        except (OSError, OverflowError) as error:
-            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else error
+        except OSError as error:
+            reason = os.strerror(error.errno or 0)
             raise OSError(f"port {port} cannot be used for the viewer ({reason}): give another one.") from error
         with contextlib.redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(HOST, port, label="ca_reg", verbose=False)

@@ -153,7 +153,7 @@ def test_a_port_that_is_not_free(capsys):
         text = refused(["train", "--viewer", str(port)], capsys)
     assert text.startswith(f"ca-reg: port {port} cannot be used for the viewer (")
     assert text.endswith("in use): give another one.")
-    assert "0-65535" in refused(["view", "runs/none", "--port", "65536"], capsys)
+    assert "from 0 to 65535, got 65536" in refused(["view", "runs/none", "--port", "65536"], capsys)
 
 
 @pytest.mark.parametrize(
