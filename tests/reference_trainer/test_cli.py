@@ -24,6 +24,7 @@ from reference_trainer.studies import gaussian_shares as shares_module
 from reference_trainer.studies import study as study_module
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
+from reference_trainer.viewer.window import Viewer
 
 SMALL = ["--downscale", "8", "--iterations", "3", "--monitor-every", "2"]
 
@@ -144,6 +145,21 @@ def test_a_card_that_is_not_there(command, capsys, monkeypatch):
 def test_without_viser(command, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert refused(command.split(), capsys) == "ca-reg: the viewer needs viser: pip install 'ca_reg[viewer]'."
+
+
+@pytest.mark.parametrize("what", ["", "point_cloud.ply"])
+def test_a_run_or_a_ply_is_shown_until_ctrl_c(what, trained, capsys, monkeypatch):
+    pytest.importorskip("viser")
+    shown = []
+
+    def draw(viewer):
+        shown.append(viewer._subject.draw(viewer._look, viewer._subject._views[0].camera)[0])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "draw", draw)
+    main(["view", str(trained / what), "--port", "0"])
+    assert re.search(r"The viewer is at http://127\.0\.0\.1:\d+, .*; Ctrl-C ends it\.", capsys.readouterr().out)
+    assert shown[0].std() > 0
 
 
 def test_a_port_that_is_not_free(capsys):
