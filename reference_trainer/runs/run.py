@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ca_reg import CAMonitor, attribute
-from reference_trainer.evaluation.evaluate import PerceptualMetric, ca_picture, error_picture, evaluate
+from ca_reg import CAMonitor
+from reference_trainer.evaluation.evaluate import PerceptualMetric, evaluate, glance
 from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.evaluation.metrics import psnr
@@ -246,15 +246,7 @@ def _train(
         return psnr(model_of(trainer).test_rendering(view).image.clamp(0, 1), view.image)
 
     def details(opacity: Tensor, view: View) -> dict[str, Tensor]:
-        model = model_of(trainer)
-        image = model.test_rendering(view).image.clamp(0, 1)
-        shares, result = attribute(model.exact_ca_score(drop_rate=0.5), model.shares, opacity, view)
-        return {
-            "render": image,
-            "error": error_picture(image, view.image),
-            "co-adaptation": ca_picture(result),
-            "log10 of share": shares[shares > 0].log10(),
-        }
+        return glance(model_of(trainer), view)
 
     with CAMonitor(
         score,
