@@ -169,7 +169,7 @@ class Viewer:
         if window.client.client_id not in self._windows:  # it has been closed meanwhile
             return
         window.client.scene.set_background_image(np.asarray(as_pillow(image)), format="jpeg", jpeg_quality=90)
-        took, model = time.perf_counter() - start, subject.model
+        took, model = max(1e-3, time.perf_counter() - start), subject.model
         if window.rough:
             pixels = self._rough_pixels * min(2.0, max(0.5, ROUGH_SECONDS / took))
             self._rough_pixels = int(min(MOST, max(FEWEST, pixels)))

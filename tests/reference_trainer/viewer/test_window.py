@@ -10,6 +10,7 @@ from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import run_experiment
+from reference_trainer.viewer import window
 from reference_trainer.viewer.picture import Look, Subject
 from reference_trainer.viewer.window import MOST, Viewer, _camera, _pose
 
@@ -47,18 +48,20 @@ def test_a_camera_of_the_page_is_the_one_that_was_jumped_to(run):
     assert _camera(Client(view.camera.resized(4000, 1000)).camera, MOST).width == 2000
 
 
-def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer):
+def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer, monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(window, "time", SimpleNamespace(monotonic=lambda: clock[0], perf_counter=time.perf_counter))
     model, scene, _ = of_run(run[0])
     viewer.show(model, measured_views(scene, print))
-    camera = scene.train[0].camera.resized(320, 240)
+    camera = scene.train[0].camera.resized(640, 480)
     client = Client(camera)
     viewer._connected(client)
     for _ in range(2):
-        wait = viewer.draw()
-        assert 0 < wait < 1
-        assert client.shown[-1].shape[0] < 240
-        assert viewer.draw() is not None  # there is nothing to do yet
-        time.sleep(wait)
+        assert viewer.draw() == pytest.approx(window.STILL)
+        assert client.shown[-1].shape[0] < 480
+        clock[0] += 0.75 * window.STILL
+        assert viewer.draw() == pytest.approx(0.25 * window.STILL)  # there is nothing to do yet
+        clock[0] += 0.25 * window.STILL
         assert viewer.draw() is None
         expected = render_gaussians(
             model.gaussians, _camera(client.camera, MOST), model.background, opacities=0.8 * model.gaussians.opacities
@@ -69,9 +72,8 @@ def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer
     assert len(client.shown) == 4
     viewer._controls[0].value = "heat"
     viewer._subject = Subject(model, [])  # no view has a score: a word instead of heat
-    viewer._windows[7].moved = 0.0
     viewer._moved()
-    viewer._windows[7].moved = 0.0
+    clock[0] += window.STILL
     viewer.draw()
     assert "none of the 0 views" in viewer._status.content
     np.testing.assert_array_equal(client.shown[-1], client.shown[-2])
@@ -111,8 +113,8 @@ def test_a_browser_shows_what_was_drawn(run, viewer):
             viewer.draw()
             page.run("new Promise(requestAnimationFrame)")
             if viewer._windows and viewer._look.mode == mode:
-                (window,) = viewer._windows.values()
-                expected, _ = viewer._subject.draw(Look(mode), _camera(window.client.camera, MOST))
+                (only,) = viewer._windows.values()
+                expected, _ = viewer._subject.draw(Look(mode), _camera(only.client.camera, MOST))
                 shown = page.picture()[:, 330:, :500]
                 expected = expected[:, 330:, :500]
                 if shown.shape == expected.shape and (shown - expected).abs().mean() < 0.02:
