@@ -249,7 +249,7 @@ class Viewer:
 
 def _camera(view: Any, most: int) -> Camera:
     """Return viser's camera as ours, with at most so many pixels."""
-    scale = min(1.0, math.sqrt(most / (view.image_width * view.image_height)))
+    scale = min(1.0, math.sqrt(most / max(1, view.image_width * view.image_height)))  # a page can be closed up
     width, height = (max(1, round(scale * side)) for side in (view.image_width, view.image_height))
     focal = 0.5 * height / math.tan(0.5 * view.fov)
     from_camera = torch.eye(4, dtype=torch.float64)
