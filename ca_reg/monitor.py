@@ -53,6 +53,9 @@ class CAMonitor:
         every: number of steps between measurements, at least 1.
         psnr: ``psnr(opacity, view)``, the quality in dB of the view rendered with these opacities, which are already
             scaled by ``1 - p`` for the test. Called without gradients. None leaves PSNR out.
+        details: ``details(opacity, view)``, what TensorBoard shows of the first view of each group besides the curves,
+            by name: images (3, H, W) in [0, 1], and numbers (N,) as histograms, such as shares. Called without
+            gradients, and only where TensorBoard is installed; images need Pillow.
         resume_step: None for a new run, which replaces a log that is already there. A resumed run gives the step of its
             checkpoint: lines up to this step are kept, later ones dropped.
 
@@ -84,6 +87,7 @@ class CAMonitor:
         views: Mapping[str, Sequence[Any]],
         every: int = 500,
         psnr: Callable[[Tensor, Any], float] | None = None,
+        details: Callable[[Tensor, Any], Mapping[str, Tensor]] | None = None,
         resume_step: int | None = None,
     ) -> None:
         check_count(every, "every", minimum=1)
@@ -100,6 +104,7 @@ class CAMonitor:
         self.views = {name: list(group) for name, group in views.items()}
         self.every = every
         self.psnr = psnr
+        self.details = details
 
         folder = Path(log_dir)
         folder.mkdir(parents=True, exist_ok=True)
@@ -148,6 +153,8 @@ class CAMonitor:
         record.update(asdict(self.score.settings))
         self._write(record)
         self._last_step = step
+        if self.details is not None and self._writer is not None:
+            self._show(self._writer, self.details, opacity, step)
         return record
 
     def close(self) -> None:
@@ -170,6 +177,22 @@ class CAMonitor:
         scaled = scale_opacity(opacity, self.score.p)
         mean = sum(float(psnr(scaled.clone(), view)) for view in group) / len(group)  # it may edit its opacities
         return mean if math.isfinite(mean) else None
+
+    @torch.no_grad()
+    def _show(
+        self,
+        writer: SummaryWriter,
+        details: Callable[[Tensor, Any], Mapping[str, Tensor]],
+        opacity: Tensor,
+        step: int,
+    ) -> None:
+        """Write the details of the first view of each group to TensorBoard."""
+        for group, views in self.views.items():
+            for name, x in details(opacity.clone(), views[0]).items():
+                if x.numel():  # such as no share above 0
+                    add = writer.add_histogram if x.ndim == 1 else writer.add_image
+                    add(f"{name}/{group}", x, step)
+        writer.flush()
 
     def _write(self, record: dict[str, float | int | str | None]) -> None:
         """Append one line, and the scalars to TensorBoard."""

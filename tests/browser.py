@@ -6,17 +6,22 @@ import os
 import shutil
 import subprocess
 import tempfile
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 class Page:
-    """A file that is open in a browser of its own, with a window of so many pixels; a context.
+    """A file or an address that is open in a browser of its own, with a window of so many pixels; a context.
 
     Args:
-        path: the file.
+        place: the file, or the address.
         width: of the window.
         height: of the window.
 
@@ -25,10 +30,11 @@ class Page:
         complaints: errors that it raised, or that the browser logged about it.
     """
 
-    def __init__(self, path: Path, width: int = 1000, height: int = 900) -> None:
+    def __init__(self, place: Path | str, width: int = 1000, height: int = 900) -> None:
         self.requests: list[str] = []
         self.complaints: list[str] = []
-        self._path, self._size, self._asked = path, (width, height), 0
+        self._size, self._asked = (width, height), 0
+        self._address = place if isinstance(place, str) else place.resolve().as_uri()
 
     def __enter__(self) -> "Page":
         commands, answers = os.pipe(), os.pipe()
@@ -58,7 +64,7 @@ class Page:
         width, height = self._size
         self("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         self._loaded = False
-        self("Page.navigate", url=self._path.resolve().as_uri())
+        self("Page.navigate", url=self._address)
         while not self._loaded:
             self._read()
         return self
@@ -91,6 +97,11 @@ class Page:
     def screenshot(self, *, whole: bool = False) -> bytes:
         """Return the window, or the whole page, as a PNG."""
         return base64.b64decode(self("Page.captureScreenshot", captureBeyondViewport=whole)["data"])
+
+    def picture(self) -> torch.Tensor:
+        """Return the window as colours (3, H, W) in [0, 1]."""
+        with Image.open(BytesIO(self.screenshot())) as file:
+            return torch.from_numpy(np.array(file.convert("RGB"))).permute(2, 0, 1) / 255
 
     def _read(self) -> dict[str, Any]:
         """Read a message, and remember what it says of requests and complaints."""

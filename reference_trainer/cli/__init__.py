@@ -16,7 +16,7 @@ import tyro
 from reference_trainer.cli.drawing import Warmup
 from reference_trainer.cli.names import Names, Recipes, Version
 from reference_trainer.cli.ply import Bake, Clean
-from reference_trainer.cli.report import Report
+from reference_trainer.cli.report import Report, View
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
 from reference_trainer.devices import check_device
@@ -60,6 +60,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "compare": Compare(out=Path("runs/compare"), config=config, recipe=recipe),
         "evaluate": Evaluate(),
         "report": Report(runs=tyro.MISSING),
+        "view": View(run=tyro.MISSING),
         "render": Render(run=Path("runs/train")),
         "study": Study(tyro.MISSING),
         "bake": Bake(ply=tyro.MISSING),

@@ -1,16 +1,18 @@
-"""The command that writes a page about runs. Its fields are the options."""
+"""Commands to look at runs: a page about them, or one of them live. One class each, its fields are the options."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from reference_trainer.cli.drawing import Device, Draw, Drawing
+from reference_trainer.cli.runs import PORT, Orbit, PlyScene
+from reference_trainer.scenes.options import OrbitOptions
 
-__all__ = ["Report"]
+__all__ = ["Report", "View"]
 
 
 @dataclass(frozen=True)
@@ -36,3 +38,43 @@ class Report:
 
         self.drawing.begin(self.device)
         write_report(self.runs, self.out, views=self.views, device=self.device)
+
+
+@dataclass(frozen=True)
+class View:
+    """Turn a run, or any 3DGS PLY, in a browser: render, co-adaptation, depth or heat, drawn live by the renderer.
+
+    Needs ca_reg[viewer]; Ctrl-C ends it.
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run of `ca-reg train`, finished or not, or a standard 3DGS PLY."""
+    scene: Annotated[PlyScene, tyro.conf.arg(name="")] = field(default_factory=PlyScene)
+    orbit: Orbit = field(default_factory=OrbitOptions)
+    regularizer: str | None = None
+    """Draw it as if it had been trained with these, such as "dropout(0.2)"."""
+    port: int = PORT
+    """Of the page, on this machine; 0 for any."""
+    device: Device = "cpu"
+    drawing: Draw = field(default_factory=Drawing)
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.evaluation.trajectory import measured_views
+        from reference_trainer.runs.measure import of_run
+        from reference_trainer.runs.score_ply import place
+        from reference_trainer.viewer.window import Viewer
+
+        shared: dict[str, Any] = {"regularizer": self.regularizer, "device": self.device}
+        with Viewer(self.port) as viewer:
+            self.drawing.begin(self.device, trains=True)  # nobody waits for a compiler later
+            if self.run.suffix.lower() == ".ply" and not self.run.is_dir():
+                background = "black" if self.scene.background == "auto" else self.scene.background
+                where = self.orbit if self.scene.path == "orbit" else self.scene
+                placed = place(self.run, where, background=background, **shared)
+                viewer.show(placed.model, placed.views)
+            else:
+                model, scene, _ = of_run(self.run, **shared)
+                viewer.show(model, measured_views(scene, print))
+            print(f"{viewer}; Ctrl-C ends it.", flush=True)
+            viewer.serve()

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from ca_reg import CAResult, CAScore
+from ca_reg import CAResult, CAScore, attribute
 from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.maps import color_variance_map
 from reference_trainer.evaluation.metrics import depth_errors, on_white, psnr, ssim
@@ -22,7 +22,7 @@ from reference_trainer.evaluation.results import machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.scenes.scene import View, Viewpoint
 
-__all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "ca_picture", "error_picture", "evaluate"]
+__all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "ca_picture", "error_picture", "evaluate", "glance"]
 
 CA_PICTURE_RANGE = 0.02
 """Variance that gets the brightest colour in CA heat maps."""
@@ -224,6 +224,21 @@ def _measure(
         save_png(files[0], image)
         save_png(files[1], side_by_side([*panels.values()], [*panels]))
     return measured
+
+
+@torch.no_grad()
+def glance(model: TrainedModel, view: View) -> dict[str, Tensor]:
+    """Return what is worth a look while a model trains: pictures of a view, and the shares of the exact score.
+
+    Returns:
+        ``"render"``, ``"error"`` and ``"co-adaptation"``, (3, H, W), and of the Gaussians that have one ``"log10 of
+        share"``; both of the latter at drop rate 1/2.
+    """
+    image = model.test_rendering(view).image.clamp(0, 1)
+    score = model.exact_ca_score(drop_rate=0.5)
+    shares, result = attribute(score, model.shares, model.gaussians.opacities, view)
+    pictures = {"render": image, "error": error_picture(image, view.image), "co-adaptation": ca_picture(result)}
+    return pictures | {"log10 of share": shares[shares > 0].log10()}
 
 
 def _maps(results: Mapping[str, CAResult]) -> dict[str, Tensor]:

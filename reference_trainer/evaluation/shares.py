@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ca_reg import CAResult, Reason, attribute, total_effects
+from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.render import render
 from reference_trainer.scenes.scene import Viewpoint
 
-__all__ = ["PER_WEIGHT_SCALE", "blend_weights", "concentration", "mean_effects", "mean_shares", "share_per_weight"]
+__all__ = [
+    "PER_WEIGHT_SCALE",
+    "Heat",
+    "blend_weights",
+    "colored_by",
+    "concentration",
+    "mean_effects",
+    "mean_shares",
+    "share_per_weight",
+]
 
 PER_WEIGHT_SCALE = (0.1, 10.0)
 """Ends of the colour scale of shares per blend weight, in units of the mean."""
@@ -20,6 +32,47 @@ PER_WEIGHT_SCALE = (0.1, 10.0)
 _TOP = (0.001, 0.01, 0.1)
 
 
+@dataclass(frozen=True)
+class Heat:
+    """How much every Gaussian of a model co-adapts for what it contributes to some views.
+
+    Args:
+        shares: of `mean_shares`, (N,).
+        weights: of `blend_weights`, (N,).
+        results: the exact score of every view.
+    """
+
+    shares: Tensor
+    weights: Tensor
+    results: Sequence[CAResult]
+
+    @classmethod
+    def of(cls, model: TrainedModel, views: Sequence[Viewpoint], *, drop_rate: float = 0.5) -> Heat:
+        """Measure a model; arguments and errors are those of `mean_shares`, which does most of it.
+
+        The weights are those of the plain opacities where the ones of the test depend on the camera.
+        """
+        shares, results = mean_shares(model, views, drop_rate=drop_rate)
+        drawn = replace(model, regularizer="") if model.depends_on_camera else model
+        return cls(shares, blend_weights(drawn, views), results)
+
+    @property
+    def values(self) -> Tensor:
+        """The heat: `share_per_weight`, (N,)."""
+        return share_per_weight(self.shares, self.weights)
+
+    @property
+    def mean(self) -> float:
+        """The score over the sum of the weights."""
+        return (self.shares.sum() / self.weights.sum()).item()
+
+    @property
+    def ranks(self) -> Tensor:
+        """The part of the Gaussians that comes before each in the order of the heat, (N,), in [0, 1)."""
+        return self.values.argsort().argsort() / len(self.shares)
+
+
+@torch.enable_grad()
 def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:
     """Return the weight with which every Gaussian enters the test-time renders, summed over all pixels and views.
 
@@ -57,6 +110,12 @@ def share_per_weight(shares: Tensor, weights: Tensor) -> Tensor:
         tensor([0.2500,    inf, 0.0000])
     """
     return torch.where(shares > 0, shares / weights, 0.0)
+
+
+def colored_by(gaussians: Gaussians, values: Tensor, low: float, high: float) -> Gaussians:
+    """Return the same Gaussians with a colour that tells a value, see `heat_colors`, the same from every direction."""
+    colors = heat_colors(values, low, high).to(gaussians.sh_dc)
+    return replace(gaussians, sh_dc=((colors - 0.5) / SH_C0)[:, None], sh_rest=torch.zeros_like(gaussians.sh_rest))
 
 
 def mean_shares(

@@ -14,7 +14,7 @@ from ca_reg import CAResult, Reason
 from reference_trainer.evaluation.evaluate import ca_picture, error_picture
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.pictures import heat_colors
-from reference_trainer.evaluation.shares import blend_weights, concentration, mean_shares, share_per_weight
+from reference_trainer.evaluation.shares import Heat, concentration
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.render.eager.projection import rotation_matrices
@@ -41,8 +41,7 @@ class Findings:
         scene: what it was trained on.
         views: what it is looked at from, by split; those that were not trained on come first.
         pictures: per view, by ``"render"``, ``"error"`` and ``"co-adaptation"``, and a ``"caption"``.
-        shares: of the exact score, mean over these views, (N,); None if no view has a score.
-        weights: of `blend_weights` over these views, (N,).
+        heat: of the exact score over these views; None if no view has a score.
         notes: what is missing, and why.
     """
 
@@ -52,14 +51,8 @@ class Findings:
     scene: Scene
     views: Mapping[str, Sequence[Viewpoint]]
     pictures: list[dict[str, str]]
-    shares: Tensor | None
-    weights: Tensor
+    heat: Heat | None
     notes: list[str]
-
-    @property
-    def share_per_weight(self) -> float:
-        """The mean: the score over the sum of the blend weights; nan without a score."""
-        return float("nan") if self.shares is None else (self.shares.sum() / self.weights.sum()).item()
 
     def packed(self, low: float, high: float) -> dict[str, Any]:
         """Return the model as the page draws it: arrays of little-endian numbers in base64.
@@ -77,12 +70,9 @@ class Findings:
         axes = rotation_matrices(gaussians.quaternions) * gaussians.scales[:, None]
         covariances = (axes @ axes.transpose(1, 2)).flatten(1)[:, [0, 1, 2, 4, 5, 8]]
         rank, heat, held = torch.zeros(n), torch.full((n, 3), 0.5), []
-        if self.shares is not None:
-            values = share_per_weight(self.shares, self.weights)
-            order = values.argsort()
-            rank[order.cpu()] = torch.arange(n) / n
-            heat = heat_colors(values, low, high)
-            along = self.shares[order.flip(0)].cumsum(0)
+        if self.heat is not None:
+            rank, heat = self.heat.ranks.cpu(), heat_colors(self.heat.values, low, high)
+            along = self.heat.shares[self.heat.ranks.argsort(descending=True)].cumsum(0)
             along = torch.cat([along.new_zeros(1), along / along[-1]])
             held = [round(along[percent * n // 100].item(), 4) for percent in range(101)]
         columns = [gaussians.means, self.opacities[:, None], covariances, rank[:, None], torch.zeros(n, 1)]
@@ -100,12 +90,12 @@ class Findings:
 
     def attribution(self) -> dict[str, object]:
         """Return how few Gaussians hold how much of the score; empty without one."""
-        if self.shares is None:
+        if self.heat is None:
             return {}
-        held = concentration(self.shares)
+        held = concentration(self.heat.shares)
         half = held.pop("half")
         found = {f"held by the {name}": f"{part:.1%}" for name, part in held.items()}
-        score = f"{self.shares.sum().item() * 1e3:.3f}"
+        score = f"{self.heat.shares.sum().item() * 1e3:.3f}"
         return {"run": self.label, "exact CA at 1/2 x1e-3": score, **found, "half is held by": f"{half:.2%}"}
 
 
@@ -132,18 +122,17 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
     chosen = {split: [view.to(device) for view in _evenly(of, views)] for split, of in found}
     flat = [view for of in chosen.values() for view in of]
     results: Sequence[CAResult | None] = [None] * len(flat)
-    shares = None
+    heat = None
     try:
-        shares, results = mean_shares(model, flat, drop_rate=DROP_RATE)
+        heat = Heat.of(model, flat, drop_rate=DROP_RATE)
+        results = heat.results
     except ValueError as error:
         notes.append(f"{label}: no co-adaptation: {error}")
-    if shares is not None and not shares.any():
-        shares = None
+    if heat is not None and not heat.shares.any():
+        heat = None
         notes.append(f"{label}: its score is 0, so that there is nothing to attribute.")
-    with torch.enable_grad():
-        weights = blend_weights(drawn, flat)
     pictures = [_pictures(model, view, result) for view, result in zip(flat, results, strict=True)]
-    return Findings(label, model, drawn.test_opacities, scene, chosen, pictures, shares, weights, notes)
+    return Findings(label, model, drawn.test_opacities, scene, chosen, pictures, heat, notes)
 
 
 def _pictures(model: TrainedModel, view: Viewpoint, result: CAResult | None) -> dict[str, str]:

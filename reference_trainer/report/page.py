@@ -113,7 +113,7 @@ def _data(runs: dict[str, Path], found: Sequence[Findings]) -> dict[str, Any]:
     notes = [note for each in found for note in each.notes]
     notes += [f"{label}: no scores, it has not been trained to its end." for label in runs.keys() - results.keys()]
     dynamics, missing = _dynamics(runs)
-    middle = next((x for each in found if (x := each.share_per_weight) > 0), 1.0)
+    middle = next((each.heat.mean for each in found if each.heat is not None), 1.0)
     low, high = (end * middle for end in PER_WEIGHT_SCALE)
     attribution = [row for each in found if (row := each.attribution())]
     return {

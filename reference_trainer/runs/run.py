@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAMonitor
-from reference_trainer.evaluation.evaluate import PerceptualMetric, evaluate
+from reference_trainer.evaluation.evaluate import PerceptualMetric, evaluate, glance
 from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.evaluation.metrics import psnr
@@ -86,9 +86,11 @@ def run_experiment(
     given: Collection[str] = (),
     device: torch.device | str = "cpu",
     monitor_every: int = 500,
+    monitor_pictures: bool = False,
     checkpoint_every: int = 500,
     lpips: str | None = None,
     progress: bool = False,
+    watch: Callable[[Trainer], None] | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """Train on a scene and measure the result; what a former call has done already is not done again.
@@ -109,9 +111,11 @@ def run_experiment(
         device: where to train.
         monitor_every: steps between measurements of CA and PSNR; 0 for none. A training of fewer steps is measured at
             its end.
+        monitor_pictures: whether each shows TensorBoard what `CAMonitor` calls details.
         checkpoint_every: steps between checkpoints.
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         progress: whether to show a progress bar.
+        watch: called after every step, with what must not be changed.
         say: receives a line about what is happening.
 
     Returns:
@@ -148,7 +152,8 @@ def run_experiment(
         else:
             trainer.save(out / CHECKPOINT)
         with _saved_at_the_end(trainer, out, say):
-            _train(trainer, out, monitor_every, checkpoint_every, resumed=resumed, progress=progress, say=say)
+            shared: dict[str, Any] = {"resumed": resumed, "progress": progress, "watch": watch, "say": say}
+            _train(trainer, out, monitor_every, checkpoint_every, pictures=monitor_pictures, **shared)
         return _measure(trainer, out, perceptual, say)
 
 
@@ -211,8 +216,10 @@ def _train(
     monitor_every: int,
     checkpoint_every: int,
     *,
+    pictures: bool,
     resumed: bool,
     progress: bool,
+    watch: Callable[[Trainer], None] | None,
     say: Callable[[str], None],
 ) -> None:
     """Train to the end with a monitor and checkpoints on the way."""
@@ -221,6 +228,8 @@ def _train(
     def checkpoint(trainer: Trainer) -> None:
         if trainer.step % checkpoint_every == 0 or trainer.step == last:
             trainer.save(out / CHECKPOINT)
+        if watch is not None:
+            watch(trainer)
 
     if not monitor_every:
         trainer.train(after_step=checkpoint, progress=progress)
@@ -236,9 +245,17 @@ def _train(
     def quality(opacity: Tensor, view: View) -> float:  # the monitor's own scaling knows of dropout only
         return psnr(model_of(trainer).test_rendering(view).image.clamp(0, 1), view.image)
 
-    views = {name: group for name, group in views.items() if group}
+    def details(opacity: Tensor, view: View) -> dict[str, Tensor]:
+        return glance(model_of(trainer), view)
+
     with CAMonitor(
-        score, out, views=views, every=monitor_every, psnr=quality, resume_step=trainer.step if resumed else None
+        score,
+        out,
+        views={name: group for name, group in views.items() if group},
+        every=monitor_every,
+        psnr=quality,
+        details=details if pictures else None,
+        resume_step=trainer.step if resumed else None,
     ) as monitor:
         say(f"{out}: CA and PSNR go to {' and '.join(monitor.backends)} every {monitor_every} steps")
 

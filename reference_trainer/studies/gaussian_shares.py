@@ -13,24 +13,17 @@ from torch import Tensor
 
 from ca_reg import CAResult, Reason
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ca_picture
-from reference_trainer.evaluation.pictures import file_names, heat_colors, save_png, side_by_side
+from reference_trainer.evaluation.pictures import file_names, save_png, side_by_side
 from reference_trainer.evaluation.results import machine, markdown_table, write_json
-from reference_trainer.evaluation.shares import (
-    PER_WEIGHT_SCALE,
-    blend_weights,
-    concentration,
-    mean_effects,
-    mean_shares,
-    share_per_weight,
-)
+from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE, Heat, colored_by, concentration, mean_effects
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
-from reference_trainer.model.gaussians import SH_C0, Gaussians
+from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.scenes.scene import View, Viewpoint
 
-__all__ = ["colored_by", "study_attribution"]
+__all__ = ["study_attribution"]
 
 # Ends of the colour scale in units of the mean. Shares grow with the size of a Gaussian, so that a picture of them
 # shows the large ones; per blend weight they show what the CA map shows, Gaussian by Gaussian.
@@ -53,14 +46,6 @@ _README = """\
 Both scales are logarithmic, from black through purple, red and orange to pale yellow, and relative to the mean of this
 model: they show where its co-adaptation lives. How much there is, the score tells.
 """
-
-
-def colored_by(gaussians: Gaussians, values: Tensor, low: float, high: float) -> Gaussians:
-    """Return the same Gaussians with a colour that tells a value, see `heat_colors`, the same from every direction."""
-    colors = heat_colors(values, low, high).to(gaussians.sh_dc)
-    return dataclasses.replace(
-        gaussians, sh_dc=((colors - 0.5) / SH_C0)[:, None], sh_rest=torch.zeros_like(gaussians.sh_rest)
-    )
 
 
 def study_attribution(
@@ -94,16 +79,15 @@ def study_attribution(
     model, scene, _ = of_run(run, device)
     out = run / "attribution" if out is None else out
     views = [view.to(device) for view in (scene.train if split == "train" else scene.test)]
-    shares, results = mean_shares(model, views, drop_rate=drop_rate)
+    heat = Heat.of(model, views, drop_rate=drop_rate)
+    shares, weights, results = heat.shares, heat.weights, heat.results
     if not shares.any():
         raise ValueError(f"the score of {run} at drop rate {drop_rate} is 0: there is nothing to attribute.")
     effects = mean_effects(model, views, drop_rate=drop_rate)
-    weights = blend_weights(model, views)
     values = [result.value for result in results if result.reason is Reason.OK]
-    per_weight = (shares.sum() / weights.sum()).item()
     scales = {
         "share": [end * shares.mean().item() for end in _SHARE_SCALE],
-        "share_per_weight": [end * per_weight for end in PER_WEIGHT_SCALE],
+        "share_per_weight": [end * heat.mean for end in PER_WEIGHT_SCALE],
     }
     data: dict[str, Any] = {
         "scene": scene.name,
@@ -122,10 +106,9 @@ def study_attribution(
     a, b, c = (x.cpu().numpy() for x in (shares, effects, weights))
     with replacing(out / "shares.npz") as place, place.open("wb") as file:
         np.savez(file, shares=a, total_effects=b, blend_weights=c)
-    per_gaussian = share_per_weight(shares, weights)
     colored = {
         "attribution": colored_by(model.gaussians, shares, *scales["share"]),
-        "attribution_per_weight": colored_by(model.gaussians, per_gaussian, *scales["share_per_weight"]),
+        "attribution_per_weight": colored_by(model.gaussians, heat.values, *scales["share_per_weight"]),
     }
     for name, gaussians in colored.items():  # with the scaling baked in, as in a run's PLY for viewers
         save_for_viewers(dataclasses.replace(model, gaussians=gaussians), out / f"{name}.ply", pad_to_degree=3)

@@ -4,10 +4,12 @@ import json
 import logging
 import math
 import sys
+from io import BytesIO
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from ca_reg import CAMonitor, CAScore
 from ca_reg.dynamics import plot_dynamics, read_dynamics
@@ -111,6 +113,30 @@ def test_tensorboard_gets_the_same_scalars(tmp_path, caplog):
     for tag in tags:
         assert [event.step for event in events.Scalars(tag)] == [10, 20, 30]
         np.testing.assert_allclose([e.value for e in events.Scalars(tag)], [r[tag] for r in records], rtol=1e-6)
+
+
+def test_tensorboard_shows_the_details_of_the_first_view_of_each_group(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    image = torch.arange(60).reshape(3, 4, 5) / 255
+
+    def details(opacity, view):
+        assert not torch.is_grad_enabled()
+        opacity.mul_(view)
+        return {"picture": image * view, "shares": opacity, "none": opacity[:0]}
+
+    records = run(make(tmp_path, details=details), 1, 31)
+    assert records == run(make(tmp_path / "without"), 1, 31)
+    events = accumulator.EventAccumulator(str(tmp_path))
+    events.Reload()
+    for group, view in (("train", 1.0), ("test", 3.0)):
+        shown = events.Images(f"picture/{group}")
+        assert [event.step for event in shown] == [10, 20, 30]
+        with Image.open(BytesIO(shown[-1].encoded_image_string)) as file:
+            pixels = np.asarray(file)
+        np.testing.assert_array_equal(pixels, (image * view * 255).round().permute(1, 2, 0))
+        shares = events.Histograms(f"shares/{group}")[-1].histogram_value
+        assert (shares.num, shares.min, shares.max) == pytest.approx((30, 0.1 * view, 0.9 * view))
+    assert len(events.Tags()["histograms"]) == 2
 
 
 def test_without_tensorboard_the_log_says_so(tmp_path, monkeypatch, caplog):

@@ -1,5 +1,6 @@
 import json
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ from reference_trainer.studies import gaussian_shares as shares_module
 from reference_trainer.studies import study as study_module
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
+from reference_trainer.viewer.window import Viewer
 
 SMALL = ["--downscale", "8", "--iterations", "3", "--monitor-every", "2"]
 
@@ -65,12 +67,15 @@ def trained(tmp_path_factory):
                 "--dropout",
                 "--noise",
                 "--opacity-decay",
+                "--monitor-pictures",
+                "--viewer",
                 "--device",
             ],
         ),
         (["evaluate"], ["--ply", "--path", "--scene", "--regularizer", "--samples", "--lpips"]),
         (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
         (["bake"], ["PATH", "--regularizer", "--out"]),
+        (["view"], ["PATH", "--scene", "--arc", "--regularizer", "--port", "--device"]),
         (["render"], ["--what", "--frames", "{test,train,flight}"]),
         (
             ["compare"],
@@ -116,7 +121,7 @@ def test_help_and_mistakes_need_no_torch():
     code = """if True:
         import contextlib, io, sys
         from reference_trainer.cli import main
-        commands = ("demo", "plan", "train", "evaluate", "bake", "render", "compare", "study", "warmup")
+        commands = ("demo", "plan", "train", "evaluate", "bake", "render", "view", "compare", "study", "warmup")
         for words in ([], *(command.split() for command in commands), ["train", "--nonsense"]):
             with contextlib.suppress(SystemExit), contextlib.redirect_stderr(io.StringIO()):
                 main([*words, "--help"])
@@ -131,6 +136,37 @@ def test_a_card_that_is_not_there(command, capsys, monkeypatch):
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     text = refused([*command.split(), "--device", "cuda"], capsys)
     assert re.fullmatch(r"ca-reg: --device cuda: PyTorch \S+ finds 0 CUDA devices; take cpu.", text)
+
+
+@pytest.mark.parametrize("command", ["view runs/none", "train --viewer"])
+def test_without_viser(command, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert refused(command.split(), capsys) == "ca-reg: the viewer needs viser: pip install 'ca_reg[viewer]'."
+
+
+@pytest.mark.parametrize("what", ["", "point_cloud.ply"])
+def test_a_run_or_a_ply_is_shown_until_ctrl_c(what, trained, capsys, monkeypatch):
+    pytest.importorskip("viser")
+    shown = []
+
+    def draw(viewer):
+        shown.append(viewer._subject.draw(viewer._look, viewer._subject._views[0].camera)[0])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "draw", draw)
+    main(["view", str(trained / what), "--port", "0"])
+    assert re.search(r"The viewer is at http://127\.0\.0\.1:\d+, .*; Ctrl-C ends it\.", capsys.readouterr().out)
+    assert shown[0].std() > 0
+
+
+def test_a_port_that_is_not_free(capsys):
+    pytest.importorskip("viser")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        text = refused(["train", "--viewer", str(port)], capsys)
+    assert text.startswith(f"ca-reg: port {port} cannot be used for the viewer (")
+    assert text.endswith("in use): give another one.")
+    assert "from 0 to 65535, got 65536" in refused(["view", "runs/none", "--port", "65536"], capsys)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from reference_trainer.evaluation.results import write_json
-from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
+from reference_trainer.evaluation.shares import blend_weights, colored_by, mean_shares, share_per_weight
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.report import page as page_module
 from reference_trainer.report.findings import find
@@ -23,7 +23,6 @@ from reference_trainer.runs.folder import CHECKPOINT, CONFIG, claim
 from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.studies.gaussian_shares import colored_by
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 

@@ -27,7 +27,7 @@ EVERY = {"monitor_every": 3, "checkpoint_every": 4}
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, options, short) -> tuple[Path, dict]:
     out = tmp_path_factory.mktemp("run")
-    return out, run_experiment(options, short, out, **EVERY)
+    return out, run_experiment(options, short, out, **EVERY, monitor_pictures=True)
 
 
 @pytest.fixture
@@ -210,6 +210,20 @@ def test_monitoring_has_no_influence(finished, options, short, tmp_path):
     run_experiment(options, short, tmp_path, monitor_every=0, checkpoint_every=4)
     assert not (tmp_path / LOG_NAME).exists()
     assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
+
+
+def test_tensorboard_shows_pictures_of_a_view_of_each_split_if_asked_to(finished, scaled):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    shown = {}
+    for out in (finished[0], scaled[0]):
+        shown[out] = accumulator.EventAccumulator(str(out))
+        shown[out].Reload()
+    tags = {f"{what}/{split}" for what in ("render", "error", "co-adaptation") for split in ("train", "test")}
+    assert set(shown[finished[0]].Tags()["images"]) == tags
+    for tag in tags:
+        images = shown[finished[0]].Images(tag)
+        assert [(image.step, image.width, image.height) for image in images] == [(step, 20, 15) for step in (3, 6, 9)]
+    assert not shown[scaled[0]].Tags()["images"]
 
 
 def test_another_run_in_the_same_folder_is_refused(finished, options, short):

@@ -11,7 +11,7 @@ from PIL import Image
 
 from ca_reg import Reason
 from reference_trainer.evaluation.results import write_json
-from reference_trainer.evaluation.shares import blend_weights, concentration, mean_effects, mean_shares
+from reference_trainer.evaluation.shares import blend_weights, colored_by, concentration, mean_effects, mean_shares
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
 from reference_trainer.model.ply import load_ply
@@ -19,7 +19,7 @@ from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies import gaussian_shares as shares_module
-from reference_trainer.studies.gaussian_shares import colored_by, study_attribution
+from reference_trainer.studies.gaussian_shares import study_attribution
 from reference_trainer.training.trainer import Trainer
 
 

@@ -1,0 +1,275 @@
+"""The page in the browser: viser shows the pictures of a model, and says where somebody has turned to."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+import socket
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, get_args
+
+import numpy as np
+import torch
+
+from reference_trainer.camera import Camera, pixels_of
+from reference_trainer.evaluation.pictures import as_pillow
+from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.evaluation.trajectory import measured_views
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.render import NotFiniteError
+from reference_trainer.render.eager.projection import rotation_matrices
+from reference_trainer.runs.run import model_of
+from reference_trainer.scenes.scene import Viewpoint
+from reference_trainer.threads import threads_for
+from reference_trainer.training.trainer import Trainer
+from reference_trainer.viewer.picture import Look, Mode, Subject
+
+__all__ = ["Viewer"]
+
+HOST = "127.0.0.1"
+STILL = 0.2
+"""Seconds without a change after which a picture is drawn at full resolution."""
+ROUGH_SECONDS = 0.1
+"""What a picture may take while something moves; the resolution follows."""
+FEWEST, MOST = 10_000, 1_000_000
+"""Pixels of a picture."""
+TRAINING_SHARE = 0.1
+"""The part of the time of a training that goes into following it, as long as nobody moves."""
+
+
+@dataclass
+class _Window:
+    """One page: whether something is to be drawn, how, and since when nothing has moved."""
+
+    client: Any
+    moved: float
+    due: bool = True
+    rough: bool = True
+
+
+class Viewer:
+    """A server of pages on this machine that show a model, in whatever way is chosen there; a context.
+
+    Everything is drawn in the thread that calls `serve` or `follow`: a training is looked at between two of its steps.
+
+    Args:
+        port: to listen at; 0 for any.
+
+    Raises:
+        ImportError: if viser is missing.
+        OSError: if the port is not free.
+        ValueError: if it is no port.
+    """
+
+    def __init__(self, port: int) -> None:
+        try:
+            import viser
+        except ImportError as error:
+            raise ImportError("the viewer needs viser: pip install 'ca_reg[viewer]'.") from error
+        if not 0 <= port < 65536:
+            raise ValueError(f"a port is a number from 0 to 65535, got {port}.")
+        try:
+            socket.create_server((HOST, port)).close()  # viser would take another port
+        except OSError as error:
+            reason = os.strerror(error.errno or 0)
+            raise OSError(f"port {port} cannot be used for the viewer ({reason}): give another one.") from error
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server = viser.ViserServer(HOST, port, label="ca_reg", verbose=False)
+        self._subject: Subject | None = None
+        self._windows: dict[int, _Window] = {}
+        self._changed = threading.Event()
+        self._rough_pixels, self._next_model = 40_000, 0.0
+        self._add_controls()
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(lambda client: self._windows.pop(client.client_id, None))
+
+    @property
+    def address(self) -> str:
+        """Of the page."""
+        return f"http://{HOST}:{self._server.get_port()}"
+
+    def __str__(self) -> str:
+        port = self._server.get_port()
+        return f"The viewer is at {self.address}, from another machine after: ssh -L {port}:{HOST}:{port} THIS_ONE"
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def show(self, model: TrainedModel, views: Mapping[str, Sequence[Viewpoint]]) -> None:
+        """Show a model from now on. The views of the first one are those to jump to, by split."""
+        flat = [view.to(model.gaussians.means.device) for group in views.values() for view in group]
+        if self._subject is None:
+            self._add_cameras(views, model.gaussians)
+        self._subject = Subject(model, flat)
+        for window in list(self._windows.values()):
+            window.due = True
+        self._changed.set()
+
+    def serve(self) -> None:
+        """Draw what is asked for until Ctrl-C."""
+        with contextlib.suppress(KeyboardInterrupt):
+            while True:
+                self._changed.wait(self.draw())
+                self._changed.clear()
+
+    def follow(self, trainer: Trainer) -> None:
+        """Draw what is asked for of a model in training, between two steps; does nothing while no page is open."""
+        if not self._windows:
+            return
+        start = time.perf_counter()
+        new = start >= self._next_model
+        if new:
+            model = model_of(trainer)
+            model = TrainedModel(
+                model.gaussians.map(torch.clone), model.background, model.regularizer, model.step, model.sh_degree
+            )
+            self.show(model, measured_views(trainer.scene, lambda text: None))
+        with contextlib.suppress(NotFiniteError):  # the training says so itself
+            self.draw()
+        if new:
+            end = time.perf_counter()
+            self._next_model = end + (end - start) * (1 / TRAINING_SHARE - 1)
+
+    def draw(self) -> float | None:
+        """Draw every page that is due; return in how many seconds the next is, None if a change must come first."""
+        waits = []
+        for window in list(self._windows.values()):
+            still = time.monotonic() - window.moved
+            if window.due or (window.rough and still >= STILL):
+                window.due, window.rough = False, still < STILL
+                self._send(window)
+            if window.rough:
+                waits.append(max(0.0, STILL - still))
+        return min(waits, default=None)
+
+    def _send(self, window: _Window) -> None:
+        """Draw a page once."""
+        subject, view = self._subject, window.client.camera
+        if subject is None:
+            return
+        start = time.perf_counter()
+        camera = _camera(view, self._rough_pixels if window.rough else MOST)
+        with threads_for(camera.width * camera.height):
+            try:
+                image, note = subject.draw(self._look, camera)
+            except ValueError as error:
+                (image, _), note = subject.draw(Look(), camera), str(error)
+        if window.client.client_id not in self._windows:  # it has been closed meanwhile
+            return
+        window.client.scene.set_background_image(np.asarray(as_pillow(image)), format="jpeg", jpeg_quality=90)
+        took, model = max(1e-3, time.perf_counter() - start), subject.model
+        if window.rough:
+            pixels = self._rough_pixels * min(2.0, max(0.5, ROUGH_SECONDS / took))
+            self._rough_pixels = int(min(MOST, max(FEWEST, pixels)))
+        else:
+            drawn = f"{len(model.gaussians):,} Gaussians, {camera.width}x{camera.height} in {took * 1e3:.0f} ms"
+            self._status.content = f"step {model.step:,}: {drawn}\n\n{note}"
+
+    @property
+    def _look(self) -> Look:
+        mode, rate, noise, mask, hidden = (control.value for control in self._controls)
+        return Look(mode, rate, noise, mask, hidden / 100)
+
+    def _add_controls(self) -> None:
+        """Fill the panel."""
+        gui = self._server.gui
+        gui.configure_theme(show_share_button=False, show_logo=False)
+        self._controls = [
+            gui.add_dropdown("Show", get_args(Mode)),
+            gui.add_slider("Drop rate", 0.0, 0.95, 0.05, 0.5, hint="Of the co-adaptation, and of the mask."),
+            gui.add_slider("Noise", 0.0, 2.0, 0.1, 0.0, hint="Opacity noise: a draw of it, or in the co-adaptation."),
+            gui.add_checkbox("Draw a mask", False, hint="Leave Gaussians out at random, at the drop rate."),
+            gui.add_slider("Hide %", 0.0, 50.0, 0.5, 0.0, hint="Leave out those that co-adapt most."),
+        ]
+        for control in self._controls:
+            control.on_update(lambda event: self._moved())
+        self._status = gui.add_markdown("")
+
+    def _add_cameras(self, views: Mapping[str, Sequence[Viewpoint]], gaussians: Gaussians) -> None:
+        """Put the cameras into the page, to jump to, and begin at the first one."""
+        from kornia.geometry.quaternion import Quaternion
+
+        gui, scene = self._server.gui, self._server.scene
+        cameras = {f"{split} {view.name}": view.camera for split, of in views.items() for view in of}
+        distance = _distance(gaussians, next(iter(cameras.values())))
+        places = torch.stack([camera.position for camera in cameras.values()])
+        apart = torch.cdist(places, places).fill_diagonal_(torch.inf).amin(1).median().item()
+        size = min(0.04 * distance, 0.25 * apart)  # of a frustum
+        poses = {name: _pose(camera, distance) for name, camera in cameras.items()}
+        scene.set_up_direction(sum(pose["up_direction"] for pose in poses.values()))
+        start, at = self._server.initial_camera, poses[next(iter(poses))]
+        start.position, start.look_at, start.fov = at["position"], at["look_at"], at["fov"]
+        folder = scene.add_frame("/cameras", show_axes=False)
+        chooser = gui.add_dropdown("Go to", list(cameras))
+        chooser.on_update(lambda event: self._jump(event.client, poses[chooser.value]))
+        shown = gui.add_checkbox("Cameras", True)
+        shown.on_update(lambda event: setattr(folder, "visible", shown.value))
+        for number, (name, camera) in enumerate(cameras.items()):
+            pose = poses[name]
+            turned = Quaternion.from_matrix(camera.world_to_camera[:3, :3].T)
+            frustum = scene.add_camera_frustum(
+                f"/cameras/{number}", pose["fov"], camera.width / camera.height, scale=size,
+                thickness=0.02 * size, color=(230, 90, 30) if name.startswith("train") else (60, 120, 220),
+                wxyz=turned.data.numpy(), position=pose["position"],
+            )  # fmt: skip
+            frustum.on_click(lambda event, pose=pose: self._jump(event.client, pose))
+
+    def _jump(self, client: Any, pose: Mapping[str, Any]) -> None:
+        """Take a page to a camera."""
+        if client is not None:  # None where the server has set the value
+            with client.atomic():
+                for name, value in pose.items():
+                    setattr(client.camera, name, value)
+
+    def _connected(self, client: Any) -> None:
+        """Draw for a page from now on."""
+        self._windows[client.client_id] = _Window(client, time.monotonic())
+        client.camera.on_update(lambda camera: self._moved(client.client_id))
+        self._changed.set()
+
+    def _moved(self, *clients: int) -> None:
+        """Draw these pages, or all, anew."""
+        for client in clients or list(self._windows):
+            if window := self._windows.get(client):
+                window.moved, window.due = time.monotonic(), True
+        self._changed.set()
+
+
+def _camera(view: Any, most: int) -> Camera:
+    """Return viser's camera as ours, with at most so many pixels."""
+    scale = min(1.0, math.sqrt(most / max(1, view.image_width * view.image_height)))  # a page can be closed up
+    width, height = (max(1, round(scale * side)) for side in (view.image_width, view.image_height))
+    focal = 0.5 * height / math.tan(0.5 * view.fov)
+    from_camera = torch.eye(4, dtype=torch.float64)
+    from_camera[:3, :3] = rotation_matrices(torch.tensor(view.wxyz)[None])[0]
+    from_camera[:3, 3] = torch.tensor(view.position)
+    return Camera(from_camera.inverse().float(), focal, focal, width / 2, height / 2, width, height)
+
+
+def _pose(camera: Camera, distance: float) -> dict[str, Any]:
+    """Return a camera as the properties of viser's; the model turns around the point at a distance in front of it."""
+    position, axes = camera.position.cpu(), camera.world_to_camera[:3, :3].cpu()
+    return {
+        "position": position.numpy(),
+        "look_at": (position + distance * axes[2]).numpy(),
+        "up_direction": (-axes[1]).numpy(),
+        "fov": 2 * math.atan(0.5 * camera.height / camera.fy),
+    }
+
+
+def _distance(gaussians: Gaussians, camera: Camera) -> float:
+    """Return how far away the middle of what a camera sees is; 1 if it sees nothing."""
+    depth = camera.project(gaussians.means)[1][pixels_of(gaussians.means, camera)[2]]
+    return depth.median().item() if len(depth) else 1.0
