@@ -16,6 +16,7 @@ import tyro
 from reference_trainer.cli.drawing import Warmup
 from reference_trainer.cli.names import Names, Recipes
 from reference_trainer.cli.ply import Bake, Clean
+from reference_trainer.cli.poses import Poses
 from reference_trainer.cli.report import Report
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
@@ -55,6 +56,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     config = with_recipe(recipe, **peeked) if recipe else RECIPES["3dgs"].config
     defaults: dict[str, Any] = {
         "demo": Demo(),
+        "poses": Poses(tyro.MISSING),
         "plan": Plan(config=config, recipe=recipe, given=given),
         "train": Train(config=config, recipe=recipe, given=given),
         "evaluate": Evaluate(),

@@ -390,7 +390,7 @@ def test_an_unknown_scene(capsys, tmp_path):
     ("arguments", "message"),
     [
         (["train", "--dropout", "1.5"], "dropout must be in [0, 1), got 1.5"),
-        (["train", "--sh-every", "0"], "sh_every must be at least 1, got 0"),
+        (["train", "--sh-every", "-1"], "sh_every must be at least 0, got -1"),
         (["train", "--downscale", "0.5"], "downscale must be at least 1"),
         (["compare", "--seeds", "0"], "at least 1 scene, 1 strategy and 1 seed"),
         (["compare", "--jobs", "0"], "at least 1 job, got 0"),
