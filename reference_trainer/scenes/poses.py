@@ -136,15 +136,15 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
         taken_with = pycolmap.infer_camera_from_image(photo)
         known = known and taken_with.has_prior_focal_length
         alike[(*image_size(photo), taken_with.mean_focal_length())].append(photo.name)
+    pycolmap.Database.open(database).close()
     for (width, height, _), names in alike.items():
         say(f"looking for features in {len(names)} photographs of {width}x{height} ...")
+        # In order, for threads would finish in any, and the numbers of the photographs are part of the result.
+        pycolmap.import_images(
+            database, folder, camera_mode=pycolmap.CameraMode.SINGLE, image_names=names, options=reader
+        )
         pycolmap.extract_features(
-            database,
-            folder,
-            image_names=names,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=reader,
-            extraction_options=features,
+            database, folder, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=features
         )
     say(f"matching {len(photos) * (len(photos) - 1) // 2} pairs ...")
     verification = pycolmap.TwoViewGeometryOptions()

@@ -68,7 +68,7 @@ def test_a_format_of_the_users_own_trains(photographs, tmp_path, monkeypatch, ho
 def test_a_format_that_is_not_there(photographs):
     with pytest.raises(ValueError, match="must name a function"):
         load_scene(photographs, format="toy_scenes:read")
-    with pytest.raises(ValueError, match=r"has none of .*run COLMAP, VGGT or InstantSplat on them first"):
+    with pytest.raises(ValueError, match=r"the photographs in .* have no cameras yet: `ca-reg poses "):
         load_scene(photographs)
 
 
