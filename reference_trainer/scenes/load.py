@@ -19,7 +19,7 @@ from reference_trainer.scenes.idr import IDR
 from reference_trainer.scenes.images import LARGE_PICTURE, image_size
 from reference_trainer.scenes.llff import LLFF
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.points import check_no_leak, choose_points, model_start
+from reference_trainer.scenes.points import check_no_leak, choose_points, filled, model_start
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.scenes.splits import blender_split, dtu_split, evenly_spaced, file_split, llff_split
 from reference_trainer.scenes.synthetic import synthetic_scene
@@ -101,6 +101,9 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         views["train"] = tuple(
             with_prior(view, frame, root, options) for view, frame in zip(views["train"], train, strict=True)
         )
+    about_more = ""
+    if options.points == "auto" and start is None:
+        cloud, about_more = filled(cloud, train, generator)
     return Scene(
         name=root.resolve().name,
         **views,
@@ -108,7 +111,7 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         start=start,
         background=color,
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
-        notes=tuple(filter(None, (about_size, _about_lenses([*train, *test], options), about_points))),
+        notes=tuple(filter(None, (about_size, _about_lenses([*train, *test], options), about_points, about_more))),
     )
 
 

@@ -15,12 +15,14 @@ from reference_trainer.ply_files import PlyVertices, read_ply
 from reference_trainer.scenes.colmap import colmap_folders, read_colmap
 from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.images import path_inside
-from reference_trainer.scenes.random_points import random_points
+from reference_trainer.scenes.random_points import random_points, random_points_in_frusta
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["check_no_leak", "choose_points", "colmap_points", "model_start", "ply_points"]
+__all__ = ["check_no_leak", "choose_points", "colmap_points", "filled", "model_start", "ply_points"]
 
 RANDOM_POINTS = 10_000  # as DNGaussian for the Blender scenes
+THIN = 1_000
+"""A measured cloud of fewer points is filled with random ones, unless it was asked for."""
 INSTANTSPLAT = "points3D.ply"
 OPAQUE = 13.0  # in place of an infinite logit, which cannot be trained
 
@@ -68,6 +70,26 @@ def choose_points(
     if cloud is None:
         raise ValueError(f"{path} has no points to start from; choose another folder or random points.")
     return cloud, f"initial points: {len(cloud.positions):,} from {cloud.source}"
+
+
+def filled(cloud: PointCloud, train: Sequence[Frame], generator: torch.Generator) -> tuple[PointCloud, str]:
+    """Add random points to a measured cloud that is too thin to grow a model from, and say so.
+
+    They lie where the training cameras look, at depths between those of 98 % of the cloud: on fern from three views,
+    459 points alone end 1 dB below.
+    """
+    cameras = [frame.camera for frame in train]
+    depths = torch.cat([camera.project(cloud.positions.double())[1] for camera in cameras])
+    depths = depths[depths > 0]
+    if len(cloud.positions) >= THIN or cloud.source == "random" or len(depths) < 2:
+        return cloud, ""
+    near, far = depths.quantile(torch.tensor([0.01, 0.99], dtype=depths.dtype)).tolist()
+    if near == far:
+        return cloud, ""
+    more = random_points_in_frusta(cameras, RANDOM_POINTS, near=near, far=far, generator=generator)
+    positions, colors = torch.cat([cloud.positions, more.positions]), torch.cat([cloud.colors, more.colors])
+    note = f"{RANDOM_POINTS:,} random ones at their depths are added, for so few grow no model"
+    return replace(cloud, positions=positions, colors=colors), note
 
 
 def colmap_points(folder: Path) -> PointCloud | None:

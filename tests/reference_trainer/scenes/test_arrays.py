@@ -41,6 +41,12 @@ def scene(tmp_path, save_image):
     return write
 
 
+def points_of(root):
+    cloud = read_arrays(root / "predictions.npz", root / "images")[1]
+    assert cloud is not None
+    return cloud
+
+
 @pytest.mark.parametrize(
     "poses",
     [
@@ -86,28 +92,28 @@ def test_pictures_by_name_whatever_folder_they_were_in(scene):
 
 def test_points_with_their_colors(scene):
     xyz, rgb = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0], [4.0, 5.0, 6.0]]), np.array([[255, 0, 51]] * 3, np.uint8)
-    loaded = load_scene(scene(extrinsic=to_camera(), intrinsic=INTRINSICS, points=xyz, colors=rgb))
-    assert loaded.points.positions.tolist() == [[1, 2, 3], [4, 5, 6]]
-    torch.testing.assert_close(loaded.points.colors, torch.tensor([[1.0, 0.0, 0.2]] * 2))
-    assert loaded.points.seen_by == frozenset(NAMES)
+    cloud = points_of(scene(extrinsic=to_camera(), intrinsic=INTRINSICS, points=xyz, colors=rgb))
+    assert cloud.positions.tolist() == [[1, 2, 3], [4, 5, 6]]
+    torch.testing.assert_close(cloud.colors, torch.tensor([[1.0, 0.0, 0.2]] * 2))
+    assert cloud.seen_by == frozenset(NAMES)
 
 
 def test_a_map_of_points_takes_the_colors_of_the_pictures_and_the_surer_half(scene):
     points = np.random.default_rng(0).normal(size=(3, 3, 4, 3))
     images = np.random.default_rng(1).random((3, 3, 3, 4)).astype(np.float32)
     sure = np.arange(36.0).reshape(3, 3, 4)
-    loaded = load_scene(
+    cloud = points_of(
         scene(extrinsic=to_camera(), intrinsic=INTRINSICS, world_points=points, images=images, world_points_conf=sure)
     )
-    assert loaded.points.positions.numpy() == pytest.approx(points.reshape(-1, 3)[18:])
+    assert cloud.positions.numpy() == pytest.approx(points.reshape(-1, 3)[18:])
     expected = np.array([images[i, :, y, x] for i in range(3) for y in range(3) for x in range(4)])[18:]
-    assert loaded.points.colors.numpy() == pytest.approx(expected)
+    assert cloud.colors.numpy() == pytest.approx(expected)
 
 
 def test_depth_is_lifted_along_the_axis_of_the_camera(scene):
     depth = np.full((3, 6, 8), 5.0)
     depth[:, 0, 0] = 0  # unknown
-    cloud = load_scene(scene(extrinsic=to_camera(), intrinsic=INTRINSICS, depth=depth)).points
+    cloud = points_of(scene(extrinsic=to_camera(), intrinsic=INTRINSICS, depth=depth))
     assert len(cloud.positions) == 3 * 47
     # Pixel (1, 0): center (1.5, 0.5), so (1.5 - 4) / 10 and (0.5 - 3) / 12 of the depth across.
     x, y = 5 * -0.25, 5 * -2.5 / 12
@@ -117,7 +123,7 @@ def test_depth_is_lifted_along_the_axis_of_the_camera(scene):
 
 def test_few_of_many_points(scene):
     points = np.random.default_rng(0).random((3 * MOST_POINTS - 1, 3))
-    cloud = load_scene(scene(extrinsic=to_camera(), intrinsic=INTRINSICS, points=points)).points
+    cloud = points_of(scene(extrinsic=to_camera(), intrinsic=INTRINSICS, points=points))
     assert cloud.positions.numpy() == pytest.approx(points[::3].astype(np.float32))
 
 
