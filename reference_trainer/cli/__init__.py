@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"ca-reg: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        print("\nca-reg: interrupted; the same command continues where it was.", file=sys.stderr)
+        print("\nca-reg: interrupted; the same command goes on from what is finished.", file=sys.stderr)
         sys.exit(130)
 
 

@@ -445,7 +445,7 @@ def test_an_interruption(monkeypatch, capsys, tmp_path):
     with pytest.raises(SystemExit) as exit_:
         main(["train", "--out", str(tmp_path)])
     assert exit_.value.code == 130
-    assert "the same command continues where it was" in capsys.readouterr().err
+    assert "the same command goes on from what is finished" in capsys.readouterr().err
 
 
 def test_the_real_arguments_are_the_default(monkeypatch, capsys):
