@@ -106,7 +106,7 @@ def test_the_plan_knows(ply):
     assert plan.applied(TrainConfig(iterations=10)).sh_degree == 3
 
 
-@pytest.mark.parametrize("command", ["train", "compare"])
+@pytest.mark.parametrize("command", ["train", pytest.param("compare", marks=pytest.mark.slow)])
 def test_from_the_command_line(ply, tmp_path, capsys, monkeypatch, command):
     monkeypatch.chdir(tmp_path)  # the file is named from here, and a worker finds it all the same
     extra = ["--strategies", "dropout", "--seeds", "1"] if command == "compare" else ["--dropout", "0.2"]
