@@ -16,6 +16,7 @@ import tyro
 from reference_trainer.cli.drawing import Warmup
 from reference_trainer.cli.names import Names, Recipes, Version
 from reference_trainer.cli.ply import Bake, Clean
+from reference_trainer.cli.poses import Poses
 from reference_trainer.cli.report import Report, View
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
@@ -41,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"ca-reg: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        print("\nca-reg: interrupted; the same command continues where it was.", file=sys.stderr)
+        print("\nca-reg: interrupted; the same command goes on from what is finished.", file=sys.stderr)
         sys.exit(130)
 
 
@@ -55,6 +56,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     config = with_recipe(recipe, **peeked) if recipe else RECIPES["3dgs"].config
     defaults: dict[str, Any] = {
         "demo": Demo(),
+        "poses": Poses(tyro.MISSING),
         "plan": Plan(config=config, recipe=recipe, given=given),
         "train": Train(config=config, recipe=recipe, given=given),
         "compare": Compare(out=Path("runs/compare"), config=config, recipe=recipe),

@@ -211,6 +211,7 @@ class PlyScene(SceneOptions):
 
     path: Annotated[str, tyro.conf.arg(aliases=("--scene",))] = "orbit"
     """For a PLY: scene folder, "synthetic" for the built-in scene, or "orbit" for cameras around the model."""
+    init: Annotated[str | None, tyro.conf.Suppress] = None  # the PLY is the model
 
 
 @dataclass(frozen=True)

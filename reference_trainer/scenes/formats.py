@@ -13,6 +13,7 @@ from importlib import import_module
 from pathlib import Path
 
 from reference_trainer.scenes.frames import Frame
+from reference_trainer.scenes.images import is_image
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud
 
@@ -98,9 +99,13 @@ def find_format(root: Path, name: str) -> tuple[str, Reader]:
         return name, _FORMATS[name].read
     if name != "auto":
         raise ValueError(f"format must be auto, module:function or one of {', '.join(_FORMATS)}, got {name!r}.")
+    if any(map(is_image, (*root.glob("*"), *root.glob("images/*")))):
+        raise ValueError(
+            f"the photographs in {root} have no cameras yet: `ca-reg poses {root}` finds them (pip install "
+            "'ca_reg[colmap]'), as do COLMAP, VGGT and InstantSplat."
+        )
     raise ValueError(
-        f"{root} has none of {', '.join(format.sign for format in _FORMATS.values())}; it has {contents(root)}. "
-        "Photographs alone have no cameras yet: run COLMAP, VGGT or InstantSplat on them first."
+        f"{root} has none of {', '.join(format.sign for format in _FORMATS.values())}; it has {contents(root)}."
     )
 
 

@@ -191,7 +191,7 @@ def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
     """Return the folder of a scene's photographs, the one that was asked for by name or the usual one.
 
     Of that and the ``<usual>_<factor>`` beside it, it is the one with the largest pictures of at most half a megapixel,
-    or with the smallest if there are none.
+    or with the smallest if there are none. Without any, it is the scene folder itself, if pictures lie in it.
 
     Raises:
         FileNotFoundError: if there is none; the message lists the folders with pictures.
@@ -203,6 +203,7 @@ def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
         reduced = [path for path, factor in factors.items() if factor.isdecimal()]
         found = [root / usual] if (root / usual).is_dir() else []
         found += sorted(reduced, key=lambda path: int(factors[path]))
+        found = found or ([root] if any(map(is_image, root.iterdir())) else [])
     if not found:
         others = sorted(each.name for each in root.iterdir() if each.is_dir() and any(map(is_image, each.iterdir())))
         raise FileNotFoundError(

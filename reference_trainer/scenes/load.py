@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from reference_trainer.scenes.arrays import ARRAYS
 from reference_trainer.scenes.colmap import COLMAP
 from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
 from reference_trainer.scenes.formats import Capture, find_format, only_default, register_format
@@ -18,7 +19,7 @@ from reference_trainer.scenes.idr import IDR
 from reference_trainer.scenes.images import LARGE_PICTURE, image_size
 from reference_trainer.scenes.llff import LLFF
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.points import check_no_leak, choose_points
+from reference_trainer.scenes.points import check_no_leak, choose_points, filled, model_start
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.scenes.splits import blender_split, dtu_split, evenly_spaced, file_split, llff_split
 from reference_trainer.scenes.synthetic import synthetic_scene
@@ -27,7 +28,8 @@ from reference_trainer.scenes.undistort import corner_displacement
 
 __all__ = ["load_options", "load_scene"]
 
-for _format in (BLENDER, IDR, COLMAP, TRANSFORMS, LLFF):  # the table; of several that a folder fits, the first counts
+# The table; of several that a folder fits, the first counts.
+for _format in (BLENDER, IDR, COLMAP, TRANSFORMS, LLFF, ARRAYS):
     register_format(_format)
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -69,6 +71,8 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         raise ValueError(f"views must be at least 1, got {options.views}.")
     if options.test not in ("auto", "none"):
         raise ValueError(f"test must be auto or none, got {options.test!r}.")
+    if options.init is not None and options.points != "auto":
+        raise ValueError(f"init takes the place of points: leave out one of {options.init} and {options.points}.")
     if options.path == "synthetic":
         return _built_in(options, seed)
     root = Path(options.path)
@@ -76,7 +80,11 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
     capture = read(root, options)
     train, test = _split(root, capture, options)
     generator = torch.Generator().manual_seed(seed)
-    cloud, about_points = choose_points(root, options.points, train, generator, own=capture.points)
+    start = None
+    if options.init is None:
+        cloud, about_points = choose_points(root, options.points, train, generator, own=capture.points)
+    else:
+        start, cloud, about_points = model_start(options.init)
     check_no_leak(cloud, [frame.name for frame in train], allow=options.allow_test_points)
     chosen = capture.background if options.background == "auto" else options.background
     color: Tensor = torch.tensor(BACKGROUNDS[chosen])
@@ -93,13 +101,17 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         views["train"] = tuple(
             with_prior(view, frame, root, options) for view, frame in zip(views["train"], train, strict=True)
         )
+    about_more = ""
+    if options.points == "auto" and start is None:
+        cloud, about_more = filled(cloud, train, generator)
     return Scene(
         name=root.resolve().name,
         **views,
         points=cloud,
+        start=start,
         background=color,
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
-        notes=tuple(filter(None, (about_size, _about_lenses([*train, *test], options), about_points))),
+        notes=tuple(filter(None, (about_size, _about_lenses([*train, *test], options), about_points, about_more))),
     )
 
 
@@ -111,6 +123,9 @@ def _built_in(options: SceneOptions, seed: int) -> Scene:
     downscale = options.downscale or 1.0
     scene = synthetic_scene(round(160 / downscale), round(120 / downscale), train_views=options.views or 3, seed=seed)
     scene = scene if options.test == "auto" else replace(scene, test=())
+    if options.init is not None:
+        start, cloud, note = model_start(options.init)
+        scene = replace(scene, start=start, points=cloud, notes=(note,))
     return scene if options.depth is None else true_priors(scene, options.depth)
 
 

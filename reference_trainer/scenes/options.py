@@ -29,11 +29,11 @@ class SceneOptions:
     """
 
     path: str = "synthetic"
-    """Scene folder (COLMAP, VGGT, InstantSplat, nerfstudio, instant-ngp, Blender, LLFF or IDR/NeuS files), or
-    "synthetic" for the built-in scene."""
+    """Scene folder (COLMAP, VGGT, InstantSplat, nerfstudio, instant-ngp, Blender, LLFF or IDR/NeuS files, or an
+    .npz of poses), or "synthetic" for the built-in scene."""
     format: str = "auto"
-    """"blender", "transforms", "colmap", "llff", "idr", a reader of yours as my_module:my_function, or "auto" for the
-    first whose files are there."""
+    """"blender", "transforms", "colmap", "llff", "idr", "npz", a reader of yours as my_module:my_function, or "auto"
+    for the first whose files are there."""
     images: str | None = None
     """Image folder within the scene, such as images_8; the cameras are scaled to its pictures. By default "images", or
     the largest images_<factor> of at most half a megapixel."""
@@ -47,7 +47,10 @@ class SceneOptions:
     """"none" to hold nothing out: all photographs train, or --views of them."""
     points: str = "auto"
     """Initial points: a COLMAP folder such as sparse_3views/0, a .ply file (points or 3DGS) within the scene, "random"
-    or "random:COUNT"; by default the largest cloud made from training views alone, else random ones."""
+    or "random:COUNT"; by default the largest cloud made from training views alone, with random ones besides if it
+    has fewer than 1,000, else random ones."""
+    init: str | None = None
+    """A 3DGS .ply, anywhere: training starts from all parameters of its Gaussians, in place of points."""
     depth: str | None = None
     """Depth of the training photographs, for terms of the loss that need one: a folder of the scene with .npy or gray
     .png files named like them, of any scale and shift; FOLDER:inverse if it is larger where nearer, as MiDaS's is;
@@ -62,8 +65,9 @@ class SceneOptions:
     """Accept initial points that were triangulated from test views; such results are not comparable with others."""
 
     def absolute(self) -> SceneOptions:
-        """Return the options with an absolute path, to be found again from another working directory."""
-        return self if self.path == "synthetic" else replace(self, path=str(Path(self.path).resolve()))
+        """Return the options with absolute paths, to be found again from another working directory."""
+        path = self.path if self.path == "synthetic" else str(Path(self.path).resolve())
+        return replace(self, path=path, init=None if self.init is None else str(Path(self.init).resolve()))
 
     def load(self, *, seed: int = 0) -> Scene:
         """Load the scene; ``seed`` decides random initial points. Errors are those of `load_scene`."""

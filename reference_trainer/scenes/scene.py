@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
+
+if TYPE_CHECKING:
+    from reference_trainer.model.gaussians import Gaussians
 
 __all__ = ["PointCloud", "Scene", "View", "Viewpoint"]
 
@@ -83,6 +86,7 @@ class Scene:
         background: the colour (3,) behind everything, in [0, 1].
         source: where the photographs come from.
         notes: what a user should know of how it was loaded, a sentence each.
+        start: a model to start from instead; ``points`` are then its centers.
     """
 
     name: str
@@ -92,6 +96,7 @@ class Scene:
     background: Tensor
     source: str = "built in"
     notes: tuple[str, ...] = ()
+    start: Gaussians | None = None
 
     def __str__(self) -> str:
         """Say what a user looks at first: which photographs, their size, the names of the views, and the notes."""

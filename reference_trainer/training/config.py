@@ -53,7 +53,7 @@ class TrainConfig:
     sh_degree: int = 3
     """Degree of the spherical harmonics of the colours, 0 to 3."""
     sh_every: int = 500
-    """A band of spherical harmonics is added every so many steps."""
+    """A band of spherical harmonics is added every so many steps; 0: all are there from the first step on."""
 
     means_rate: float = 1.6e-4
     """Initial learning rate of the means, in units of the scene's extent."""
@@ -143,7 +143,7 @@ class TrainConfig:
 
     def sh_degree_at(self, number: int) -> int:
         """Highest band of spherical harmonics of the step with this number, the first being 1."""
-        return min(self.sh_degree, number // self.sh_every)
+        return min(self.sh_degree, number // self.sh_every) if self.sh_every else self.sh_degree
 
     # What follows imports torch, which the command line does without until it has to.
 
@@ -202,9 +202,8 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("iterations", "fields"), lambda x: x >= 1, "at least 1", ""),
     (("dropout",), lambda x: 0 <= x < 1, "in [0, 1)", ": 0 turns it off"),
     (("noise",), lambda x: x >= 0, "at least 0", ": 0 turns it off"),
-    (("seed", "regularize_from", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from"),
+    (("seed", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from"),
      lambda x: x >= 0, "at least 0", ""),
-    (("sh_every",), lambda x: x >= 1, "at least 1", ": set sh_degree=0 for constant colours"),
     (("sh_degree",), lambda x: x in (0, 1, 2, 3), "0, 1, 2 or 3", ""),
     (("initial_points",), lambda x: x in ("all", "seen"), "all or seen", ""),
     (("prune_size",), lambda x: x is None or x > 0, "positive, or None to keep what is large", ""),

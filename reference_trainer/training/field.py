@@ -46,7 +46,9 @@ class Field:
         self.label = f"field {number}/" if number else ""
         self.regularizer = config.make_regularizer()
         learns, start = self.regularizer.learns, initial_gaussians(scene, config)
-        start = replace(start, learned={name: torch.full((len(start),), x.start) for name, x in learns.items()})
+        known = start.learned  # of a model with the same regularizers
+        learned = {name: known.get(name, torch.full((len(start),), x.start)) for name, x in learns.items()}
+        start = replace(start, learned=learned)
         rates = LearningRates(
             means=config.means_rate_at(0) * scene.extent,
             log_scales=config.scales_rate,

@@ -1,9 +1,12 @@
-"""Where training starts: which of the scene's points become Gaussians, and how large these are."""
+"""Where training starts: which of the scene's points become Gaussians, and how large these are; or from a model."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ca_reg.neighbors import mean_neighbor_distance
 from reference_trainer.model.gaussians import Gaussians
@@ -17,8 +20,11 @@ __all__ = ["drawn_by_any", "initial_gaussians"]
 def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
     """Make one round Gaussian per point, as wide as the distance to its neighbours times ``config.initial_scale``.
 
+    Where the scene has a model to start from, its Gaussians are taken as they are, with as many bands of spherical
+    harmonics as are asked for: further ones are left out, missing ones 0.
+
     Args:
-        scene: with its initial points.
+        scene: with its initial points or model.
         config: says which points to take and how large and how opaque the Gaussians are.
 
     Raises:
@@ -32,13 +38,18 @@ def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
     """
     if scene.points is None:
         raise ValueError(f"scene {scene.name!r} has no initial points: load it with points='random'.")
-    start = Gaussians.from_points(
-        scene.points.positions,
-        scene.points.colors,
-        mean_neighbor_distance(scene.points.positions) * config.initial_scale,
-        sh_degree=config.sh_degree,
-        opacity=config.initial_opacity,
-    )
+    if scene.start is not None:
+        bands = (config.sh_degree + 1) ** 2 - 1
+        rest = scene.start.sh_rest[:, :bands]
+        start = replace(scene.start, sh_rest=pad(rest, (0, 0, 0, bands - rest.shape[1])))
+    else:
+        start = Gaussians.from_points(
+            scene.points.positions,
+            scene.points.colors,
+            mean_neighbor_distance(scene.points.positions) * config.initial_scale,
+            sh_degree=config.sh_degree,
+            opacity=config.initial_opacity,
+        )
     if config.initial_points == "all":
         return start
     seen = drawn_by_any(start, scene.train)

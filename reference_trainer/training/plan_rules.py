@@ -32,9 +32,12 @@ def sh_bands(scene: Scene, config: TrainConfig) -> Finding:
 
     Lower degrees for few views save time, but were not shown to be as good.
     """
-    name, reached = "SH bands", config.iterations // config.sh_every
+    name = "SH bands"
     if config.sh_degree == 0:
         return Finding(name, "left out", "asked for (sh_degree=0)")
+    if scene.start is not None:
+        return Finding(name, "used", f"all from the first step on: training starts from degree {scene.start.sh_degree}")
+    reached = config.sh_degree_at(config.iterations)
     if reached < config.sh_degree:
         reason = f"bands above degree {reached} would begin after the last step, {config.iterations}, and stay 0"
         return Finding(name, "reduced" if reached else "left out", reason, {"sh_degree": reached})
@@ -157,6 +160,8 @@ def initial_size(scene: Scene, config: TrainConfig) -> Finding:
     """The size of initial points. Distances between random points say nothing about a surface, and pile them up."""
     name, points = "size of initial points", _points(scene)
     count = len(points.positions)
+    if scene.start is not None:
+        return Finding(name, "used", f"by construction: {count} Gaussians have sizes of their own")
     if points.source != "random":
         size = f"as wide as {config.initial_scale:g} x the distance to their neighbours"
         return Finding(name, "used", f"{count} measured points, {size}")

@@ -31,7 +31,7 @@ class Trainer:
     """Fits Gaussians to the training views of a scene.
 
     Args:
-        scene: photographs, cameras and initial points.
+        scene: photographs, cameras and initial points; or a model to start from, all of whose bands train at once.
         config: all settings.
         device: where to train.
 
@@ -62,6 +62,8 @@ class Trainer:
 
     def __init__(self, scene: Scene, config: TrainConfig, device: torch.device | str = "cpu") -> None:
         config.check()
+        if scene.start is not None:  # whose colors have all bands already
+            config = dataclasses.replace(config, sh_every=0)
         self.scene = scene
         self.config = config
         self.device = torch.device(device)

@@ -23,8 +23,8 @@ from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
 __all__ = [
-    "small_scene", "write_blender", "write_checkpoint", "write_colmap_binary", "write_colmap_text", "write_image",
-    "write_llff", "write_log", "write_lpips", "write_model", "write_model_ascii", "write_points",
+    "small_scene", "write_arrays", "write_blender", "write_checkpoint", "write_colmap_binary", "write_colmap_text",
+    "write_image", "write_llff", "write_log", "write_lpips", "write_model", "write_model_ascii", "write_points",
     "write_run_settings", "write_split", "write_trainer",
 ]  # fmt: skip
 
@@ -87,6 +87,18 @@ def write_idr(folder: Path) -> None:
     world = np.array([[9.0, 0.0, 4.0, 1.0], [0.0, 9.5, 3.0, 2.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
     arrays = {f"{kind}_mat_{i}": x for kind, x in (("world", world), ("scale", np.eye(4))) for i in range(VIEWS)}
     np.savez(folder / "cameras_sphere.npz", **arrays)
+
+
+def write_arrays(folder: Path) -> None:
+    """Three cameras, points with colors and confidence, names, and pictures."""
+    _pictures(folder / "images")
+    points = np.arange(3.0 * POINTS).reshape(POINTS, 3)
+    np.savez(
+        folder / "predictions.npz", extrinsic=np.stack([np.eye(4)] * VIEWS),
+        intrinsic=np.array([[9.0, 0.0, 4.0], [0.0, 9.5, 3.0], [0.0, 0.0, 1.0]]), points=points,
+        colors=points.astype(np.uint8), conf=np.arange(1.0 * POINTS),
+        names=np.array([f"r_{i}.png" for i in range(VIEWS)]),
+    )  # fmt: skip
 
 
 def write_blender(folder: Path) -> None:

@@ -15,6 +15,7 @@ from ca_reg.dynamics import read_dynamics
 from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import read_run_settings
+from reference_trainer.scenes.arrays import read_arrays
 from reference_trainer.scenes.colmap import read_colmap
 from reference_trainer.scenes.idr import read_idr
 from reference_trainer.scenes.images import LARGEST_IMAGE, read_image
@@ -132,6 +133,14 @@ TARGETS = (
         "binary",
         checksummed=True,
         check=_frames_fit,
+    ),
+    Target(
+        "poses and points .npz",
+        "predictions.npz",
+        samples.write_arrays,
+        lambda folder: read_arrays(folder / "predictions.npz", folder / "images"),
+        "binary",  # the names of the arrays are outside the checksums, and those that nobody knows are passed over
+        check=lambda found: (_frames_fit(found[0]), _points_fit(found[1])),
     ),
     Target(
         "Blender transforms.json",

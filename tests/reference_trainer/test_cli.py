@@ -424,7 +424,7 @@ def test_an_unknown_scene(capsys, tmp_path):
     ("arguments", "message"),
     [
         (["train", "--dropout", "1.5"], "dropout must be in [0, 1), got 1.5"),
-        (["train", "--sh-every", "0"], "sh_every must be at least 1, got 0"),
+        (["train", "--sh-every", "-1"], "sh_every must be at least 0, got -1"),
         (["train", "--downscale", "0.5"], "downscale must be at least 1"),
         (["compare", "--seeds", "0"], "at least 1 scene, 1 strategy and 1 seed"),
         (["compare", "--jobs", "0"], "at least 1 job, got 0"),
@@ -479,7 +479,7 @@ def test_an_interruption(monkeypatch, capsys, tmp_path):
     with pytest.raises(SystemExit) as exit_:
         main(["train", "--out", str(tmp_path)])
     assert exit_.value.code == 130
-    assert "the same command continues where it was" in capsys.readouterr().err
+    assert "the same command goes on from what is finished" in capsys.readouterr().err
 
 
 def test_the_real_arguments_are_the_default(monkeypatch, capsys):

@@ -68,7 +68,7 @@ def test_a_format_of_the_users_own_trains(photographs, tmp_path, monkeypatch, ho
 def test_a_format_that_is_not_there(photographs):
     with pytest.raises(ValueError, match="must name a function"):
         load_scene(photographs, format="toy_scenes:read")
-    with pytest.raises(ValueError, match=r"has none of .*run COLMAP, VGGT or InstantSplat on them first"):
+    with pytest.raises(ValueError, match=r"the photographs in .* have no cameras yet: `ca-reg poses "):
         load_scene(photographs)
 
 
@@ -80,7 +80,7 @@ def test_few_photographs_all_train_from_whatever_points_there_are(photographs, c
     scene = load_scene(photographs)
     assert [view.name for view in scene.train] == list(PICTURES)
     assert scene.test == ()
-    assert scene.points.positions.tolist() == [[0.5, -1.5, 2.25], [-4, 8, 0.125]]
+    assert scene.points.positions[:2].tolist() == [[0.5, -1.5, 2.25], [-4, 8, 0.125]]
     held_out = load_scene(photographs, views=2)
     assert (len(held_out.train), len(held_out.test)) == (2, 1)
     assert held_out.points.source == "random"
@@ -109,8 +109,8 @@ def test_instantsplat_and_the_colours_of_point_clouds(photographs, colmap_text, 
     (folder / "points3D.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 2\n{head}end_header\n{row}\n{row}\n")
     points = load_scene(photographs).points
     assert points.seen_by == set(PICTURES)
-    assert points.positions.tolist() == [[1, 2, 3]] * 2
-    torch.testing.assert_close(points.colors, torch.tensor([colors] * 2))
+    assert points.positions[:2].tolist() == [[1, 2, 3]] * 2
+    torch.testing.assert_close(points.colors[:2], torch.tensor([colors] * 2))
 
 
 APPLIED = np.array([[0.0, 1, 0, 0.5], [1, 0, 0, 0], [0, 0, -1, 2]])  # nerfstudio's, moved

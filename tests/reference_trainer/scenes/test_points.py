@@ -1,15 +1,18 @@
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 
 import pytest
 import torch
 
 from reference_trainer.camera import Camera
+from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.points import (
     check_no_leak,
     choose_points,
     colmap_points,
+    filled,
 )
 from reference_trainer.scenes.random_points import random_points_in_box, random_points_in_frusta
 from reference_trainer.scenes.scene import PointCloud
@@ -110,3 +113,30 @@ def test_random_points_repeat_and_leave_the_global_state(draw):
     assert torch.equal(one.positions, two.positions)
     assert torch.equal(torch.get_rng_state(), before)
     assert not torch.equal(draw(torch.Generator().manual_seed(6)).positions, one.positions)
+
+
+def test_a_thin_cloud_gets_random_points_at_its_depths(generator):
+    frames = [
+        Frame(name, Path(name), looking(at, (0.0, 0.0, 10.0)))
+        for name, at in (("a", (0.0, 0.0, 0.0)), ("b", (1.0, 0.0, 0.0)))
+    ]
+    flat = torch.rand(999, 3, generator=generator) + torch.tensor([0.0, 0.0, 8.0])
+    thin = PointCloud(flat, torch.rand(999, 3, generator=generator), "sparse/0", frozenset("ab"))
+    more, note = filled(thin, frames, generator)
+    assert "10,000 random ones at their depths" in note
+    assert torch.equal(more.positions[:999], flat)
+    assert torch.equal(more.colors[:999], thin.colors)
+    assert (more.source, more.seen_by, len(more.positions)) == ("sparse/0", frozenset("ab"), 10_999)
+    known = torch.stack([frame.camera.project(flat)[1] for frame in frames])
+    depths = torch.stack([frame.camera.project(more.positions[999:])[1] for frame in frames])
+    within = (depths > known.min() - 1e-4) & (depths < known.max() + 1e-4)  # of the camera that drew it, at least
+    assert within.any(0).all()
+    assert within.sum() > 10_000
+
+
+def test_a_cloud_that_is_large_or_tells_no_depths_stays_as_it_is(generator):
+    frames = [Frame("a", Path("a"), looking((0.0, 0.0, 0.0), (0.0, 0.0, 10.0)))]
+    many = PointCloud(torch.rand(1000, 3, generator=generator) + 5, torch.zeros(1000, 3), "sparse/0")
+    behind = PointCloud(torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -2.0]]), torch.zeros(2, 3), "sparse/0")
+    for cloud in (many, behind, PointCloud(many.positions[:9], many.colors[:9], "random")):
+        assert filled(cloud, frames, generator) == (cloud, "")

@@ -52,7 +52,7 @@ def test_all_regularizers_are_one_expression(settings, text):
         ("densify_gradient", math.inf),
         ("regularize_from", -1),
         ("sh_degree", 4),
-        ("sh_every", 0),
+        ("sh_every", -1),
         ("means_rate", 0.0),
         ("means_rate_final", -1e-6),
         ("initial_points", "some"),

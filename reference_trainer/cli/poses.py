@@ -1,0 +1,39 @@
+"""The command that finds the cameras of photographs. Its fields are the options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+__all__ = ["Poses"]
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Find the cameras of photographs that have none, with COLMAP (ca_reg[colmap]), so that they can be trained on.
+
+    Writes sparse/0 beside them, and says which photographs were registered.
+    """
+
+    photos: Annotated[Path, tyro.conf.Positional]
+    """Folder of the photographs, two at least."""
+    out: Path | None = None
+    """Another scene folder to write, with copies of the photographs; by default theirs."""
+    camera: str | None = None
+    """COLMAP's name of the lens, such as OPENCV; by default SIMPLE_PINHOLE below 8 photographs, else SIMPLE_RADIAL."""
+    seed: int = 0
+    """Decides everything random."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from reference_trainer.scenes.poses import find_poses
+
+        found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, say=_say)
+        print(f"{found}\nThe cameras are in {found.folder}: ca-reg train {found.folder.parents[1]}")
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)

@@ -1,0 +1,165 @@
+"""Scenes of one ``.npz``: what scripts around VGGT, DUSt3R, MapAnything or Depth Anything save of their predictions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from reference_trainer.camera import Camera
+from reference_trainer.npy_files import read_npz
+from reference_trainer.scenes.formats import Capture, SceneFormat
+from reference_trainer.scenes.frames import Frame, view_matrix
+from reference_trainer.scenes.idr import IDR
+from reference_trainer.scenes.images import image_size, list_images, match_images, picture_folder
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import PointCloud
+
+__all__ = ["ARRAYS", "read_arrays"]
+
+TO_CAMERA = ("extrinsic", "extrinsics", "world_to_camera", "w2c", "cam_from_world", "viewmats")
+TO_WORLD = ("camera_poses", "camera_to_world", "cam2world", "c2w", "poses")
+INTRINSICS = ("intrinsic", "intrinsics", "K", "Ks")
+POINTS = ("points", "points3d", "pts3d", "world_points", "world_points_from_depth")
+COLORS = ("colors", "rgb", "images", "image")
+CONFIDENCE = ("confidence", "conf", "world_points_conf", "depth_conf")
+NAMES = ("image_names", "names", "image_paths")
+LARGEST = 2**30  # bytes of an array
+MOST_POINTS = 50_000  # what networks predict is a point for each pixel
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], PointCloud | None]:
+    """Read S cameras of an ``.npz`` file, pair them with the images of a folder, and read the points beside them.
+
+    Convention: OpenCV axes, half-integer pixel centers. ``extrinsic(s)``, ``world_to_camera``, ``w2c``,
+    ``cam_from_world`` and ``viewmats`` are world to camera; ``camera_poses``, ``camera_to_world``, ``cam2world``,
+    ``c2w`` and ``poses`` camera to world; both (S, 3, 4) or (S, 4, 4). ``intrinsic(s)``, ``K`` or ``Ks``, (S, 3, 3) or
+    (3, 3), are for pictures of the size of ``images``, ``depth`` or a map of points in the file, else of the image
+    files. Images belong to the cameras by ``image_names``, ``names`` or ``image_paths``, else in sorted order.
+
+    Points are ``points``, ``points3d``, ``pts3d``, ``world_points`` or ``world_points_from_depth``, (..., 3), else
+    ``depth`` (S, H, W) lifted, in the colors of ``colors``, ``rgb`` or ``images``: bytes, or floats up to 1. Of points
+    with a ``confidence`` the better half counts, of more than 50,000 every so many-th, and none that is not finite.
+
+    Raises:
+        FileNotFoundError: if the folder is missing.
+        ValueError: if there are no poses or intrinsics, or they make no cameras of the images.
+    """
+    path, folder = Path(path), Path(folder)
+    asked = (*TO_CAMERA, *TO_WORLD, *INTRINSICS, *POINTS, *COLORS, *CONFIDENCE, *NAMES, "depth")
+    arrays = read_npz(path, largest=LARGEST, names=asked)
+    arrays = {name: x for name, x in arrays.items() if (x.dtype.kind == "U") == (name in NAMES)}
+    poses, k = _first(arrays, (*TO_CAMERA, *TO_WORLD)), _first(arrays, INTRINSICS)
+    if poses is None or k is None:
+        raise ValueError(
+            f"{path} needs poses, called {', '.join(TO_CAMERA)} (world to camera) or {', '.join(TO_WORLD)} (camera to "
+            f"world), and intrinsics, called {', '.join(INTRINSICS)}; of names that mean something it has "
+            f"{sorted(arrays)}."
+        )
+    k = np.broadcast_to(k, (len(poses), 3, 3)) if k.shape == (3, 3) else k
+    if poses.ndim != 3 or poses.shape[1:] not in ((3, 4), (4, 4)) or k.shape != (len(poses), 3, 3):
+        raise ValueError(
+            f"{path}: poses must have shape (S, 3, 4) or (S, 4, 4) and intrinsics (S, 3, 3), got {poses.shape} and "
+            f"{k.shape}."
+        )
+    files, size, frames = _files(path, folder, _first(arrays, NAMES), len(poses)), _map_size(arrays), []
+    to_camera = not arrays.keys().isdisjoint(TO_CAMERA)
+    for file, pose, of in zip(files, poses, k, strict=True):
+        axes, at = (pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]) if to_camera else (pose[:3, :3].T, pose[:3, 3])
+        fx, fy, cx, cy = (float(of[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        try:
+            camera = Camera(view_matrix(axes, at), fx, fy, cx, cy, *(size or image_size(file)))
+        except ValueError as error:
+            raise ValueError(f"{path}: the camera of {file.name}: {error}") from error
+        frames.append(Frame(file.name, file, camera))
+    return frames, _points(path, arrays, frames)
+
+
+def _first(arrays: Arrays, names: Sequence[str]) -> NDArray[Any] | None:
+    """Return the first of some arrays that is there."""
+    return next((arrays[name] for name in names if name in arrays), None)
+
+
+def _files(path: Path, folder: Path, names: NDArray[Any] | None, count: int) -> list[Path]:
+    """Return the image files of the cameras."""
+    if names is None:
+        files = list_images(folder)
+    else:
+        stems = [re.split(r"[/\\]", str(name))[-1] for name in names.ravel()]
+        found = match_images(folder, stems)
+        files = [found[stem] for stem in stems]
+    if len(files) != count or len(set(files)) != count:
+        raise ValueError(f"{path} has {count} cameras for the {len(set(files))} images of {folder}: each needs one.")
+    return files
+
+
+def _map_size(arrays: Arrays) -> tuple[int, int] | None:
+    """Return width and height of the pictures that were predicted from, None if the file has no map of them."""
+    maps = [arrays[name].shape for name in ("images", "image", "depth", *POINTS) if name in arrays]
+    maps = [shape for shape in maps if len(shape) > 3 or (len(shape) == 3 and shape[2] != 3)]
+    if not maps:
+        return None
+    height, width = maps[0][2:4] if maps[0][1] == 3 else maps[0][1:3]
+    return width, height
+
+
+def _points(path: Path, arrays: Arrays, frames: Sequence[Frame]) -> PointCloud | None:
+    """Return the points, None if there are none."""
+    found = _first(arrays, POINTS)
+    if found is None and "depth" in arrays:
+        depths = arrays["depth"]
+        if depths.shape not in ((shape := (len(frames), *depths.shape[1:3])), (*shape, 1)):
+            raise ValueError(f"{path}: depth must have shape (S, H, W), got {depths.shape} for {len(frames)} cameras.")
+        found = np.stack([_lifted(depth, frame.camera) for depth, frame in zip(depths, frames, strict=True)])
+    if found is None:
+        return None
+    if found.shape[-1:] != (3,):
+        raise ValueError(f"{path}: points must have shape (..., 3), got {found.shape}.")
+    positions = found.reshape(-1, 3)
+    colors = np.full(positions.shape, 0.5)
+    for name in [name for name in COLORS if name in arrays][::-1]:
+        given = arrays[name]
+        given = np.moveaxis(given, 1, -1) if given.ndim == 4 and given.shape[1] == 3 else given
+        if given.size == positions.size:
+            colors = given.reshape(-1, 3) / (255 if given.dtype.kind in "iu" or given.max(initial=0) > 1 else 1)
+    keep, confidence = np.isfinite(positions).all(1), _first(arrays, CONFIDENCE)
+    if confidence is not None and confidence.size == len(positions):
+        keep &= confidence.ravel() >= np.median(confidence)
+    chosen = np.flatnonzero(keep)
+    chosen = chosen[:: -(-len(chosen) // MOST_POINTS) or 1]
+    if len(chosen) == 0:
+        return None
+    where, color = (torch.from_numpy(x[chosen].astype(np.float32)) for x in (positions, colors.clip(0, 1)))
+    return PointCloud(where, color, source=str(path), seen_by=frozenset(frame.name for frame in frames))
+
+
+def _lifted(depth: NDArray[Any], camera: Camera) -> NDArray[Any]:
+    """Return the world points (H, W, 3) of a map of depths along the camera's axis."""
+    rows, columns = (torch.arange(size) + 0.5 for size in depth.shape[:2])
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).double()
+    depths = torch.from_numpy(depth.reshape(depth.shape[:2]).astype(np.float64))
+    return camera.lift(pixels, depths.where(depths > 0, torch.nan)).numpy()
+
+
+def _files_of(root: Path) -> list[Path]:
+    """Return the ``.npz`` files of a folder, if it is none of IDR's."""
+    return [] if IDR.found(root) else sorted(root.glob("*.npz"))
+
+
+def _read(root: Path, options: SceneOptions) -> Capture:
+    """Read a scene folder."""
+    files = _files_of(root)
+    if len(files) != 1:
+        raise ValueError(f"{root} must hold one .npz with the poses, got {[file.name for file in files]}.")
+    frames, points = read_arrays(files[0], picture_folder(root, options.images))
+    return Capture(sorted(frames, key=lambda frame: frame.name), points=points)
+
+
+ARRAYS = SceneFormat("npz", "an .npz of poses", lambda root: bool(_files_of(root)), _read)

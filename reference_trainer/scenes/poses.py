@@ -1,0 +1,174 @@
+"""Cameras and points for photographs that have none: COLMAP's structure from motion, by pycolmap."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from reference_trainer.scenes.colmap import colmap_folders
+from reference_trainer.scenes.images import image_size, list_images
+
+__all__ = ["FoundPoses", "find_poses"]
+
+FEW = 8
+"""Below so many photographs the settings are others than COLMAP's, which are for dozens."""
+LARGEST_SIDE = 1600
+"""Pixels of the longer side at which features are looked for: beyond, time grows and poses hardly improve."""
+
+
+@dataclass(frozen=True)
+class FoundPoses:
+    """What was found of some photographs.
+
+    Args:
+        folder: of the COLMAP model, ``sparse/0`` in the scene.
+        registered: names of the photographs that have a camera now.
+        left_out: names of the others.
+        points: number of points.
+        error: mean reprojection error of their features, pixels of the photographs.
+        focal: focal lengths of the cameras, pixels, sorted.
+    """
+
+    folder: Path
+    registered: tuple[str, ...]
+    left_out: tuple[str, ...]
+    points: int
+    error: float
+    focal: tuple[float, ...]
+
+    def __str__(self) -> str:
+        """Say what was found, and what to do about the rest."""
+        lengths = " to ".join(f"{x:.0f}" for x in dict.fromkeys((self.focal[0], self.focal[-1])))
+        every = len(self.registered) + len(self.left_out)
+        lines = [
+            f"{len(self.registered)} of {every} photographs registered: {', '.join(self.registered)}",
+            f"{self.points:,} points, reprojection error {self.error:.2f} pixels, focal length {lengths} pixels",
+        ]
+        if self.left_out:
+            lines.append(
+                f"left out: {', '.join(self.left_out)}. They share too little with the others: add a photograph from "
+                "in between, or go on without them"
+            )
+        return "\n".join(lines)
+
+
+def find_poses(
+    scene: str | Path,
+    out: str | Path | None = None,
+    *,
+    camera: str | None = None,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda text: None,
+) -> FoundPoses:
+    """Find cameras and points of a folder of photographs, and write them as the COLMAP model ``sparse/0``.
+
+    The photographs are those in ``images`` of the scene folder, or in the folder itself. Those of one size and focal
+    length are taken to be from one camera. Below `FEW` photographs, where COLMAP's own settings find little, features
+    are described over several scales and affine shapes, points need two photographs instead of three, and a focal
+    length that a photograph's EXIF data tell is kept, for so few photographs know it less well. The model appears as a
+    whole or not at all. A second call gives the same result.
+
+    Args:
+        scene: folder of the photographs, sorted by name.
+        out: another scene folder to write, with copies of the photographs in ``images``; by default the same.
+        camera: COLMAP's name of a camera model; by default SIMPLE_PINHOLE below `FEW` photographs, else SIMPLE_RADIAL.
+        seed: of all that is random.
+        say: receives a line about what is happening.
+
+    Raises:
+        ImportError: if pycolmap is missing.
+        FileNotFoundError: if there is no such folder.
+        ValueError: if it holds fewer than two photographs, or they show too little in common for any camera.
+        FileExistsError: if the scene has cameras already.
+        OSError: if it cannot be written.
+    """
+    scene = Path(scene)
+    out = scene if out is None else Path(out)
+    photos = list_images(scene / "images" if (scene / "images").is_dir() else scene)
+    if len(photos) < 2:
+        raise ValueError(f"{photos[0].parent} holds 1 photograph, and depth needs at least 2: take another one.")
+    if found := colmap_folders(out):
+        raise FileExistsError(f"{out} has cameras already, in {found[0]}: train on it, or delete them to find others.")
+    with tempfile.TemporaryDirectory() as work:
+        model = _reconstruct(photos, Path(work), camera, seed, say)
+        if model is None:
+            raise ValueError(
+                f"none of the {len(photos)} photographs in {photos[0].parent} could be placed: neighboring ones must "
+                "show the same things from places some steps apart, sharp, without much that moves. Add photographs "
+                "from in between, or take the poses of VGGT or InstantSplat."
+            )
+        registered = {image.name for image in model.images.values() if image.has_pose}
+        if out != scene:
+            (out / "images").mkdir(parents=True, exist_ok=True)
+            for photo in photos:
+                shutil.copy2(photo, out / "images")
+        _write(model, out / "sparse" / "0")
+    return FoundPoses(
+        out / "sparse" / "0",
+        tuple(photo.name for photo in photos if photo.name in registered),
+        tuple(photo.name for photo in photos if photo.name not in registered),
+        model.num_points3D(),
+        model.compute_mean_reprojection_error(),
+        tuple(sorted(camera.mean_focal_length() for camera in model.cameras.values())),
+    )
+
+
+def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, say: Callable[[str], None]) -> Any:
+    """Return the reconstruction with the most photographs, None if there is none."""
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise ImportError("finding cameras needs pycolmap: pip install 'ca_reg[colmap]'.") from error
+    few, folder, database = len(photos) < FEW, photos[0].parent, work / "database.db"
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.set_random_seed(seed)
+    reader = pycolmap.ImageReaderOptions(camera_model=camera or ("SIMPLE_PINHOLE" if few else "SIMPLE_RADIAL"))
+    features = pycolmap.FeatureExtractionOptions(max_image_size=LARGEST_SIDE)
+    features.sift.estimate_affine_shape = features.sift.domain_size_pooling = few
+    alike, known = defaultdict(list), True
+    for photo in photos:
+        taken_with = pycolmap.infer_camera_from_image(photo)
+        known = known and taken_with.has_prior_focal_length
+        alike[(*image_size(photo), taken_with.mean_focal_length())].append(photo.name)
+    pycolmap.Database.open(database).close()
+    for (width, height, _), names in alike.items():
+        say(f"looking for features in {len(names)} photographs of {width}x{height} ...")
+        # In order, for threads would finish in any, and the numbers of the photographs are part of the result.
+        pycolmap.import_images(
+            database, folder, camera_mode=pycolmap.CameraMode.SINGLE, image_names=names, options=reader
+        )
+        pycolmap.extract_features(
+            database, folder, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=features
+        )
+    say(f"matching {len(photos) * (len(photos) - 1) // 2} pairs ...")
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    pycolmap.match_exhaustive(database, verification_options=verification)
+    say("placing cameras and points ...")
+    # One thread: the order of additions, and so the result, would depend on how many there are.
+    mapping = pycolmap.IncrementalPipelineOptions(min_model_size=2, num_threads=1, random_seed=seed)
+    if few:
+        mapping.triangulation.ignore_two_view_tracks = False
+        mapping.mapper.init_min_tri_angle, mapping.mapper.init_min_num_inliers = 4.0, 30
+        mapping.mapper.abs_pose_min_num_inliers = 15
+        mapping.ba_refine_focal_length = mapping.mapper.abs_pose_refine_focal_length = not known
+    models = pycolmap.incremental_mapping(database, folder, work, options=mapping).values()
+    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+
+
+def _write(model: Any, folder: Path) -> None:
+    """Write a model beside its place and move it there."""
+    part = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(part, ignore_errors=True)  # of a process that was killed
+    part.mkdir(parents=True)
+    try:
+        model.write_binary(part)
+        os.replace(part, folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)

@@ -1,0 +1,154 @@
+"""Cameras of photographs that have none, held against the cameras that took them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from reference_trainer.cli import main
+from reference_trainer.scenes import load_scene
+from reference_trainer.scenes.colmap import read_colmap
+from reference_trainer.scenes.poses import _write, find_poses
+
+
+@pytest.fixture
+def noise(tmp_path):
+    """Three photographs without anything in common, and without a scale at which they have corners."""
+    for i in range(3):
+        pixels = np.random.default_rng(i).integers(0, 256, (90, 120, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f"{i}.png")
+    return tmp_path
+
+
+def centers_and_axes(cameras):
+    centers = np.array([camera.position.double().numpy() for camera in cameras])
+    return centers, np.array([camera.world_to_camera[:3, :3].double().numpy() for camera in cameras])
+
+
+def errors(found, true) -> tuple[float, float]:
+    """Largest errors of a rotation, degrees, and of a center, by the largest distance, after the best similarity.
+
+    The rotation between the worlds is the mean of those that the cameras tell, made a rotation.
+    """
+    (p, r), (q, s) = centers_and_axes(found), centers_and_axes(true)
+    u, _, v = np.linalg.svd(np.einsum("nij,nik->jk", s, r))
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    p, q = (p - p.mean(0)) @ turn.T, q - q.mean(0)
+    apart = (
+        np.linalg.norm((p * q).sum() / (p**2).sum() * p - q, axis=1).max()
+        / np.linalg.norm(q[:, None] - q, axis=2).max()
+    )
+    cosines = [(np.trace(of.T @ at @ turn.T) - 1) / 2 for of, at in zip(s, r, strict=True)]
+    return float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).max()), float(apart)
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_three_photographs_of_fern(data_root, tmp_path, capsys):
+    pycolmap = pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
+    fern, photos, again = data_root / "fern", tmp_path / "photos", tmp_path / "again"
+    names = json.loads((fern / "split.json").read_text())["train"]
+    photos.mkdir()
+    for name in names:
+        Image.open(fern / "images_8" / name).save(photos / name)
+
+    main(["poses", str(photos)])
+    said = capsys.readouterr().out
+    assert "3 of 3 photographs registered: image001.png, image010.png, image019.png" in said
+    assert f"ca-reg train {photos}" in said
+
+    loaded = load_scene(photos)
+    true = {view.name: view.camera for view in load_scene(fern, images="images_8", test="none").train}
+    rotation, center = errors([view.camera for view in loaded.train], [true[view.name] for view in loaded.train])
+    # What COLMAP found of all 20 photographs is the truth here; one pixel is 0.14 degrees. Three photographs determine
+    # the focal length poorly, and a wrong one turns the cameras.
+    assert rotation < 1
+    assert center < 0.02
+    assert len(loaded.points.positions) > 300
+    assert loaded.points.seen_by == set(names)
+
+    # pycolmap reads the same from the files.
+    model, theirs = read_colmap(photos / "sparse/0"), pycolmap.Reconstruction(photos / "sparse/0")
+    for image in model.images:
+        other = theirs.images[image.id]
+        assert other.name == image.name
+        assert other.cam_from_world().matrix() == pytest.approx(image.world_to_camera[:3], abs=1e-12)
+    assert {i: p.xyz.tolist() for i, p in theirs.points3D.items()} == dict(
+        zip(model.points.ids.tolist(), model.points.positions.tolist(), strict=True)
+    )
+
+    # The same photographs give the same cameras, and another folder gets copies of them.
+    before = (photos / "sparse").rename(tmp_path / "before") / "0"
+    assert find_poses(photos, again).registered == tuple(names)
+    for file in before.iterdir():
+        assert file.read_bytes() == (again / "sparse/0" / file.name).read_bytes(), file.name
+    assert [path.name for path in sorted((again / "images").iterdir())] == names
+    assert [path.name for path in sorted(photos.iterdir())] == names
+
+
+@pytest.mark.slow
+def test_photographs_with_nothing_in_common(noise):
+    pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
+    with pytest.raises(
+        ValueError, match=r"none of the 3 photographs in .* could be placed: neighboring ones must show"
+    ):
+        find_poses(noise)
+    assert sorted(path.name for path in noise.iterdir()) == ["0.png", "1.png", "2.png"]
+
+
+def test_without_pycolmap(noise, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(SystemExit) as stop:
+        main(["poses", str(noise)])
+    assert stop.value.code == 2
+    assert "needs pycolmap: pip install 'ca_reg[colmap]'" in capsys.readouterr().err
+
+
+def test_photographs_without_cameras_are_told_how_to_get_them(noise, capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--path", str(noise), "--out", str(noise / "run")])
+    assert (
+        f"the photographs in {noise} have no cameras yet: `ca-reg poses {noise}` finds them" in capsys.readouterr().err
+    )
+
+
+def test_too_few_photographs_and_cameras_that_are_there(noise, colmap_text):
+    (noise / "0.png").unlink()
+    (noise / "1.png").unlink()
+    with pytest.raises(ValueError, match="holds 1 photograph, and depth needs at least 2"):
+        find_poses(noise)
+    Image.new("RGB", (8, 6)).save(noise / "b.png")
+    colmap_text(noise / "sparse" / "0")
+    with pytest.raises(FileExistsError, match=r"has cameras already, in .*sparse/0: train on it, or delete them"):
+        find_poses(noise)
+
+
+class Model:
+    """Stands for a reconstruction; writing it may fail half-way."""
+
+    def __init__(self, fails: bool) -> None:
+        self.fails = fails
+
+    def write_binary(self, folder: Path) -> None:
+        (folder / "cameras.bin").write_bytes(b"half")
+        if self.fails:
+            raise OSError(28, "No space left on device")
+        (folder / "images.bin").write_bytes(b"all")
+
+
+def test_a_model_is_written_whole_or_not_at_all(tmp_path):
+    folder = tmp_path / "sparse" / "0"
+    with pytest.raises(OSError, match="No space left"):
+        _write(Model(fails=True), folder)
+    assert not any((tmp_path / "sparse").iterdir())
+    killed = tmp_path / "sparse" / ".0.part"  # of a process that had no time to clean up
+    killed.mkdir()
+    (killed / "points3D.bin").write_bytes(b"old")
+    _write(Model(fails=False), folder)
+    assert {path.name for path in folder.iterdir()} == {"cameras.bin", "images.bin"}
+    assert not killed.exists()
