@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.constants import MIN_ALPHA, TILE
 from reference_trainer.render.splats import Projection, TileLists
@@ -89,7 +89,9 @@ def _measure(
         ellipse = ellipses[i]
         ellipse[0], ellipse[1], ellipse[5], ellipse[7] = x, y, limit, f4(row)
         ellipse[2], ellipse[3], ellipse[4] = factors[i, 0], factors[i, 1], factors[i, 2]
-        ellipse[6] = covariances[i, 1] * math.sqrt(limit / covariances[i, 0])  # the dy at which it reaches furthest right
+        ellipse[6] = covariances[i, 1] * math.sqrt(
+            limit / covariances[i, 0]
+        )  # the dy at which it reaches furthest right
 
 
 @kernel
@@ -100,6 +102,7 @@ def _find_spans(
     """Find the tiles of every strip, nearest first: within one, an ellipse covers an interval of columns."""
     columns = (width + TILE - 1) // TILE
     for place in range(first, last):
+        prefetch(ellipses[order[min(place + 8, len(order) - 1)]])
         i = order[place]
         x, y, a, b, c, limit, tip, top = ellipses[i]
         row, total = np.int32(top), 0
@@ -128,6 +131,7 @@ def _walk(
     for part in range(first, last):
         at = places[part]
         for place in range(part * order.shape[0] // _PARTS, (part + 1) * order.shape[0] // _PARTS):
+            prefetch(offsets[order[min(place + 8, len(order) - 1)] :])
             i = order[place]
             slot = offsets[i]
             for strip in range(strips[place], strips[place + 1]):

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.render.constants import MIN_ALPHA, MIN_TRANSMITTANCE
 from reference_trainer.render.loops import tiles
 from reference_trainer.render.loops.tiles import CHUNK, PIXELS
@@ -155,6 +155,9 @@ def _backward(
             s[_LIGHT + p] = _ONE
         ended = False
         for e in range(starts[tile], starts[tile + 1]):
+            ahead = min(e + 6, len(gaussians) - 1)
+            prefetch(table[gaussians[ahead]])
+            prefetch(rows[slots[ahead]])
             i = gaussians[e]
             row = rows[slots[e]]
             if ended or tiles.is_faint(table, i):

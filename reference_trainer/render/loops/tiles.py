@@ -11,7 +11,7 @@ from numba import types
 from numba.extending import intrinsic
 from torch import Tensor
 
-from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
 from reference_trainer.render.splats import Splats, TileLists
@@ -129,6 +129,7 @@ def read_entries(
     """
     count = 0
     for e in range(first, last, step):
+        prefetch(table[gaussians[max(0, min(e + CHUNK * step, len(gaussians) - 1))]])
         i = gaussians[e]
         if is_faint(table, i):
             continue
