@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -9,10 +11,11 @@ from reference_trainer.camera import Camera
 from reference_trainer.render.checks import check_projection
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.eager import formulas
+from reference_trainer.render.eager.absolute import absolute_gradients
 from reference_trainer.render.eager.binning import bin_gaussians
 from reference_trainer.render.eager.projection import project
 from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
-from reference_trainer.render.eager.walk import geometry_rows, walk
+from reference_trainer.render.eager.walk import blocks, geometry_rows, walk
 from reference_trainer.render.splats import MomentImages, Splats
 
 __all__ = ["TorchEngine"]
@@ -63,6 +66,13 @@ class TorchEngine:
         drawn = (self.composite(self.masked(splats, row), background, depth=False) for row in opacities)
         images, alphas, _ = zip(*drawn, strict=True)
         return torch.stack(images), torch.stack(alphas)
+
+    def absolute_gradients(
+        self, splats: Splats, values: Tensor, background: Tensor, _drawn: Tensor
+    ) -> Callable[[Tensor], Tensor]:
+        """Take the blocks of the lists now: the backward pass is to wait for nothing."""
+        tiles = list(blocks(splats.lists, values.device))
+        return lambda gradient: absolute_gradients(splats, values, gradient, background, tiles)
 
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Composite mean and variance back to front."""
