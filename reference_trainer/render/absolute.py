@@ -51,8 +51,9 @@ def absgrad_sink(means: Tensor) -> Tensor:
 
 
 def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tensor | None = None) -> Rendering:
-    """Return the rendering, whose backward pass also delivers `absolute_gradients`: as the gradient of ``sink`` (M, 2).
+    """Return the rendering, whose backward pass also delivers `Engine.absolute_gradients`.
 
+    They become the gradient of ``sink`` (M, 2).
     The values of the sink do not matter. The background (3,) of the image is black by default.
     """
     splats, shown = _detached(rendering.splats), rendering.depth

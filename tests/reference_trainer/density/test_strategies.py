@@ -20,7 +20,7 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians, inverse_sigmoid
 from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render.eager.absolute import absolute_gradients
+from reference_trainer.render.eager.engine import TorchEngine
 from reference_trainer.render.engine import engine_for
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import make_plan
@@ -171,7 +171,7 @@ def test_absgrad_counts_sums_of_absolute_values_of_what_was_drawn(tiny_scene):
             out = render_gaussians(drawn, step.view.camera, trainer.background, sh_degree=step.sh_degree)
         image = out.image - step.view.image
         upstream = torch.cat([image.sign() / image.numel(), torch.zeros_like(out.alpha)[None]])
-        sums = absolute_gradients(out.splats, out.splats.colors, upstream, trainer.background)
+        sums = TorchEngine().absolute_gradients(out.splats, out.splats.colors, trainer.background, out.image)(upstream)
         half = torch.tensor([step.view.camera.width / 2, step.view.camera.height / 2])
         expected[out.splats.indices] += (sums * half).norm(dim=1).double()
         counts[out.splats.indices[out.splats.lists.touched]] += 1
