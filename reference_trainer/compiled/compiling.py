@@ -10,9 +10,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
 from numba.core.caching import FunctionCache, NullCache
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
 
-__all__ = ["KERNELS", "describe_compilation", "inlined", "kernel", "reported_to"]
+__all__ = ["KERNELS", "describe_compilation", "inlined", "kernel", "prefetch", "reported_to"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -134,3 +139,18 @@ def inlined(function: F) -> F:
     """Compile a part of kernels into each of them."""
     compiled: F = numba.njit(inline="always", fastmath=_FAST, error_model="numpy")(function)
     return compiled
+
+
+@intrinsic
+def prefetch(_context: Any, _array: Any) -> Any:
+    """Have the beginning of an array fetched that is needed soon, so that nobody waits for the memory then."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        start = builder.bitcast(make_array(signature.args[0])(context, builder, arguments[0]).data, cgutils.voidptr_t)
+        whole = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [start.type, whole, whole, whole])
+        fetch = builder.module.declare_intrinsic("llvm.prefetch", [start.type], kind)
+        builder.call(fetch, [start, *(whole(x) for x in (0, 3, 1))])  # to be read, and kept in all caches; data
+        return context.get_dummy_value()
+
+    return types.void(_array), generate

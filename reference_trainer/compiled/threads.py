@@ -19,7 +19,7 @@ import torch
 
 __all__ = ["in_threads"]
 
-_RANGES = 8  # for each thread: so many that none waits long for the others
+_RANGES = 32  # for each thread: so many that none waits long for the others
 _LEAST = 64  # items worth a call
 
 _pools: dict[int, ThreadPoolExecutor] = {}

@@ -6,6 +6,7 @@ import functools
 import importlib.util
 import os
 import warnings
+from collections.abc import Callable
 from importlib.metadata import version
 from typing import Protocol
 
@@ -48,6 +49,15 @@ class Engine(Protocol):
 
     def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
         """Draw splats with K other opacities, (K, M), as in `masked`: images (K, 3, H, W), alphas; no gradients."""
+
+    def absolute_gradients(
+        self, splats: Splats, values: Tensor, background: Tensor, drawn: Tensor
+    ) -> Callable[[Tensor], Tensor]:
+        """Return what sums the absolute gradients that pixels give to the positions (AbsGS), (M, 2), without a graph.
+
+        The values (M, 4), colours and depth, were drawn over the background (4,); ``drawn`` is their picture and the
+        accumulated alpha, (5, H, W), and what is returned takes the gradient of a loss with respect to that.
+        """
 
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Return mean and variance of every pixel under random factors on the alphas of the full model.

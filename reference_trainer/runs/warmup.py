@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 
@@ -57,8 +58,9 @@ def _use_everything() -> None:
     from reference_trainer.training.trainer import Trainer
 
     scene = synthetic_scene(width=8, height=6, points=20)
-    for analytic in (False, True):
-        trainer = Trainer(scene, TrainConfig(iterations=1, dropout=0.2, analytic=analytic))
+    plain = TrainConfig(iterations=1, dropout=0.2)
+    for config in (plain, replace(plain, analytic=True), replace(plain, density="absgrad")):
+        trainer = Trainer(scene, config)
         trainer.train_step()
     model, view = model_of(trainer), trainer.views[0]
     opacities = model.gaussians.opacities.detach().requires_grad_()

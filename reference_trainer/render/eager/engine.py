@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -12,7 +14,7 @@ from reference_trainer.render.eager import formulas
 from reference_trainer.render.eager.binning import bin_gaussians
 from reference_trainer.render.eager.projection import project
 from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
-from reference_trainer.render.eager.walk import geometry_rows, walk
+from reference_trainer.render.eager.walk import blocks, geometry_rows, pad_entries, pixel_offsets, tile, walk
 from reference_trainer.render.splats import MomentImages, Splats
 
 __all__ = ["TorchEngine"]
@@ -63,6 +65,32 @@ class TorchEngine:
         drawn = (self.composite(self.masked(splats, row), background, depth=False) for row in opacities)
         images, alphas, _ = zip(*drawn, strict=True)
         return torch.stack(images), torch.stack(alphas)
+
+    def absolute_gradients(
+        self, splats: Splats, values: Tensor, background: Tensor, _drawn: Tensor
+    ) -> Callable[[Tensor], Tensor]:
+        """Differentiate block after block; these are made now: the backward pass is to wait for nothing."""
+        rows = pad_entries(torch.cat([geometry_rows(splats), values.T]))
+        of_lists, pixels = list(blocks(splats.lists, rows.device)), pixel_offsets(rows)
+
+        def sums(gradient: Tensor) -> Tensor:
+            upstream, total = tile(gradient, splats.lists), rows.new_zeros(2, rows.shape[1])
+            for block in of_lists:
+                entries = rows[:, block.gaussians]
+                raw = block.alphas(entries[:6]).requires_grad_()
+                with torch.enable_grad():
+                    drawn = formulas.over(formulas.blend_weights(raw), entries[6:], background[:, None])
+                (to_raw,) = torch.autograd.grad(drawn, raw, upstream[block.tiles])
+                # ln alpha falls by half the square of (l11 dx + l21 dy, l22 dy); its gradient in the position is that
+                # of alpha divided by alpha.
+                x, y, l11, l21, l22 = entries[:5, :, None]
+                dx, dy = pixels[0] + block.centers[0][..., None] - x, pixels[1] + block.centers[1][..., None] - y
+                w1, w2 = l11 * dx + l21 * dy, l22 * dy
+                slopes = raw.detach() * to_raw * torch.stack([l11 * w1, l21 * w1 + l22 * w2])
+                total.index_add_(1, block.gaussians.flatten(), slopes.abs().sum(2).flatten(1))
+            return total[:, :-1].T
+
+        return sums
 
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Composite mean and variance back to front."""

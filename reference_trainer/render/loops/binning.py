@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.constants import MIN_ALPHA, TILE
 from reference_trainer.render.splats import Projection, TileLists
@@ -71,33 +71,42 @@ def _nearest_first(depths: Array) -> Any:
 
 
 @kernel
-def _count_strips(
-    first: int, last: int, centers: Array, covariances: Array, opacities: Array, height: int, rows: Array, counts: Array
-) -> None:
-    """Find the first row of tiles that each ellipse touches, and how many."""
+def _measure(
+    first: int, last: int, centers: Array, factors: Array, covariances: Array, opacities: Array, height: int,
+    ellipses: Array, strips: Array,
+) -> None:  # fmt: skip
+    """Collect what `_find_spans` needs of every ellipse, its first row of tiles the last, and count its rows of tiles.
+
+    One row of memory for each: the nearest first are all over the memory, and what counts then is the number of places.
+    """
     size = f4(height)
     for i in range(first, last):
-        reach = math.sqrt(_squared_radius(opacities[i]) * covariances[i, 2])
-        top, bottom = _first_pixel(centers[i, 1] - reach, size), _last_pixel(centers[i, 1] + reach, size)
-        rows[i] = np.int32(top) // TILE
-        counts[i] = np.int32(bottom) // TILE - rows[i] + 1 if bottom >= top else 0
+        x, y, limit = centers[i, 0], centers[i, 1], _squared_radius(opacities[i])
+        reach = math.sqrt(limit * covariances[i, 2])
+        top, bottom = _first_pixel(y - reach, size), _last_pixel(y + reach, size)
+        row = np.int32(top) // TILE
+        strips[i] = np.int32(bottom) // TILE - row + 1 if bottom >= top else 0
+        ellipse = ellipses[i]
+        ellipse[0], ellipse[1], ellipse[5], ellipse[7] = x, y, limit, f4(row)
+        ellipse[2], ellipse[3], ellipse[4] = factors[i, 0], factors[i, 1], factors[i, 2]
+        ellipse[6] = covariances[i, 1] * math.sqrt(
+            limit / covariances[i, 0]
+        )  # the dy at which it reaches furthest right
 
 
 @kernel
 def _find_spans(
-    first: int, last: int, centers: Array, factors: Array, covariances: Array, opacities: Array, width: int,
-    height: int, rows: Array, strips: Array, spans: Array, entries: Array,
+    first: int, last: int, order: Array, ellipses: Array, width: int, height: int, strips: Array, spans: Array,
+    entries: Array,
 ) -> None:  # fmt: skip
-    """Find the tiles of every strip: within one, an ellipse covers an interval of columns."""
+    """Find the tiles of every strip, nearest first: within one, an ellipse covers an interval of columns."""
     columns = (width + TILE - 1) // TILE
-    for i in range(first, last):
-        x, y = centers[i, 0], centers[i, 1]
-        a, b, c = factors[i, 0], factors[i, 1], factors[i, 2]
-        limit = _squared_radius(opacities[i])
-        tip = covariances[i, 1] * math.sqrt(limit / covariances[i, 0])  # the dy at which it reaches furthest right
-        total = 0
-        for strip in range(strips[i], strips[i + 1]):
-            row = rows[i] + strip - strips[i]
+    for place in range(first, last):
+        prefetch(ellipses[order[min(place + 8, len(order) - 1)]])
+        i = order[place]
+        x, y, a, b, c, limit, tip, top = ellipses[i]
+        row, total = np.int32(top), 0
+        for strip in range(strips[place], strips[place + 1]):
             upper = f4(row * TILE) + _HALF - y
             lower = min(f4(row * TILE) + (_TILE - _HALF), f4(height) - _HALF) - y
             to_left, to_right = min(max(-tip, upper), lower), min(max(tip, upper), lower)
@@ -108,6 +117,7 @@ def _find_spans(
             spans[strip, 0] = row * columns + np.int32(left) // TILE
             spans[strip, 1] = row * columns + np.int32(right) // TILE + 1 if right >= left else spans[strip, 0]
             total += spans[strip, 1] - spans[strip, 0]
+            row += 1
         entries[i] = total
 
 
@@ -121,9 +131,10 @@ def _walk(
     for part in range(first, last):
         at = places[part]
         for place in range(part * order.shape[0] // _PARTS, (part + 1) * order.shape[0] // _PARTS):
+            prefetch(offsets[order[min(place + 8, len(order) - 1)] :])
             i = order[place]
             slot = offsets[i]
-            for strip in range(strips[i], strips[i + 1]):
+            for strip in range(strips[place], strips[place + 1]):
                 for tile in range(spans[strip, 0], spans[strip, 1]):
                     if fill:
                         gaussians[at[tile]] = i
@@ -147,11 +158,11 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
     m, f, c, z = (x.detach().numpy() for x in projection)
     o = opacities.detach().numpy()
     count, tiles, order = m.shape[0], -(-width // TILE) * -(-height // TILE), _nearest_first(z)
-    rows, of_rows, entries = (np.empty(count, np.int32) for _ in range(3))
-    in_threads(_count_strips, count, m, c, o, height, rows, of_rows, least=8192)
-    strips = _ends(of_rows)
+    ellipses, of_rows, entries = np.empty((count, 8), f4), np.empty(count, np.int32), np.empty(count, np.int32)
+    in_threads(_measure, count, m, f, c, o, height, ellipses, of_rows, least=8192)
+    strips = _ends(of_rows[order])
     spans = np.empty((strips[-1], 2), np.int32)
-    in_threads(_find_spans, count, m, f, c, o, width, height, rows, strips, spans, entries, least=4096)
+    in_threads(_find_spans, count, order, ellipses, width, height, strips, spans, entries, least=4096)
     offsets, of_parts, nothing = _ends(entries), np.zeros((_PARTS, tiles), np.int64), np.empty(0, np.int32)
     least = -(-_PARTS * 4096 // max(1, count))  # parts that are worth a thread
     in_threads(_walk, _PARTS, order, strips, spans, offsets, of_parts, nothing, nothing, least=least)

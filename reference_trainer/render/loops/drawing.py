@@ -6,19 +6,20 @@ back as well: what lies behind a splat is what was drawn less what has been pass
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.render.constants import MIN_ALPHA, MIN_TRANSMITTANCE
 from reference_trainer.render.loops import tiles
 from reference_trainer.render.loops.tiles import CHUNK, PIXELS
 from reference_trainer.render.splats import Splats
 
-__all__ = ["composite", "composite_masks"]
+__all__ = ["absolute_gradients", "composite", "composite_masks"]
 
 Array = Any
 f4 = np.float32
@@ -26,7 +27,7 @@ _ZERO, _ONE, _LEAST_LIGHT, _LEAST = f4(0), f4(1), f4(MIN_TRANSMITTANCE), f4(MIN_
 
 # Places in a tile's state: what is kept of every pixel stands in one array, so that the compiler sees that nothing
 # overlaps. With an array for each it would give up and not use vector instructions: four times slower.
-_LIGHT, _RED, _GREEN, _BLUE, _BEHIND, _SLOPE = (i * PIXELS for i in range(6))
+_LIGHT, _RED, _GREEN, _BLUE, _DEPTH, _BEHIND, _SLOPE = (i * PIXELS for i in range(7))
 
 
 @inlined
@@ -140,45 +141,63 @@ def _masked(
             _finish(states[picture], background, drawn[picture], tile, columns)
 
 
-@kernel
-def _backward(
-    first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array, drawn: Array,
-    upstream: Array, rows: Array,
-) -> None:  # fmt: skip
-    s, d = np.empty(6 * PIXELS, f4), np.empty(4 * PIXELS, f4)
-    for tile in range(first, last):
-        tiles.load(upstream, tile, columns, s, _LIGHT)
-        tiles.load(drawn, tile, columns, d, _LIGHT)
-        for p in range(PIXELS):
-            of_colors = s[_RED + p] * d[_RED + p] + s[_GREEN + p] * d[_GREEN + p] + s[_BLUE + p] * d[_BLUE + p]
-            s[_BEHIND + p] = of_colors + s[_LIGHT + p] * d[_LIGHT + p]
-            s[_LIGHT + p] = _ONE
-        ended = False
-        for e in range(starts[tile], starts[tile + 1]):
-            i = gaussians[e]
-            row = rows[slots[e]]
-            if ended or tiles.is_faint(table, i):
-                row[:] = _ZERO
-                continue
-            polynomial = tiles.footprint(table, i, tile, columns)
-            r, g, b = table[i, 6], table[i, 7], table[i, 8]
-            to_r, to_g, to_b = _ZERO, _ZERO, _ZERO
+def _make_backward(absolute: bool) -> Any:
+    """Return the kernel of the gradients, or of the sums of their absolute values in the positions, with a depth."""
+
+    @kernel
+    def _backward(
+        first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array, drawn: Array,
+        upstream: Array, rows: Array,
+    ) -> None:  # fmt: skip
+        s, d = np.empty(7 * PIXELS, f4), np.empty(5 * PIXELS, f4)
+        for tile in range(first, last):
+            tiles.load(upstream, tile, columns, s, _LIGHT)
+            tiles.load(drawn, tile, columns, d, _LIGHT)
             for p in range(PIXELS):
-                raw, now = tiles.alpha_at(polynomial, p), s[_LIGHT + p]
-                alpha = tiles.clamped(raw)
-                weight, rest = _pass(alpha, now)
-                along = s[_RED + p] * r + s[_GREEN + p] * g + s[_BLUE + p] * b
-                beyond = s[_BEHIND + p] - weight * along
-                s[_BEHIND + p], s[_LIGHT + p] = beyond, rest
-                # A splat adds T c itself, and dims by 1 / (1 - alpha) all behind it; the clamp lets gradients pass.
-                s[_SLOPE + p] = raw * (now * along - beyond / (_ONE - alpha)) if rest > _ZERO else _ZERO
-                to_r += weight * s[_RED + p]
-                to_g += weight * s[_GREEN + p]
-                to_b += weight * s[_BLUE + p]
-            tiles.footprint_gradient(table, i, tile, columns, s[_SLOPE:], row)
-            row[6], row[7], row[8] = to_r, to_g, to_b
-            if e % CHUNK == 0:
-                ended = _have_ended(s)
+                of_colors = s[_RED + p] * d[_RED + p] + s[_GREEN + p] * d[_GREEN + p] + s[_BLUE + p] * d[_BLUE + p]
+                s[_BEHIND + p] = of_colors + s[_LIGHT + p] * d[_LIGHT + p]
+                if absolute:
+                    s[_BEHIND + p] += s[_DEPTH + p] * d[_DEPTH + p]
+                s[_LIGHT + p] = _ONE
+            ended = False
+            for e in range(starts[tile], starts[tile + 1]):
+                ahead = min(e + 6, len(gaussians) - 1)
+                prefetch(table[gaussians[ahead]])
+                prefetch(rows[slots[ahead]])
+                i = gaussians[e]
+                row = rows[slots[e]]
+                if ended or tiles.is_faint(table, i):
+                    row[:] = _ZERO
+                    continue
+                polynomial = tiles.footprint(table, i, tile, columns)
+                r, g, b = table[i, 6], table[i, 7], table[i, 8]
+                to_r, to_g, to_b = _ZERO, _ZERO, _ZERO
+                for p in range(PIXELS):
+                    raw, now = tiles.alpha_at(polynomial, p), s[_LIGHT + p]
+                    alpha = tiles.clamped(raw)
+                    weight, rest = _pass(alpha, now)
+                    along = s[_RED + p] * r + s[_GREEN + p] * g + s[_BLUE + p] * b
+                    if absolute:
+                        along += s[_DEPTH + p] * table[i, 9]
+                    beyond = s[_BEHIND + p] - weight * along
+                    s[_BEHIND + p], s[_LIGHT + p] = beyond, rest
+                    # A splat adds T c itself, and dims by 1 / (1 - alpha) all behind it; the clamp lets gradients pass.
+                    s[_SLOPE + p] = raw * (now * along - beyond / (_ONE - alpha)) if rest > _ZERO else _ZERO
+                    to_r += weight * s[_RED + p]
+                    to_g += weight * s[_GREEN + p]
+                    to_b += weight * s[_BLUE + p]
+                if absolute:
+                    row[0], row[1] = tiles.absolute_slopes(table, i, tile, columns, s[_SLOPE:])
+                else:
+                    tiles.footprint_gradient(table, i, tile, columns, s[_SLOPE:], row)
+                    row[6], row[7], row[8] = to_r, to_g, to_b
+                if e % CHUNK == 0:
+                    ended = _have_ended(s)
+
+    return _backward
+
+
+_backward, _absolute = _make_backward(False), _make_backward(True)
 
 
 def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> Tensor:
@@ -217,3 +236,19 @@ def composite(splats: Splats, background: Tensor) -> Tensor:
         splats, background, p.means, p.factors, splats.opacities, splats.colors
     )
     return splats.lists.cut(drawn)
+
+
+def absolute_gradients(
+    splats: Splats, values: Tensor, _background: Tensor, drawn: Tensor
+) -> Callable[[Tensor], Tensor]:
+    """Return what sums the absolute gradients of positions, see `Engine.absolute_gradients`."""
+    lists, table = splats.lists, tiles.make_table(splats._replace(colors=values))
+    images = lists.padded(torch.cat([1 - drawn[4:], drawn[:4]]))
+
+    def sums(gradient: Tensor) -> Tensor:
+        rows, upstream = table.new_empty(lists.gaussians.shape[0], 2), torch.cat([-gradient[4:], gradient[:4]])
+        assert lists.slots is not None
+        tiles.over_tiles(_absolute, lists, lists.slots, table, images, lists.padded(upstream), rows)
+        return tiles.sum_rows(rows, lists)
+
+    return sums

@@ -8,7 +8,7 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.render.checks import check_projection
 from reference_trainer.render.loops.binning import bin_gaussians
-from reference_trainer.render.loops.drawing import composite, composite_masks
+from reference_trainer.render.loops.drawing import absolute_gradients, composite, composite_masks
 from reference_trainer.render.loops.moments import moments, shares
 from reference_trainer.render.loops.projection import project, visible
 from reference_trainer.render.splats import Splats
@@ -53,5 +53,6 @@ class LoopEngine:
         drawn = composite_masks(splats, opacities, background)
         return drawn[:, 1:], 1 - drawn[:, 0]
 
+    absolute_gradients = staticmethod(absolute_gradients)
     moments = staticmethod(moments)
     shares = staticmethod(shares)

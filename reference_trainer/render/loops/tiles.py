@@ -11,15 +11,15 @@ from numba import types
 from numba.extending import intrinsic
 from torch import Tensor
 
-from reference_trainer.compiled.compiling import inlined, kernel
+from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
-    "CHUNK", "PIXELS", "X", "Y", "alpha_at", "clamped", "footprint", "footprint_gradient", "footprint_of",
-    "geometry_gradients", "is_faint", "load", "longest_list", "make_table", "over_tiles", "read_entries", "store",
-    "sum_rows", "whole_tiles",
+    "CHUNK", "PIXELS", "X", "Y", "absolute_slopes", "alpha_at", "clamped", "footprint", "footprint_gradient",
+    "footprint_of", "geometry_gradients", "is_faint", "load", "longest_list", "make_table", "over_tiles",
+    "read_entries", "store", "sum_rows", "whole_tiles",
 ]  # fmt: skip
 
 Array = Any
@@ -129,6 +129,7 @@ def read_entries(
     """
     count = 0
     for e in range(first, last, step):
+        prefetch(table[gaussians[max(0, min(e + CHUNK * step, len(gaussians) - 1))]])
         i = gaussians[e]
         if is_faint(table, i):
             continue
@@ -233,3 +234,15 @@ def footprint_gradient(table: Any, i: Any, tile: Any, columns: Any, slopes: Any,
     row[3] = w1 * sy - l11 * sxy - l21 * syy + dy * to_w1
     row[4] = w2 * sy - l22 * syy + dy * to_w2
     row[5] = s
+
+
+@inlined
+def absolute_slopes(table: Any, i: Any, tile: Any, columns: Any, slopes: Any) -> Any:
+    """Sum the absolute gradients of a splat's position, given those of its ln alpha at the pixels of a tile."""
+    l11, l21, l22, _, _, w1, w2 = _from_center(table, i, tile, columns)
+    to_x, to_y = _ZERO, _ZERO
+    for p in range(PIXELS):
+        along, across = l11 * X[p] + l21 * Y[p] - w1, l22 * Y[p] - w2
+        to_x += abs(slopes[p] * (l11 * along))
+        to_y += abs(slopes[p] * (l21 * along + l22 * across))
+    return to_x, to_y

@@ -20,7 +20,8 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians, inverse_sigmoid
 from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render.absolute import absolute_gradients
+from reference_trainer.render.eager.engine import TorchEngine
+from reference_trainer.render.engine import engine_for
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
@@ -170,7 +171,7 @@ def test_absgrad_counts_sums_of_absolute_values_of_what_was_drawn(tiny_scene):
             out = render_gaussians(drawn, step.view.camera, trainer.background, sh_degree=step.sh_degree)
         image = out.image - step.view.image
         upstream = torch.cat([image.sign() / image.numel(), torch.zeros_like(out.alpha)[None]])
-        sums = absolute_gradients(out.splats, out.splats.colors, upstream, trainer.background)
+        sums = TorchEngine().absolute_gradients(out.splats, out.splats.colors, trainer.background, out.image)(upstream)
         half = torch.tensor([step.view.camera.width / 2, step.view.camera.height / 2])
         expected[out.splats.indices] += (sums * half).norm(dim=1).double()
         counts[out.splats.indices[out.splats.lists.touched]] += 1
@@ -205,12 +206,10 @@ def test_absgrad_lowers_opacities_at_its_steps_until_densification_ends(tiny_sce
 
 
 def test_absolute_gradients_cost_nothing_unless_they_are_asked_for(tiny_scene, monkeypatch):
-    from reference_trainer.render import absolute
-
     def refuse(*arguments):
         raise AssertionError("computed without need")
 
-    monkeypatch.setattr(absolute, "absolute_gradients", refuse)
+    monkeypatch.setattr(type(engine_for(torch.device("cpu"))), "absolute_gradients", refuse)
     Trainer(tiny_scene, TrainConfig(iterations=1)).train()
     with pytest.raises(AssertionError, match="without need"):
         Trainer(tiny_scene, TrainConfig(iterations=1, density="absgrad")).train()
