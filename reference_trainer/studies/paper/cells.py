@@ -20,7 +20,7 @@ from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.metrics import depth_errors, psnr
 from reference_trainer.evaluation.results import mean_std
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
-from reference_trainer.runs.engines.engine import Failure
+from reference_trainer.runs.engines.engine import Failure, Task, attempt
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.options import SceneOptions
@@ -103,33 +103,42 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
 
     Returns:
         Why trainings failed, by name. The same call tries them again.
+
+    Raises:
+        ValueError: if a scene has no test views.
+        FileNotFoundError: if there is no such scene.
     """
     rows = rows_of(grid)
     left = [cell for cell in declared(grid) if not is_done(cell, rows)]
+    for name in dict.fromkeys(cell.scene for cell in left):
+        if not grid.scenes[name].options.load().test:
+            raise ValueError(f"{name} has no test views, which the claims are about: hold some out with --split llff.")
+    cells = {_folder(grid, cell): cell for cell in left}
     failed: dict[str, Failure] = {}
-    against = dict.fromkeys(cell.scene for cell in left if "depth" in cell.needs)
-    denser = config_of(resolved({}, "3dgs", DENSER * grid.iterations), 0)
-    dense = [
-        Run(f"{name}, all photographs", scene.dense, denser, grid.out / name / "dense")
-        for name in against
-        if (scene := grid.scenes[name]).options.path != "synthetic"
-    ]
-    jobs: list[tuple[list[Run], int, dict[str, Cell]]] = [(dense, 0, {})]
-    for seed in range(grid.seeds):
-        for path in (True, False):
-            cells = {str(_folder(grid, cell)): cell for cell in left
-                     if cell.seed == seed and ("path" in cell.needs) == path}  # fmt: skip
-            runs = [_run(grid, cell) for cell in cells.values()]
-            jobs.append((runs, max(1, grid.iterations // SIXTHS) if path else 0, cells))
-    for runs, every, cells in jobs:
 
-        def keep(run: Run, results: dict[str, Any], cells: Mapping[str, Cell] = cells) -> None:
-            if cell := cells.get(str(run.out)):
-                rows[cell.scene].add(measured(cell, run.out, results, grid.out / cell.scene / "dense", running.device))
+    def keep(run: Run, results: dict[str, Any]) -> None:
+        if cell := cells.get(run.out):
+            dense = grid.out / cell.scene / "dense"
+            task = Task(run.label, measured, (cell, run.out, results, dense, running.device))
+            row = attempt(task, torch.get_num_threads())
+            if isinstance(row, Failure):
+                failed[run.label] = row
+            else:
+                rows[cell.scene].add(row.value)
                 shutil.rmtree(run.out)
 
-        outcomes = run_grid(runs, replace(running, monitor_every=every), done=keep) if runs else []
-        failed |= {run.label: end for run, end in zip(runs, outcomes, strict=True) if isinstance(end, Failure)}
+    def do(runs: list[Run], every: int) -> None:
+        for run, end in zip(runs, run_grid(runs, replace(running, monitor_every=every), done=keep), strict=True):
+            failed.update({run.label: end} if isinstance(end, Failure) else {})
+
+    against = dict.fromkeys(cell.scene for cell in left if "depth" in cell.needs)
+    denser = config_of(resolved({}, "3dgs", DENSER * grid.iterations), 0)
+    photographed = {name: scene for name in against if (scene := grid.scenes[name]).options.path != "synthetic"}
+    do([Run(f"{name}, dense", x.dense, denser, grid.out / name / "dense") for name, x in photographed.items()], 0)
+    for seed in range(grid.seeds):
+        for path in (True, False):  # which of them are monitored
+            of = [cell for cell in left if cell.seed == seed and ("path" in cell.needs) == path]
+            do([_run(grid, cell) for cell in of], max(1, grid.iterations // SIXTHS) if path else 0)
     return failed
 
 

@@ -83,7 +83,8 @@ def details(name: str, kept: Kept) -> str:
     for scene in kept.scenes:
         found = {_name(setting, kept): [*kept.of(scene, setting).values()] for setting in claim.settings}
         if any(found.values()):
-            parts.append(f"**{scene}**\n\n{_table({key: of for key, of in found.items() if of}, claim.shows)}")
+            about = kept.scenes[scene].content.get("about", "")
+            parts.append(f"**{scene}**: {about}\n\n{_table({key: of for key, of in found.items() if of}, claim.shows)}")
             checks = [(check, of) for check in claim.checks if (of := differences(check, scene, kept))]
             parts += ["".join(_line(check, of, kept) for check, of in checks)] if checks else []
     return "\n".join(parts) or "Not yet measured.\n"
