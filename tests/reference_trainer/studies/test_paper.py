@@ -69,6 +69,7 @@ def test_the_schemes_are_those_of_the_registry():
     assert used - {""} == set(REGULARIZERS)
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_the_declared_scenes_start_without_their_test_views(data_root):
     widths = {}
@@ -225,12 +226,12 @@ def test_a_relative_check_divides_by_the_other_figure(kept):
 
 
 def test_pages_are_made_again_between_their_marks(kept):
-    text = "before\n<!-- paper claims -->\nold\n<!-- end -->\nafter <!-- paper details 1 -->\n<!-- end -->\n"
+    text = "before\n<!-- paper claims -->\nstale words\n<!-- end -->\nafter <!-- paper details 1 -->\n<!-- end -->\n"
     made = page(text, kept)
     assert made == page(made, kept)
     assert made.startswith("before\n<!-- paper claims -->\n|  | claim |")
     assert details("1", kept) in made
-    assert "old" not in made
+    assert "stale" not in made
 
 
 def test_the_figure_shows_every_scene_with_a_sweep(tmp_path):
