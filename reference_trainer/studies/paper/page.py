@@ -11,6 +11,7 @@ from reference_trainer.evaluation.results import format_mean_std, markdown_table
 from reference_trainer.runs.figures import new_figure
 from reference_trainer.studies.paper.claims import CLAIMS, QUALITY, Check, Claim
 from reference_trainer.studies.paper.rows import Row, Rows, label, resolved, value
+from reference_trainer.studies.paper.scenes import SCENES
 from reference_trainer.studies.paper.verdict import Verdict, interval, overall, verdict
 
 __all__ = ["Kept", "claims_table", "details", "judged", "page", "sweeps"]
@@ -78,16 +79,19 @@ def claims_table(kept: Kept) -> str:
 
 
 def details(name: str, kept: Kept) -> str:
-    """Return what is measured of a claim: on every scene the table of its settings, and the checks."""
+    """Return what is measured of a claim: on every scene the table of its settings, and the checks; else ""."""
     claim, parts = CLAIMS[name], []
     for scene in kept.scenes:
-        found = {_name(setting, kept): [*kept.of(scene, setting).values()] for setting in claim.settings}
-        if any(found.values()):
+        found = {}
+        for setting in claim.settings if scene in claim.scenes or scene not in SCENES else ():
+            if of := [row for row in kept.of(scene, setting).values() if claim.needs <= row.keys()]:
+                found[_name(setting, kept)] = of
+        if len(found) >= min(2, len(claim.settings)):
             about = kept.scenes[scene].content.get("about", "")
-            parts.append(f"**{scene}**: {about}\n\n{_table({key: of for key, of in found.items() if of}, claim.shows)}")
+            parts.append(f"**{scene}**: {about}\n\n{_table(found, claim.shows)}")
             checks = [(check, of) for check in claim.checks if (of := differences(check, scene, kept))]
             parts += ["".join(_line(check, of, kept) for check, of in checks)] if checks else []
-    return "\n".join(parts) or "Not yet measured.\n"
+    return "\n".join(parts)
 
 
 def sweeps(kept: Kept, path: Path) -> None:
@@ -124,8 +128,10 @@ def page(text: str, kept: Kept) -> str:
         elif what == "rows":
             body = _rows(Rows(kept.folder.parent / f"{name}.json").rows)
         else:
-            headed = [f"## {key}. {claim.says}\n\n{details(key, kept)}" for key, claim in CLAIMS.items()]
-            body = details(name, kept) if name else "\n".join(headed)
+            found = {key: details(key, kept) for key in ([name] if name else CLAIMS)}
+            headed = [f"## {key}. {CLAIMS[key].says}\n\n{text}" for key, text in found.items() if text]
+            missing = ", ".join(key for key, text in found.items() if not text)
+            body = "\n".join([*headed, f"Not yet measured: {missing}.\n"] if missing else headed)
         return f"{match[1]}{body}{match[4]}"
 
     return _MARKS.sub(made, text)
