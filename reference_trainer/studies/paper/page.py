@@ -89,8 +89,8 @@ def details(name: str, kept: Kept) -> str:
         if len(found) >= min(2, len(claim.settings)):
             about = kept.scenes[scene].content.get("about", "")
             parts.append(f"**{scene}**: {about}\n\n{_table(found, claim.shows)}")
-            checks = [(check, of) for check in claim.checks if (of := differences(check, scene, kept))]
-            parts += ["".join(_line(check, of, kept) for check, of in checks)] if checks else []
+            lines = [_line(check, apart, kept) for check in claim.checks if (apart := differences(check, scene, kept))]
+            parts += ["".join(lines)] if lines else []
     return "\n".join(parts)
 
 
