@@ -1,5 +1,6 @@
 """The study of the paper's claims: its grid, the rule of its verdicts, what is kept, and a run of seconds."""
 
+import dataclasses
 import itertools
 import json
 import math
@@ -22,7 +23,7 @@ from reference_trainer.runs.grid import Running
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.paper import cells as cells_module
-from reference_trainer.studies.paper.cells import Grid, declared, estimate, is_done, renders, rows_of, run_cells
+from reference_trainer.studies.paper.cells import Grid, declared, depths, estimate, is_done, renders, rows_of, run_cells
 from reference_trainer.studies.paper.claims import CLAIMS, Check, Claim, chosen
 from reference_trainer.studies.paper.page import Kept, claims_table, details, judged, page, sweeps
 from reference_trainer.studies.paper.rows import Rows, config_of, resolved, value
@@ -251,14 +252,17 @@ def test_the_pages_show_what_is_kept(path):
 # What is measured of a model
 
 
+def few():
+    """Three Gaussians at random, and a model of them that was trained with dropout, in float64."""
+    s = random_scene(3, 16, 12, seed=1, size=0.4)
+    colors = ((s.colors - 0.5) / SH_C0)[:, None]
+    parts = s.means, s.scales.log(), s.quaternions, torch.logit(s.opacities), colors, torch.zeros(3, 0, 3)
+    return s, TrainedModel(Gaussians(*parts).map(torch.Tensor.double), torch.zeros(3).double(), "dropout(0.2)")
+
+
 def test_the_mean_of_all_masks_is_what_the_exact_render_is():
     """Three Gaussians, eight masks: the PSNR of D is that of the enumerated mean."""
-    s = random_scene(3, 16, 12, seed=1, size=0.4)
-    model = TrainedModel(
-        Gaussians(s.means, s.scales.log(), s.quaternions, torch.logit(s.opacities),
-                  ((s.colors - 0.5) / SH_C0)[:, None], torch.zeros(3, 0, 3)).map(torch.Tensor.double),
-        torch.zeros(3, dtype=torch.float64), "dropout(0.2)",
-    )  # fmt: skip
+    s, model = few()
     mean = 0
     for mask in itertools.product([0.0, 1.0], repeat=3):
         kept = torch.tensor(mask, dtype=torch.float64)
@@ -273,6 +277,27 @@ def test_the_mean_of_all_masks_is_what_the_exact_render_is():
     # 400 draws: the mean image errs by a twentieth of the deviation of one, and its PSNR by hundredths of a decibel.
     assert found["five"] == pytest.approx(found["mean"], abs=0.1)
     assert found["one"] < found["five"]
+
+
+def test_depth_is_compared_with_another_model_where_that_is_opaque_and_the_mask_counts():
+    s, model = few()
+    view = View("v", s.camera.to(dtype=torch.float64), torch.zeros(3, 12, 16, dtype=torch.float64))
+    dense = dataclasses.replace(
+        model,
+        gaussians=dataclasses.replace(model.gaussians, opacity_logits=torch.full((3,), 4.0).double()),
+        regularizer="",
+    )
+    assert depths(dense, view, dense) == {"abs_rel": 0, "rmse": 0, "mae": 0, "log10": 0}
+    one, truth = (x.test_rendering(view, depth=True) for x in (model, dense))
+    opaque = truth.alpha > 0.8
+    assert 0.05 < opaque.double().mean() < 0.95
+    mask = torch.zeros(12, 16)
+    mask[:, 6:] = 1
+    for chosen_mask, counts in ((None, opaque), (mask, opaque & (mask == 1))):
+        d, t = ((x.depth / x.alpha.clamp_min(1e-6))[counts] for x in (one, truth))
+        found = depths(model, dataclasses.replace(view, mask=chosen_mask), dense)
+        assert found["mae"] == pytest.approx((d - t).abs().mean().item())
+        assert found["abs_rel"] == pytest.approx(((d - t).abs() / t).mean().item())
 
 
 # Runs
@@ -333,3 +358,28 @@ def test_a_training_that_fails_stops_no_other(tmp_path, monkeypatch):
     assert list(failed) == ["synthetic, 3dgs, dropout(0.2), seed 0"]
     (only,) = Rows(tmp_path / "rows" / "synthetic.json").rows
     assert only["test"] == {"psnr": 20.1235}
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_where_depth_is_not_known_a_model_of_all_photographs_comes_first(data_root, tmp_path, monkeypatch):
+    grid = Grid(chosen(["14"]), chosen_scenes(["fern"], data_root, SceneOptions("")), "3dgs", 20, 1, tmp_path, tmp_path)
+    trained, against = [], []
+
+    def train(options, config, out, *_):
+        trained.append((out.relative_to(tmp_path.resolve()).parts, options.test, config.iterations))
+        return {"mean": {"test": {"psnr": 20.0}}, "seconds": 1.0}
+
+    def measured(cell, run, results, dense, device):
+        against.append(dense)
+        return {"setting": dict(cell.setting), "seed": cell.seed, "depth": {}}
+
+    monkeypatch.setattr(grid_module, "train_run", train)
+    monkeypatch.setattr(cells_module, "measured", measured)
+    assert run_cells(grid, Running(Here())) == {}
+    first, *others = trained
+    assert first == (("fern", "dense"), "none", 40)
+    assert [where[1] for where, *_ in others] == ["3dgs", "3dgs_dropout_0.2", "3dgs_noise_0.8"]
+    assert {(test, steps) for _, test, steps in others} == {("auto", 20)}
+    assert set(against) == {tmp_path / "fern" / "dense"}
+    assert len(Rows(tmp_path / "fern.json").rows) == 3
