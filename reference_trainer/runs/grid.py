@@ -70,7 +70,9 @@ class Running:
             )
 
 
-def run_grid(runs: Sequence[Run], running: Running) -> list[dict[str, Any] | Failure]:
+def run_grid(
+    runs: Sequence[Run], running: Running, *, done: Callable[[Run, dict[str, Any]], None] = lambda run, results: None
+) -> list[dict[str, Any] | Failure]:
     """Do all runs; what is finished already is read here and not given to a worker.
 
     The folders of the runs are made here, so that a worker on another machine knows whether it sees the same ones.
@@ -78,6 +80,7 @@ def run_grid(runs: Sequence[Run], running: Running) -> list[dict[str, Any] | Fai
     Args:
         runs: what to do.
         running: where and how.
+        done: is called here with each run that is finished and its results, before other runs begin.
 
     Returns:
         For every run the content of ``results.json``, or why there is none.
@@ -87,6 +90,8 @@ def run_grid(runs: Sequence[Run], running: Running) -> list[dict[str, Any] | Fai
     def note(number: int, outcome: Value | Failure, when: str) -> None:
         outcomes[number] = outcome.value if isinstance(outcome, Value) else outcome
         running.say(f"[{len(outcomes)}/{len(runs)}] {runs[number].label}: {_line(outcomes[number], when)}")
+        if isinstance(outcome, Value):
+            done(runs[number], outcome.value)
 
     tasks: dict[int, Task] = {}
     for number, run in enumerate(runs):

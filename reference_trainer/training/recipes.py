@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["RECIPES", "Recipe", "with_recipe"]
+__all__ = ["RECIPES", "Recipe", "with_recipe", "with_steps"]
 
 
 @dataclass(frozen=True)
@@ -130,6 +130,19 @@ RECIPES: dict[str, Recipe] = {
 }
 """All recipes, by the name that ``--recipe`` knows."""
 
+
+def with_steps(expression: str, times: float) -> str:
+    """Return an expression whose steps, the whole numbers from 100 on, are so many times as late.
+
+    Example:
+        >>> with_steps("d2gs(ramp(0.05, 0.3, 0, 10_000), neighbors=10)", 0.3)
+        'd2gs(ramp(0.05, 0.3, 0, 3000), neighbors=10)'
+    """
+    if times == 1:
+        return expression
+    return re.sub(r"(?<![\w.])[1-9][\d_]{2,}(?![\w.])", lambda at: str(round(times * int(at[0]))), expression)
+
+
 _MARKS = "sh_every", "densify_from", "densify_until", "prune_size_from", "opacity_reset_from"
 
 
@@ -162,10 +175,5 @@ def with_recipe(name: str, **changes: object) -> TrainConfig:
         for mark in _MARKS
         if (at := getattr(config, mark)) is not None
     }
-    for field in ("loss", "density"):
-        scaled[field] = re.sub(
-            r"(?<![\w.])[1-9][\d_]{2,}(?![\w.])",
-            lambda at: str(round(times * int(at[0]))) if times != 1 else at[0],
-            getattr(config, field),
-        )
+    scaled |= {field: with_steps(getattr(config, field), times) for field in ("loss", "density")}
     return dataclasses.replace(config, **{**scaled, **changes})  # type: ignore[arg-type]

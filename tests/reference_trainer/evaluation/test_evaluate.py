@@ -10,7 +10,7 @@ from PIL import Image
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier, opacity_noise
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores, evaluate
-from reference_trainer.evaluation.metrics import psnr, ssim
+from reference_trainer.evaluation.metrics import DepthErrors, psnr, ssim
 from reference_trainer.evaluation.pictures import file_names
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
@@ -74,8 +74,10 @@ def test_depth_is_held_against_the_truth_where_it_is_known(tiny_scene, gaussians
     assert len(pairs) > 20
     assert found.depth_abs_rel == pytest.approx(sum(abs(d - t) / t for d, t in pairs) / len(pairs), rel=1e-4)
     assert found.depth_rmse == pytest.approx((sum((d - t) ** 2 for d, t in pairs) / len(pairs)) ** 0.5, rel=1e-4)
-    assert math.isnan(without.depth_abs_rel)
-    assert math.isnan(without.depth_rmse)
+    assert found.depth_mae == pytest.approx(sum(abs(d - t) for d, t in pairs) / len(pairs), rel=1e-4)
+    logs = [abs(math.log10(d / t)) for d, t in pairs if d > 0]
+    assert found.depth_log10 == pytest.approx(sum(logs) / len(logs), rel=1e-4)
+    assert all(math.isnan(getattr(without, f"depth_{name}")) for name in DepthErrors._fields)
 
 
 def test_outside_of_its_mask_a_view_does_not_count(tiny_scene, gaussians):
@@ -220,7 +222,7 @@ def test_no_gradient_and_no_global_random_number(tiny_scene, gaussians):
 
 
 def of(name: str, split: str, value: float) -> ViewScores:
-    return ViewScores(name, split, *[value] * 14)
+    return ViewScores(name, split, *[value] * 16)
 
 
 def test_means_leave_out_what_does_not_exist():
@@ -296,7 +298,8 @@ def test_photographs_are_not_needed_for_co_adaptation(tiny_scene, gaussians):
     bare = evaluate(model, {"orbit": [Viewpoint("v", view.camera) for view in tiny_scene.train]}, samples=4, seed=3)
     full = evaluate(model, {"orbit": tiny_scene.train}, samples=4, seed=3, perceptual=Brightness())
     for one, other in zip(bare.views, full.views, strict=True):
-        needing = {name: getattr(one, name) for name in ("psnr", "ssim", "lpips", "depth_abs_rel", "depth_rmse")}
+        depths = (f"depth_{name}" for name in DepthErrors._fields)
+        needing = {name: getattr(one, name) for name in ("psnr", "ssim", "lpips", *depths)}
         assert all(math.isnan(x) for x in needing.values())
         assert all(math.isfinite(getattr(other, name)) for name in needing)
         same = dataclasses.replace(other, name="v", **needing)

@@ -8,7 +8,7 @@ import skimage.metrics
 import torch
 from torch import Tensor
 
-from reference_trainer.evaluation.metrics import psnr, ssim
+from reference_trainer.evaluation.metrics import on_white, psnr, ssim
 
 
 def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -95,6 +95,27 @@ def test_psnr_of_equal_images_is_infinite():
 def test_psnr_falls_by_twenty_decibels_when_the_error_grows_tenfold():
     image, target = pair(10, 10)
     assert psnr(target + 0.1 * (image - target), target) - psnr(image, target) == pytest.approx(20, abs=1e-9)
+
+
+def test_in_a_mask_psnr_has_the_error_of_its_pixels_alone():
+    mask = torch.zeros(6, 8)
+    mask[1:4, 2:7] = 1
+    mask[5] = 254 / 255  # the edge of a mask, which is none
+    target = torch.full((3, 6, 8), 0.5, dtype=torch.float64)
+    image = target + torch.where(mask == 1, 0.1, 0.4)
+    assert psnr(image, target, mask) == pytest.approx(20, abs=1e-5)  # -10 log10(0.1^2)
+    assert psnr(target.where(mask == 1, 0.0), target, mask) == math.inf
+    assert math.isnan(psnr(image, target, torch.zeros(6, 8)))
+
+
+def test_over_the_masked_picture_ssim_is_that_of_pictures_that_are_white_outside():
+    image, target = pair(20, 24)
+    mask = torch.zeros(20, 24)
+    mask[4:15, 6:20] = 1
+    outside = torch.rand(3, 20, 24, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    assert ssim(on_white(target, mask), on_white(target.where(mask == 1, outside), mask)) == pytest.approx(1, abs=1e-12)
+    white = [np.where(mask == 1, x, 1.0) for x in (image.numpy(), target.numpy())]
+    assert ssim(on_white(image, mask), on_white(target, mask)) == pytest.approx(direct_ssim(*white), abs=1e-9)
 
 
 def test_inputs_may_carry_gradients():

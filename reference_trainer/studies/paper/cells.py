@@ -1,0 +1,279 @@
+"""The grid: which trainings there are, in which order, what of them is missing, and how it is done."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ca_reg.functional import Multiplier
+from ca_reg.monitor import LOG_NAME
+from reference_trainer.evaluation.metrics import depth_errors, psnr
+from reference_trainer.evaluation.results import mean_std
+from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
+from reference_trainer.runs.engines.engine import Failure, Task, attempt
+from reference_trainer.runs.grid import Run, Running, run_grid
+from reference_trainer.runs.run import load_run, model_of
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import View
+from reference_trainer.studies.paper.claims import Claim, Setting
+from reference_trainer.studies.paper.rows import Row, Rows, config_of, label, resolved, value
+from reference_trainer.studies.paper.scenes import PaperScene
+from reference_trainer.threads import threads_for
+
+__all__ = ["Cell", "Grid", "declared", "estimate", "is_done", "listing", "rows_of", "run_cells"]
+
+SIXTHS = 6
+OPAQUE = 0.8
+DENSER = 2
+"""How many times the iterations, for the model of all photographs that depths are compared with."""
+_FIGURES = ("psnr", "ssim", "lpips", "ca", "ca_half", "ca_exact", "ca_exact_half", "cv")
+_COST = {"binocular": 2.0, "corgs": 3.3, "fsgs": 1.6, "dngaussian": 2.0, "photometric + views(3)": 4.0,
+         "photometric + consistency(0.4, 0.2)": 1.8}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The trainings that are asked for.
+
+    Args:
+        claims: by name.
+        scenes: by name, with the paths of their folders.
+        recipe: of all trainings that do not name another.
+        iterations: of every training.
+        seeds: how many.
+        out: folder for what is trained, ``NAME/LABEL/seed_K``, removed once its row is kept.
+        rows: folder of the kept rows, ``NAME.json``.
+    """
+
+    claims: Mapping[str, Claim]
+    scenes: Mapping[str, PaperScene]
+    recipe: str = "3dgs"
+    iterations: int = 3_000
+    seeds: int = 3
+    out: Path = Path("runs/paper")
+    rows: Path = Path("runs/paper")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training, and what is measured of it beside the usual."""
+
+    scene: str
+    setting: Setting
+    seed: int
+    needs: frozenset[str] = frozenset()
+
+    @property
+    def name(self) -> str:
+        """What it is called in lines."""
+        return f"{self.scene}, {label(self.setting, {'iterations': self.setting['iterations']})}, seed {self.seed}"
+
+
+def declared(grid: Grid) -> list[Cell]:
+    """Return the trainings of a grid, each once: first all of one seed, in the order of the claims."""
+    found: dict[str, Cell] = {}
+    for seed in range(grid.seeds):
+        for claim in grid.claims.values():
+            for name, scene in grid.scenes.items():
+                for given in claim.settings if name in claim.scenes else ():
+                    setting = resolved(given, grid.recipe, grid.iterations)
+                    if scene.recipes is None or setting["recipe"] in scene.recipes:
+                        cell = Cell(name, setting, seed, claim.needs)
+                        known = found.get(cell.name, cell)
+                        found[cell.name] = replace(cell, needs=cell.needs | known.needs)
+    return list(found.values())
+
+
+def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
+    """Do what is missing of a grid; each training is kept before the next but ``running.engine.jobs`` begins.
+
+    Args:
+        grid: what to do.
+        running: where and how; its monitor is set here.
+
+    Returns:
+        Why trainings failed, by name. The same call tries them again.
+
+    Raises:
+        ValueError: if a scene has no test views.
+        FileNotFoundError: if there is no such scene.
+    """
+    rows = rows_of(grid)
+    left = [cell for cell in declared(grid) if not is_done(cell, rows)]
+    for name in dict.fromkeys(cell.scene for cell in left):
+        if not grid.scenes[name].options.load().test:
+            raise ValueError(f"{name} has no test views, which the claims are about: hold some out with --split llff.")
+    cells = {_folder(grid, cell): cell for cell in left}
+    failed: dict[str, Failure] = {}
+
+    def keep(run: Run, results: dict[str, Any]) -> None:
+        if cell := cells.get(run.out):
+            dense = grid.out / cell.scene / "dense"
+            task = Task(run.label, measured, (cell, run.out, results, dense, running.device))
+            row = attempt(task, torch.get_num_threads())
+            if isinstance(row, Failure):
+                failed[run.label] = row
+            else:
+                rows[cell.scene].add(row.value)
+                shutil.rmtree(run.out)
+
+    def do(runs: list[Run], every: int) -> None:
+        for run, end in zip(runs, run_grid(runs, replace(running, monitor_every=every), done=keep), strict=True):
+            failed.update({run.label: end} if isinstance(end, Failure) else {})
+
+    against = dict.fromkeys(cell.scene for cell in left if "depth" in cell.needs)
+    denser = config_of(resolved({}, "3dgs", DENSER * grid.iterations), 0)
+    photographed = {name: scene for name in against if (scene := grid.scenes[name]).options.path != "synthetic"}
+    do([Run(f"{name}, dense", x.dense, denser, grid.out / name / "dense") for name, x in photographed.items()], 0)
+    for seed in range(grid.seeds):
+        for path in (True, False):  # which of them are monitored
+            of = [cell for cell in left if cell.seed == seed and ("path" in cell.needs) == path]
+            do([_run(grid, cell) for cell in of], max(1, grid.iterations // SIXTHS) if path else 0)
+    return failed
+
+
+def rows_of(grid: Grid) -> dict[str, Rows]:
+    """Return the kept rows of every scene."""
+    usual = asdict(SceneOptions())
+
+    def about(name: str, scene: PaperScene) -> dict[str, Any]:
+        options = {key: x for key, x in asdict(scene.options).items() if key != "path" and x != usual[key]}
+        return {"scene": name, "about": scene.about, "options": options}
+
+    return {
+        name: Rows(grid.rows / f"{name}.json", about(name, scene), grid.out / f".{name}.lock")
+        for name, scene in grid.scenes.items()
+    }
+
+
+def is_done(cell: Cell, rows: Mapping[str, Rows]) -> bool:
+    """Return whether all that is asked of a training is kept."""
+    return (row := rows[cell.scene].of(cell.setting).get(cell.seed)) is not None and cell.needs <= row.keys()
+
+
+def estimate(cell: Cell, grid: Grid, rows: Mapping[str, Rows]) -> float:
+    """Return about how many processor seconds a training and its evaluation take: as long as its like, if kept."""
+    scene, setting = grid.scenes[cell.scene], cell.setting
+    like = [
+        value(row, "seconds") / row["setting"]["iterations"]
+        for row in rows[cell.scene].rows
+        if all(row["setting"].get(name) == setting.get(name) for name in ("recipe", "loss"))
+    ]
+    guess = scene.step * _COST.get(setting.get("loss", ""), _COST.get(setting["recipe"], 1.0))
+    views = scene.views * (1.0 + 2.0 * ("path" in cell.needs))
+    return float((mean_std(like)[0] if like else guess) * setting["iterations"] + views)
+
+
+def listing(grid: Grid) -> str:
+    """Return a line for each training: kept, or the processor minutes it may take; and the hours of claims and all."""
+    rows, cells = rows_of(grid), declared(grid)
+    left = {cell.name: estimate(cell, grid, rows) / 3600 for cell in cells if not is_done(cell, rows)}
+    lines = [f"{cell.name}: " + (f"{60 * left[cell.name]:.0f} min" if cell.name in left else "kept") for cell in cells]
+    for name, claim in grid.claims.items():
+        of = [cell.name for cell in declared(replace(grid, claims={name: claim}))]
+        hours = sum(left.get(each, 0.0) for each in of)
+        lines.append(f"claim {name}: {len(of)} trainings, {sum(each in left for each in of)} left, {hours:.1f} hours")
+    total = f"{len(cells)} trainings, {len(left)} left: about {sum(left.values()):.1f} hours of one core"
+    return "\n".join([*lines, f"all: {total}, claims share trainings"])
+
+
+@torch.no_grad()
+def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, device: str = "cpu") -> Row:
+    """Return the row of a finished training."""
+    means = {
+        split: {name: x for name in _FIGURES if (x := results["mean"].get(split, {}).get(name)) is not None}
+        for split in ("test", "train")
+    }
+    machine = {"commit": _commit(), "version": results["machine"]["ca_reg"], "cpu": results["machine"]["cpu"]}
+    row: Row = {"setting": dict(cell.setting), "seed": cell.seed, **means, "gaussians": results["gaussians"],
+                "seconds": results["processor_seconds"]}  # fmt: skip
+    if "path" in cell.needs:
+        log = [json.loads(line) for line in (run / LOG_NAME).read_text("utf-8").splitlines()]
+        row["path"] = {str(sixth): each["ca/test"] for sixth, each in enumerate(log[:SIXTHS], start=1)}
+    if cell.needs & {"renders", "depth"}:
+        trainer = load_run(run, device)
+        model, views = model_of(trainer), [view.to(device) for view in trainer.scene.test]
+        with threads_for(trainer.scene.pixels):
+            if "renders" in cell.needs:
+                row["renders"] = _mean([renders(model, view, cell.seed) for view in views])
+            if "depth" in cell.needs:
+                truth = None if views[0].depth is not None else model_of(load_run(dense, device))
+                row["depth"] = _mean([depths(model, view, truth) for view in views])
+    return {**_rounded(row), **machine}
+
+
+def renders(model: TrainedModel, view: View, seed: int, draws: int = 5) -> dict[str, float]:
+    """Return the PSNR of a model of dropout by how it is rendered, beside scaled opacities, which is that of the test.
+
+    "one" is a render with one mask, in mean over the draws; "five" the mean of the draws; "mean" the exact mean.
+    """
+    opacities, p = model.gaussians.opacities, model.dropout
+    generator = torch.Generator(opacities.device).manual_seed(seed)
+    keep = torch.rand(draws, len(opacities), generator=generator, device=opacities.device) >= p
+    images = MaskedRenders(model).many(opacities * keep, view)[0]
+    pictures = {"five": images.mean(0), "mean": model.moments(opacities, view, Multiplier.dropout(p)).mean}
+    found = {name: psnr(image.clamp(0, 1), view.image, view.mask) for name, image in pictures.items()}
+    return {"one": mean_std(psnr(image.clamp(0, 1), view.image, view.mask) for image in images)[0]} | found
+
+
+def depths(model: TrainedModel, view: View, truth: TrainedModel | None) -> dict[str, float]:
+    """Return the errors of the depth at a view, against the true one, or that of another model where it is opaque."""
+
+    def depth(of: TrainedModel) -> tuple[Tensor, Tensor]:
+        out = of.test_rendering(view, depth=True)
+        assert out.depth is not None
+        return out.depth / out.alpha.clamp_min(1e-6), out.alpha
+
+    known = view.depth
+    if truth is not None:
+        far, alpha = depth(truth)
+        known = far.where(alpha > OPAQUE, 0.0)
+    assert known is not None
+    known = known if view.mask is None else known * (view.mask > 0.5)
+    return depth_errors(depth(model)[0], known)._asdict()
+
+
+def _folder(grid: Grid, cell: Cell) -> Path:
+    """Return where a training lives."""
+    hidden = {"iterations": cell.setting["iterations"]}
+    return (
+        grid.out / cell.scene / re.sub(r"[^\w.=-]+", "_", label(cell.setting, hidden)).strip("_") / f"seed_{cell.seed}"
+    )
+
+
+def _run(grid: Grid, cell: Cell) -> Run:
+    """Return a training as the engine of sweeps takes it."""
+    config = config_of(cell.setting, cell.seed)
+    options = grid.scenes[cell.scene].options_for(cell.setting, config.loss)
+    return Run(cell.name, options, config, _folder(grid, cell))
+
+
+def _mean(of: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the means of figures over the views that have them."""
+    return {name: mean_std(each[name] for each in of)[0] for name in of[0]}
+
+
+def _rounded(data: Any) -> Any:
+    """Return nested figures with six digits, None for what is not finite."""
+    if isinstance(data, dict):
+        return {name: _rounded(x) for name, x in data.items()}
+    return (float(f"{data:.6g}") if math.isfinite(data) else None) if isinstance(data, float) else data
+
+
+def _commit() -> str | None:
+    """Return the commit of this checkout, None if it is none."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None

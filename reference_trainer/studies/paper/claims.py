@@ -1,0 +1,192 @@
+"""The claims of the paper, and the comparisons that go with them: which trainings, which table, which checks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+from reference_trainer.studies.paper.scenes import SCENES
+
+__all__ = ["CLAIMS", "QUALITY", "Check", "Claim", "Setting", "chosen"]
+
+Setting = Mapping[str, Any]
+"""What a training changes of its recipe: fields of `TrainConfig`, ``recipe`` if it is another than that of the study,
+and ``views``. Steps in expressions are those of 10,000 iterations, with which they scale."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """Something that must hold in mean over the seeds: ``low < a - b < high``, of figures of the same seed.
+
+    Args:
+        of: a figure of a row, such as "test psnr".
+        a: the setting that it is of.
+        b: the setting that it is compared with.
+        low: lower end of what is claimed.
+        high: upper end.
+        to: the figure of ``b``; by default the same.
+        relative: whether the difference is divided by the figure of ``b``.
+    """
+
+    of: str
+    a: Setting
+    b: Setting
+    low: float = -math.inf
+    high: float = math.inf
+    to: str = ""
+    relative: bool = False
+
+
+_PSNR, _CA = "test psnr", "test ca"
+QUALITY = (_PSNR, "test ssim", "test lpips", _CA, "test ca_exact_half", "gaussians", "seconds")
+_FEW = ("synthetic", "fern", "lego", "dtu-scan65")
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim, or a comparison without one.
+
+    Args:
+        says: the claim.
+        paper: the paper's figures; CA in units of 1e-3.
+        settings: what is trained: the rows of its table.
+        checks: all of which must hold; none for a comparison.
+        shows: the columns of its table.
+        scenes: on which of the declared scenes; on a scene of one's own every claim can be tested.
+        needs: what is measured for it alone: "path", "renders" or "depth".
+    """
+
+    says: str
+    paper: str
+    settings: tuple[Setting, ...]
+    checks: tuple[Check, ...] = ()
+    shows: tuple[str, ...] = QUALITY
+    scenes: tuple[str, ...] = _FEW
+    needs: frozenset[str] = frozenset()
+
+
+def _with(regularizer: str = "", **changes: Any) -> Setting:
+    return {"regularizer": regularizer} | changes if regularizer else changes
+
+
+def _higher(of: str, a: Setting, b: Setting, to: str = "") -> Check:
+    return Check(of, a, b, low=0, to=to)
+
+
+def _lower(of: str, a: Setting, b: Setting, to: str = "") -> Check:
+    return Check(of, a, b, high=0, to=to)
+
+
+def _alike(of: str, a: Setting, b: Setting, within: float, to: str = "", *, relative: bool = False) -> Check:
+    return Check(of, a, b, -within, within, to, relative)
+
+
+def _falling(of: str, settings: Sequence[Setting]) -> tuple[Check, ...]:
+    return tuple(_lower(of, after, before) for before, after in pairwise(settings))
+
+
+_EVERY = tuple(SCENES)
+_PLAIN, _DROPOUT, _NOISE, _BOTH = map(_with, ("", "dropout(0.2)", "noise(0.8)", "dropout(0.2) + noise(0.8)"))
+_THREE = (_PLAIN, _DROPOUT, _NOISE)
+_VIEWS = (_with(views=2), _PLAIN, *(_with(views=n) for n in (6, 9, 17)))
+_DROPPED = tuple({**_DROPOUT, **setting} for setting in _VIEWS)
+_RATE = {0.0: _PLAIN} | {p: _with(f"dropout({p})") for p in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)}
+_SIGMA = {0.0: _PLAIN} | {s: _with(f"noise({s})") for s in (0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)}
+_DEGREES = tuple(_with(sh_degree=degree) for degree in (0, 1, 2))
+_SCALES = tuple(_with(f"scale_noise({s})") for s in (0.1, 0.2, 0.4, 0.7))
+_PLACES, _COLORS = ([_with(f"{name}({s})") for s in (0.1, 0.3, 0.5)] for name in ("position_noise", "sh_noise"))
+_CONCRETE, _DENSITY, _GEOMETRY, _CLUSTERED = map(_with, ("concrete", "density", "geometry", "clustered(0.2)"))
+_ANCHORS, _TIERS = map(_with, ("drop_anchors(ramp(0.0, 0.02, 0, 10_000))", "d2gs(ramp(0.05, 0.3, 0, 10_000))"))
+_TRIPLED = _with(loss="photometric + views(3)")
+_BINOCULAR = _with(recipe="binocular")
+_ABSOLUTE, _LASTING = {**_BINOCULAR, "density": "absgrad"}, {**_BINOCULAR, "opacity_decay": 1.0}
+_SYSTEMS = tuple(
+    {"recipe": name, **each} for name in ("3dgs", "dngaussian", "fsgs", "corgs", "binocular") for each in _THREE
+)
+_SCHEMES = (
+    *_THREE, _with("drop_gaussian(0.2, 10_000)"), _DENSITY, _GEOMETRY, _with("soft(0.2)"), _CONCRETE, _ANCHORS,
+    _CLUSTERED, _TIERS, _with("depth(ramp(0.05, 0.3, 0, 10_000))"), _SCALES[1], _PLACES[0], _COLORS[0],
+    _with("segs(0.08, 0.02, 2_000, 9_500)"), _with("drop_sh(until=(2_000, 4_000, 6_000))"),
+    _with(loss="photometric + consistency(0.4, 0.2)"), _with(opacity_decay=0.999),
+)  # fmt: skip
+
+CLAIMS = {
+    "1": Claim("dropout of 0.2 lowers CA and raises the PSNR of new views",
+               "LLFF: CA 8.21 -> 2.34, 19.36 -> 20.20 dB; Blender: 23.54 -> 24.14 dB", (_PLAIN, _DROPOUT),
+               (_lower(_CA, _DROPOUT, _PLAIN), _higher(_PSNR, _DROPOUT, _PLAIN)), scenes=_EVERY),
+    "2": Claim("so does opacity noise of 0.8", "LLFF: CA 8.21 -> 2.30, 19.36 -> 19.91 dB; Blender: 23.54 -> 23.65 dB",
+               (_PLAIN, _NOISE), (_lower(_CA, _NOISE, _PLAIN), _higher(_PSNR, _NOISE, _PLAIN)), scenes=_EVERY),
+    "3": Claim("both together bring less than 0.1 dB over dropout alone", "22.12, 22.12 and 22.11 dB",
+               (_DROPOUT, _NOISE, _BOTH), (Check(_PSNR, _BOTH, _DROPOUT, high=0.1),), scenes=_EVERY),
+    "4": Claim("CA falls as the training views increase", "a figure (flower)", (*_VIEWS, *_DROPPED),
+               _falling(_CA, _VIEWS), scenes=("fern",)),
+    "5": Claim("CA drops early in the training, from 1/6 to 2/6 of the steps, then settles: to 20 % after 4/6",
+               "a figure (flower, orchids)", _THREE,
+               (_lower("path 2", _PLAIN, _PLAIN, "path 1"),
+                _alike("path 6", _PLAIN, _PLAIN, 0.2, "path 4", relative=True)),
+               tuple(f"path {sixth}" for sixth in range(1, 7)), _EVERY, frozenset({"path"})),
+    "6": Claim("CA is lower at training views than at new ones", "all rows of LLFF and DTU: 7.54 < 8.21, 1.75 < 2.34",
+               _THREE, tuple(_lower("train ca", each, each, _CA) for each in _THREE),
+               ("train ca", _CA, "train ca_exact_half", "test ca_exact_half"), _EVERY),
+    "7": Claim("the dropout rate 0.2 is best, no other 0.1 dB above it, and 0.3 to 0.5 less than 0.3 dB below",
+               "21.44, 21.90, 22.12, 22.04, 22.03, 21.93, 21.79 dB for 0 to 0.6", tuple(_RATE.values()),
+               (_higher(_PSNR, _DROPOUT, _PLAIN), *(Check(_PSNR, _RATE[p], _DROPOUT, high=0.1) for p in (0.1, 0.6)),
+                *(Check(_PSNR, _RATE[p], _DROPOUT, -0.3, 0.1) for p in (0.3, 0.4, 0.5)))),
+    "8": Claim("noise of 0.8 helps, 0.4 to 1.0 are alike to 0.2 dB, and CA falls with its scale",
+               "21.44 dB without, 22.07, 22.00, 22.12, 22.05 dB at 0.4, 0.6, 0.8, 1.0; CA 1.95 -> 0.64",
+               tuple(_SIGMA.values()),
+               (_higher(_PSNR, _NOISE, _PLAIN), *(_alike(_PSNR, _SIGMA[s], _NOISE, 0.2) for s in (0.4, 0.6, 1.0)),
+                *_falling(_CA, [*_SIGMA.values()]))),
+    "9": Claim("after dropout a render with scaled opacities (C) and the mean of five dropout renders (B) are alike to "
+               "0.1 dB, and better than one dropout render (A)", "21.98 (A), 22.12 (B), 22.12 dB (C)", (_DROPOUT,),
+               (*(_higher(of, _DROPOUT, _DROPOUT, "renders one") for of in ("renders five", _PSNR)),
+                _alike(_PSNR, _DROPOUT, _DROPOUT, 0.1, "renders five")),
+               ("renders one", "renders five", _PSNR, "renders mean"), _EVERY, frozenset({"renders"})),
+    "10": Claim("noise of 0.2 on scales helps, of 0.1 on positions harms, of 0.1 on colors does nothing (0.1 dB)",
+                "21.44 dB without; 21.76, 21.09, 21.48 dB", (_PLAIN, *_SCALES, *_PLACES, *_COLORS),
+                (_higher(_PSNR, _SCALES[1], _PLAIN), _lower(_PSNR, _PLACES[0], _PLAIN),
+                 _alike(_PSNR, _COLORS[0], _PLAIN, 0.1))),
+    "11": Claim("the degree of the spherical harmonics matters less than 0.2 dB",
+                "19.29, 19.24, 19.38, 19.36 dB for 0 to 3",
+                (*_DEGREES, _PLAIN), tuple(_alike(_PSNR, each, _PLAIN, 0.2) for each in _DEGREES)),
+    "12": Claim("the number of Gaussians stays comparable, to a quarter", "111k, 115k with dropout, 98k with noise",
+                _THREE, tuple(_alike("gaussians", each, _PLAIN, 0.25, relative=True) for each in (_DROPOUT, _NOISE)),
+                ("gaussians",), _EVERY),
+    "13": Claim("the variance of color along a ray, CV, falls", "0.256 -> 0.107 with dropout, 0.053 with noise", _THREE,
+                tuple(_lower("test cv", each, _PLAIN) for each in (_DROPOUT, _NOISE)), ("test cv", "train cv"), _EVERY),
+    "14": Claim("depth becomes better (AbsRel)", "0.0732 -> 0.0676 with dropout, 0.0651 with noise", _THREE,
+                tuple(_lower("depth abs_rel", each, _PLAIN) for each in (_DROPOUT, _NOISE)),
+                ("depth abs_rel", "depth rmse", "depth mae", "depth log10"),
+                tuple(name for name in SCENES if name != "lego"), frozenset({"depth"})),  # it has no other photographs
+    "15": Claim("concrete dropout is worse than none, dropout by density as good as uniform one, to 0.15 dB",
+                "21.44 dB without, 20.88; 22.05 against 22.12 dB", (_PLAIN, _DROPOUT, _CONCRETE, _DENSITY, _GEOMETRY),
+                (_lower(_PSNR, _CONCRETE, _PLAIN), _alike(_PSNR, _DENSITY, _DROPOUT, 0.15))),
+    "16": Claim("steps of three views raise CA and the number of Gaussians", "CA 8.2 -> 24.3, 111k -> 1,144k",
+                (_PLAIN, _TRIPLED), tuple(_higher(of, _TRIPLED, _PLAIN) for of in (_CA, "gaussians"))),
+    "17": Claim("absolute gradients lower the CA of Binocular3DGS; without its opacity decay it rises",
+                "1.95 -> 1.59; 4.83", (_BINOCULAR, _ABSOLUTE, _LASTING),
+                (_lower(_CA, _ABSOLUTE, _BINOCULAR), _higher(_CA, _LASTING, _BINOCULAR))),
+    "systems": Claim("five systems, each plain, with dropout and with noise", "the main table", _SYSTEMS),
+    "schemes": Claim("the field's schemes side by side", "", _SCHEMES),
+    "views": Claim("dropout helps, however many views", "UGOD: it harms at 24", (*_VIEWS, *_DROPPED),
+                   tuple(_higher(_PSNR, *pair) for pair in zip(_DROPPED, _VIEWS, strict=True)), scenes=("fern",)),
+    "neighbors": Claim("dropping neighbors together is better (DropAnSH-GS: they compensate)", "",
+                       (_DROPOUT, _CLUSTERED, _ANCHORS), (_higher(_PSNR, _CLUSTERED, _DROPOUT),)),
+    "guided": Claim("rates by depth and density are better than one for all (D2GS)", "", (_DROPOUT, _TIERS),
+                    (_higher(_PSNR, _TIERS, _DROPOUT),)),
+}  # fmt: skip
+"""The seventeen claims by their number, then what the field asks beside them."""
+
+
+def chosen(names: Sequence[str], scenes: Sequence[str] | None = None) -> dict[str, Claim]:
+    """Return claims by name, none for all; with ``scenes`` they are tested on these, whatever is declared.
+
+    Raises ValueError if there is no such claim.
+    """
+    if unknown := [name for name in names if name not in CLAIMS]:
+        raise ValueError(f"there is no claim {unknown[0]}; choose of {', '.join(CLAIMS)}.")
+    found = {name: CLAIMS[name] for name in names or CLAIMS}
+    return found if scenes is None else {name: replace(it, scenes=tuple(scenes)) for name, it in found.items()}

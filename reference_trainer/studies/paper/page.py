@@ -1,0 +1,192 @@
+"""Tables, verdicts and figures of the kept rows, and the pages of the docs that show them between marks."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from reference_trainer.evaluation.results import format_mean_std, markdown_table
+from reference_trainer.runs.figures import new_figure
+from reference_trainer.studies.paper.claims import CLAIMS, QUALITY, Check, Claim
+from reference_trainer.studies.paper.rows import Row, Rows, label, resolved, value
+from reference_trainer.studies.paper.scenes import SCENES
+from reference_trainer.studies.paper.verdict import Verdict, interval, overall, verdict
+
+__all__ = ["Kept", "claims_table", "details", "judged", "page", "sweeps"]
+
+_TITLES = {
+    "test psnr": ("PSNR", 1.0), "test ssim": ("SSIM", 1.0), "test lpips": ("LPIPS", 1.0), "test ca": ("CA", 1e-3),
+    "train ca": ("CA, training views", 1e-3), "test ca_exact_half": ("exact CA at 1/2", 1e-3),
+    "train ca_exact_half": ("exact CA at 1/2, training views", 1e-3), "test cv": ("CV", 1.0),
+    "train cv": ("CV, training views", 1.0), "gaussians": ("Gaussians, k", 1e3), "seconds": ("processor s", 1.0),
+    "renders one": ("A: one render", 1.0), "renders five": ("B: mean of five", 1.0),
+    "renders mean": ("D: exact mean", 1.0), "depth abs_rel": ("AbsRel", 1.0), "depth rmse": ("RMSE", 1.0),
+    "depth mae": ("MAE", 1.0), "depth log10": ("log10", 1.0),
+} | {f"path {sixth}": (f"CA at {sixth}/6", 1e-3) for sixth in range(1, 7)}  # fmt: skip
+_MARKS = re.compile(r"(<!-- paper (\w+)(?: ([\w-]+))? -->\n).*?(<!-- end -->)", re.DOTALL)
+_AXES = {"4": ("views", "training views"), "7": ("dropout", "dropout rate"), "8": ("noise", "noise, sigma")}
+
+
+class Kept:
+    """The rows of all scenes of a folder, of one recipe and number of iterations."""
+
+    def __init__(self, folder: Path, recipe: str = "3dgs", iterations: int = 3_000) -> None:
+        self.folder, self.recipe, self.iterations = folder, recipe, iterations
+        self.scenes = {file.stem: Rows(file) for file in sorted(folder.glob("*.json"))}
+
+    def of(self, scene: str, setting: Mapping[str, object]) -> dict[int, Row]:
+        """Return the rows of a setting on a scene by seed."""
+        return self.scenes[scene].of(resolved(setting, self.recipe, self.iterations))
+
+
+def differences(check: Check, scene: str, kept: Kept) -> list[float]:
+    """Return the differences that a check is about, of every seed that has both figures."""
+    a, b = kept.of(scene, check.a), kept.of(scene, check.b)
+    pairs = [(value(a[seed], check.of), value(b[seed], check.to or check.of)) for seed in sorted(a.keys() & b.keys())]
+    found = [(x - y) / (y if check.relative else 1.0) for x, y in pairs]
+    return [difference for difference in found if math.isfinite(difference)]
+
+
+def judged(claim: Claim, kept: Kept) -> dict[str, tuple[int, Verdict]]:
+    """Return for every scene on which all checks of a claim are measured with how many seeds, and the verdict."""
+    found = {}
+    for scene in kept.scenes:
+        of = [(check, differences(check, scene, kept)) for check in claim.checks]
+        if of and all(seeds for _, seeds in of):
+            verdicts = [verdict(seeds, check.low, check.high) for check, seeds in of]
+            found[scene] = min(len(seeds) for _, seeds in of), overall(verdicts, needs_all=True)
+    return found
+
+
+def claims_table(kept: Kept) -> str:
+    """Return one row for each claim: the verdict, and on which scenes."""
+    rows: list[dict[str, object]] = []
+    columns = ["", "claim", "the paper", "verdict", "scenes (seeds)"]
+    for name, claim in CLAIMS.items():
+        if not claim.checks:
+            continue
+        scenes = judged(claim, kept)
+        known = [end for seeds, end in scenes.values() if seeds > 1]
+        verdicts = {end: [f"{scene} ({seeds})" for scene, (seeds, it) in scenes.items() if it == end]
+                    for end in ("holds", "fails", "undecided")}  # fmt: skip
+        where = "; ".join(f"{end}: {', '.join(of)}" for end, of in verdicts.items() if of)
+        final = overall(known) if known else "one seed" if scenes else "not yet measured"
+        cells = name, claim.says, claim.paper or "-", final, where or "-"
+        rows.append(dict(zip(columns, cells, strict=True)))
+    return markdown_table(rows, columns)
+
+
+def details(name: str, kept: Kept) -> str:
+    """Return what is measured of a claim: on every scene the table of its settings, and the checks; else ""."""
+    claim, parts = CLAIMS[name], []
+    for scene in kept.scenes:
+        found = {}
+        for setting in claim.settings if scene in claim.scenes or scene not in SCENES else ():
+            if of := [row for row in kept.of(scene, setting).values() if claim.needs <= row.keys()]:
+                found[_name(setting, kept)] = of
+        if len(found) >= min(2, len(claim.settings)):
+            about = kept.scenes[scene].content.get("about", "")
+            parts.append(f"**{scene}**: {about}\n\n{_table(found, claim.shows)}")
+            lines = [_line(check, apart, kept) for check in claim.checks if (apart := differences(check, scene, kept))]
+            parts += ["".join(lines)] if lines else []
+    return "\n".join(parts)
+
+
+def sweeps(kept: Kept, path: Path) -> None:
+    """Draw PSNR and CA against views, dropout rate and noise, of every scene that has them."""
+    with new_figure(path) as figure:
+        figure.set_size_inches(12, 6)
+        for column, (name, (word, title)) in enumerate(_AXES.items(), start=1):
+            for row, (of, unit) in enumerate((("test psnr", 1.0), ("test ca", 1e-3))):
+                axes = figure.add_subplot(2, 3, column + 3 * row, xlabel=title, ylabel=_TITLES[of][0])
+                for scene in kept.scenes:
+                    points = []
+                    for setting in CLAIMS[name].settings:
+                        at, rows = _place(setting, word), kept.of(scene, setting).values()
+                        if at is not None and rows:
+                            points.append((at, *interval([value(each, of) / unit for each in rows])))
+                    if len(points) > 2:
+                        x, y, error = zip(*sorted(points), strict=True)
+                        axes.errorbar(x, y, [0 if math.isinf(e) else e for e in error], marker="o", label=scene)
+                if axes.lines:
+                    axes.legend()
+
+
+def page(text: str, kept: Kept) -> str:
+    """Return the text of a page with everything between its marks made again.
+
+    The marks are ``<!-- paper WHAT NAME -->`` and ``<!-- end -->``; WHAT is ``claims`` for the verdicts, ``details`` of
+    a claim by its name, all of them without, or ``rows`` for all rows of the file NAME beside the folder.
+    """
+
+    def made(match: re.Match[str]) -> str:
+        what, name = match[2], match[3]
+        if what == "claims":
+            body = claims_table(kept)
+        elif what == "rows":
+            body = _rows(Rows(kept.folder.parent / f"{name}.json").rows)
+        else:
+            found = {key: details(key, kept) for key in ([name] if name else CLAIMS)}
+            headed = [f"## {key}. {CLAIMS[key].says}\n\n{text}" for key, text in found.items() if text]
+            missing = ", ".join(key for key, text in found.items() if not text)
+            body = "\n".join([*headed, f"Not yet measured: {missing}.\n"] if missing else headed)
+        return f"{match[1]}{body}{match[4]}"
+
+    return _MARKS.sub(made, text)
+
+
+def _rows(rows: Sequence[Row]) -> str:
+    """Return one row for each setting, named by what differs from the first."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(label(row["setting"], rows[0]["setting"]), []).append(row)
+    return _table(found, QUALITY)
+
+
+def _table(rows: Mapping[str, Sequence[Row]], figures: Sequence[str]) -> str:
+    """Return one row for each setting: means and sample deviations over the seeds, of the figures that one has."""
+    lines: list[dict[str, object]] = []
+    titles: dict[str, None] = {}
+    for name, of in rows.items():
+        lines.append({"setting": f"`{name}`" if name != "plain" else name, "seeds": len(of)})
+        for figure in figures:
+            title, unit = _TITLES[figure]
+            values = [value(row, figure) for row in of]
+            if any(map(math.isfinite, values)):
+                titles[title] = None
+                lines[-1][title] = format_mean_std(values, unit=unit)
+    order = [title for title, _ in map(_TITLES.__getitem__, figures) if title in titles]
+    return markdown_table(lines, ["setting", "seeds", *order])
+
+
+def _line(check: Check, of: Sequence[float], kept: Kept) -> str:
+    """Return a check in words: what is compared, mean and two standard errors, what is claimed, and the verdict."""
+    title, unit = _TITLES[check.of]
+    unit, sign = (0.01, " %") if check.relative else (unit, "")
+    mean, spread = (x / unit for x in interval(of))
+    measured = f"{mean:+.3g}{'' if math.isinf(spread) else f' ± {spread:.2g}'}{sign}"
+    ends = [
+        f"{word} {end / unit:g}{sign}"
+        for word, end in (("above", check.low), ("below", check.high))
+        if math.isfinite(end)
+    ]
+    than = _TITLES[check.to or check.of][0]
+    pair = f"{_name(check.a, kept)} - {_name(check.b, kept)}" if check.a != check.b else _name(check.a, kept)
+    what = title if than == title else f"{title} - {than}"
+    return f"- `{pair}`, {what}: {measured} (claimed: {' and '.join(ends)}), {verdict(of, check.low, check.high)}\n"
+
+
+def _name(setting: Mapping[str, object], kept: Kept) -> str:
+    """Return what a setting is called among those of the same recipe."""
+    return label(setting, {"recipe": kept.recipe})
+
+
+def _place(setting: Mapping[str, object], word: str) -> float | None:
+    """Return where a setting stands on the axis of views, dropout or noise; None beside it."""
+    regularizer = str(setting.get("regularizer", ""))
+    if word == "views":
+        return None if regularizer else float(str(setting.get("views", 3)))
+    found = re.fullmatch(rf"{word}\(([\d.]+)\)", regularizer)
+    return float(found[1]) if found else None if regularizer else 0.0
