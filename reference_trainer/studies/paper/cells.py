@@ -36,7 +36,8 @@ SIXTHS = 6
 OPAQUE = 0.8
 DENSER = 2
 """How many times the iterations, for the model of all photographs that depths are compared with."""
-_FIGURES = ("psnr", "ssim", "lpips", "ca", "ca_half", "ca_exact", "ca_exact_half", "cv")
+_FIGURES = ("psnr", "ssim", "lpips", "ca", "ca_half", "ca_exact", "ca_exact_half", "cv",
+            "depth_abs_rel", "depth_rmse")  # fmt: skip
 _COST = {"binocular": 2.0, "corgs": 3.3, "fsgs": 1.6, "dngaussian": 2.0, "photometric + views(3)": 4.0,
          "photometric + consistency(0.4, 0.2)": 1.8}  # fmt: skip
 

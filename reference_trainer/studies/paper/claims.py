@@ -41,7 +41,9 @@ class Check:
 
 
 _PSNR, _CA = "test psnr", "test ca"
-QUALITY = (_PSNR, "test ssim", "test lpips", _CA, "test ca_exact_half", "gaussians", "seconds")
+QUALITY = (_PSNR, "test ssim", "test lpips", _CA, "test ca_exact_half", "test depth_abs_rel", "test depth_rmse",
+           "gaussians", "seconds", "pace")  # fmt: skip
+"""The columns of a table of models, those of them that were measured."""
 _FEW = ("synthetic", "fern", "lego", "dtu-scan65")
 
 
@@ -103,8 +105,9 @@ _ANCHORS, _TIERS = map(_with, ("drop_anchors(ramp(0.0, 0.02, 0, 10_000))", "d2gs
 _TRIPLED = _with(loss="photometric + views(3)")
 _BINOCULAR = _with(recipe="binocular")
 _ABSOLUTE, _LASTING = {**_BINOCULAR, "density": "absgrad"}, {**_BINOCULAR, "opacity_decay": 1.0}
-_SYSTEMS = tuple(
-    {"recipe": name, **each} for name in ("3dgs", "dngaussian", "fsgs", "corgs", "binocular") for each in _THREE
+_SYSTEMS, _FURTHER = (
+    tuple({"recipe": name, **each} for name in names for each in _THREE)
+    for names in (("3dgs", "dngaussian", "fsgs", "corgs", "binocular"), ("mvgs", "absgs", "segs"))
 )
 _SCHEMES = (
     *_THREE, _with("drop_gaussian(0.2, 10_000)"), _DENSITY, _GEOMETRY, _with("soft(0.2)"), _CONCRETE, _ANCHORS,
@@ -170,6 +173,7 @@ CLAIMS = {
                 "1.95 -> 1.59; 4.83", (_BINOCULAR, _ABSOLUTE, _LASTING),
                 (_lower(_CA, _ABSOLUTE, _BINOCULAR), _higher(_CA, _LASTING, _BINOCULAR))),
     "systems": Claim("five systems, each plain, with dropout and with noise", "the main table", _SYSTEMS),
+    "further": Claim("further systems, likewise", "", _FURTHER, scenes=("synthetic", "fern")),
     "schemes": Claim("the field's schemes side by side", "", _SCHEMES),
     "views": Claim("dropout helps, however many views", "UGOD: it harms at 24", (*_VIEWS, *_DROPPED),
                    tuple(_higher(_PSNR, *pair) for pair in zip(_DROPPED, _VIEWS, strict=True)), scenes=("fern",)),

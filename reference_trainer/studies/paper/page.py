@@ -21,11 +21,13 @@ _TITLES = {
     "train ca": ("CA, training views", 1e-3), "test ca_exact_half": ("exact CA at 1/2", 1e-3),
     "train ca_exact_half": ("exact CA at 1/2, training views", 1e-3), "test cv": ("CV", 1.0),
     "train cv": ("CV, training views", 1.0), "gaussians": ("Gaussians, k", 1e3), "seconds": ("processor s", 1.0),
+    "pace": ("s/iteration", 1.0),
+    "test depth_abs_rel": ("depth AbsRel", 1.0), "test depth_rmse": ("depth RMSE", 1.0),
     "renders one": ("A: one render", 1.0), "renders five": ("B: mean of five", 1.0),
     "renders mean": ("D: exact mean", 1.0), "depth abs_rel": ("AbsRel", 1.0), "depth rmse": ("RMSE", 1.0),
     "depth mae": ("MAE", 1.0), "depth log10": ("log10", 1.0),
 } | {f"path {sixth}": (f"CA at {sixth}/6", 1e-3) for sixth in range(1, 7)}  # fmt: skip
-_MARKS = re.compile(r"(<!-- paper (\w+)(?: ([\w-]+))? -->\n).*?(<!-- end -->)", re.DOTALL)
+_MARKS = re.compile(r"(<!-- paper (\w+)(?: ([\w-]+))?(?: (\d+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 _AXES = {"4": ("views", "training views"), "7": ("dropout", "dropout rate"), "8": ("noise", "noise, sigma")}
 
 
@@ -117,22 +119,26 @@ def sweeps(kept: Kept, path: Path) -> None:
 def page(text: str, kept: Kept) -> str:
     """Return the text of a page with everything between its marks made again.
 
-    The marks are ``<!-- paper WHAT NAME -->`` and ``<!-- end -->``; WHAT is ``claims`` for the verdicts, ``details`` of
-    a claim by its name, all of them without, or ``rows`` for all rows of the file NAME beside the folder.
+    The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``; WHAT is ``claims`` for the verdicts,
+    ``details`` of a claim by its name, all of them without, or ``rows`` for all rows of the file NAME beside the
+    folder; iterations are those of ``kept`` where none are given.
     """
 
     def made(match: re.Match[str]) -> str:
         what, name = match[2], match[3]
+        of = Kept(kept.folder, kept.recipe, int(match[4])) if match[4] else kept
         if what == "claims":
-            body = claims_table(kept)
+            body = claims_table(of)
         elif what == "rows":
             body = _rows(Rows(kept.folder.parent / f"{name}.json").rows)
+        elif name:
+            body = details(name, of) or "Not yet measured.\n"
         else:
-            found = {key: details(key, kept) for key in ([name] if name else CLAIMS)}
+            found = {key: details(key, of) for key in CLAIMS}
             headed = [f"## {key}. {CLAIMS[key].says}\n\n{text}" for key, text in found.items() if text]
             missing = ", ".join(key for key, text in found.items() if not text)
             body = "\n".join([*headed, f"Not yet measured: {missing}.\n"] if missing else headed)
-        return f"{match[1]}{body}{match[4]}"
+        return f"{match[1]}{body}{match[5]}"
 
     return _MARKS.sub(made, text)
 

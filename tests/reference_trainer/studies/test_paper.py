@@ -236,6 +236,15 @@ def test_pages_are_made_again_between_their_marks(kept):
     assert "stale" not in made
 
 
+def test_a_mark_names_one_comparison_and_its_iterations(kept):
+    text = "<!-- paper details 1 100 -->\n<!-- end -->\n"
+    rows = Rows(kept.folder / "a.json")
+    for setting in CLAIMS["1"].settings:
+        rows.add({**row(25.0), "setting": resolved(setting, "3dgs", 100)})
+    assert page(text, kept).count("| 1 | 25 |") == 2
+    assert "Not yet measured." in page(text.replace("100", "50"), kept)
+
+
 def test_the_figure_shows_every_scene_with_a_sweep(tmp_path):
     rows = Rows(tmp_path / "a.json", {"scene": "a"})
     for rate, quality in ((0.1, 20.5), (0.2, 21.0), (0.3, 20.8)):
