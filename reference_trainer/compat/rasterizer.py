@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor, nn
 
-from reference_trainer.compat.antialiasing import antialiased
+from reference_trainer.compat.antialiasing import filtered
 from reference_trainer.compat.contributions import contributions
 from reference_trainer.compat.extensions import make_module
 from reference_trainer.compat.outputs import Unknown, kinds_of
@@ -20,6 +20,7 @@ from reference_trainer.compat.unpacking import names_of_results
 from reference_trainer.model.relocation import compute_relocation
 from reference_trainer.render import draw, splat
 from reference_trainer.render.absolute import splat_weights, with_absolute_gradients
+from reference_trainer.render.constants import DILATION
 
 __all__ = ["GaussianRasterizer", "rasterizer_module"]
 
@@ -27,6 +28,7 @@ FIELDS = ("antialiasing", "confidence", "pixel_weights")  # of the settings, whi
 SCORES = ("accum_weights", "accum_count", "accum_blend", "accum_dist", "depths")
 DEPTHS = {"depth", "surfels"}
 FLOOR = 2.5e-5  # INRIA's least share of the area, of antialiasing
+FLOOR_OF_MIP = 1e-6  # that of Mip-Splatting
 
 
 class GaussianRasterizer(nn.Module):
@@ -113,8 +115,10 @@ class GaussianRasterizer(nn.Module):
         splats = splat(
             means3D, rotations, scales, opacities, camera, sh=shs, sh_degree=settings.sh_degree, colors=colors_precomp
         )
-        if settings.antialiasing:
-            splats = antialiased(splats, means3D, rotations, scales, camera, floor=FLOOR)
+        blur = DILATION if settings.kernel_size is None else float(settings.kernel_size)
+        if settings.antialiasing or settings.kernel_size is not None:
+            floor = FLOOR if settings.antialiasing else FLOOR_OF_MIP
+            splats = filtered(splats, means3D, rotations, scales, camera, blur=blur, floor=floor)
         # Pixels per unit of normalised device coordinates, for every column.
         half = [0.5 * camera.width, 0.5 * camera.height, 0.5 * camera.width, 0.5 * camera.height]
         sink = means2D.index_select(0, splats.indices) * means2D.new_tensor(half[:columns])
@@ -137,7 +141,7 @@ class GaussianRasterizer(nn.Module):
             found["weights"] = means3D.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
         if "surfels" in kinds:
             found["surfels"] = surfel_planes(rendering._replace(splats=splats), means3D, rotations, camera)
-        radii = visible_radii(means3D, rotations, scales, camera)
+        radii = visible_radii(means3D, rotations, scales, camera, blur=blur)
         if settings.pixel_weights is not None:
             sums = contributions(splats, settings.pixel_weights.reshape(camera.height, camera.width))
             table = torch.stack([*sums, projection.depths.detach()])

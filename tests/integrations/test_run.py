@@ -123,7 +123,7 @@ def test_a_script_is_regularized_and_the_report_says_how(repository, tmp_path, c
     }
     assert (written["dropout"], written["arguments"], written["ended"]) == (0.5, ["3"], "exit 0")
     assert "[ca_reg] 2 renders regularized, steps 2 to 3" in regularized.err
-    assert "[ca_reg] 3 renders left alone: further render in the same iteration (scope main)" in regularized.err
+    assert "[ca_reg] 3 renders left alone: render of another place in the script" in regularized.err
     before, after = seen(plain.out), seen(regularized.out)
     assert after[0] == before[0]
     assert all(a < 0.8 * b for a, b in zip(after[1:], before[1:], strict=True))
