@@ -84,11 +84,11 @@ class GaussianRasterizer(nn.Module):
         out, with a warning unless they are None.
 
         Returns:
-            The image (3, H, W), not clamped; radii in pixels, shape (N,) int32, 0 for what is out of view; and what
-            the caller calls the further members, see `kinds_of`. Depth and inverse depth are sums of weight times
-            (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's sum of weights
-            over the pixels, shape (N,), without a gradient; so are the scores of Taming 3DGS, see `contributions`.
-            Surfels are the seven planes of `surfel_planes`.
+            What the caller calls the members, see `kinds_of`; first, by default, the image (3, H, W), not clamped, and
+            radii in pixels, shape (N,) int32, 0 for what is out of view. Depth and inverse depth are sums of weight
+            times (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's sum of
+            weights over the pixels, shape (N,), without a gradient; so are the scores of Taming 3DGS, see
+            `contributions`. Surfels are the seven planes of `surfel_planes`.
 
         Raises:
             ValueError: if ``means2D`` has another shape, a covariance is given, or the outputs cannot be told.
@@ -147,14 +147,13 @@ class GaussianRasterizer(nn.Module):
             table = torch.stack([*sums, projection.depths.detach()])
             table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
             found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": radii}
-        labels = names[2:] if names else kinds
+        labels = (*(names or kinds), "radii")  # which a caller of one value alone does not name
         drawn = rendering.alpha.detach() > 0
         found = {
             name: _returned(x, drawn) if x.shape[-2:] == drawn.shape else x
             for name, x in {**found, "image": rendering.image}.items()
-        }
-        members = [found.get(str(kind), Unknown(str(label))) for kind, label in zip(kinds, labels, strict=True)]
-        return (found["image"], radii, *members)
+        } | {"radii": radii}
+        return tuple(found.get(str(kind), Unknown(str(label))) for kind, label in zip(kinds, labels, strict=False))
 
     def _axes(
         self, scales: Tensor | None, rotations: Tensor | None, covariances: Tensor | None
