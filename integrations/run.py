@@ -61,8 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.cpu:
             from reference_trainer.compat import stand_in
 
-            root = options.script.resolve().parent if isinstance(options.script, Path) else Path.cwd()
-            undo.enter_context(stand_in() if options.gsplat else stand_in(root, options.outputs, options.rasterizer))
+            given = (options.sources.root, options.outputs, options.rasterizer)
+            undo.enter_context(stand_in() if options.gsplat else stand_in(*given))
         if hook is not None:
             hook.install()
             undo.callback(_uninstall, hook)

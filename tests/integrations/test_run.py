@@ -378,6 +378,17 @@ def test_what_a_script_imports_is_read_also_through_the_files_beside_it(reposito
     assert read_script("nowhere.train").packages == {"nowhere"}
 
 
+@pytest.mark.parametrize("reaches_up", [False, True])
+def test_a_script_that_reaches_above_its_folder_is_read_with_what_lies_there(repository, reaches_up):
+    script = repository / "scripts" / "train.py"
+    script.parent.mkdir()
+    script.write_text(reaches_up * "import sys; sys.path.append('..')\n" + "import scene.gaussian_model, train\n")
+    sources = read_script(script)
+    assert sources.root == (repository if reaches_up else script.parent).resolve()
+    assert sources.models == ["scene.gaussian_model:GaussianModel"] * reaches_up
+    assert ("diff_gaussian_rasterization" in sources.packages) == reaches_up
+
+
 def test_a_package_that_is_built_on_another_needs_it():
     """torchmetrics requires torch, and tells so in what is installed with it."""
     assert Sources({"torchmetrics", "nowhere"}).need("torch")
