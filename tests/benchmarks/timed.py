@@ -28,7 +28,7 @@ __all__ = ["main"]
 def main(file: str, shift: str, module: str, *arguments: str) -> None:
     """Run the module; the file is written however it ends."""
     times: list[float] = []
-    register_optimizer_step_post_hook(lambda *_: times.append(time.process_time()))
+    watch = register_optimizer_step_post_hook(lambda *_: times.append(time.process_time()))
     sys.argv = [module, *arguments]
     out = Path(file).resolve()
     try:
@@ -39,6 +39,7 @@ def main(file: str, shift: str, module: str, *arguments: str) -> None:
         ):
             runpy.run_module(module, run_name="__main__", alter_sys=True)
     finally:
+        watch.remove()
         out.write_text(json.dumps({"seconds": times[-1] - times[0] if times else None}))
 
 

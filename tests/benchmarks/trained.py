@@ -29,6 +29,7 @@ _QUALITY = {
     "ca_exact_half": ("exact CA at 1/2", 1e-3),
 }
 _OWN = {"gaussians": ("Gaussians, k", 1e3), "processor_seconds": ("processor s", 1.0)}
+_BESIDE = {"seconds_per_iteration": ("s/iteration", 1.0)}  # in `side_by_side`
 _MARKS = re.compile(r"(<!-- trained (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -53,7 +54,8 @@ def keep(runs: Iterable[Path]) -> dict[str, Any]:
 
 def table(kept: Mapping[str, Any]) -> str:
     """Return one row per setting, means and sample standard deviations over its seeds; CA in units of 1e-3."""
-    columns = _QUALITY | _OWN
+    first = next(iter(kept["rows"].values()))[0]
+    columns = {name: of for name, of in (_QUALITY | _OWN | _BESIDE).items() if name in first}
     rows = [
         {"setting": f"`{label}`" if label != "none" else label, "seeds": len(of)}
         | {title: format_mean_std([run[name] for run in of], unit=unit) for name, (title, unit) in columns.items()}
