@@ -57,9 +57,12 @@ class GaussianRasterizationSettings(_Fields):
 
 
 def warn_of_ignored(kind: str, values: dict[str, Any]) -> None:
-    """Warn, once each, of values that the stand-in does not know; None, False and zeros are nothing to ignore."""
+    """Warn, once each, of values that the stand-in does not know; None, False and zeros are nothing to ignore.
+
+    Zeros that wait for a gradient are something.
+    """
     for name, value in sorted(values.items()):
-        if value.any() if isinstance(value, Tensor) else value not in (None, False):
+        if (value.requires_grad or value.any()) if isinstance(value, Tensor) else value not in (None, False):
             _warn(kind, name)
 
 
