@@ -117,7 +117,7 @@ class _Generator(metaclass=_AnyGenerator):
     """Makes plain generators, all of them on the CPU."""
 
     def __new__(cls, device: Any = "cpu") -> Any:
-        return _GENERATOR.__new__(_GENERATOR, _on_cpu(device))
+        return _GENERATOR(_on_cpu(device))
 
 
 class _Event:
