@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from types import CodeType, FrameType
+from traceback import walk_stack
+from types import CodeType
 from typing import Any, NamedTuple
 
 from ca_reg import Chain, OpacityNoise
@@ -32,21 +33,17 @@ class Caller(NamedTuple):
 
 def calling_render() -> Caller:
     """Return the nearest calling function named render..., else the nearest foreign one."""
-    frame: FrameType | None = sys._getframe(1)
-    foreign: list[FrameType] = []
-    found: FrameType | None = None
-    while frame is not None and found is None and len(foreign) < _OUTWARD:
-        module = frame.f_globals.get("__name__", "")
-        if module.rpartition(".")[0] != __package__ and module.partition(".")[0] != "torch":
-            foreign.append(frame)
-            found = frame if frame.f_code.co_name.startswith("render") else None
-        frame = frame.f_back
-    frame = found = found or next(iter(foreign), None)
-    place = []
-    while frame is not None:
-        place.append((frame.f_code, frame.f_lasti))
-        frame = frame.f_back
-    return Caller({} if found is None else dict(found.f_locals), tuple(place))
+    stack = [frame for frame, _ in walk_stack(sys._getframe(1))]
+    foreign = [frame for frame in stack if _is_foreign(frame.f_globals.get("__name__", ""))][:_OUTWARD]
+    renders = [frame for frame in foreign if frame.f_code.co_name.startswith("render")]
+    for found in (*renders, *foreign):
+        place = stack[stack.index(found) :]
+        return Caller(dict(found.f_locals), tuple((frame.f_code, frame.f_lasti) for frame in place))
+    return Caller({}, ())
+
+
+def _is_foreign(module: str) -> bool:
+    return module.rpartition(".")[0] != __package__ and module.partition(".")[0] != "torch"
 
 
 def find_instance(variables: Mapping[str, Any], classes: tuple[type, ...]) -> Any:

@@ -23,8 +23,7 @@ __all__ = ["make_rasterization"]
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 READ = {
     "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane", "far_plane",
-    "radius_clip", "sh_degree", "packed", "backgrounds", "render_mode", "absgrad", "rasterize_mode",
-    "eps2d",
+    "radius_clip", "eps2d", "sh_degree", "packed", "backgrounds", "render_mode", "absgrad", "rasterize_mode",
 }  # fmt: skip
 WITHOUT_EFFECT = {"tile_size", "channel_chunk", "segmented", "sparse_grad", "ut_params", "renderer_config"}
 NEAREST = 1e-6  # a nearer near plane is taken for this one
