@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -58,7 +59,10 @@ def table(kept: Mapping[str, Any]) -> str:
     columns = {name: of for name, of in (_QUALITY | _OWN | _BESIDE).items() if name in first}
     rows = [
         {"setting": f"`{label}`" if label != "none" else label, "seeds": len(of)}
-        | {title: format_mean_std([run[name] for run in of], unit=unit) for name, (title, unit) in columns.items()}
+        | {
+            title: format_mean_std([math.nan if run[name] is None else run[name] for run in of], unit=unit)
+            for name, (title, unit) in columns.items()
+        }
         for label, of in kept["rows"].items()
     ]
     return markdown_table(rows, ["setting", "seeds", *(title for title, _ in columns.values())])
