@@ -8,28 +8,42 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from types import FrameType
-from typing import Any
+from traceback import walk_stack
+from types import CodeType
+from typing import Any, NamedTuple
 
 from ca_reg import Chain, OpacityNoise
 
-__all__ = ["calling_render", "find_instance", "is_viewer", "refuse_a_second_regularizer"]
+__all__ = ["Caller", "calling_render", "find_instance", "is_viewer", "refuse_a_second_regularizer"]
 
 _OUTWARD = 8  # frames to search: torch.nn.Module puts two between the rasterizer and its caller
 
 
-def calling_render() -> Mapping[str, Any]:
-    """Return the variables of the nearest calling function named render..., else of the nearest foreign one."""
-    frame: FrameType | None = sys._getframe(1)
-    foreign: list[FrameType] = []
-    while frame is not None and len(foreign) < _OUTWARD:
-        module = frame.f_globals.get("__name__", "")
-        if module.rpartition(".")[0] != __package__ and module.partition(".")[0] != "torch":
-            if frame.f_code.co_name.startswith("render"):
-                return dict(frame.f_locals)
-            foreign.append(frame)
-        frame = frame.f_back
-    return dict(foreign[0].f_locals) if foreign else {}
+class Caller(NamedTuple):
+    """Who asks for a render.
+
+    Args:
+        variables: those of the calling function.
+        place: where it stands in the script, with all calls that led there: in a loop the same for each render.
+    """
+
+    variables: Mapping[str, Any]
+    place: tuple[tuple[CodeType, int], ...]
+
+
+def calling_render() -> Caller:
+    """Return the nearest calling function named render..., else the nearest foreign one."""
+    stack = [frame for frame, _ in walk_stack(sys._getframe(1))]
+    foreign = [frame for frame in stack if _is_foreign(frame.f_globals.get("__name__", ""))][:_OUTWARD]
+    renders = [frame for frame in foreign if frame.f_code.co_name.startswith("render")]
+    for found in (*renders, *foreign):
+        place = stack[stack.index(found) :]
+        return Caller(dict(found.f_locals), tuple((frame.f_code, frame.f_lasti) for frame in place))
+    return Caller({}, ())
+
+
+def _is_foreign(module: str) -> bool:
+    return module.rpartition(".")[0] != __package__ and module.partition(".")[0] != "torch"
 
 
 def find_instance(variables: Mapping[str, Any], classes: tuple[type, ...]) -> Any:

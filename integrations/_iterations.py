@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any, Literal
 
 from torch import Tensor
@@ -28,6 +28,7 @@ class Field:
         self._by_parameters = steps == "parameters"
         self._updates_end_step: bool | None = None
         self._versions: tuple[tuple[int, int], ...] = ()
+        self._place: Hashable = None
 
     @property
     def training_step(self) -> int:
@@ -54,10 +55,11 @@ class Field:
             self.begin(self.step + 1)
         return rendered
 
-    def count_render(self, parameters: tuple[Tensor, ...]) -> None:
-        """Count a training render; raise RuntimeError if steps go by without anyone saying so.
+    def count_render(self, parameters: tuple[Tensor, ...], place: Hashable) -> bool:
+        """Count a training render; return whether it is asked for at the place of the first one of its step.
 
-        Whoever trains the parameters changes their versions; that begins a step, or must not happen within one.
+        Raises RuntimeError if steps go by without anyone saying so. Whoever trains the parameters changes their
+        versions; that begins a step, or must not happen within one.
         """
         versions = tuple((id(x), x._version) for x in parameters)
         trained = self.renders > 0 and versions != self._versions
@@ -72,6 +74,9 @@ class Field:
                 "the launcher --steps parameters; or call hook.step(iteration) at the start of every iteration."
             )
         self.renders += 1
+        if self.renders == 1:
+            self._place = place
+        return place == self._place
 
 
 class Iterations:

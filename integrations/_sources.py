@@ -25,11 +25,13 @@ class Sources:
         rasterizers: of every foreign module that a ``...Rasterizer`` or its ``...RasterizationSettings`` are imported
             from, those names.
         models: classes with a method ``update_learning_rate``, as ``module:Class``.
+        root: the folder of the script, or that above it if it imports files from there.
     """
 
     packages: set[str] = field(default_factory=set)
     rasterizers: dict[str, set[str]] = field(default_factory=dict)
     models: list[str] = field(default_factory=list)
+    root: Path = Path()
 
     @property
     def classes(self) -> list[str]:
@@ -67,22 +69,30 @@ class Sources:
 
 
 def read_script(script: Path | str) -> Sources:
-    """Read a script, and the files beside it that it imports, itself or through others.
+    """Read a script, and the files that it imports, itself or through others.
 
-    The script is the path of a file, or the name of a module in the present folder; so it is below.
+    They lie beside it, or beside its folder if it writes to ``sys.path``. The script is the path of a file, or the name
+    of a module in the present folder; so it is below.
     """
     folder = script.resolve().parent if isinstance(script, Path) else Path.cwd()
-    files = [script if isinstance(script, Path) else folder / f"{script.replace('.', '/')}.py"]
+    start = script if isinstance(script, Path) else folder / f"{script.replace('.', '/')}.py"
+    above = start.is_file() and b"sys.path" in start.read_bytes()
     read: set[Path] = set()
-    sources = Sources({script.partition(".")[0]} if isinstance(script, str) else set())
+    sources = Sources({script.partition(".")[0]} if isinstance(script, str) else set(), root=folder)
+    files = [(start, folder)]
     while files:
-        path = files.pop().resolve()
+        path, origin = files.pop()
+        path = path.resolve()
         if path in read or not path.is_file():
             continue
         read.add(path)
-        for level, name in sources.read(path, folder):
-            module = (path.parents[level - 1] if level else folder).joinpath(*name.split("."))
-            files += [module.with_suffix(".py"), module / "__init__.py"]
+        sources.root = min(sources.root, origin)
+        for level, name in sources.read(path, origin):
+            for place in (folder, folder.parent)[: 1 + above] if level == 0 else (path.parents[level - 1],):
+                module = place.joinpath(*name.split("."))
+                files += [
+                    (file, origin if level else place) for file in (module.with_suffix(".py"), module / "__init__.py")
+                ]
     return sources
 
 

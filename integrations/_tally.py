@@ -14,7 +14,8 @@ class Skip(StrEnum):
     """Why a render was left alone."""
 
     FURTHER_VIEW = (
-        "further render in the same iteration (scope main); if it is a training view like the first: --scope all"
+        "render of another place in the script, after the first of its iteration (scope main); if it is a training "
+        "view like the first: --scope all"
     )
     CONSTANT_OPACITY = "opacities that are not trained, such as a depth render with constant ones"
     DETACHED_MEANS = "positions that are not trained, such as a depth render for the opacities"

@@ -30,7 +30,8 @@ from ._wrapped import Wrapped
 __all__ = ["DEFAULT_MODEL", "RasterizerHook", "Scope", "Steps"]
 
 Scope = Literal["main", "all"]
-"""Which training renders of an iteration are regularized: the first of every model, or all with one mask."""
+"""Which training renders of an iteration are regularized: the first of every model, with those that follow it in the
+same loop of the script (a batch), or all; always with one mask."""
 
 DEFAULT_MODEL = "scene.gaussian_model:GaussianModel"
 _MANY_ZEROS = 1e-3  # share of opacities that are 0 by no rounding
@@ -56,8 +57,8 @@ class RasterizerHook(Hook):
         regularizer: a :class:`~ca_reg.Regularizer`, or several, as :class:`~ca_reg.Chain` takes them; any other module
             must take ``generator=`` in its ``forward``. The hook sets its mode and its step.
         scope: "main" regularizes the first training render of every model and iteration, as the paper's code does, and
-            leaves second views and pseudo views alone; "all" regularizes all with one mask, for code bases with several
-            views in an iteration (MVGS).
+            those of the same place in the script, which are its batch (MVGS, 4DGaussians); it leaves second views and
+            pseudo views alone, which are rendered elsewhere. "all" regularizes all. The mask is one.
         seed: of the masks and the noise.
         rasterizer: the class to hook, or its name as ``module:Class``; by default those of
             ``diff_gaussian_rasterization`` and ``diff_gaussian_rasterization_abs``, as soon as they are imported.
@@ -195,7 +196,7 @@ class RasterizerHook(Hook):
         if is_overridden():
             return self._leave(call, Skip.SCORE)
         means, opacities = call.arguments["means3D"], call.arguments["opacities"]
-        render = calling_render()
+        render, place = calling_render()
         model = None if self._wrapped is None else find_instance(render, self._wrapped.models)
         if not torch.is_grad_enabled() or is_viewer(render, self._viewer):
             refuse_a_second_regularizer(render, self._chain)
@@ -207,8 +208,7 @@ class RasterizerHook(Hook):
         parameters = tuple(x for x in (means if means.is_leaf else None, leaf_of(opacities)) if x is not None)
         # Without a model a parameter tells the fields apart; where none is found, all calls belong to one field.
         field = self._iterations.field(model if model is not None else parameters[0] if parameters else self)
-        field.count_render(parameters)
-        if self._scope == "main" and field.renders > 1:
+        if not field.count_render(parameters, place) and self._scope == "main":
             return self._leave(call, Skip.FURTHER_VIEW)
         refuse_a_second_regularizer(render, self._chain)
         self._refuse_zeros(opacities)

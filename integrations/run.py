@@ -61,8 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.cpu:
             from reference_trainer.compat import stand_in
 
-            root = options.script.resolve().parent if isinstance(options.script, Path) else Path.cwd()
-            undo.enter_context(stand_in() if options.gsplat else stand_in(root, options.outputs, options.rasterizer))
+            given = (options.sources.root, options.outputs, options.rasterizer)
+            undo.enter_context(stand_in() if options.gsplat else stand_in(*given))
         if hook is not None:
             hook.install()
             undo.callback(_uninstall, hook)
@@ -90,7 +90,12 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--noise", type=float, metavar="SIGMA", help="standard deviation of the relative opacity noise, e.g. 0.8")
     add("--start", type=int, default=0, metavar="STEP", help="first step with --dropout and --noise (default: 0)")
     add("--ramp", type=int, metavar="STEPS", help="raise both rates linearly from 0 over so many steps after --start")
-    add("--scope", choices=get_args(Scope), default="main", help="first training render of an iteration, or all")
+    add(
+        "--scope",
+        choices=get_args(Scope),
+        default="main",
+        help="first training render of an iteration and its batch, or all",
+    )
     add("--seed", type=int, default=0, help="of masks and noise (default: 0); the script's random numbers are its own")
     add("--report", type=Path, metavar="FILE", help="write what was done as JSON, too")
     add(

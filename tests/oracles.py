@@ -50,8 +50,9 @@ def random_scene(n: int, width: int, height: int, seed: int, *, size: float = 0.
 
 
 def brute_force(
-    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, camera: Camera
-) -> tuple[Tensor, Tensor]:
+    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, camera: Camera,
+    blur: float = 0.3,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Composite every Gaussian at every pixel, one after the other, straight from the definitions.
 
     Returns the colour sums (C, H, W) and the accumulated alpha (H, W); differentiable by autograd.
@@ -83,7 +84,7 @@ def brute_force(
             [torch.stack([camera.fx / pz, zero, -camera.fx * u / pz]),
              torch.stack([zero, camera.fy / pz, -camera.fy * v / pz])]
         )  # fmt: skip
-        projected = jacobian @ rotation @ covariance @ rotation.T @ jacobian.T + 0.3 * torch.eye(2, dtype=means.dtype)
+        projected = jacobian @ rotation @ covariance @ rotation.T @ jacobian.T + blur * torch.eye(2, dtype=means.dtype)
         centre = torch.stack([camera.fx * px / pz + camera.cx, camera.fy * py / pz + camera.cy])
         offset = pixels - centre
         power = -0.5 * ((offset @ torch.linalg.inv(projected)) * offset).sum(-1)

@@ -25,7 +25,8 @@ def cuda_on_cpu() -> Iterator[None]:
     """Let torch functions take the CPU wherever they are told to take a CUDA device.
 
     With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
-    ``.cuda()`` of tensors and modules, ``.pin_memory()``, and ``torch.load(map_location="cuda")`` mean the CPU, and
+    ``.cuda()`` of tensors and modules, ``.pin_memory()``, ``torch.load(map_location="cuda")`` and
+    ``torch.Generator("cuda")`` mean the CPU, and
     ``torch.cuda.Event``, ``Stream``, ``synchronize``, ``set_device``, ``current_device``, ``current_stream``,
     ``reset_peak_memory_stats`` and ``nvtx`` are harmless, and ``mem_get_info``, ``get_device_properties`` and
     ``get_device_name`` speak of a device with `MEMORY` bytes; everything is restored at the end.
@@ -35,8 +36,6 @@ def cuda_on_cpu() -> Iterator[None]:
     into one of them in place is written into the other.
 
     It holds for this thread and for those that are started within the block, such as a viewer's.
-
-    Not covered: ``torch.Generator("cuda")``.
 
     Example:
         >>> with cuda_on_cpu():
@@ -49,6 +48,7 @@ def cuda_on_cpu() -> Iterator[None]:
     with ExitStack() as undo:
         undo.enter_context(patch.multiple(torch.cuda, **_STAND_INS))
         undo.enter_context(patch.object(torch, "load", _load_on_cpu(torch.load)))
+        undo.enter_context(patch.object(torch, "Generator", _Generator))
         undo.enter_context(patch.object(threading.Thread, "start", _start_on_cpu(threading.Thread.start)))
         undo.enter_context(_CudaMeansCpu())
         yield
@@ -103,6 +103,21 @@ def _on_cpu(value: Any) -> Any:
     if isinstance(value, torch.device) and value.type == "cuda":
         return torch.device("cpu")
     return value
+
+
+_GENERATOR = torch.Generator
+
+
+class _AnyGenerator(type):
+    def __instancecheck__(cls, value: object) -> bool:
+        return isinstance(value, _GENERATOR)
+
+
+class _Generator(metaclass=_AnyGenerator):
+    """Makes plain generators, all of them on the CPU."""
+
+    def __new__(cls, device: Any = "cpu") -> Any:
+        return _GENERATOR(_on_cpu(device))
 
 
 class _Event:

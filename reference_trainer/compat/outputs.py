@@ -1,4 +1,4 @@
-"""What the rasterizers of the INRIA family return beside colours and radii, told by its name."""
+"""What the rasterizers of the INRIA family return, told by its name."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ SAY_IT = (
     "of depth, inverse_depth, alpha, weights and surfels"
 )
 _NAMES = {
+    "image": {"image", "color", "colour", "rgb"},
+    "radii": {"radii"},
     "depth": {"depth"},
     "inverse_depth": {"inverse_depth", "inv_depth", "invdepth", "inverse_depths", "inv_depths", "invdepths"},
     "alpha": {"alpha", "alphas", "acc", "accumulation", "opacity", "silhouette"},
@@ -56,10 +58,10 @@ for _operator in ("getitem", "len", "iter", "bool", "gt", "lt", "add", "mul", "t
 
 
 def kinds_of(names: tuple[str, ...] | None, fields: set[str]) -> tuple[str | None, ...]:
-    """Return what the values after colours and radii are; None for an unknown one.
+    """Return what the values are; None for an unknown one. Image and radii come first if no name says otherwise.
 
     Args:
-        names: by which the caller calls the values, colours and radii among them; None if it does not take them apart.
+        names: by which the caller calls the values; None if it does not take them apart.
         fields: of the settings, as the caller gives them: with ``antialiasing`` (INRIA since October 2024) a third of
             three values is an inverse depth, whatever its name, and with ``confidence`` (FSGS) there are four; with
             ``pixel_weights`` (Taming 3DGS) there are scores of the Gaussians, under their own names.
@@ -69,22 +71,29 @@ def kinds_of(names: tuple[str, ...] | None, fields: set[str]) -> tuple[str | Non
 
     Example:
         >>> kinds_of(("rendered_image", "radii", "rendered_depth", "is_used"), set())
-        ('depth', None)
+        ('image', 'radii', 'depth', None)
+        >>> kinds_of(("count", "score", "rendered_image", "radii"), set())
+        (None, None, 'image', 'radii')
         >>> kinds_of(("rendered_image", "radii", "depth_image"), {"antialiasing"})
-        ('inverse_depth',)
+        ('image', 'radii', 'inverse_depth')
     """
+    first: tuple[str | None, ...] = ("image", "radii")
     if names is None:
         if "confidence" in fields:
-            return ("depth", "alpha")
+            return (*first, "depth", "alpha")
         if "antialiasing" not in fields:
             raise ValueError(
                 f"cannot tell what the rasterizer should return, which its caller does not unpack: {SAY_IT}."
             )
-        return ("inverse_depth",)
+        return (*first, "inverse_depth")
     if len(names) == 3 and "antialiasing" in fields:
-        return ("inverse_depth",)
+        return (*first, "inverse_depth")
     scores = _SCORES if "pixel_weights" in fields else set()
-    return tuple(name if name in scores else _KINDS.get(_plain(name)) for name in names[2:])
+    kinds = [name if name in scores else _KINDS.get(_plain(name)) for name in names]
+    for place, kind in enumerate(first):
+        if kind not in kinds:
+            kinds[place : place + 1] = [kind]
+    return tuple(kinds)
 
 
 def _plain(name: str) -> str:

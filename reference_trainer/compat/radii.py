@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.constants import NEAR_PLANE
+from reference_trainer.render.constants import DILATION, NEAR_PLANE
 from reference_trainer.render.eager.projection import project
 
 __all__ = ["SMALLEST_SPREAD", "in_front", "longer_radii", "visible_radii"]
@@ -37,11 +37,13 @@ def longer_radii(covariances: Tensor, smallest: float) -> Tensor:
 
 
 @torch.no_grad()
-def visible_radii(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) -> Tensor:
+def visible_radii(
+    means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera, *, blur: float = DILATION
+) -> Tensor:
     """Measure the radii of the splats that meet the picture: pixels, (N,) int32, 0 before the near plane or off it.
 
     As in the originals the opacity does not matter: a Gaussian of opacity 0 has a radius, though it is not drawn.
-    Quaternions are wxyz, scales standard deviations.
+    Quaternions are wxyz, scales standard deviations, ``blur`` is in square pixels.
 
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
@@ -51,7 +53,8 @@ def visible_radii(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Ca
     """
     radii = torch.zeros(means.shape[0], dtype=torch.int32, device=means.device)
     front = torch.nonzero(in_front(means, camera)).squeeze(1)
-    splats = project(means[front], quaternions[front], scales[front], camera.to(means.device, means.dtype))
+    camera = camera.to(means.device, means.dtype)
+    splats = project(means[front], quaternions[front], scales[front], camera, dilation=blur)
     centre = splats.means - 0.5  # in the INRIA code pixel centres are integers
     tiles = centre.new_tensor([-(-camera.width // CUDA_TILE), -(-camera.height // CUDA_TILE)])
     extents = longer_radii(splats.covariances, SMALLEST_SPREAD)

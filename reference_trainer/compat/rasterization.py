@@ -12,18 +12,18 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.compat.antialiasing import antialiased
+from reference_trainer.compat.antialiasing import filtered
 from reference_trainer.compat.radii import longer_radii
 from reference_trainer.render import Splats, draw, splat
 from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradients
-from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
+from reference_trainer.render.constants import DILATION, MIN_ALPHA, NEAR_PLANE
 
 __all__ = ["make_rasterization"]
 
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 READ = {
     "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane", "far_plane",
-    "radius_clip", "sh_degree", "packed", "backgrounds", "render_mode", "absgrad", "rasterize_mode",
+    "radius_clip", "eps2d", "sh_degree", "packed", "backgrounds", "render_mode", "absgrad", "rasterize_mode",
 }  # fmt: skip
 WITHOUT_EFFECT = {"tile_size", "channel_chunk", "segmented", "sparse_grad", "ut_params", "renderer_config"}
 NEAREST = 1e-6  # a nearer near plane is taken for this one
@@ -52,13 +52,13 @@ def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterizat
 
     Returns:
         The function. It raises ValueError, by name, for arguments that the renderer has not: cameras other than
-        pinholes, another ``eps2d``, covariances, batches of scenes, features that are no colours, ``distributed``,
+        pinholes, an ``eps2d`` above 0.3, covariances, batches of scenes, features that are no colours, ``distributed``,
         the unscented transform, and gradients of the poses.
 
     Example:
         >>> def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane=0.01,
         ...                   far_plane=1e10, radius_clip=0.0, sh_degree=None, packed=True, backgrounds=None,
-        ...                   render_mode="RGB", absgrad=False, rasterize_mode="classic"): ...
+        ...                   render_mode="RGB", absgrad=False, rasterize_mode="classic", eps2d=0.3): ...
         >>> draw_on_any_device = make_rasterization(rasterization, per_axis=True)
         >>> one, pose = torch.ones(1, 3), torch.eye(4)[None]
         >>> lens = torch.tensor([[[50.0, 0, 16], [0, 50, 16], [0, 0, 1]]])
@@ -159,8 +159,9 @@ def _look(given: SimpleNamespace, number: int, means: Tensor, scales: Tensor, un
     (fx, _, cx), (_, fy, cy), _ = given.Ks[number].tolist()
     camera = Camera(pose, fx, fy, cx, cy, given.width, given.height)
     splats = splat(means, given.quats, scales, given.opacities, camera, **_colors(given, number))
-    if given.rasterize_mode == "antialiased":
-        splats = antialiased(splats, means, given.quats, scales, camera, floor=1e-10)
+    floor = 1e-10 if given.rasterize_mode == "antialiased" else None
+    if floor is not None or given.eps2d != DILATION:
+        splats = filtered(splats, means, given.quats, scales, camera, blur=given.eps2d, floor=floor)
     projection = splats.projection
     centers, extents = projection.means.detach(), _extents(splats, per_axis)
     size = centers.new_tensor([given.width, given.height])

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor, nn
 
-from reference_trainer.compat.antialiasing import antialiased
+from reference_trainer.compat.antialiasing import filtered
 from reference_trainer.compat.contributions import contributions
 from reference_trainer.compat.extensions import make_module
 from reference_trainer.compat.outputs import Unknown, kinds_of
@@ -20,6 +20,7 @@ from reference_trainer.compat.unpacking import names_of_results
 from reference_trainer.model.relocation import compute_relocation
 from reference_trainer.render import draw, splat
 from reference_trainer.render.absolute import splat_weights, with_absolute_gradients
+from reference_trainer.render.constants import DILATION
 
 __all__ = ["GaussianRasterizer", "rasterizer_module"]
 
@@ -27,6 +28,7 @@ FIELDS = ("antialiasing", "confidence", "pixel_weights")  # of the settings, whi
 SCORES = ("accum_weights", "accum_count", "accum_blend", "accum_dist", "depths")
 DEPTHS = {"depth", "surfels"}
 FLOOR = 2.5e-5  # INRIA's least share of the area, of antialiasing
+FLOOR_OF_MIP = 1e-6  # that of Mip-Splatting
 
 
 class GaussianRasterizer(nn.Module):
@@ -82,11 +84,11 @@ class GaussianRasterizer(nn.Module):
         out, with a warning unless they are None.
 
         Returns:
-            The image (3, H, W), not clamped; radii in pixels, shape (N,) int32, 0 for what is out of view; and what
-            the caller calls the further members, see `kinds_of`. Depth and inverse depth are sums of weight times
-            (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's sum of weights
-            over the pixels, shape (N,), without a gradient; so are the scores of Taming 3DGS, see `contributions`.
-            Surfels are the seven planes of `surfel_planes`.
+            What the caller calls the members, see `kinds_of`; first, by default, the image (3, H, W), not clamped, and
+            radii in pixels, shape (N,) int32, 0 for what is out of view. Depth and inverse depth are sums of weight
+            times (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's sum of
+            weights over the pixels, shape (N,), without a gradient; so are the scores of Taming 3DGS, see
+            `contributions`. Surfels are the seven planes of `surfel_planes`.
 
         Raises:
             ValueError: if ``means2D`` has another shape, a covariance is given, or the outputs cannot be told.
@@ -113,8 +115,10 @@ class GaussianRasterizer(nn.Module):
         splats = splat(
             means3D, rotations, scales, opacities, camera, sh=shs, sh_degree=settings.sh_degree, colors=colors_precomp
         )
-        if settings.antialiasing:
-            splats = antialiased(splats, means3D, rotations, scales, camera, floor=FLOOR)
+        blur = DILATION if settings.kernel_size is None else float(settings.kernel_size)
+        if settings.antialiasing or settings.kernel_size is not None:
+            floor = FLOOR if settings.antialiasing else FLOOR_OF_MIP
+            splats = filtered(splats, means3D, rotations, scales, camera, blur=blur, floor=floor)
         # Pixels per unit of normalised device coordinates, for every column.
         half = [0.5 * camera.width, 0.5 * camera.height, 0.5 * camera.width, 0.5 * camera.height]
         sink = means2D.index_select(0, splats.indices) * means2D.new_tensor(half[:columns])
@@ -137,20 +141,19 @@ class GaussianRasterizer(nn.Module):
             found["weights"] = means3D.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
         if "surfels" in kinds:
             found["surfels"] = surfel_planes(rendering._replace(splats=splats), means3D, rotations, camera)
-        radii = visible_radii(means3D, rotations, scales, camera)
+        radii = visible_radii(means3D, rotations, scales, camera, blur=blur)
         if settings.pixel_weights is not None:
             sums = contributions(splats, settings.pixel_weights.reshape(camera.height, camera.width))
             table = torch.stack([*sums, projection.depths.detach()])
             table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
             found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": radii}
-        labels = names[2:] if names else kinds
+        labels = (*(names or kinds), "radii")  # which a caller of one value alone does not name
         drawn = rendering.alpha.detach() > 0
         found = {
             name: _returned(x, drawn) if x.shape[-2:] == drawn.shape else x
             for name, x in {**found, "image": rendering.image}.items()
-        }
-        members = [found.get(str(kind), Unknown(str(label))) for kind, label in zip(kinds, labels, strict=True)]
-        return (found["image"], radii, *members)
+        } | {"radii": radii}
+        return tuple(found.get(str(kind), Unknown(str(label))) for kind, label in zip(kinds, labels, strict=False))
 
     def _axes(
         self, scales: Tensor | None, rotations: Tensor | None, covariances: Tensor | None

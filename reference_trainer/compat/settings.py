@@ -32,6 +32,7 @@ class _Fields(NamedTuple):
     confidence: Tensor | None = None
     antialiasing: bool | None = None
     pixel_weights: Tensor | None = None
+    kernel_size: float | None = None
 
 
 class GaussianRasterizationSettings(_Fields):
@@ -40,9 +41,10 @@ class GaussianRasterizationSettings(_Fields):
     Convention: matrices act on row vectors (``x_world @ viewmatrix``), so they are the transposes of the textbook's.
     ``viewmatrix`` is world to camera, ``projmatrix`` world to clip space, both (4, 4); sizes are in pixels, ``tanfovx``
     and ``tanfovy`` tangents of half the fields of view. ``confidence`` (N, 1) is a factor on the gradients of every
-    Gaussian (FSGS, CoR-GS), ``antialiasing`` that of INRIA since October 2024, and ``pixel_weights`` (H, W) asks for
-    the scores of Taming 3DGS. Not read are ``campos``, which the view matrix has too, ``prefiltered`` and ``debug``.
-    Further fields are left out, with a warning unless they are None.
+    Gaussian (FSGS, CoR-GS), ``antialiasing`` that of INRIA since October 2024, ``pixel_weights`` (H, W) asks for the
+    scores of Taming 3DGS, and ``kernel_size`` is the blur of Mip-Splatting, square pixels. Not read are ``campos``,
+    which the view matrix has too, ``prefiltered`` and ``debug``. Further fields are left out, with a warning unless
+    they are None, or zeros.
     """
 
     __slots__ = ()
@@ -55,9 +57,13 @@ class GaussianRasterizationSettings(_Fields):
 
 
 def warn_of_ignored(kind: str, values: dict[str, Any]) -> None:
-    """Warn, once each, of values that the stand-in does not know; None is nothing to ignore."""
-    for name in sorted(name for name, value in values.items() if value is not None):
-        _warn(kind, name)
+    """Warn, once each, of values that the stand-in does not know; None, False and zeros are nothing to ignore.
+
+    Zeros that wait for a gradient are something.
+    """
+    for name, value in sorted(values.items()):
+        if (value.requires_grad or value.any()) if isinstance(value, Tensor) else value not in (None, False):
+            _warn(kind, name)
 
 
 @functools.cache

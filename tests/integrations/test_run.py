@@ -123,7 +123,7 @@ def test_a_script_is_regularized_and_the_report_says_how(repository, tmp_path, c
     }
     assert (written["dropout"], written["arguments"], written["ended"]) == (0.5, ["3"], "exit 0")
     assert "[ca_reg] 2 renders regularized, steps 2 to 3" in regularized.err
-    assert "[ca_reg] 3 renders left alone: further render in the same iteration (scope main)" in regularized.err
+    assert "[ca_reg] 3 renders left alone: render of another place in the script" in regularized.err
     before, after = seen(plain.out), seen(regularized.out)
     assert after[0] == before[0]
     assert all(a < 0.8 * b for a, b in zip(after[1:], before[1:], strict=True))
@@ -376,6 +376,17 @@ def test_what_a_script_imports_is_read_also_through_the_files_beside_it(reposito
     assert read_script(repository / "other.py").packages == expected
     assert "diff_gaussian_rasterization" in read_script(repository / "train.py").packages
     assert read_script("nowhere.train").packages == {"nowhere"}
+
+
+@pytest.mark.parametrize("reaches_up", [False, True])
+def test_a_script_that_reaches_above_its_folder_is_read_with_what_lies_there(repository, reaches_up):
+    script = repository / "scripts" / "train.py"
+    script.parent.mkdir()
+    script.write_text(reaches_up * "import sys; sys.path.append('..')\n" + "import scene.gaussian_model, train\n")
+    sources = read_script(script)
+    assert sources.root == (repository if reaches_up else script.parent).resolve()
+    assert sources.models == ["scene.gaussian_model:GaussianModel"] * reaches_up
+    assert ("diff_gaussian_rasterization" in sources.packages) == reaches_up
 
 
 def test_a_package_that_is_built_on_another_needs_it():

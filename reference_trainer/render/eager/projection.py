@@ -39,7 +39,9 @@ def _rotations(quaternions: Tensor) -> Tensor:
     return torch.stack(rows).view(3, 3, -1)
 
 
-def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) -> Projection:
+def project(
+    means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera, *, dilation: float = DILATION
+) -> Projection:
     """Project 3D Gaussians with a local affine approximation of the perspective (EWA splatting).
 
     Convention: OpenCV camera, half-pixel centres, wxyz quaternions. Every Gaussian must lie in front of the camera.
@@ -63,12 +65,12 @@ def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) 
     row_y = (camera.fy / z) * (down - slope_y.clamp(-limit_y, limit_y) * forward)
     axes = _rotations(quaternions) * scales.T
     row_x, row_y = (row_x[:, None] * axes).sum(0), (row_y[:, None] * axes).sum(0)
-    xx, xy, yy = (row_x * row_x).sum(0) + DILATION, (row_x * row_y).sum(0), (row_y * row_y).sum(0) + DILATION
+    xx, xy, yy = (row_x * row_x).sum(0) + dilation, (row_x * row_y).sum(0), (row_y * row_y).sum(0) + dilation
     # The determinant as a sum of squares (Cauchy-Binet): xx yy - xy^2 would cancel for needles. Divided by yy before it
     # is squared: the squares of the squares of the scales would overflow from a million scene sizes on.
     l22 = torch.rsqrt(yy)
     cross = torch.linalg.cross(row_x, row_y * l22, dim=0)
-    l11 = torch.rsqrt((cross * cross).sum(0) + DILATION * (xx + yy - DILATION) * (l22 * l22))
+    l11 = torch.rsqrt((cross * cross).sum(0) + dilation * (xx + yy - dilation) * (l22 * l22))
     return Projection(
         means=torch.stack([camera.fx * slope_x + camera.cx, camera.fy * slope_y + camera.cy], dim=-1),
         factors=torch.stack([l11, -xy * (l22 * l22) * l11, l22], dim=-1),

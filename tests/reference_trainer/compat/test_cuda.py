@@ -30,6 +30,8 @@ CUDA = torch.device("cuda:0")
         lambda: torch.nn.Linear(2, 2).to("cuda").weight,
         lambda: torch.nn.Linear(2, 2, device="cuda").weight,
         lambda: torch.nn.Parameter(torch.ones(2).cuda().requires_grad_(True)),
+        lambda: torch.Generator("cuda"),
+        lambda: torch.Generator(device=CUDA),
     ],
 )
 def test_cuda_means_the_cpu_within_the_block_only(make):
@@ -43,6 +45,8 @@ def test_cuda_means_the_cpu_within_the_block_only(make):
 def test_other_arguments_are_left_alone(generator):
     state = generator.get_state()
     with cuda_on_cpu():
+        assert isinstance(generator, torch.Generator)
+        assert isinstance(torch.Generator().manual_seed(1), type(generator))
         drawn = torch.rand(4, generator=generator)
         assert torch.zeros(2, dtype=torch.float64, device="meta").device.type == "meta"
         assert torch.einsum("ij,j->i", torch.eye(2), torch.ones(2)).tolist() == [1, 1]

@@ -27,7 +27,20 @@ from reference_trainer.compat.outputs import Unknown, kinds_of
     ],
 )
 def test_values_are_told_by_their_names_and_by_the_settings(names, fields, kinds):
-    assert kinds_of(names and tuple(names.split(", ")), set(fields)) == kinds
+    assert kinds_of(names and tuple(names.split(", ")), set(fields)) == ("image", "radii", *kinds)
+
+
+@pytest.mark.parametrize(
+    ("names", "kinds"),
+    [
+        ("rendered_image, infl, radii, depth", ("image", None, "radii", "depth")),
+        ("gaussians_count, important_score, rendered_image, radii", (None, None, "image", "radii")),
+        ("rendering, counts, radii", ("image", None, "radii")),
+        ("0, 1, 2", ("image", "radii", None)),
+    ],
+)
+def test_image_and_radii_are_where_their_names_are(names, kinds):
+    assert kinds_of(tuple(names.split(", ")), set()) == kinds
 
 
 def test_what_nothing_tells_is_asked_for():

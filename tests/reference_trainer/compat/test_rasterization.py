@@ -32,8 +32,8 @@ def slow(a):
     """Draw with gsplat's torch projection and harmonics, one Gaussian after the other at all pixels."""
     covariances, _ = own._quat_scale_to_covar_preci(a["quats"], a["scales"], True, False)
     radii, means2d, depths, conics, compensations = own._fully_fused_projection(
-        a["means"], covariances, a["viewmats"], a["Ks"], WIDTH, HEIGHT, near_plane=a.get("near_plane", 0.01),
-        far_plane=a.get("far_plane", 1e10), calc_compensations=True,
+        a["means"], covariances, a["viewmats"], a["Ks"], WIDTH, HEIGHT, eps2d=a.get("eps2d", 0.3),
+        near_plane=a.get("near_plane", 0.01), far_plane=a.get("far_plane", 1e10), calc_compensations=True,
     )  # fmt: skip
     y, x = torch.meshgrid(torch.arange(HEIGHT).double() + 0.5, torch.arange(WIDTH).double() + 0.5, indexing="ij")
     sums, alphas, colors = [], [], a["colors"]
@@ -78,6 +78,8 @@ CASES = {
     "colors of each camera": {"colors": torch.stack([harmonics(N)[:, 0], harmonics(N)[:, 1]]), "packed": False},
     "harmonics": {"colors": harmonics(N), "sh_degree": 2, "packed": False, "backgrounds": BACKGROUNDS},
     "antialiased": {"rasterize_mode": "antialiased"},
+    "less blur": {"eps2d": 0.1, "packed": False},
+    "less blur, antialiased": {"eps2d": 0.1, "rasterize_mode": "antialiased"},
     "near and far": {"near_plane": 1.6, "far_plane": 2.3, "render_mode": "RGB+D", "packed": False},
     "depth": {"render_mode": "D", "backgrounds": BACKGROUNDS},
     "expected depth": {"render_mode": "ED", "packed": False},
@@ -194,7 +196,7 @@ def test_nothing_in_view_and_no_gradients():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"eps2d": 0.1}, "eps2d .* got 0.1: leave it at 0.3"),
+        ({"eps2d": 0.5}, r"eps2d.* must be in \[0, 0.3\] .* got 0.5"),
         ({"camera_model": "fisheye"}, "camera_model .* got 'fisheye'"),
         ({"covars": torch.zeros(N, 3, 3)}, r"covars .* a tensor of shape \(24, 3, 3\)"),
         ({"distributed": True}, "distributed"),

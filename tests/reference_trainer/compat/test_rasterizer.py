@@ -170,8 +170,12 @@ def test_errors_name_the_problem(settings_of, changes, words):
         _call(settings_of(scene.camera), scene, **changes)
 
 
-def test_antialiasing_makes_up_for_the_blur(settings_of):
-    """Against the covariances of the projections, one by one, with and without the 0.3 square pixels of blur."""
+@pytest.mark.parametrize(
+    ("asked", "blur", "floor"),
+    [({"antialiasing": True}, 0.3, 2.5e-5), ({"kernel_size": 0.1}, 0.1, 1e-6), ({"kernel_size": 0.0}, 0.0, 1.0)],
+)
+def test_antialiasing_makes_up_for_the_blur(settings_of, asked, blur, floor):
+    """Against the covariances of the projections, one by one, with and without the blur, in square pixels."""
     scene = random_scene(40, 30, 20, seed=8, size=0.05)
     camera = scene.camera
     pose, shares = camera.world_to_camera, []
@@ -182,11 +186,19 @@ def test_antialiasing_makes_up_for_the_blur(settings_of):
         lens = pose.new_tensor([[camera.fx / z, 0, -camera.fx * x / z**2], [0, camera.fy / z, -camera.fy * y / z**2]])
         half = lens @ pose[:3, :3] @ turn @ torch.diag(scale)
         plain = half @ half.T
-        shares.append((plain.det() / (plain + 0.3 * torch.eye(2).double()).det()).clamp_min(2.5e-5).sqrt())
+        shares.append((plain.det() / (plain + blur * torch.eye(2).double()).det()).clamp_min(floor).sqrt())
     faint = scene._replace(opacities=scene.opacities * torch.stack(shares))
-    plain, blurred = (_call(settings_of(camera, antialiasing=on), scene)[0] for on in (False, True))
-    torch.testing.assert_close(blurred, brute_force(*faint)[0], rtol=0, atol=1e-9)
-    assert (plain - blurred).abs().max() > 0.05
+    plain, (blurred, radii, *_) = (_call(settings_of(camera, **each), scene) for each in ({}, asked))
+    torch.testing.assert_close(blurred, brute_force(*faint, blur=blur)[0], rtol=0, atol=1e-9)
+    assert (plain[0] - blurred).abs().max() > 0.05
+    assert (radii <= plain[1]).all()
+    assert torch.equal(radii, plain[1]) == (blur == 0.3)
+
+
+def test_more_blur_than_the_renderers_is_refused(settings_of):
+    scene = random_scene(4, 8, 8, seed=0)
+    with pytest.raises(ValueError, match=r"kernel_size, eps2d\) must be in \[0, 0.3\] .* got 0.5"):
+        _call(settings_of(scene.camera, kernel_size=0.5), scene)
 
 
 def test_the_first_band_may_stand_apart(settings_of):

@@ -47,10 +47,12 @@ def test_matrices_that_disagree_are_refused(settings_of, mistake):
 
 def test_unknown_fields_are_left_out_with_one_warning_each(settings_of):
     camera = random_scene(1, 40, 24, seed=1).camera
-    changes = {"kernel_of_the_test": 0.1, "offset_of_the_test": torch.zeros(2), "none": None}
+    changes = {"kernel_of_the_test": 0.1, "offset_of_the_test": torch.ones(2)}
+    changes["sink_of_the_test"] = torch.zeros(2, requires_grad=True)
+    nothing = {"none": None, "zeros": torch.zeros(2), "off": False}
     with pytest.warns(UserWarning, match="does not know the setting .*, and ignores it") as warned:
-        settings = settings_of(camera, **changes)
-    assert ["offset" in str(w.message) for w in warned] == [False, True]
+        settings = settings_of(camera, **changes, **nothing)
+    assert ["offset" in str(w.message) for w in warned] == [False, True, False]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         settings_of(camera, **changes)

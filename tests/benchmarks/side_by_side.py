@@ -1,0 +1,110 @@
+"""One scene in several trainers, plain and with dropout, all scored by one evaluator: a table of docs/integrations.md.
+
+    PYTHONPATH=tests python -m benchmarks.side_by_side docs/data/side_by_side.json --scene fern --images images_16 \
+        --train fern3 --both fern6 --3DGS gaussian-splatting --gsplat gsplat/examples
+
+``fern3`` and ``fern6`` are COLMAP folders with the training photographs, and with those of the test as every second one
+by name. The last two are where the scripts lie; what they import, but for CUDA, is installed. Every run has a folder of
+its own below ``--out`` and is not repeated; the file, which ``benchmarks.trained`` shows, is written after each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from reference_trainer.evaluation.results import machine, write_json
+
+__all__ = ["TRAINERS", "collect"]
+
+# Each with its own settings, but for where densification begins, and what would leave the coordinates of the scene.
+TRAINERS = {
+    "ca-reg": "reference_trainer.cli train --path {scene} --images {images} --out {out} --iterations {iterations} "
+    "--densify-from 100 --densify-gradient 0.0002 --monitor-every 0 --seed {seed} {dropout}",
+    "3DGS": "ca_reg.integrations.run --cpu --seed {seed} {dropout} train.py -s {train} -m {out} "
+    "--iterations {iterations} --densify_from_iter 100 --test_iterations -1 --disable_viewer",
+    "gsplat": "ca_reg.integrations.run --cpu --seed {seed} {dropout} simple_trainer.py default --data_dir {both} "
+    "--data_factor 1 --test_every 2 --no-normalize-world-space --result_dir {out} --max_steps {iterations} "
+    "--eval_steps --save_ply --ply_steps {iterations} --strategy.refine-start-iter 100 --disable_viewer "
+    "--disable_video",
+    "splatfacto": "ca_reg.integrations.run --cpu --seed {seed} {dropout} ns-train splatfacto --output-dir {out} "
+    "--experiment-name a --timestamp b --machine.device-type cpu --max-num-iterations {iterations} --vis tensorboard "
+    "--pipeline.model.num-downscales 0 --pipeline.model.warmup-length 100 --pipeline.model.cull-alpha-thresh 0.005 "
+    "--pipeline.model.background-color black --data {both} colmap --colmap-path sparse/0 --images-path images "
+    "--downscale-factor 1 --eval-mode interval --eval-interval 2 --auto-scale-poses False --center-method none "
+    "--orientation-method none --assume-colmap-world-coordinate-convention False",
+}
+EXPORT = "ca_reg.integrations.run --cpu ns-export gaussian-splat --load-config {config} --output-dir {out}/export"
+PLYS = ("point_cloud", "splat")
+EVALUATE = "reference_trainer.cli evaluate --ply {ply} --scene {scene} --images {images} --out {out}/evaluation"
+TIMED = Path(__file__).resolve().with_name("timed.py")
+SETTINGS = {"plain": "", "dropout": "--dropout 0.2"}
+
+
+def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Train, export and evaluate, each in a process of its own; return the figures that are kept."""
+    environment = os.environ | {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}  # nerfstudio loads its checkpoints as pickles
+    folder = vars(args).get(trainer, out)
+    names = vars(args) | {"out": out, "seed": seed, "dropout": SETTINGS[setting]}
+
+    def call(command: str, **further: object) -> float:
+        timed = [sys.executable, str(TIMED), str(out / "times.json"), str(seed)]
+        timed += command.format(**names, **further).split()
+        with (out / "log").open("a") as log:
+            subprocess.run(timed, cwd=folder, env=environment, stdout=log, stderr=log, check=True)
+        return json.loads((out / "times.json").read_text("utf-8"))["seconds"]
+
+    seconds = call(TRAINERS[trainer])
+    result = out / "results.json"  # which the trainer of this package writes, and evaluate below
+    if not result.is_file():
+        for config in out.rglob("config.yml"):
+            call(EXPORT, config=config)
+        (ply,) = (path for path in out.rglob("*.ply") if path.stem in (*PLYS, f"point_cloud_{args.iterations - 1}"))
+        call(EVALUATE + (" --regularizer dropout(0.2)" if SETTINGS[setting] else ""), ply=ply)
+        result = out / "evaluation" / "evaluation.json"
+    found = json.loads(result.read_text("utf-8"))
+    kept = {name: found["mean"]["test"][name] for name in ("psnr", "ssim", "ca", "ca_exact_half")}
+    pace = {"gaussians": found["gaussians"], "seconds_per_iteration": seconds / (args.iterations - 1)}
+    return {"seed": seed, **kept, **pace}
+
+
+def collect(out: Path) -> dict[str, Any]:
+    """Return the figures of all runs that are finished, by trainer and setting, as `benchmarks.trained` shows them."""
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for trainer in TRAINERS:
+        for setting, options in SETTINGS.items():
+            for kept in sorted((out / trainer / setting).glob("*/kept.json")):
+                rows.setdefault(f"{trainer} {options}".strip(), []).append(json.loads(kept.read_text("utf-8")))
+    return {"machine": machine(), "rows": rows}
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("file", type=Path)
+    for name in ("--scene", "--train", "--both", "--3DGS", "--gsplat"):
+        add(name, type=lambda path: Path(path).resolve(), required=True)
+    add("--images", default="images")
+    add("--trainers", choices=TRAINERS, nargs="+", default=list(TRAINERS))
+    add("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    add("--iterations", type=int, default=500)
+    add("--out", type=lambda path: Path(path).resolve(), default=Path("runs/side_by_side").resolve())
+    args = parser.parse_args()
+    for seed in args.seeds:
+        for trainer in args.trainers:
+            for setting in SETTINGS:
+                out = args.out / trainer / setting / str(seed)
+                if not (out / "kept.json").is_file():
+                    out.mkdir(parents=True)
+                    write_json(out / "kept.json", train(trainer, setting, seed, out, args))
+                write_json(args.file, collect(args.out))
+
+
+if __name__ == "__main__":
+    main()
