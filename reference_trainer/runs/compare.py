@@ -7,8 +7,10 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from reference_trainer.losses import LossTerm
 from reference_trainer.runs.compare_report import Comparison, save
 from reference_trainer.runs.engines.engine import Failure
+from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
@@ -108,7 +110,7 @@ def compare(
         there.
 
     Raises:
-        ValueError: if there is nothing to run.
+        ValueError: if there is nothing to run, or a scene lacks what a term of the loss needs.
     """
     if not scenes or not configs or not seeds:
         raise ValueError(
@@ -124,6 +126,12 @@ def compare(
         )
         for folder, name, seed in grid
     ]
+    terms = [term for config in configs.values() for term in config.make_losses()]
+    if looking := [term for term in terms if type(term).begin is not LossTerm.begin]:
+        for options in {run.options for run in runs if not (run.out / RESULTS).exists()}:
+            scene = options.load()
+            for term in looking:
+                term.begin(scene)
     comparisons = {folder: Comparison({}, {}) for folder in scenes}
     for (folder, name, seed), outcome in zip(grid, run_grid(runs, running), strict=True):
         if isinstance(outcome, Failure):

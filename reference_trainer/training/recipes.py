@@ -88,7 +88,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         "DNGaussian (CVPR 2024) on LLFF, Fictionarry/DNGaussian 13ecf60",
         "spherical harmonics for neural colors; one loss with a depth weight of 0.01 for its three optimizer steps; no "
-        "smoothness of the depth, no removal of near or unseen Gaussians, splits at any opacity",
+        "smoothness of the depth, no removal of near or unseen Gaussians, growth at any opacity",
         "a depth prior (--depth); there random points",
     ),
     "binocular": Recipe(

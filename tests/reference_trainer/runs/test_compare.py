@@ -26,6 +26,7 @@ from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.grid import Running
 from reference_trainer.runs.measure import render_run
 from reference_trainer.runs.run import run_experiment
+from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 
@@ -126,6 +127,19 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
     assert stored["failures"]["dropout, seed 1"]["error"] == "RuntimeError: all Gaussians were pruned"
     assert "in train" in stored["failures"]["dropout, seed 1"]["traceback"]
     assert [row["seeds"] for row in cells(Path("out/fern", TABLE).read_text())] == ["2", "2"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "lacking"),
+    [({"loss": "pearson"}, "--depth"), ({"fields": 2, "loss": "co_regularization"}, "no initial point")],
+)
+def test_what_a_scene_lacks_is_said_once_before_any_run(changes, lacking, tmp_path, monkeypatch):
+    scene = dataclasses.replace(synthetic_scene(width=32, height=24, points=9), points=None)
+    monkeypatch.setattr(SceneOptions, "load", lambda self: scene)
+    engine = Here()
+    with pytest.raises(ValueError, match=lacking):
+        compare({tmp_path: SceneOptions()}, {"a": TrainConfig(**changes)}, [0, 1], Running(engine))
+    assert engine.tasks == []
 
 
 def test_failed_runs_are_listed_at_the_end(tmp_path):
