@@ -13,9 +13,9 @@ __all__ = ["Poses"]
 
 @dataclass(frozen=True)
 class Poses:
-    """Find the cameras of photographs that have none, with COLMAP (ca_reg[colmap]), so that they can be trained on.
+    """Find the cameras of photographs that have none, by COLMAP.
 
-    Writes sparse/0 beside them, and says which photographs were registered.
+    Writes sparse/0 beside them, for training, and says which photographs were registered. Needs ca_reg[colmap].
     """
 
     photos: Annotated[Path, tyro.conf.Positional]

@@ -42,9 +42,9 @@ class Report:
 
 @dataclass(frozen=True)
 class View:
-    """Turn a run, or any 3DGS PLY, in a browser: render, co-adaptation, depth or heat, drawn live by the renderer.
+    """Turn a run, or any 3DGS PLY, live in a browser.
 
-    Needs ca_reg[viewer]; Ctrl-C ends it.
+    Render, co-adaptation, depth or heat, drawn by the renderer. Needs ca_reg[viewer]; Ctrl-C ends it.
     """
 
     run: Annotated[Path, tyro.conf.Positional]

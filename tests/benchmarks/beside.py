@@ -1,7 +1,7 @@
 """A recipe beside the unmodified fork it is named after: the same views, points and schedule, scored by one evaluator.
 
 ``PYTHONPATH=tests python -m benchmarks.beside fsgs path/to/FSGS --path data/fern`` trains both, the fork by the
-launcher on a CPU, and puts the figures into ``beside.json``, a file for `benchmarks.trained`. What a fork imports must
+launcher on a CPU, and puts the figures into ``beside.json``, rows as of `ca-reg study paper`. What a fork imports must
 be installed. A second start takes what is finished.
 """
 
@@ -20,14 +20,14 @@ from PIL import Image
 from scipy.interpolate import NearestNDInterpolator
 from scipy.spatial.transform import Rotation
 
-from benchmarks.trained import table
 from reference_trainer.cli import main as ca_reg
-from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.results import machine
 from reference_trainer.json_files import read_json
 from reference_trainer.scenes.depth import point_prior
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.pseudo import depth_bounds
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.studies.paper.rows import Row, Rows
 
 _NEVER = 10**6
 _ROOT = Path(__file__).parents[2]  # before the tests in the path: their folders have names of packages
@@ -192,7 +192,8 @@ def main(
     where = ["--path", path, "--no-undistort", *(["--images", images] if images else [])]
     if not (out / "llff/poses_bounds.npy").is_file():
         write_scene(SceneOptions(path=path, images=images, undistort=False).load(), out / "llff")
-    rows: dict[str, list[dict[str, float]]] = {f"{recipe}: {fork.name}": [], f"{recipe}: recipe": []}
+    kept = {"scene": Path(path).name, "iterations": n, "machine": machine(), "usual": {}}
+    rows = Rows(out / "beside.json", kept)
     for seed in fork_seeds:
         run, scored = out / f"{recipe}/fork_{seed}", out / f"{recipe}/fork_scored_{seed}"
         ply = run / f"point_cloud/iteration_{n}/point_cloud.ply"
@@ -207,26 +208,22 @@ def main(
         if not (scored / "evaluation.json").is_file():
             ca_reg(["evaluate", "--ply", str(ply), *where, "--out", str(scored)])
         found = read_json(scored / "evaluation.json")
-        rows[f"{recipe}: {fork.name}"] += [
-            _row(seed, found, found["ply"]["gaussians"], float((run / "seconds").read_text()))
-        ]
+        seconds = float((run / "seconds").read_text())
+        rows.add(_row(f"{recipe}: {fork.name}", seed, found, found["ply"]["gaussians"], seconds))
     for seed in seeds:
         run = out / f"{recipe}/recipe_{seed}"
         if not (run / "results.json").is_file():
             options = f"--recipe {recipe} --seed {seed} {_ALL.recipe} {FORKS[recipe].recipe}".format(**marks).split()
             ca_reg(["train", *where, *options, "--out", str(run)])
         found = read_json(run / "results.json")
-        rows[f"{recipe}: recipe"] += [_row(seed, found, found["gaussians"], found["processor_seconds"])]
-    write_json(out / f"{recipe}/rows.json", rows)
-    rows = {label: runs for file in sorted(out.glob("*/rows.json")) for label, runs in read_json(file).items()}
-    write_json(out / "beside.json", {"scene": Path(path).name, "iterations": n, "machine": machine(), "rows": rows})
-    print(table({"rows": rows}))
+        rows.add(_row(f"{recipe}: recipe", seed, found, found["gaussians"], found["processor_seconds"]))
+    print(rows.file.read_text("utf-8"))
 
 
-def _row(seed: int, found: dict[str, Any], gaussians: int, seconds: float) -> dict[str, float]:
+def _row(name: str, seed: int, found: dict[str, Any], gaussians: int, seconds: float) -> Row:
     """Return the figures of one training over the test views."""
     test = {name: found["mean"]["test"][name] for name in ("psnr", "ssim", "ca", "ca_exact_half")}
-    return {"seed": seed, **test, "gaussians": gaussians, "processor_seconds": seconds}
+    return {"setting": {"recipe": name}, "seed": seed, "test": test, "gaussians": gaussians, "seconds": seconds}
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 
 ``fern3`` and ``fern6`` are COLMAP folders with the training photographs, and with those of the test as every second one
 by name. The last two are where the scripts lie; what they import, but for CUDA, is installed. Every run has a folder of
-its own below ``--out`` and is not repeated; the file, which ``benchmarks.trained`` shows, is written after each.
+its own below ``--out``; the file, of rows as of `ca-reg study paper`, is written after each, and none is measured again.
 """
 
 from __future__ import annotations
@@ -13,14 +13,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
-from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.results import machine
+from reference_trainer.studies.paper.rows import Row, Rows
 
-__all__ = ["TRAINERS", "collect"]
+__all__ = ["TRAINERS", "train"]
 
 # Each with its own settings, but for where densification begins, and what would leave the coordinates of the scene.
 TRAINERS = {
@@ -46,8 +47,8 @@ TIMED = Path(__file__).resolve().with_name("timed.py")
 SETTINGS = {"plain": "", "dropout": "--dropout 0.2"}
 
 
-def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Train, export and evaluate, each in a process of its own; return the figures that are kept."""
+def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Namespace) -> Row:
+    """Train, export and evaluate, each in a process of its own; return the row that is kept."""
     environment = os.environ | {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}  # nerfstudio loads its checkpoints as pickles
     folder = vars(args).get(trainer, out)
     names = vars(args) | {"out": out, "seed": seed, "dropout": SETTINGS[setting]}
@@ -68,19 +69,20 @@ def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Names
         call(EVALUATE + (" --regularizer dropout(0.2)" if SETTINGS[setting] else ""), ply=ply)
         result = out / "evaluation" / "evaluation.json"
     found = json.loads(result.read_text("utf-8"))
-    kept = {name: found["mean"]["test"][name] for name in ("psnr", "ssim", "ca", "ca_exact_half")}
-    pace = {"gaussians": found["gaussians"], "seconds_per_iteration": seconds / (args.iterations - 1)}
-    return {"seed": seed, **kept, **pace}
+    test = {name: found["mean"]["test"][name] for name in ("psnr", "ssim", "ca", "ca_exact_half")}
+    pace = seconds / (args.iterations - 1)
+    return {
+        "setting": named(trainer, setting),
+        "seed": seed,
+        "test": test,
+        "gaussians": found["gaussians"],
+        "pace": pace,
+    }
 
 
-def collect(out: Path) -> dict[str, Any]:
-    """Return the figures of all runs that are finished, by trainer and setting, as `benchmarks.trained` shows them."""
-    rows: dict[str, list[dict[str, Any]]] = {}
-    for trainer in TRAINERS:
-        for setting, options in SETTINGS.items():
-            for kept in sorted((out / trainer / setting).glob("*/kept.json")):
-                rows.setdefault(f"{trainer} {options}".strip(), []).append(json.loads(kept.read_text("utf-8")))
-    return {"machine": machine(), "rows": rows}
+def named(trainer: str, setting: str) -> dict[str, str]:
+    """Return what a row is of."""
+    return {"recipe": f"{trainer} {SETTINGS[setting]}".strip()}
 
 
 def main() -> None:
@@ -96,14 +98,15 @@ def main() -> None:
     add("--iterations", type=int, default=500)
     add("--out", type=lambda path: Path(path).resolve(), default=Path("runs/side_by_side").resolve())
     args = parser.parse_args()
+    rows = Rows(args.file, {"scene": args.scene.name, "machine": machine(), "usual": {}})
     for seed in args.seeds:
         for trainer in args.trainers:
             for setting in SETTINGS:
-                out = args.out / trainer / setting / str(seed)
-                if not (out / "kept.json").is_file():
+                if seed not in rows.of(named(trainer, setting)):
+                    out = args.out / trainer / setting / str(seed)
+                    shutil.rmtree(out, ignore_errors=True)
                     out.mkdir(parents=True)
-                    write_json(out / "kept.json", train(trainer, setting, seed, out, args))
-                write_json(args.file, collect(args.out))
+                    rows.add(train(trainer, setting, seed, out, args))
 
 
 if __name__ == "__main__":

@@ -7,9 +7,8 @@ import textwrap
 
 import torch
 
-from benchmarks.side_by_side import collect
+from benchmarks import side_by_side
 from benchmarks.timed import main
-from benchmarks.trained import table
 
 
 def test_seeds_are_shifted_and_steps_are_timed(tmp_path, monkeypatch):
@@ -39,16 +38,18 @@ def test_seeds_are_shifted_and_steps_are_timed(tmp_path, monkeypatch):
     assert 0.04 <= json.loads((tmp_path / "times.json").read_text())["seconds"] < 5  # two steps after the first
 
 
-def test_rows_are_the_runs_that_are_finished(tmp_path):
-    for folder, psnr in (("gsplat/plain/0", 20.0), ("gsplat/plain/1", 22.0), ("ca-reg/dropout/0", 23.0)):
-        (tmp_path / folder).mkdir(parents=True)
-        kept = {"seed": int(folder[-1]), "psnr": psnr, "ssim": 0.5, "ca": 2e-3, "ca_exact_half": 4e-3,
-                "gaussians": 31_000, "seconds_per_iteration": 0.25}  # fmt: skip
-        (tmp_path / folder / "kept.json").write_text(json.dumps(kept))
-    (tmp_path / "3DGS" / "plain" / "0").mkdir(parents=True)  # not finished
-    lines = table(collect(tmp_path)).splitlines()
-    assert lines[0].endswith("| Gaussians, k | s/iteration |")
-    assert lines[2:] == [
-        "| `ca-reg --dropout 0.2` | 1 | 23 | 0.5 | 2 | 4 | 31 | 0.25 |",
-        "| `gsplat` | 2 | 21.0 ± 1.4 | 0.5 ± 0 | 2 ± 0 | 4 ± 0 | 31 ± 0 | 0.25 ± 0 |",
-    ]
+def test_what_is_kept_is_not_measured_again(tmp_path, monkeypatch):
+    asked = []
+
+    def train(trainer, setting, seed, out, args):
+        asked.append((trainer, setting, seed))
+        return {"setting": side_by_side.named(trainer, setting), "seed": seed, "gaussians": 9}
+
+    monkeypatch.setattr(side_by_side, "train", train)
+    options = ["", str(tmp_path / "rows.json"), "--out", str(tmp_path / "out"), "--trainers", "gsplat", "--seeds"]
+    for name in ("scene", "train", "both", "3DGS", "gsplat"):
+        options[1:1] = [f"--{name}", str(tmp_path)]
+    for seeds in (["0"], ["0", "1"]):
+        monkeypatch.setattr(sys, "argv", [*options, *seeds])
+        side_by_side.main()
+    assert asked == [("gsplat", setting, seed) for seed in (0, 1) for setting in ("plain", "dropout")]

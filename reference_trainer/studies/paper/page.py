@@ -121,7 +121,7 @@ def page(text: str, kept: Kept) -> str:
 
     The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``; WHAT is ``claims`` for the verdicts,
     ``details`` of a claim by its name, all of them without, or ``rows`` for all rows of the file NAME beside the
-    folder; iterations are those of ``kept`` where none are given.
+    folder, which says in ``usual`` what of a setting needs no name; iterations are by default those of ``kept``.
     """
 
     def made(match: re.Match[str]) -> str:
@@ -130,7 +130,7 @@ def page(text: str, kept: Kept) -> str:
         if what == "claims":
             body = claims_table(of)
         elif what == "rows":
-            body = _rows(Rows(kept.folder.parent / f"{name}.json").rows)
+            body = _rows(Rows(kept.folder.parent / f"{name}.json"))
         elif name:
             body = details(name, of) or "Not yet measured.\n"
         else:
@@ -143,11 +143,11 @@ def page(text: str, kept: Kept) -> str:
     return _MARKS.sub(made, text)
 
 
-def _rows(rows: Sequence[Row]) -> str:
-    """Return one row for each setting, named by what differs from the first."""
+def _rows(rows: Rows) -> str:
+    """Return one row for each setting, named by what differs from what is usual in the file."""
     found: dict[str, list[Row]] = {}
-    for row in rows:
-        found.setdefault(label(row["setting"], rows[0]["setting"]), []).append(row)
+    for row in rows.rows:
+        found.setdefault(label(row["setting"], rows.content["usual"]), []).append(row)
     return _table(found, QUALITY)
 
 
