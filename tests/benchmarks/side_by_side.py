@@ -5,7 +5,7 @@
 
 ``fern3`` and ``fern6`` are COLMAP folders with the training photographs, and with those of the test as every second one
 by name. The last two are where the scripts lie; what they import, but for CUDA, is installed. Every run has a folder of
-its own below ``--out``; the file, of rows as of `ca-reg study paper`, is written after each, and none is measured again.
+its own below ``--out``; the file, of rows as of `ca-reg study paper`, is written after each, and none is repeated.
 """
 
 from __future__ import annotations
