@@ -140,7 +140,7 @@ TARGETS = (
         samples.write_arrays,
         lambda folder: read_arrays(folder / "predictions.npz", folder / "images"),
         "binary",  # the names of the arrays are outside the checksums, and those that nobody knows are passed over
-        check=lambda found: (_frames_fit(found[0]), _points_fit(found[1])),
+        check=lambda found: (_frames_fit(found[0]), found[1] is None or _points_fit(found[1])),
     ),
     Target(
         "Blender transforms.json",
