@@ -29,7 +29,8 @@ class CoAdaptation(WeightedTerm):
         weight: at least 0, or a schedule.
         p: drop rate in [0, 1); in an analytic step the regularizer's own draws count at the training view instead.
         where: ``"training"``, the view of the step, or a camera drawn anew at each step: between two training cameras
-            on a ``"line"`` or on an ``"arc"`` (`cameras_between`), or in their ``"box"`` (`pseudo_cameras`).
+            on a ``"line"`` or on an ``"arc"`` (`cameras_between`), on an arc that goes half of its length ``"beyond"``
+            either, or in their ``"box"`` (`pseudo_cameras`).
         every: the term counts at every so many steps, by that factor more, so that ``weight`` is that of all steps.
 
     Raises:

@@ -63,10 +63,15 @@ def pseudo_cameras(scene: Scene) -> Callable[[torch.Generator], Camera]:
     return draw
 
 
-def cameras_between(scene: Scene, path: CameraPath = "arc") -> Callable[[torch.Generator], Camera]:
+def cameras_between(
+    scene: Scene, path: CameraPath = "arc", *, past: float = -0.15
+) -> Callable[[torch.Generator], Camera]:
     """Return a function that draws cameras between two random training cameras, with the intrinsics of one of them.
 
-    They stand at 0.15 to 0.85 of the way: see `camera_between`.
+    Args:
+        scene: with the training cameras.
+        path: the way from one to the other, see `camera_between`.
+        past: how far past either, as a share of the way; by default they stand at 0.15 to 0.85 of it.
 
     Raises:
         ValueError: if the scene has less than two training cameras.
@@ -83,7 +88,7 @@ def cameras_between(scene: Scene, path: CameraPath = "arc") -> Callable[[torch.G
 
     def draw(generator: torch.Generator) -> Camera:
         first, second = torch.randperm(len(cameras), generator=generator, device=generator.device)[:2].tolist()
-        along = 0.15 + 0.7 * torch.rand((), generator=generator, device=generator.device).item()
+        along = (1 + 2 * past) * torch.rand((), generator=generator, device=generator.device).item() - past
         return camera_between(cameras[first], cameras[second], along, path).to(generator.device)
 
     return draw
@@ -116,6 +121,7 @@ def camera_between(first: Camera, second: Camera, along: float, path: CameraPath
 
 
 VIRTUAL_VIEWS = {"box": pseudo_cameras} | {path: partial(cameras_between, path=path) for path in get_args(CameraPath)}
+VIRTUAL_VIEWS["beyond"] = partial(cameras_between, past=0.5)
 """Where cameras without a photograph may stand, by name: functions of a scene that return one that draws them."""
 
 
