@@ -115,7 +115,7 @@ def run_experiment(
         checkpoint_every: steps between checkpoints.
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         progress: whether to show a progress bar.
-        watch: called after every step, with what must not be changed.
+        watch: called after every step, and before every view is measured, with what must not be changed.
         say: receives a line about what is happening.
 
     Returns:
@@ -154,7 +154,13 @@ def run_experiment(
         with _saved_at_the_end(trainer, out, say):
             shared: dict[str, Any] = {"resumed": resumed, "progress": progress, "watch": watch, "say": say}
             _train(trainer, out, monitor_every, checkpoint_every, pictures=monitor_pictures, **shared)
-        return _measure(trainer, out, perceptual, say)
+
+        def go_on(text: str) -> None:  # a page that is open is drawn between the views that are measured, too
+            say(text)
+            if watch is not None:
+                watch(trainer)
+
+        return _measure(trainer, out, perceptual, go_on)
 
 
 def load_run(folder: Path, device: torch.device | str = "cpu") -> Trainer:
