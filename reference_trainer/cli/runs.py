@@ -115,7 +115,7 @@ class Train:
     out: Path = Path("runs/train")
     """Folder of the run."""
     scene: Scene = field(default_factory=SceneOptions)
-    config: Config = RECIPES["3dgs"].config
+    config: Config = field(default_factory=TrainConfig)
     recipe: Recipe = None
     auto: bool = True
     """Leave out what the scene does not need, as `ca-reg plan` says; what other options or the recipe set stays."""
@@ -185,7 +185,7 @@ class Plan:
 
     folder: Folder = None
     scene: Scene = field(default_factory=SceneOptions)
-    config: Config = RECIPES["3dgs"].config
+    config: Config = field(default_factory=TrainConfig)
     recipe: Recipe = None
     given: Given = frozenset()
     out: Path | None = None
@@ -318,7 +318,7 @@ class Compare:
     path: tuple[str, ...] = ("synthetic",)
     """Scene folders, or "synthetic"; the other options hold for all of them."""
     scene: Annotated[EveryScene, tyro.conf.arg(name="")] = field(default_factory=EveryScene)
-    config: Config = RECIPES["3dgs"].config
+    config: Config = field(default_factory=TrainConfig)
     recipe: Recipe = None
     strategies: tuple[str, ...] = ("baseline", "dropout", "noise", "both")
     """What to compare: these, "analytic-dropout", "analytic-noise", whose rates --dropout and --noise give (0.2 and 0.8

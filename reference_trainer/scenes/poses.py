@@ -11,6 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -145,24 +146,18 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
             database, folder, camera_mode=pycolmap.CameraMode.SINGLE, image_names=names, options=reader
         )
 
-    def extract(stop: Any) -> None:
-        for names in alike.values():
-            pycolmap.extract_features(
-                database, folder, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE,
-                extraction_options=features, cancellation_token=stop,
-            )  # fmt: skip
-
+    extract = partial(
+        pycolmap.extract_features, database, folder, image_names=[photo.name for photo in photos],
+        extraction_options=features,
+    )  # fmt: skip
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-
-    def match(stop: Any) -> None:
-        pycolmap.match_exhaustive(
-            database, pairing_options=pycolmap.ExhaustivePairingOptions(block_size=5),  # written block by block
-            verification_options=verification, cancellation_token=stop,
-        )  # fmt: skip
-
-    _watched(extract, database, "keypoints", len(photos), desc="features", unit="photo", disable=not progress)
+    match = partial(
+        pycolmap.match_exhaustive, database, pairing_options=pycolmap.ExhaustivePairingOptions(block_size=5),
+        verification_options=verification,
+    )  # fmt: skip
     pairs = len(photos) * (len(photos) - 1) // 2
+    _watched(extract, database, "keypoints", len(photos), desc="features", unit="photo", disable=not progress)
     _watched(match, database, "two_view_geometries", pairs, desc="matching", unit="pair", disable=not progress)
     # One thread: the order of additions, and so the result, would depend on how many there are.
     mapping = pycolmap.IncrementalPipelineOptions(min_model_size=2, num_threads=1, random_seed=seed)
@@ -175,22 +170,18 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
-def _watched(job: Callable[[Any], None], database: Path, table: str, total: int, **bar: Any) -> None:
+def _watched(job: Callable[..., None], database: Path, table: str, total: int, **bar: Any) -> None:
     """Do a job of COLMAP's in another thread, with a bar of the rows that it has written; Ctrl-C ends it."""
     import pycolmap
     from tqdm import tqdm
 
-    stop = pycolmap.CancellationToken()
-    with (
-        ThreadPoolExecutor(1) as pool,
-        closing(sqlite3.connect(database)) as connection,
-        tqdm(total=total, **bar) as shown,
-    ):
-        running = pool.submit(job, stop)
+    stop, rows = pycolmap.CancellationToken(), f"SELECT count(*) FROM {table}"
+    with ThreadPoolExecutor(1) as pool, closing(sqlite3.connect(database)) as opened, tqdm(total=total, **bar) as shown:
+        running = pool.submit(job, cancellation_token=stop)
         try:
             while not running.done():
                 wait([running], 0.5)
-                shown.update(connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0] - shown.n)
+                shown.update(opened.execute(rows).fetchone()[0] - shown.n)
         finally:
             stop.cancel()
         running.result()
