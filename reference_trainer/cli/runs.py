@@ -147,12 +147,12 @@ class Train:
         between = min(self.monitor_every, self.config.iterations)
         pictures = between >= PICTURES_FROM if self.monitor_pictures == "auto" else self.monitor_pictures == "on"
         with ExitStack() as stack:
-            watch = None
+            watched: dict[str, Any] = {}
             if self.viewer is not None:
                 from reference_trainer.viewer.window import Viewer
 
                 viewer = stack.enter_context(Viewer(*self.viewer or (PORT,)))
-                watch = viewer.follow
+                watched = {"watch": viewer.follow}
                 print(viewer)
             if self.config.renderer == "torch":
                 self.drawing.begin(self.device, trains=True)
@@ -169,8 +169,8 @@ class Train:
                 monitor_pictures=pictures,
                 lpips=self.lpips,
                 progress=True,
-                watch=watch,
                 say=print,
+                **watched,
             )
         print(summary(results))
         print(f"Everything is in {self.out}; a page: ca-reg report {self.out}; curves: tensorboard --logdir {self.out}")

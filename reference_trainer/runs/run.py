@@ -90,7 +90,7 @@ def run_experiment(
     checkpoint_every: int = 500,
     lpips: str | None = None,
     progress: bool = False,
-    watch: Callable[[Trainer], None] | None = None,
+    watch: Callable[[Trainer], None] = lambda trainer: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """Train on a scene and measure the result; what a former call has done already is not done again.
@@ -157,8 +157,7 @@ def run_experiment(
 
         def go_on(text: str) -> None:  # a page that is open is drawn between the views that are measured, too
             say(text)
-            if watch is not None:
-                watch(trainer)
+            watch(trainer)
 
         return _measure(trainer, out, perceptual, go_on)
 
@@ -225,7 +224,7 @@ def _train(
     pictures: bool,
     resumed: bool,
     progress: bool,
-    watch: Callable[[Trainer], None] | None,
+    watch: Callable[[Trainer], None],
     say: Callable[[str], None],
 ) -> None:
     """Train to the end with a monitor and checkpoints on the way."""
@@ -234,8 +233,7 @@ def _train(
     def checkpoint(trainer: Trainer) -> None:
         if trainer.step % checkpoint_every == 0 or trainer.step == last:
             trainer.save(out / CHECKPOINT)
-        if watch is not None:
-            watch(trainer)
+        watch(trainer)
 
     if not monitor_every:
         trainer.train(after_step=checkpoint, progress=progress)
