@@ -179,8 +179,9 @@ def _watched(job: Callable[..., None], database: Path, table: str, total: int, *
     with ThreadPoolExecutor(1) as pool, closing(sqlite3.connect(database)) as opened, tqdm(total=total, **bar) as shown:
         running = pool.submit(job, cancellation_token=stop)
         try:
-            while not running.done():
-                wait([running], 0.5)
+            done: set[Any] = set()
+            while not done:
+                done = wait([running], 0.5).done
                 shown.update(opened.execute(rows).fetchone()[0] - shown.n)
         finally:
             stop.cancel()
