@@ -21,6 +21,7 @@ from reference_trainer.cli.report import Report, View
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
 from reference_trainer.cli.studies import Study
 from reference_trainer.devices import check_device
+from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
 
 __all__ = ["main"]
@@ -53,7 +54,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     peek.add_argument("--iterations", type=int, default=argparse.SUPPRESS)
     peeked = vars(peek.parse_known_args(arguments)[0])
     recipe, given = peeked.pop("recipe"), given_fields(arguments)
-    config = with_recipe(recipe, **peeked) if recipe else RECIPES["3dgs"].config
+    config = with_recipe(recipe, **peeked) if recipe else TrainConfig()
     defaults: dict[str, Any] = {
         "demo": Demo(),
         "poses": Poses(tyro.MISSING),

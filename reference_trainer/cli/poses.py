@@ -31,9 +31,5 @@ class Poses:
         """Run the command."""
         from reference_trainer.scenes.poses import find_poses
 
-        found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, say=_say)
+        found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, progress=True)
         print(f"{found}\nThe cameras are in {found.folder}: ca-reg train {found.folder.parents[1]}")
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)

@@ -115,7 +115,7 @@ class Train:
     out: Path = Path("runs/train")
     """Folder of the run."""
     scene: Scene = field(default_factory=SceneOptions)
-    config: Config = RECIPES["3dgs"].config
+    config: Config = field(default_factory=TrainConfig)
     recipe: Recipe = None
     auto: bool = True
     """Leave out what the scene does not need, as `ca-reg plan` says; what other options or the recipe set stays."""
@@ -147,12 +147,12 @@ class Train:
         between = min(self.monitor_every, self.config.iterations)
         pictures = between >= PICTURES_FROM if self.monitor_pictures == "auto" else self.monitor_pictures == "on"
         with ExitStack() as stack:
-            watch = None
+            watched: dict[str, Any] = {}
             if self.viewer is not None:
                 from reference_trainer.viewer.window import Viewer
 
                 viewer = stack.enter_context(Viewer(*self.viewer or (PORT,)))
-                watch = viewer.follow
+                watched = {"watch": viewer.follow}
                 print(viewer)
             if self.config.renderer == "torch":
                 self.drawing.begin(self.device, trains=True)
@@ -169,8 +169,8 @@ class Train:
                 monitor_pictures=pictures,
                 lpips=self.lpips,
                 progress=True,
-                watch=watch,
                 say=print,
+                **watched,
             )
         print(summary(results))
         print(f"Everything is in {self.out}; a page: ca-reg report {self.out}; curves: tensorboard --logdir {self.out}")
@@ -185,7 +185,7 @@ class Plan:
 
     folder: Folder = None
     scene: Scene = field(default_factory=SceneOptions)
-    config: Config = RECIPES["3dgs"].config
+    config: Config = field(default_factory=TrainConfig)
     recipe: Recipe = None
     given: Given = frozenset()
     out: Path | None = None
@@ -318,7 +318,7 @@ class Compare:
     path: tuple[str, ...] = ("synthetic",)
     """Scene folders, or "synthetic"; the other options hold for all of them."""
     scene: Annotated[EveryScene, tyro.conf.arg(name="")] = field(default_factory=EveryScene)
-    config: Config = RECIPES["3dgs"].config
+    config: Config = field(default_factory=TrainConfig)
     recipe: Recipe = None
     strategies: tuple[str, ...] = ("baseline", "dropout", "noise", "both")
     """What to compare: these, "analytic-dropout", "analytic-noise", whose rates --dropout and --noise give (0.2 and 0.8

@@ -48,11 +48,13 @@ class Heat:
 
     @classmethod
     def of(cls, model: TrainedModel, views: Sequence[Viewpoint], *, drop_rate: float = 0.5) -> Heat:
-        """Measure a model; arguments and errors are those of `mean_shares`, which does most of it.
+        """Measure a model; arguments and errors are those of `mean_shares`, and a ValueError if all scores are 0.
 
         The weights are those of the plain opacities where the ones of the test depend on the camera.
         """
         shares, results = mean_shares(model, views, drop_rate=drop_rate)
+        if not shares.any():
+            raise ValueError(f"the score at drop rate {drop_rate} is 0: there is nothing to attribute.")
         drawn = replace(model, regularizer="") if model.depends_on_camera else model
         return cls(shares, blend_weights(drawn, views), results)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,13 +21,9 @@ from reference_trainer.render.eager.projection import rotation_matrices
 from reference_trainer.report.packing import jpeg, numbers
 from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
+from reference_trainer.scenes.splits import evenly_spaced
 
-__all__ = ["DROP_RATE", "Findings", "find"]
-
-DROP_RATE = 0.5
-"""Of the exact score, whatever the models were trained with."""
-
-T = TypeVar("T")
+__all__ = ["Findings", "find"]
 
 
 @dataclass(frozen=True)
@@ -101,7 +97,7 @@ class Findings:
 
 @torch.no_grad()
 def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
-    """Draw a run's last checkpoint from its views, and split the exact score over its Gaussians.
+    """Draw a run's last checkpoint from its views, and split the exact score at drop rate 1/2 over its Gaussians.
 
     Args:
         run: its folder.
@@ -119,18 +115,14 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
         drawn = replace(model, regularizer="")
         notes.append(f"{label}: its test-time opacities depend on the camera; the model is drawn with the plain ones.")
     found = sorted(measured_views(scene, lambda text: None).items(), key=lambda item: item[0] == "train")
-    chosen = {split: [view.to(device) for view in _evenly(of, views)] for split, of in found}
+    chosen = {split: [of[i].to(device) for i in evenly_spaced(len(of), min(views, len(of)))] for split, of in found}
     flat = [view for of in chosen.values() for view in of]
-    results: Sequence[CAResult | None] = [None] * len(flat)
     heat = None
     try:
-        heat = Heat.of(model, flat, drop_rate=DROP_RATE)
-        results = heat.results
+        heat = Heat.of(model, flat)
     except ValueError as error:
         notes.append(f"{label}: no co-adaptation: {error}")
-    if heat is not None and not heat.shares.any():
-        heat = None
-        notes.append(f"{label}: its score is 0, so that there is nothing to attribute.")
+    results = [None] * len(flat) if heat is None else heat.results
     pictures = [_pictures(model, view, result) for view, result in zip(flat, results, strict=True)]
     return Findings(label, model, drawn.test_opacities, scene, chosen, pictures, heat, notes)
 
@@ -146,10 +138,3 @@ def _pictures(model: TrainedModel, view: Viewpoint, result: CAResult | None) -> 
         found["co-adaptation"] = jpeg(ca_picture(result))
         said.append(f"exact CA at 1/2 {result.value * 1e3:.2f}e-3")
     return found | {"caption": ", ".join(said)}
-
-
-def _evenly(items: Sequence[T], count: int) -> Sequence[T]:
-    """Return so many items, evenly chosen, the first and the last among them; all if there are not more."""
-    if len(items) <= count:
-        return items
-    return [items[round(i * (len(items) - 1) / max(1, count - 1))] for i in range(count)]

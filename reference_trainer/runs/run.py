@@ -90,7 +90,7 @@ def run_experiment(
     checkpoint_every: int = 500,
     lpips: str | None = None,
     progress: bool = False,
-    watch: Callable[[Trainer], None] | None = None,
+    watch: Callable[[Trainer], None] = lambda trainer: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """Train on a scene and measure the result; what a former call has done already is not done again.
@@ -115,7 +115,7 @@ def run_experiment(
         checkpoint_every: steps between checkpoints.
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         progress: whether to show a progress bar.
-        watch: called after every step, with what must not be changed.
+        watch: called after every step, and before every view is measured, with what must not be changed.
         say: receives a line about what is happening.
 
     Returns:
@@ -154,7 +154,12 @@ def run_experiment(
         with _saved_at_the_end(trainer, out, say):
             shared: dict[str, Any] = {"resumed": resumed, "progress": progress, "watch": watch, "say": say}
             _train(trainer, out, monitor_every, checkpoint_every, pictures=monitor_pictures, **shared)
-        return _measure(trainer, out, perceptual, say)
+
+        def go_on(text: str) -> None:  # a page that is open is drawn between the views that are measured, too
+            say(text)
+            watch(trainer)
+
+        return _measure(trainer, out, perceptual, go_on)
 
 
 def load_run(folder: Path, device: torch.device | str = "cpu") -> Trainer:
@@ -219,7 +224,7 @@ def _train(
     pictures: bool,
     resumed: bool,
     progress: bool,
-    watch: Callable[[Trainer], None] | None,
+    watch: Callable[[Trainer], None],
     say: Callable[[str], None],
 ) -> None:
     """Train to the end with a monitor and checkpoints on the way."""
@@ -228,8 +233,7 @@ def _train(
     def checkpoint(trainer: Trainer) -> None:
         if trainer.step % checkpoint_every == 0 or trainer.step == last:
             trainer.save(out / CHECKPOINT)
-        if watch is not None:
-            watch(trainer)
+        watch(trainer)
 
     if not monitor_every:
         trainer.train(after_step=checkpoint, progress=progress)

@@ -16,17 +16,9 @@ if TYPE_CHECKING:
     from reference_trainer.scenes.synthetic import synthetic_scene
 
 __all__ = [
-    "Capture",
-    "Frame",
-    "PointCloud",
-    "Scene",
-    "SceneFormat",
-    "View",
-    "check_no_leak",
-    "load_scene",
-    "register_format",
+    "Capture", "Frame", "PointCloud", "Scene", "SceneFormat", "View", "check_no_leak", "load_scene", "register_format",
     "synthetic_scene",
-]
+]  # fmt: skip
 
 _MODULES = {
     "Capture": "formats",

@@ -14,16 +14,9 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "composite",
-    "image_size",
-    "is_image",
-    "list_images",
-    "match_images",
-    "path_inside",
-    "picture_folder",
-    "read_image",
+    "composite", "image_size", "is_image", "list_images", "match_images", "path_inside", "picture_folder", "read_image",
     "resize_image",
-]
+]  # fmt: skip
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
 # Pillow would otherwise try all formats that it knows on a file, whatever its name, and hand PostScript to Ghostscript.

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +68,7 @@ def find_poses(
     *,
     camera: str | None = None,
     seed: int = 0,
-    say: Callable[[str], None] = lambda text: None,
+    progress: bool = False,
 ) -> FoundPoses:
     """Find cameras and points of a folder of photographs, and write them as the COLMAP model ``sparse/0``.
 
@@ -79,7 +83,7 @@ def find_poses(
         out: another scene folder to write, with copies of the photographs in ``images``; by default the same.
         camera: COLMAP's name of a camera model; by default SIMPLE_PINHOLE below `FEW` photographs, else SIMPLE_RADIAL.
         seed: of all that is random.
-        say: receives a line about what is happening.
+        progress: whether to show progress bars.
 
     Raises:
         ImportError: if pycolmap is missing.
@@ -96,7 +100,7 @@ def find_poses(
     if found := colmap_folders(out):
         raise FileExistsError(f"{out} has cameras already, in {found[0]}: train on it, or delete them to find others.")
     with tempfile.TemporaryDirectory() as work:
-        model = _reconstruct(photos, Path(work), camera, seed, say)
+        model = _reconstruct(photos, Path(work), camera, seed, progress)
         if model is None:
             raise ValueError(
                 f"none of the {len(photos)} photographs in {photos[0].parent} could be placed: neighboring ones must "
@@ -119,7 +123,7 @@ def find_poses(
     )
 
 
-def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, say: Callable[[str], None]) -> Any:
+def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, progress: bool) -> Any:
     """Return the reconstruction with the most photographs, None if there is none."""
     try:
         import pycolmap
@@ -137,20 +141,24 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
         known = known and taken_with.has_prior_focal_length
         alike[(*image_size(photo), taken_with.mean_focal_length())].append(photo.name)
     pycolmap.Database.open(database).close()
-    for (width, height, _), names in alike.items():
-        say(f"looking for features in {len(names)} photographs of {width}x{height} ...")
-        # In order, for threads would finish in any, and the numbers of the photographs are part of the result.
+    for names in alike.values():  # in order: the numbers of the photographs are part of the result
         pycolmap.import_images(
             database, folder, camera_mode=pycolmap.CameraMode.SINGLE, image_names=names, options=reader
         )
-        pycolmap.extract_features(
-            database, folder, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=features
-        )
-    say(f"matching {len(photos) * (len(photos) - 1) // 2} pairs ...")
+
+    extract = partial(
+        pycolmap.extract_features, database, folder, image_names=[photo.name for photo in photos],
+        extraction_options=features,
+    )  # fmt: skip
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    pycolmap.match_exhaustive(database, verification_options=verification)
-    say("placing cameras and points ...")
+    match = partial(
+        pycolmap.match_exhaustive, database, pairing_options=pycolmap.ExhaustivePairingOptions(block_size=5),
+        verification_options=verification,
+    )  # fmt: skip
+    pairs = len(photos) * (len(photos) - 1) // 2
+    _watched(extract, database, "keypoints", len(photos), desc="features", unit="photo", disable=not progress)
+    _watched(match, database, "two_view_geometries", pairs, desc="matching", unit="pair", disable=not progress)
     # One thread: the order of additions, and so the result, would depend on how many there are.
     mapping = pycolmap.IncrementalPipelineOptions(min_model_size=2, num_threads=1, random_seed=seed)
     if few:
@@ -160,6 +168,24 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
         mapping.ba_refine_focal_length = mapping.mapper.abs_pose_refine_focal_length = not known
     models = pycolmap.incremental_mapping(database, folder, work, options=mapping).values()
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+
+
+def _watched(job: Callable[..., None], database: Path, table: str, total: int, **bar: Any) -> None:
+    """Do a job of COLMAP's in another thread, with a bar of the rows that it has written; Ctrl-C ends it."""
+    import pycolmap
+    from tqdm import tqdm
+
+    stop, rows = pycolmap.CancellationToken(), f"SELECT count(*) FROM {table}"
+    with ThreadPoolExecutor(1) as pool, closing(sqlite3.connect(database)) as opened, tqdm(total=total, **bar) as shown:
+        running = pool.submit(job, cancellation_token=stop)
+        try:
+            done: set[Any] = set()
+            while not done:
+                done = wait([running], 0.5).done
+                shown.update(opened.execute(rows).fetchone()[0] - shown.n)
+        finally:
+            stop.cancel()
+        running.result()
 
 
 def _write(model: Any, folder: Path) -> None:

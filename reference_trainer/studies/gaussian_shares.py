@@ -81,8 +81,6 @@ def study_attribution(
     views = [view.to(device) for view in (scene.train if split == "train" else scene.test)]
     heat = Heat.of(model, views, drop_rate=drop_rate)
     shares, weights, results = heat.shares, heat.weights, heat.results
-    if not shares.any():
-        raise ValueError(f"the score of {run} at drop rate {drop_rate} is 0: there is nothing to attribute.")
     effects = mean_effects(model, views, drop_rate=drop_rate)
     values = [result.value for result in results if result.reason is Reason.OK]
     scales = {

@@ -67,10 +67,7 @@ class Subject:
     @cached_property
     def heat(self) -> Heat:
         """The heat at drop rate 1/2; a ValueError if no view has a score, or all scores are 0."""
-        heat = Heat.of(self.model, self._views)
-        if not heat.shares.any():
-            raise ValueError("the score is 0: there is no co-adaptation to attribute.")
-        return heat
+        return Heat.of(self.model, self._views)
 
     @torch.no_grad()
     def draw(self, look: Look, camera: Camera) -> tuple[Tensor, str]:

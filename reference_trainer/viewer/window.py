@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, get_args
 
 import numpy as np
@@ -53,7 +52,7 @@ class _Window:
     rough: bool = True
 
 
-class Viewer:
+class Viewer(contextlib.AbstractContextManager["Viewer", None]):
     """A server of pages on this machine that show a model, in whatever way is chosen there; a context.
 
     Everything is drawn in the thread that calls `serve` or `follow`: a training is looked at between two of its steps.
@@ -98,12 +97,7 @@ class Viewer:
         port = self._server.get_port()
         return f"The viewer is at {self.address}, from another machine after: ssh -L {port}:{HOST}:{port} THIS_ONE"
 
-    def __enter__(self) -> Viewer:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 

@@ -58,7 +58,8 @@ def test_three_photographs_of_fern(data_root, tmp_path, capsys):
         Image.open(fern / "images_8" / name).save(photos / name)
 
     main(["poses", str(photos)])
-    said = capsys.readouterr().out
+    said, shown = capsys.readouterr()
+    assert all(f"{stage}: 100%" in shown and "| 3/3 [" in shown for stage in ("features", "matching"))
     assert "3 of 3 photographs registered: image001.png, image010.png, image019.png" in said
     assert f"ca-reg train {photos}" in said
 

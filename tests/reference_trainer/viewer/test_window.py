@@ -1,4 +1,5 @@
 import time
+from itertools import cycle
 from types import SimpleNamespace
 
 import numpy as np
@@ -82,7 +83,7 @@ def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer
 def test_a_training_that_is_watched_ends_with_the_same_model(run, options, short, tmp_path, viewer):
     client = Client(options.load().train[0].camera)
     viewer._connected(client)
-    modes = iter(["render", "co-adaptation", "depth", "heat"] * 3)
+    modes = cycle(["render", "co-adaptation", "depth", "heat"])
 
     def watch(trainer):
         viewer._next_model = 0.0
@@ -91,8 +92,8 @@ def test_a_training_that_is_watched_ends_with_the_same_model(run, options, short
         viewer._controls[4].value = 0.0 if trainer.step < 9 else 20.0
         viewer.follow(trainer)
 
-    run_experiment(options, short, tmp_path, monitor_every=0, watch=watch)
-    assert len(client.shown) == short.iterations
+    results = run_experiment(options, short, tmp_path, monitor_every=0, watch=watch)
+    assert len(client.shown) == short.iterations + len(results["views"])  # also while the result is measured
     assert (tmp_path / "point_cloud.ply").read_bytes() == (run[0] / "point_cloud.ply").read_bytes()
 
 
