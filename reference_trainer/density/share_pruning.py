@@ -10,8 +10,6 @@ from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.evaluation.shares import blend_weights, share_per_weight
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.optimizer import GaussianOptimizer
-from reference_trainer.scenes.scene import Scene
-from reference_trainer.training.config import TrainConfig
 
 __all__ = ["SharePruning"]
 
@@ -44,11 +42,6 @@ class SharePruning(AdaptiveDensity):
             if not 0 < value < 1:
                 raise ValueError(f"{name} must be in (0, 1), got {value}.")
         self.every, self.fraction, self.drop_rate = every, fraction, drop_rate
-
-    def begin(self, config: TrainConfig, scene: Scene, device: torch.device, count: int) -> None:
-        """Remember the training views."""
-        super().begin(config, scene, device, count)
-        self.scene = scene
 
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Prune by share as well, after all else; the others keep what was counted of them."""

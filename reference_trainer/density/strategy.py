@@ -45,8 +45,9 @@ class DensityStrategy(abc.ABC):
     field: int = 0
 
     config: TrainConfig
+    scene: Scene
     extent: float
-    white: bool
+    large: float
     device: torch.device
 
     def begin(self, config: TrainConfig, scene: Scene, device: torch.device, count: int) -> None:
@@ -59,7 +60,8 @@ class DensityStrategy(abc.ABC):
             count: their number.
         """
         self.config = replace(config, seed=config.seed + (self.field << 32))  # every field splits by its own numbers
-        self.extent, self.white, self.device = scene.extent, scene.is_white, device
+        self.scene, self.extent, self.device = scene, scene.extent, device
+        self.large = config.dense_fraction * self.extent  # what is larger is split, what is smaller cloned
         self.reset(count)
 
     def is_due(self, step: int) -> bool:
