@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -15,10 +15,8 @@ from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.render import Splats
 from reference_trainer.renderers.gsplat import GsplatSplats
 from reference_trainer.scenes.scene import Scene
-
-if TYPE_CHECKING:
-    from reference_trainer.training.config import TrainConfig
-    from reference_trainer.training.field import Field
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.field import Field
 
 __all__ = ["DensityStrategy"]
 

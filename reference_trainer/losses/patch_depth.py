@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,9 +11,7 @@ from torch.nn.functional import unfold
 from ca_reg import Params
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import PriorTerm
-
-if TYPE_CHECKING:
-    from reference_trainer.training.step import Step
+from reference_trainer.training.step import Step
 
 __all__ = ["PatchDepth", "patch_error"]
 
