@@ -105,8 +105,6 @@ class Paper:
     """List the trainings, which are kept and how long the others may take; train nothing."""
     pages: tuple[Path, ...] = ()
     """Write what is kept between the marks of these Markdown files; train nothing."""
-    figure: Path | None = None
-    """Draw PSNR and CA against views, rates and noise into this file; train nothing."""
     out: Path = Path("runs/paper")
     """Folder for the trainings at work, which are removed when they are kept."""
     rows: Path | None = None
@@ -124,7 +122,7 @@ class Paper:
         from reference_trainer.runs.grid import Running
         from reference_trainer.studies.paper.cells import Grid, listing, run_cells
         from reference_trainer.studies.paper.claims import chosen
-        from reference_trainer.studies.paper.page import Kept, details, page, sweeps
+        from reference_trainer.studies.paper.page import Kept, details, page
         from reference_trainer.studies.paper.scenes import chosen_scenes
 
         rows = self.rows or self.out
@@ -132,12 +130,10 @@ class Paper:
         scenes = chosen_scenes(self.scenes, self.data, own)
         claims = chosen(self.claims, [*scenes] if own.path else None)
         grid = Grid(claims, scenes, self.recipe, self.iterations, self.seeds, self.out, rows)
-        if self.pages or self.figure is not None:
-            kept = Kept(rows, self.recipe, self.iterations)
-            for path in self.pages:
-                write_text(path, page(path.read_text("utf-8"), kept))
-            if self.figure is not None:
-                sweeps(kept, self.figure)
+        kept = Kept(rows, self.recipe, self.iterations)
+        for path in self.pages:
+            write_text(path, page(path.read_text("utf-8"), kept))
+        if self.pages:
             return
         if self.list:
             print(listing(grid))

@@ -88,7 +88,7 @@ class AdaptiveDensity(DensityStrategy):
         """Count the gradients of what was drawn."""
         means, drawn = splats.projection.means, splats.lists.touched
         assert means.grad is not None
-        absolute = means.absgrad[drawn] if "absgrad" in self.needs else None  # type: ignore[attr-defined]
+        absolute = means.absgrad[drawn] if "absgrad" in self.needs else None  # type: ignore[union-attr]
         self.statistics.update(splats.indices[drawn], means.grad[drawn], camera.width, camera.height, absolute)
 
     def state_dict(self) -> dict[str, Tensor]:
