@@ -5,8 +5,8 @@ import torch
 
 from reference_trainer.density.operations import decay_opacity, densify, prune, reset_opacity
 from reference_trainer.density.statistics import DensityStatistics
-from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
-from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
+from reference_trainer.model.gaussians import PARAMETERS, Gaussians, inverse_sigmoid
+from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.model.rendering import render_gaussians
 
 
@@ -24,7 +24,7 @@ def some(n: int, seed: int = 0, **given: torch.Tensor) -> Gaussians:
 
 
 def optimizer_of(gaussians: Gaussians) -> GaussianOptimizer:
-    return GaussianOptimizer(gaussians, LearningRates(means=1e-3))
+    return GaussianOptimizer(gaussians, dict.fromkeys(PARAMETERS, 1e-3))
 
 
 def seen(gradients: list[float]) -> DensityStatistics:

@@ -18,7 +18,7 @@ from reference_trainer.density.ray_boxes import ray_box
 from reference_trainer.evaluation.shares import blend_weights
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians, inverse_sigmoid
-from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
+from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render.eager.engine import TorchEngine
 from reference_trainer.render.engine import engine_for
@@ -49,7 +49,7 @@ def some(n: int, seed: int = 0, size: float = 0.1) -> Gaussians:
 
 def stepped(gaussians: Gaussians) -> GaussianOptimizer:
     """An optimizer whose moments are not zero."""
-    optimizer = GaussianOptimizer(gaussians, LearningRates(means=1e-3))
+    optimizer = GaussianOptimizer(gaussians, dict.fromkeys(PARAMETERS, 1e-3))
     sum((x.square() * (1 + torch.arange(len(x)).view(-1, *[1] * (x.ndim - 1)))).sum() for _, x in
         optimizer.gaussians.named()).backward()  # fmt: skip
     optimizer.step()
@@ -406,7 +406,7 @@ def test_mcmc_draws_by_opacity():
     logits = inverse_sigmoid(torch.cat([torch.tensor([0.1, 0.3, 0.6]), torch.full((40_000,), 1e-4)]))
     start = some(40_003)
     start.opacity_logits[:] = logits
-    optimizer = GaussianOptimizer(start, LearningRates(means=1e-3))
+    optimizer = GaussianOptimizer(start, dict.fromkeys(PARAMETERS, 1e-3))
     with torch.no_grad():
         relocate(optimizer, optimizer.gaussians.opacities <= 0.005, torch.Generator().manual_seed(0))
     for i, p in enumerate((0.1, 0.3, 0.6)):
@@ -441,7 +441,7 @@ def test_mcmc_noise_is_that_of_the_source(tiny_scene):
     start = some(2 * n)
     start.quaternions[:], start.log_scales[:] = torch.tensor(quaternion), torch.tensor(scales).log()
     start.opacity_logits[:] = inverse_sigmoid(opacities)
-    optimizer = GaussianOptimizer(start, LearningRates(means=1e-3))
+    optimizer = GaussianOptimizer(start, dict.fromkeys(PARAMETERS, 1e-3))
     strategy = begun("mcmc", tiny_scene, 2 * n, iterations=100, densify_every=0)
     strategy.before_step(optimizer, 0)
     assert torch.equal(optimizer.gaussians.means, start.means)  # no step was taken
