@@ -74,7 +74,7 @@ class Clean:
             self.out or self.ply.with_name(f"{self.ply.stem}_clean.ply"),
             fraction=self.fraction,
             refine=self.refine,
-            background="black" if self.scene.background == "auto" else self.scene.background,
+            background=self.scene.background,
             regularizer=self.regularizer,
             device=self.device,
         )

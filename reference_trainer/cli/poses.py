@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -31,9 +32,5 @@ class Poses:
         """Run the command."""
         from reference_trainer.scenes.poses import find_poses
 
-        found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, say=_say)
+        found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, say=partial(print, flush=True))
         print(f"{found}\nThe cameras are in {found.folder}: ca-reg train {found.folder.parents[1]}")
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)

@@ -69,9 +69,8 @@ class View:
         with Viewer(self.port) as viewer:
             self.drawing.begin(self.device, trains=True)  # nobody waits for a compiler later
             if self.run.suffix.lower() == ".ply" and not self.run.is_dir():
-                background = "black" if self.scene.background == "auto" else self.scene.background
                 where = self.orbit if self.scene.path == "orbit" else self.scene
-                placed = place(self.run, where, background=background, **shared)
+                placed = place(self.run, where, background=self.scene.background, **shared)
                 viewer.show(placed.model, placed.views)
             else:
                 model, scene, _ = of_run(self.run, **shared)

@@ -268,10 +268,8 @@ class Evaluate:
             model, scene, default = of_run(run, self.device, regularizer=self.regularizer)
             measure(model, measured_views(scene, print), self.out or default, about={"scene": scene.name}, **shared)
         elif ply is not None:
-            where = self.orbit if orbit else self.scene
-            shared |= {"regularizer": self.regularizer, "device": self.device}
-            background = "black" if self.scene.background == "auto" else self.scene.background
-            score_ply(ply, where, self.out, background=background, **shared)
+            shared |= {"regularizer": self.regularizer, "device": self.device, "background": self.scene.background}
+            score_ply(ply, self.orbit if orbit else self.scene, self.out, **shared)
 
 
 @dataclass(frozen=True)

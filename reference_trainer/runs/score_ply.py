@@ -145,16 +145,16 @@ def place(
     ply: Path,
     where: SceneOptions | OrbitOptions,
     *,
-    background: str = "black",
+    background: str = "auto",
     regularizer: str | None = None,
     device: str = "cpu",
     say: Say = print,
 ) -> Placed:
     """Load the model of a PLY and the views of a scene, or cameras on an orbit; arguments and errors of `score_ply`."""
     scene = where.load() if isinstance(where, SceneOptions) else None
-    if scene is None and background not in BACKGROUNDS:
+    if scene is None and background not in ("auto", *BACKGROUNDS):
         raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {background!r}.")
-    color = torch.tensor(BACKGROUNDS[background]) if scene is None else scene.background
+    color = torch.tensor(BACKGROUNDS.get(background, BACKGROUNDS["black"])) if scene is None else scene.background
     model, facts = of_ply(ply, background=color, regularizer=regularizer, device=device)
     say(f"{ply}: {facts}")
     about: dict[str, object] = {"ply": asdict(facts)}
@@ -171,7 +171,7 @@ def score_ply(
     where: SceneOptions | OrbitOptions,
     out: Path | None = None,
     *,
-    background: str = "black",
+    background: str = "auto",
     regularizer: str | None = None,
     samples: int = 5,
     seed: int = 0,
@@ -185,7 +185,7 @@ def score_ply(
         ply: the model, in the frame of the scene's cameras; for an orbit in any frame and of any size.
         where: the scene or the orbit.
         out: folder for the results; ``<ply>_evaluation`` by default.
-        background: of an orbit, ``"black"`` or ``"white"``; a scene has its own.
+        background: of an orbit, ``"black"``, also by default, or ``"white"``; a scene has its own.
         regularizer: as of `of_ply`.
         samples: K of the CA score.
         seed: of its masks.
