@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from ca_reg.regularizers import parse
-from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric
+from reference_trainer.evaluation.evaluate import Evaluation
+from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
-from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
+from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.frame_check import check_frame
 from reference_trainer.runs.measure import measure
@@ -100,11 +101,12 @@ def of_ply(
             raise ValueError(f"{ply} says what it was trained with: {error} Give --regularizer.") from error
     if baked > 0 and not loaded.for_rendering:
         gaussians = replace(
-            gaussians, opacity_logits=inverse_sigmoid((gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6))
+            gaussians, opacity_logits=torch.logit((gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6))
         )
         text = text or f"dropout({baked:g})"
-    bands = [degree for degree in range(gaussians.sh_degree + 1) if degree == 0 or _band(gaussians, degree).any()]
-    facts = PlyFacts(len(gaussians), gaussians.sh_degree, bands[-1], loaded.opacity_scale, loaded.for_rendering, text)
+    degrees = range(1, gaussians.sh_degree + 1)
+    used = max((d for d in degrees if gaussians.sh_rest[:, d**2 - 1 : (d + 1) ** 2 - 1].any()), default=0)
+    facts = PlyFacts(len(gaussians), gaussians.sh_degree, used, loaded.opacity_scale, loaded.for_rendering, text)
     model = TrainedModel(
         gaussians.to(device), background.to(device), text, loaded.step, for_rendering=loaded.for_rendering
     )
@@ -175,7 +177,7 @@ def score_ply(
     regularizer: str | None = None,
     samples: int = 5,
     seed: int = 0,
-    perceptual: PerceptualMetric | None = None,
+    perceptual: LPIPS | None = None,
     device: str = "cpu",
     say: Say = print,
 ) -> Evaluation:
@@ -228,11 +230,6 @@ def _on_orbit(model: TrainedModel, orbit: OrbitOptions, about: dict[str, object]
     views = [Viewpoint(f"{index:03d}", camera) for index, camera in enumerate(cameras)]
     found = {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged}
     return Placed(model, enlarged, {"orbit": views}, None, about | {"orbit": asdict(orbit) | found})
-
-
-def _band(gaussians: Gaussians, degree: int) -> Tensor:
-    """Return the coefficients of one band of spherical harmonics above 0."""
-    return gaussians.sh_rest[:, degree**2 - 1 : (degree + 1) ** 2 - 1]
 
 
 def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
