@@ -29,7 +29,6 @@ class Poses:
     """Decides everything random."""
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.scenes.poses import find_poses
 
         found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, say=partial(print, flush=True))

@@ -33,7 +33,6 @@ class Report:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.report.page import write_report
 
         self.drawing.begin(self.device)
@@ -59,7 +58,6 @@ class View:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.evaluation.trajectory import measured_views
         from reference_trainer.runs.measure import of_run
         from reference_trainer.runs.score_ply import place

@@ -84,7 +84,6 @@ class Demo:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.runs.compare import compare, strategies
         from reference_trainer.runs.compare_report import report
         from reference_trainer.runs.engines.processes import Processes
@@ -134,7 +133,6 @@ class Train:
     """One thread and repeatable algorithms: the same result whatever the number of threads, and on CUDA every time."""
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.evaluation.tables import summary
         from reference_trainer.runs.run import run_experiment
         from reference_trainer.training.determinism import deterministic
@@ -192,7 +190,6 @@ class Plan:
     """JSON file for the plan; by default none is written."""
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.evaluation.results import markdown_table, write_json
         from reference_trainer.training.plan import make_plan
 
@@ -242,7 +239,6 @@ class Evaluate:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.evaluation.lpips import load_lpips
         from reference_trainer.evaluation.trajectory import measured_views
         from reference_trainer.runs.measure import measure, of_run
@@ -288,7 +284,6 @@ class Render:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.runs.measure import render_run
 
         self.drawing.begin(self.device)
@@ -346,7 +341,6 @@ class Compare:
         return self.engine != "processes" and bool(self.address or os.environ.get("RAY_ADDRESS"))
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.runs.compare import compare, scene_folders, strategies
         from reference_trainer.runs.compare_report import report
         from reference_trainer.runs.engines.choice import choose_engine

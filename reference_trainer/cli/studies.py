@@ -30,7 +30,6 @@ class ErrorRuntime:
     device: Device = "cpu"
 
     def __call__(self) -> None:
-        """Run the study."""
         from reference_trainer.studies.error_runtime import error_runtime_study
         from reference_trainer.studies.study import run_study
 
@@ -53,7 +52,6 @@ class Attribution:
     device: Device = "cpu"
 
     def __call__(self) -> None:
-        """Run the study."""
         from reference_trainer.studies.gaussian_shares import study_attribution
 
         study_attribution(self.run, self.out, split=self.split, drop_rate=self.drop_rate, device=self.device)
@@ -67,7 +65,6 @@ class Stability:
     """Folder for the JSON, the tables and the picture."""
 
     def __call__(self) -> None:
-        """Run the study."""
         from reference_trainer.studies.stability.stability_study import study_stability
 
         study_stability(self.out)
@@ -116,7 +113,6 @@ class Paper:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the study."""
         from reference_trainer.files import write_text
         from reference_trainer.runs.engines.processes import Processes
         from reference_trainer.runs.grid import Running
@@ -155,5 +151,4 @@ class Study:
     what: ErrorRuntime | Attribution | Stability | Paper
 
     def __call__(self) -> None:
-        """Run the study that was chosen."""
         self.what()
