@@ -99,7 +99,8 @@ def run_grid(
             note(number, _read(run), "before")
         else:
             run.out.mkdir(parents=True, exist_ok=True)
-            how = (running.device, running.monitor_every, running.checkpoint_every, _lpips(running.lpips))
+            lpips = running.lpips if running.lpips in (None, "installed") else str(Path(running.lpips).resolve())
+            how = (running.device, running.monitor_every, running.checkpoint_every, lpips)
             tasks[number] = Task(run.label, train_run, (*_where(run), *how, chosen_engine()))
     numbers = list(tasks)
     for index, outcome in run_all(running.engine, list(tasks.values()), retries=running.retries, say=running.say):
@@ -150,11 +151,6 @@ def _read(run: Run) -> Value | Failure:
 def _where(run: Run) -> tuple[SceneOptions, TrainConfig, Path]:
     """Return what a run is and where it lives; workers have other working directories."""
     return run.options.absolute(), run.config, run.out.resolve()
-
-
-def _lpips(option: str | None) -> str | None:
-    """Return the perceptual metric with an absolute path, if it is one."""
-    return option if option in (None, "installed") else str(Path(option).resolve())
 
 
 def _line(outcome: dict[str, Any] | Failure, when: str) -> str:
