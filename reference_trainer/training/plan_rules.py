@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from reference_trainer.camera import pixels_of
 from reference_trainer.losses import Photometric
@@ -51,7 +50,8 @@ def sh_bands(scene: Scene, config: TrainConfig) -> PlanItem:
     if reached < config.sh_degree:
         reason = f"bands above degree {reached} would begin after the last step, {config.iterations}, and stay 0"
         return PlanItem(name, "reduced" if reached else "left out", reason, {"sh_degree": reached})
-    seen = int(_views_per_point(scene).median())
+    positions = _points(scene).positions
+    seen = int(torch.stack([pixels_of(positions, view.camera)[2] for view in scene.train]).sum(0).median())
     sees = f"the median point is seen by {seen} of {len(scene.train)} training views"
     return PlanItem(name, "used", f"{sees}; lower degrees are not known to end as well")
 
@@ -190,8 +190,3 @@ def _points(scene: Scene) -> PointCloud:
     """The initial points, which `make_plan` has made sure of."""
     assert scene.points is not None
     return scene.points
-
-
-def _views_per_point(scene: Scene) -> Tensor:
-    """Number of training views whose picture holds a point, shape (N,)."""
-    return torch.stack([pixels_of(_points(scene).positions, view.camera)[2] for view in scene.train]).sum(0)
