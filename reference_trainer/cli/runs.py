@@ -84,22 +84,19 @@ class Demo:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        from reference_trainer.runs.compare import compare, strategies
-        from reference_trainer.runs.compare_report import report
-        from reference_trainer.runs.engines.processes import Processes
-        from reference_trainer.runs.grid import Running
-
-        self.drawing.begin("cpu", trains=True)
         steps = self.iterations
-        config = TrainConfig(iterations=steps, opacity_reset_every=0, densify_from=min(500, steps // 4))
-        chosen = strategies(["baseline", "dropout", "noise", "both"], config)
-        what = f"the built-in scene (3 views) with {', '.join(chosen)}"
+        comparison = Compare(
+            self.out,
+            config=TrainConfig(iterations=steps, opacity_reset_every=0, densify_from=min(500, steps // 4)),
+            seeds=self.seeds,
+            jobs=self.jobs,
+            engine="processes",
+            monitor_every=max(1, steps // 5),
+            drawing=DrawingOfSweep(self.drawing.engine),
+        )
+        what = f"the built-in scene (3 views) with {', '.join(comparison.strategies)}"
         print(f"Training {what}: {steps} steps each, {self.jobs} at a time.")
-        running = Running(Processes(self.jobs), monitor_every=max(1, steps // 5), say=print)
-        comparisons = compare({self.out: SceneOptions("synthetic")}, chosen, range(self.seeds), running)
-        report(comparisons, say=print)
-        if comparisons[self.out].failures:
-            sys.exit(1)
+        comparison()
 
 
 @dataclass(frozen=True)

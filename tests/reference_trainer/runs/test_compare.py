@@ -93,9 +93,10 @@ def test_the_options_hold_for_every_scene(tmp_path):
 def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
     """One run of eight fails; every scene has its own table and its own failures."""
 
-    def train(options, config, out, device, monitor_every, checkpoint_every, lpips, engine):
+    def train(options, config, out, engine, how):
         assert engine == chosen_engine()
-        assert (device, monitor_every, checkpoint_every, lpips) == ("cpu", 7, 9, str(Path("weights.pth").resolve()))
+        lpips = str(Path("weights.pth").resolve())
+        assert how == {"device": "cpu", "monitor_every": 7, "checkpoint_every": 9, "lpips": lpips}
         assert out.is_dir()
         assert out.is_absolute()
         if (options.path, config.dropout, config.seed) == ("synthetic", 0.2, 1):
