@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -29,7 +28,12 @@ class Poses:
     """Decides everything random."""
 
     def __call__(self) -> None:
+        """Run the command."""
         from reference_trainer.scenes.poses import find_poses
 
-        found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, say=partial(print, flush=True))
+        found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, say=_say)
         print(f"{found}\nThe cameras are in {found.folder}: ca-reg train {found.folder.parents[1]}")
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
