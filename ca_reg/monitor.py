@@ -7,9 +7,9 @@ import logging
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -32,7 +32,7 @@ LOG_NAME = "ca.jsonl"
 _log = logging.getLogger(__name__)
 
 
-class CAMonitor:
+class CAMonitor(AbstractContextManager["CAMonitor"]):
     """Log co-adaptation and PSNR of groups of views every so many steps (the paper's training dynamics).
 
     Each measurement becomes one line of ``ca.jsonl``, on disk when the call returns: ``step``, ``gaussians`` and for
@@ -163,12 +163,7 @@ class CAMonitor:
         if self._writer is not None:
             self._writer.close()
 
-    def __enter__(self) -> CAMonitor:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @torch.no_grad()

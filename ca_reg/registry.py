@@ -27,6 +27,7 @@ class Registry(Generic[T]):
         kind: what its members are, for messages.
         base: the class of all of them.
         values: functions that may stand among the arguments, by name.
+        known: what makes the members that are there from the start, by name.
 
     Example:
         >>> from ca_reg.regularizers import REGULARIZERS
@@ -34,11 +35,10 @@ class Registry(Generic[T]):
         [GaussianDropout(p=LinearRamp(...), compensate=False), OpacityNoise(sigma=0.8, clip=False, scale=False)]
     """
 
-    def __init__(self, kind: str, base: type[T], values: Mapping[str, Callable[..., Any]] | None = None) -> None:
-        self.kind = kind
-        self.base = base
-        self._values = dict(values or {})
-        self._factories: dict[str, Callable[..., T]] = {}
+    def __init__(
+        self, kind: str, base: type[T], values: Mapping[str, Callable[..., Any]] = {}, **known: Callable[..., T]
+    ) -> None:
+        self.kind, self.base, self._values, self._factories = kind, base, dict(values), known
 
     def register(self, name: str) -> Callable[[_Factory], _Factory]:
         """Return a decorator that enters a class, or a function that makes an object, under a name.

@@ -24,29 +24,28 @@ from ca_reg.schedules import SCHEDULES
 
 __all__ = ["REGULARIZERS", "GaussianDropout", "IndependentDropout", "OpacityNoise", "parse"]
 
-REGULARIZERS: Registry[Regularizer] = Registry("regularizer", Regularizer, SCHEDULES)
+REGULARIZERS: Registry[Regularizer] = Registry(
+    "regularizer",
+    Regularizer,
+    SCHEDULES,
+    dropout=GaussianDropout,
+    noise=OpacityNoise,
+    clustered=ClusteredDropout,
+    concrete=ConcreteDropout,
+    d2gs=D2GSDropout,
+    density=DensityDropout,
+    depth=DepthDropout,
+    drop_anchors=AnchorDropout,
+    drop_gaussian=DropGaussian,
+    drop_sh=SHDropout,
+    geometry=GeometryDropout,
+    position_noise=PositionNoise,
+    scale_noise=ScaleNoise,
+    segs=SEGSNoise,
+    sh_noise=SHNoise,
+    soft=SoftDropout,
+)
 """What can be asked for by name; ``REGULARIZERS.register("name")`` adds a class."""
-
-_TABLE: dict[str, type[Regularizer]] = {
-    "dropout": GaussianDropout,
-    "noise": OpacityNoise,
-    "clustered": ClusteredDropout,
-    "concrete": ConcreteDropout,
-    "d2gs": D2GSDropout,
-    "density": DensityDropout,
-    "depth": DepthDropout,
-    "drop_anchors": AnchorDropout,
-    "drop_gaussian": DropGaussian,
-    "drop_sh": SHDropout,
-    "geometry": GeometryDropout,
-    "position_noise": PositionNoise,
-    "scale_noise": ScaleNoise,
-    "segs": SEGSNoise,
-    "sh_noise": SHNoise,
-    "soft": SoftDropout,
-}
-for _name, _class in _TABLE.items():
-    REGULARIZERS.register(_name)(_class)
 
 
 def parse(text: str, *, imports: bool = True) -> Chain:

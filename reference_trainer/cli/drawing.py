@@ -63,7 +63,6 @@ class Warmup:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.runs.warmup import warm_up
 
         self.drawing.begin("cpu")

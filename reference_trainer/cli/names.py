@@ -22,7 +22,6 @@ class Names:
     """Which option."""
 
     def __call__(self) -> None:
-        """Run the command."""
         from ca_reg.regularizers import REGULARIZERS
         from reference_trainer.density import DENSITY
         from reference_trainer.losses import LOSSES
@@ -49,7 +48,6 @@ class Recipes:
     """
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.training.recipes import RECIPES
 
         for name, recipe in RECIPES.items():
@@ -61,7 +59,6 @@ class Version:
     """Print what a bug report should say: versions, processor, engine."""
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.evaluation.results import machine
 
         for name, value in machine().items():

@@ -30,7 +30,6 @@ class Bake:
     """The file to write; by default <ply>_for_viewers.ply."""
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.runs.bake import bake_ply
 
         out = self.out or self.ply.with_name(f"{self.ply.stem}_for_viewers.ply")
@@ -63,7 +62,6 @@ class Clean:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.runs.clean import clean_ply
 
         orbit = self.scene.path == "orbit"
@@ -74,7 +72,7 @@ class Clean:
             self.out or self.ply.with_name(f"{self.ply.stem}_clean.ply"),
             fraction=self.fraction,
             refine=self.refine,
-            background="black" if self.scene.background == "auto" else self.scene.background,
+            background=self.scene.background,
             regularizer=self.regularizer,
             device=self.device,
         )

@@ -33,7 +33,6 @@ class Report:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.report.page import write_report
 
         self.drawing.begin(self.device)
@@ -59,7 +58,6 @@ class View:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.evaluation.trajectory import measured_views
         from reference_trainer.runs.measure import of_run
         from reference_trainer.runs.score_ply import place
@@ -69,9 +67,8 @@ class View:
         with Viewer(self.port) as viewer:
             self.drawing.begin(self.device, trains=True)  # nobody waits for a compiler later
             if self.run.suffix.lower() == ".ply" and not self.run.is_dir():
-                background = "black" if self.scene.background == "auto" else self.scene.background
                 where = self.orbit if self.scene.path == "orbit" else self.scene
-                placed = place(self.run, where, background=background, **shared)
+                placed = place(self.run, where, background=self.scene.background, **shared)
                 viewer.show(placed.model, placed.views)
             else:
                 model, scene, _ = of_run(self.run, **shared)

@@ -84,23 +84,19 @@ class Demo:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
-        from reference_trainer.runs.compare import compare, strategies
-        from reference_trainer.runs.compare_report import report
-        from reference_trainer.runs.engines.processes import Processes
-        from reference_trainer.runs.grid import Running
-
-        self.drawing.begin("cpu", trains=True)
         steps = self.iterations
-        config = TrainConfig(iterations=steps, opacity_reset_every=0, densify_from=min(500, steps // 4))
-        chosen = strategies(["baseline", "dropout", "noise", "both"], config)
-        what = f"the built-in scene (3 views) with {', '.join(chosen)}"
+        comparison = Compare(
+            self.out,
+            config=TrainConfig(iterations=steps, opacity_reset_every=0, densify_from=min(500, steps // 4)),
+            seeds=self.seeds,
+            jobs=self.jobs,
+            engine="processes",
+            monitor_every=max(1, steps // 5),
+            drawing=DrawingOfSweep(self.drawing.engine),
+        )
+        what = f"the built-in scene (3 views) with {', '.join(comparison.strategies)}"
         print(f"Training {what}: {steps} steps each, {self.jobs} at a time.")
-        running = Running(Processes(self.jobs), monitor_every=max(1, steps // 5), say=print)
-        comparisons = compare({self.out: SceneOptions("synthetic")}, chosen, range(self.seeds), running)
-        report(comparisons, say=print)
-        if comparisons[self.out].failures:
-            sys.exit(1)
+        comparison()
 
 
 @dataclass(frozen=True)
@@ -134,7 +130,6 @@ class Train:
     """One thread and repeatable algorithms: the same result whatever the number of threads, and on CUDA every time."""
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.evaluation.tables import summary
         from reference_trainer.runs.run import run_experiment
         from reference_trainer.training.determinism import deterministic
@@ -192,7 +187,6 @@ class Plan:
     """JSON file for the plan; by default none is written."""
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.evaluation.results import markdown_table, write_json
         from reference_trainer.training.plan import make_plan
 
@@ -242,7 +236,6 @@ class Evaluate:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.evaluation.lpips import load_lpips
         from reference_trainer.evaluation.trajectory import measured_views
         from reference_trainer.runs.measure import measure, of_run
@@ -268,10 +261,8 @@ class Evaluate:
             model, scene, default = of_run(run, self.device, regularizer=self.regularizer)
             measure(model, measured_views(scene, print), self.out or default, about={"scene": scene.name}, **shared)
         elif ply is not None:
-            where = self.orbit if orbit else self.scene
-            shared |= {"regularizer": self.regularizer, "device": self.device}
-            background = "black" if self.scene.background == "auto" else self.scene.background
-            score_ply(ply, where, self.out, background=background, **shared)
+            shared |= {"regularizer": self.regularizer, "device": self.device, "background": self.scene.background}
+            score_ply(ply, self.orbit if orbit else self.scene, self.out, **shared)
 
 
 @dataclass(frozen=True)
@@ -290,7 +281,6 @@ class Render:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.runs.measure import render_run
 
         self.drawing.begin(self.device)
@@ -348,7 +338,6 @@ class Compare:
         return self.engine != "processes" and bool(self.address or os.environ.get("RAY_ADDRESS"))
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.runs.compare import compare, scene_folders, strategies
         from reference_trainer.runs.compare_report import report
         from reference_trainer.runs.engines.choice import choose_engine

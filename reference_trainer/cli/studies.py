@@ -30,7 +30,6 @@ class ErrorRuntime:
     device: Device = "cpu"
 
     def __call__(self) -> None:
-        """Run the study."""
         from reference_trainer.studies.error_runtime import error_runtime_study
         from reference_trainer.studies.study import run_study
 
@@ -53,7 +52,6 @@ class Attribution:
     device: Device = "cpu"
 
     def __call__(self) -> None:
-        """Run the study."""
         from reference_trainer.studies.gaussian_shares import study_attribution
 
         study_attribution(self.run, self.out, split=self.split, drop_rate=self.drop_rate, device=self.device)
@@ -67,7 +65,6 @@ class Stability:
     """Folder for the JSON, the tables and the picture."""
 
     def __call__(self) -> None:
-        """Run the study."""
         from reference_trainer.studies.stability.stability_study import study_stability
 
         study_stability(self.out)
@@ -105,8 +102,6 @@ class Paper:
     """List the trainings, which are kept and how long the others may take; train nothing."""
     pages: tuple[Path, ...] = ()
     """Write what is kept between the marks of these Markdown files; train nothing."""
-    figure: Path | None = None
-    """Draw PSNR and CA against views, rates and noise into this file; train nothing."""
     out: Path = Path("runs/paper")
     """Folder for the trainings at work, which are removed when they are kept."""
     rows: Path | None = None
@@ -118,13 +113,12 @@ class Paper:
     drawing: Draw = field(default_factory=Drawing)
 
     def __call__(self) -> None:
-        """Run the study."""
         from reference_trainer.files import write_text
         from reference_trainer.runs.engines.processes import Processes
         from reference_trainer.runs.grid import Running
         from reference_trainer.studies.paper.cells import Grid, listing, run_cells
         from reference_trainer.studies.paper.claims import chosen
-        from reference_trainer.studies.paper.page import Kept, details, page, sweeps
+        from reference_trainer.studies.paper.page import Kept, details, page
         from reference_trainer.studies.paper.scenes import chosen_scenes
 
         rows = self.rows or self.out
@@ -132,12 +126,10 @@ class Paper:
         scenes = chosen_scenes(self.scenes, self.data, own)
         claims = chosen(self.claims, [*scenes] if own.path else None)
         grid = Grid(claims, scenes, self.recipe, self.iterations, self.seeds, self.out, rows)
-        if self.pages or self.figure is not None:
-            kept = Kept(rows, self.recipe, self.iterations)
-            for path in self.pages:
-                write_text(path, page(path.read_text("utf-8"), kept))
-            if self.figure is not None:
-                sweeps(kept, self.figure)
+        kept = Kept(rows, self.recipe, self.iterations)
+        for path in self.pages:
+            write_text(path, page(path.read_text("utf-8"), kept))
+        if self.pages:
             return
         if self.list:
             print(listing(grid))
@@ -159,5 +151,4 @@ class Study:
     what: ErrorRuntime | Attribution | Stability | Paper
 
     def __call__(self) -> None:
-        """Run the study that was chosen."""
         self.what()

@@ -24,14 +24,16 @@ __all__ = [
     "SharePruning",
 ]
 
-DENSITY: Registry[DensityStrategy] = Registry("density strategy", DensityStrategy)  # type: ignore[type-abstract]
+DENSITY: Registry[DensityStrategy] = Registry(
+    "density strategy",
+    DensityStrategy,  # type: ignore[type-abstract]
+    adaptive=AdaptiveDensity,
+    absgrad=AbsGradDensity,
+    proximity=ProximityDensity,
+    mcmc=MCMCDensity,
+    ray_boxes=RayBoxDensity,
+    share_pruning=SharePruning,
+    co_pruning=CoPruning,
+    self_ensembling=SelfEnsembling,
+)
 """What can be asked for by name; ``DENSITY.register("name")`` adds a class."""
-
-DENSITY.register("adaptive")(AdaptiveDensity)
-DENSITY.register("absgrad")(AbsGradDensity)
-DENSITY.register("proximity")(ProximityDensity)
-DENSITY.register("mcmc")(MCMCDensity)
-DENSITY.register("ray_boxes")(RayBoxDensity)
-DENSITY.register("share_pruning")(SharePruning)
-DENSITY.register("co_pruning")(CoPruning)
-DENSITY.register("self_ensembling")(SelfEnsembling)

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from reference_trainer.camera import Camera
 from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.density.operations import is_large, reset_opacity
-from reference_trainer.density.statistics import screen_norm
 from reference_trainer.model.optimizer import GaussianOptimizer
-from reference_trainer.render import Splats
-from reference_trainer.renderers.gsplat import GsplatSplats
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
 
@@ -68,11 +63,6 @@ class AbsGradDensity(AdaptiveDensity):
         """Put the own thresholds into the settings."""
         super().begin(dataclasses.replace(config, **self.settings), scene, device, count)  # type: ignore[arg-type]
 
-    def reset(self, count: int) -> None:
-        """Forget both gradients."""
-        super().reset(count)
-        self.absolute_sum = torch.zeros(count, device=self.device)
-
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Lower opacities as well."""
         super().before_step(optimizer, step)
@@ -81,24 +71,7 @@ class AbsGradDensity(AdaptiveDensity):
 
     def selected(self, optimizer: GaussianOptimizer) -> Tensor:
         """Take the large by their absolute gradients."""
-        torn = self.absolute_sum / self.statistics.steps.clamp(min=1) >= self.split_gradient
-        return torch.where(
-            is_large(optimizer, self.config.dense_fraction * self.extent), torn, super().selected(optimizer)
-        )
-
-    def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:
-        """Count both gradients of what was drawn."""
-        super().observe(splats, camera)
-        drawn = splats.lists.touched
-        absolute: Tensor = splats.projection.means.absgrad  # type: ignore[union-attr]
-        norms = screen_norm(absolute[drawn], camera.width, camera.height)
-        self.absolute_sum[splats.indices[drawn]] += norms.to(self.absolute_sum)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the counts."""
-        return super().state_dict() | {"absolute_sum": self.absolute_sum}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Go on counting."""
-        super().load_state_dict({name: x for name, x in state.items() if name != "absolute_sum"})
-        self.absolute_sum = state["absolute_sum"]
+        seen = self.statistics
+        assert seen.absolute_sum is not None
+        torn = seen.absolute_sum / seen.steps.clamp(min=1) >= self.split_gradient
+        return torch.where(is_large(optimizer, self.large), torn, super().selected(optimizer))

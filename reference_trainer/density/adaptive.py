@@ -32,7 +32,7 @@ class AdaptiveDensity(DensityStrategy):
 
     def reset(self, count: int) -> None:
         """Forget the gradients."""
-        self.statistics = DensityStatistics.zeros(count, self.device)
+        self.statistics = DensityStatistics.zeros(count, self.device, absolute="absgrad" in self.needs)
 
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Densify, prune, reset and decay as the schedule says for the steps that are done."""
@@ -50,7 +50,7 @@ class AdaptiveDensity(DensityStrategy):
         if config.opacity_reset_every and step < self.config.densify_end:
             since = step - config.opacity_reset_from
             early = config.opacity_reset_over_white and step == config.densify_from > 0
-            if (since >= 0 and since % config.opacity_reset_every == 0) or (early and self.white):
+            if (since >= 0 and since % config.opacity_reset_every == 0) or (early and self.scene.is_white):
                 reset_opacity(optimizer, config.opacity_reset)
 
     def densify(self, optimizer: GaussianOptimizer, step: int) -> None:
@@ -67,7 +67,7 @@ class AdaptiveDensity(DensityStrategy):
         densify(
             optimizer,
             self.selected(optimizer),
-            size_threshold=self.config.dense_fraction * self.extent,
+            size_threshold=self.large,
             generator=self.split_generator(step),
         )
 
@@ -86,14 +86,14 @@ class AdaptiveDensity(DensityStrategy):
 
     def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:
         """Count the gradients of what was drawn."""
-        gradient = splats.projection.means.grad
-        assert gradient is not None
-        drawn = splats.lists.touched
-        self.statistics.update(splats.indices[drawn], gradient[drawn], camera.width, camera.height)
+        means, drawn = splats.projection.means, splats.lists.touched
+        assert means.grad is not None
+        absolute = means.absgrad[drawn] if "absgrad" in self.needs else None  # type: ignore[union-attr]
+        self.statistics.update(splats.indices[drawn], means.grad[drawn], camera.width, camera.height, absolute)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the counts."""
-        return dict(vars(self.statistics))
+        return self.statistics.named()
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Go on counting."""

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 
 from ca_reg.neighbors import nearest_distance
 from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.training.errors import TrainingStoppedError
-
-if TYPE_CHECKING:
-    from reference_trainer.training.field import Field
+from reference_trainer.training.field import Field
 
 __all__ = ["CoPruning"]
 

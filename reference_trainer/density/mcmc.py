@@ -10,7 +10,7 @@ from torch import Tensor
 
 from reference_trainer.density.operations import refuse_not_finite
 from reference_trainer.density.strategy import DensityStrategy
-from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
+from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.model.relocation import compute_relocation, quat_scale_to_covar_preci
 from reference_trainer.training.randomness import stream
@@ -62,8 +62,9 @@ class MCMCDensity(DensityStrategy):
             generator = stream(self.config.seed, step, "relocation", self.device)
             relocate(optimizer, optimizer.gaussians.opacities <= self.config.prune_opacity, generator)
             n, limit = len(optimizer.gaussians), self.config.max_gaussians
-            target = int(self.growth * n)
-            grow(optimizer, max(0, (target if limit is None else min(limit, target)) - n), generator)
+            target = int(self.growth * n) if limit is None else min(limit, int(self.growth * n))
+            if target > n:
+                optimizer.append(drawn_copies(optimizer, optimizer.gaussians.opacities, target - n, generator))
         if step and self.noise:
             gaussians = optimizer.gaussians
             covariances, _ = quat_scale_to_covar_preci(gaussians.quaternions, gaussians.scales, compute_preci=False)
@@ -78,19 +79,17 @@ class MCMCDensity(DensityStrategy):
 def relocate(optimizer: GaussianOptimizer, dead: Tensor, generator: torch.Generator) -> None:
     """Make dead Gaussians, (N,) bool, copies of live ones; if none is alive, nothing happens."""
     if bool(dead.any()) and not bool(dead.all()):
-        drawn = _draw(torch.where(dead, 0, optimizer.gaussians.opacities), int(dead.sum()), generator)
-        copies = shared(optimizer.gaussians, drawn)
-        _shrink(optimizer, drawn, copies)
-        optimizer.relocate(dead.nonzero().squeeze(1), copies)
+        living = torch.where(dead, 0, optimizer.gaussians.opacities)
+        optimizer.relocate(dead.nonzero().squeeze(1), drawn_copies(optimizer, living, int(dead.sum()), generator))
 
 
-def grow(optimizer: GaussianOptimizer, count: int, generator: torch.Generator) -> None:
-    """Add so many copies of Gaussians."""
-    if count:
-        drawn = _draw(optimizer.gaussians.opacities, count, generator)
-        copies = shared(optimizer.gaussians, drawn)
-        _shrink(optimizer, drawn, copies)
-        optimizer.append(copies)
+def drawn_copies(optimizer: GaussianOptimizer, weights: Tensor, count: int, generator: torch.Generator) -> Gaussians:
+    """Return copies of Gaussians that are drawn in proportion to weights (N,), and shrink those as well."""
+    drawn = torch.multinomial(weights, count, replacement=True, generator=generator)
+    copies = shared(optimizer.gaussians, drawn)
+    optimizer.relocate(drawn, copies)  # opacity and scales: all else is the same
+    optimizer.forget(drawn)
+    return copies
 
 
 def shared(gaussians: Gaussians, drawn: Tensor) -> Gaussians:
@@ -105,16 +104,5 @@ def shared(gaussians: Gaussians, drawn: Tensor) -> Gaussians:
     at_one_place = drawn.bincount(minlength=len(gaussians))[drawn] + 1
     binoms = torch.tensor(table, dtype=torch.float64, device=drawn.device)
     opacities, scales = compute_relocation(copies.opacities, copies.scales, at_one_place, binoms)
-    logits = inverse_sigmoid(opacities.clamp(*_OPACITIES))
+    logits = torch.logit(opacities.clamp(*_OPACITIES))
     return replace(copies, opacity_logits=logits, log_scales=scales.log())
-
-
-def _draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Draw numbers of Gaussians in proportion to weights, with replacement, shape (count,)."""
-    return torch.multinomial(weights, count, replacement=True, generator=generator)
-
-
-def _shrink(optimizer: GaussianOptimizer, drawn: Tensor, copies: Gaussians) -> None:
-    """Give those that were drawn the opacity and scales of their copies, and clear their optimizer state."""
-    optimizer.relocate(drawn, copies)  # all else is the same
-    optimizer.forget(drawn)

@@ -8,7 +8,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from reference_trainer.model.gaussians import inverse_sigmoid
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.render.eager.projection import rotation_matrices
 from reference_trainer.training.errors import TrainingStoppedError
@@ -85,26 +84,19 @@ def refuse_not_finite(optimizer: GaussianOptimizer, step: int) -> None:
         raise TrainingStoppedError(f"Gaussians became nan or infinite by step {step}: lower the learning rates.")
 
 
-def prune(optimizer: GaussianOptimizer, *, min_opacity: float, max_scale: float | None = None) -> int:
+def prune(optimizer: GaussianOptimizer, *, min_opacity: float, max_scale: float | None = None) -> None:
     """Remove Gaussians that are too faint or too large.
 
     Args:
         optimizer: holds the Gaussians; changed.
         min_opacity: fainter ones go; compared with the plain opacity, without any regularizer.
         max_scale: Gaussians with a larger standard deviation go, world units; None keeps them.
-
-    Returns:
-        How many were removed.
     """
-    with torch.no_grad():
-        gaussians = optimizer.gaussians
-        keep = gaussians.opacities >= min_opacity
-        if max_scale is not None:
-            keep &= gaussians.scales.amax(dim=1) <= max_scale
-        removed = int((~keep).sum())
-    if removed:
+    keep = optimizer.gaussians.opacities.detach() >= min_opacity
+    if max_scale is not None:
+        keep &= ~is_large(optimizer, max_scale)
+    if not bool(keep.all()):
         optimizer.select(keep)
-    return removed
 
 
 def reset_opacity(optimizer: GaussianOptimizer, ceiling: float) -> None:
@@ -117,4 +109,4 @@ def decay_opacity(optimizer: GaussianOptimizer, factor: float) -> None:
     """Multiply every opacity by ``factor`` (Binocular3DGS's opacity decay); the optimizer state stays."""
     opacities = optimizer.gaussians.opacities.detach() * factor
     # The floor keeps the logit finite; a Gaussian this faint is pruned long before.
-    optimizer.set_opacity_logits(inverse_sigmoid(opacities.clamp(min=1e-7)), forget=False)
+    optimizer.set_opacity_logits(torch.logit(opacities.clamp(min=1e-7)), forget=False)

@@ -49,7 +49,7 @@ class ProximityDensity(AdaptiveDensity):
 
     def grow(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Clone, split and unpool, in this order: each sees what the ones before have added."""
-        steep, large = self.selected(optimizer), is_large(optimizer, self.config.dense_fraction * self.extent)
+        steep, large = self.selected(optimizer), is_large(optimizer, self.large)
         clone(optimizer, steep & ~large)
         sparse = self._sparse(optimizer, self.split_distance)[0]
         sparse[: len(steep)] |= steep & large

@@ -14,8 +14,7 @@ from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.density.operations import clone, is_large, split
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.training.config import TrainConfig
+from reference_trainer.scenes.scene import View
 from reference_trainer.training.randomness import stream
 
 __all__ = ["RayBoxDensity", "ray_box", "worst_region"]
@@ -48,11 +47,6 @@ class RayBoxDensity(AdaptiveDensity):
             raise ValueError(f"height and width must be positive pixels, got {height} and {width}.")
         self.views, self.height, self.width = views, height, width
 
-    def begin(self, config: TrainConfig, scene: Scene, device: torch.device, count: int) -> None:
-        """Remember the training views."""
-        super().begin(config, scene, device, count)
-        self.scene = scene
-
     @torch.no_grad()
     def grow(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Clone and split once."""
@@ -61,7 +55,7 @@ class RayBoxDensity(AdaptiveDensity):
         places = normalize(torch.stack([view.camera.position for view in views]), dim=1)
         threshold = self.config.densify_gradient * (0.5 if bool((pdist(places) > 1).any()) else 1.0)
         steep = self.statistics.mean_gradient >= threshold
-        large = is_large(optimizer, self.config.dense_fraction * self.extent)
+        large = is_large(optimizer, self.large)
         clone(optimizer, (steep & ~large) | self._inside(optimizer, views, step))
         split(optimizer, steep & large, generator=self.split_generator(step))
 

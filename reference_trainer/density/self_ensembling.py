@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -19,10 +18,8 @@ from reference_trainer.render import splat
 from reference_trainer.scenes.pseudo import pseudo_cameras
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.field import Field
 from reference_trainer.training.randomness import stream
-
-if TYPE_CHECKING:
-    from reference_trainer.training.field import Field
 
 __all__ = ["SelfEnsembling"]
 

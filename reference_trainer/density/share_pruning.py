@@ -7,11 +7,9 @@ from torch import Tensor
 
 from ca_reg import attribute
 from reference_trainer.density.adaptive import AdaptiveDensity
-from reference_trainer.evaluation.shares import blend_weights, share_per_weight
+from reference_trainer.evaluation.shares import all_but_highest, blend_weights, share_per_weight
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.optimizer import GaussianOptimizer
-from reference_trainer.scenes.scene import Scene
-from reference_trainer.training.config import TrainConfig
 
 __all__ = ["SharePruning"]
 
@@ -45,20 +43,11 @@ class SharePruning(AdaptiveDensity):
                 raise ValueError(f"{name} must be in (0, 1), got {value}.")
         self.every, self.fraction, self.drop_rate = every, fraction, drop_rate
 
-    def begin(self, config: TrainConfig, scene: Scene, device: torch.device, count: int) -> None:
-        """Remember the training views."""
-        super().begin(config, scene, device, count)
-        self.scene = scene
-
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Prune by share as well, after all else; the others keep what was counted of them."""
         super().before_step(optimizer, step)
         if self.config.densify_from < step < self.config.densify_end and step % self.every == 0:
-            values = self.shares_per_weight(optimizer, step)
-            first = values.argsort(descending=True, stable=True)[: round(self.fraction * len(values))]
-            keep = torch.ones_like(values, dtype=torch.bool)
-            keep[first[values[first] > 0]] = False
-            self.select(optimizer, keep)
+            self.select(optimizer, all_but_highest(self.shares_per_weight(optimizer, step), self.fraction))
 
     def shares_per_weight(self, optimizer: GaussianOptimizer, step: int) -> Tensor:
         """Return the quotients over the training views of the Gaussians as they are, shape (N,), float64."""

@@ -7,14 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["DensityStatistics", "screen_norm"]
-
-
-def screen_norm(gradient: Tensor, width: int, height: int) -> Tensor:
-    """Return the norms (M,) of gradients per pixel (M, 2), per half an image size (INRIA's device coordinates)."""
-    half_size = gradient.new_tensor([0.5 * width, 0.5 * height])
-    norms: Tensor = (gradient * half_size).norm(dim=1)
-    return norms
+__all__ = ["DensityStatistics"]
 
 
 @dataclass
@@ -28,17 +21,21 @@ class DensityStatistics:
         gradient_sum: summed norms of the loss gradient with respect to the projected centre, in units of half the image
             size per unit (the INRIA code's normalised device coordinates), shape (N,).
         steps: the number of steps that drew it, shape (N,).
+        absolute_sum: as ``gradient_sum``, of absolute gradients; None where they are not looked at.
     """
 
     gradient_sum: Tensor
     steps: Tensor
+    absolute_sum: Tensor | None = None
 
     @classmethod
-    def zeros(cls, count: int, device: torch.device | str = "cpu") -> DensityStatistics:
+    def zeros(cls, count: int, device: torch.device | str = "cpu", *, absolute: bool = False) -> DensityStatistics:
         """Return empty statistics of ``count`` Gaussians."""
-        return cls(*(torch.zeros(count, device=device) for _ in range(2)))
+        return cls(*(torch.zeros(count, device=device) for _ in range(2 + absolute)))
 
-    def update(self, indices: Tensor, gradient: Tensor, width: int, height: int) -> None:
+    def update(
+        self, indices: Tensor, gradient: Tensor, width: int, height: int, absolute: Tensor | None = None
+    ) -> None:
         """Count one step.
 
         Args:
@@ -46,13 +43,20 @@ class DensityStatistics:
             gradient: of the loss with respect to their projected centres, per pixel, shape (M, 2).
             width: image width, pixels.
             height: image height, pixels.
+            absolute: the sums over the pixels of the absolute gradients, shape (M, 2).
         """
-        self.gradient_sum[indices] += screen_norm(gradient, width, height).to(self.gradient_sum)
+        for total, x in ((self.gradient_sum, gradient), (self.absolute_sum, absolute)):
+            if total is not None and x is not None:
+                total[indices] += (x * x.new_tensor([0.5 * width, 0.5 * height])).norm(dim=1).to(total)
         self.steps[indices] += 1
+
+    def named(self) -> dict[str, Tensor]:
+        """Return what there is, by name."""
+        return {name: x for name, x in vars(self).items() if x is not None}
 
     def __getitem__(self, index: Tensor) -> DensityStatistics:
         """Return those of some Gaussians."""
-        return DensityStatistics(self.gradient_sum[index], self.steps[index])
+        return DensityStatistics(**{name: x[index] for name, x in self.named().items()})
 
     @property
     def mean_gradient(self) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -15,10 +15,8 @@ from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.render import Splats
 from reference_trainer.renderers.gsplat import GsplatSplats
 from reference_trainer.scenes.scene import Scene
-
-if TYPE_CHECKING:
-    from reference_trainer.training.config import TrainConfig
-    from reference_trainer.training.field import Field
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.field import Field
 
 __all__ = ["DensityStrategy"]
 
@@ -45,8 +43,9 @@ class DensityStrategy(abc.ABC):
     field: int = 0
 
     config: TrainConfig
+    scene: Scene
     extent: float
-    white: bool
+    large: float
     device: torch.device
 
     def begin(self, config: TrainConfig, scene: Scene, device: torch.device, count: int) -> None:
@@ -59,7 +58,8 @@ class DensityStrategy(abc.ABC):
             count: their number.
         """
         self.config = replace(config, seed=config.seed + (self.field << 32))  # every field splits by its own numbers
-        self.extent, self.white, self.device = scene.extent, scene.is_white, device
+        self.scene, self.extent, self.device = scene, scene.extent, device
+        self.large = config.dense_fraction * self.extent  # what is larger is split, what is smaller cloned
         self.reset(count)
 
     def is_due(self, step: int) -> bool:

@@ -8,13 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ca_reg import CAResult, CAScore, attribute
 from reference_trainer.evaluation.kept import KeptRecords
+from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.maps import color_variance_map
 from reference_trainer.evaluation.metrics import DepthErrors, depth_errors, on_white, psnr, ssim
 from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
@@ -22,21 +23,12 @@ from reference_trainer.evaluation.results import machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.scenes.scene import View, Viewpoint
 
-__all__ = ["Evaluation", "PerceptualMetric", "ViewScores", "ca_picture", "error_picture", "evaluate", "glance"]
+__all__ = ["Evaluation", "ViewScores", "ca_picture", "error_picture", "evaluate", "glance"]
 
 CA_PICTURE_RANGE = 0.02
 """Variance that gets the brightest colour in CA heat maps."""
 ERROR_PICTURE_RANGE = 0.25
 """Absolute error, the mean of the channels, that gets the brightest colour."""
-
-
-class PerceptualMetric(Protocol):
-    """A perceptual distance between two images (3, H, W) in [0, 1]."""
-
-    name: str
-
-    def __call__(self, image: Tensor, target: Tensor) -> float:
-        """Return the distance."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +106,7 @@ def evaluate(
     *,
     samples: int = 5,
     seed: int = 0,
-    perceptual: PerceptualMetric | None = None,
+    perceptual: LPIPS | None = None,
     pictures: Path | None = None,
     keep: Path | None = None,
     say: Callable[[str], None] = lambda text: None,
@@ -177,7 +169,7 @@ def _measure(
     split: str,
     index: int,
     scores: Sequence[CAScore],
-    perceptual: PerceptualMetric | None,
+    perceptual: LPIPS | None,
     files: Sequence[Path],
 ) -> ViewScores:
     """Measure one view, and write its picture and its panel if there are files for them."""

@@ -18,6 +18,7 @@ from reference_trainer.scenes.scene import Viewpoint
 __all__ = [
     "PER_WEIGHT_SCALE",
     "Heat",
+    "all_but_highest",
     "blend_weights",
     "colored_by",
     "concentration",
@@ -112,6 +113,14 @@ def share_per_weight(shares: Tensor, weights: Tensor) -> Tensor:
         tensor([0.2500,    inf, 0.0000])
     """
     return torch.where(shares > 0, shares / weights, 0.0)
+
+
+def all_but_highest(values: Tensor, fraction: float) -> Tensor:
+    """Return who stays, (N,) bool, without that fraction of all Gaussians whose values (N,) are highest and not 0."""
+    first = values.argsort(descending=True, stable=True)[: round(fraction * len(values))]
+    keep = torch.ones_like(values, dtype=torch.bool)
+    keep[first[values[first] > 0]] = False
+    return keep
 
 
 def colored_by(gaussians: Gaussians, values: Tensor, low: float, high: float) -> Gaussians:

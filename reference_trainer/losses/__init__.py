@@ -19,22 +19,22 @@ from reference_trainer.losses.warp import Warp
 
 __all__ = ["LOSSES", "CoAdaptation", "Consistency", "LossTerm", "Photometric"]
 
-LOSSES: Registry[LossTerm] = Registry("loss term", LossTerm, SCHEDULES)  # type: ignore[type-abstract]
+LOSSES: Registry[LossTerm] = Registry(
+    "loss term",
+    LossTerm,  # type: ignore[type-abstract]
+    SCHEDULES,
+    photometric=Photometric,
+    views=Views,
+    pearson=Pearson,
+    patch_depth=PatchDepth,
+    warp=Warp,
+    smooth_depth=SmoothDepth,
+    alpha=Alpha,
+    flat=Flat,
+    scale=Scale,
+    opacity=Opacity,
+    co_adaptation=CoAdaptation,
+    consistency=Consistency,
+    co_regularization=CoRegularization,
+)
 """What can be asked for by name; ``LOSSES.register("name")`` adds a class."""
-
-for _name, _term in {
-    "photometric": Photometric,
-    "views": Views,
-    "pearson": Pearson,
-    "patch_depth": PatchDepth,
-    "warp": Warp,
-    "smooth_depth": SmoothDepth,
-    "alpha": Alpha,
-    "flat": Flat,
-    "scale": Scale,
-    "opacity": Opacity,
-    "co_adaptation": CoAdaptation,
-    "consistency": Consistency,
-    "co_regularization": CoRegularization,
-}.items():
-    LOSSES.register(_name)(_term)

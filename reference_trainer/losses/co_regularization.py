@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import permutations
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -11,10 +11,8 @@ from ca_reg.schedules import Schedule
 from reference_trainer.losses.photometric import _check_lambda, photometric_loss
 from reference_trainer.losses.term import WeightedTerm
 from reference_trainer.scenes.pseudo import pseudo_cameras
-
-if TYPE_CHECKING:
-    from reference_trainer.scenes.scene import Scene
-    from reference_trainer.training.step import Step
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.step import Step
 
 __all__ = ["CoRegularization"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -11,9 +11,7 @@ from ca_reg.functional import Multiplier, expected_squared_error
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.photometric import _check_lambda, photometric_loss
 from reference_trainer.losses.term import WeightedTerm
-
-if TYPE_CHECKING:
-    from reference_trainer.training.step import Step
+from reference_trainer.training.step import Step
 
 __all__ = ["Consistency"]
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import WeightedTerm
-
-if TYPE_CHECKING:
-    from reference_trainer.training.step import Step
+from reference_trainer.training.step import Step
 
 __all__ = ["Opacity"]
 

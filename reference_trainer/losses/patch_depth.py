@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import unfold
 
-from ca_reg import Params
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import PriorTerm
-
-if TYPE_CHECKING:
-    from reference_trainer.training.step import Step
+from reference_trainer.training.step import Step
 
 __all__ = ["PatchDepth", "patch_error"]
 
@@ -78,8 +75,13 @@ class PatchDepth(PriorTerm):
     def _depth(self, step: Step) -> Tensor:
         if self.which == "plain":
             return step.depth
-        x = _hard(step.params) if self.which == "hard" else _soft(step.params)
-        depth = step.render(step.view.camera, x, depth=True).depth
+        names, x = ("opacities", "means", "scales", "quaternions", "sh"), step.params
+        fixed = x._replace(**{name: getattr(x, name).detach() for name in names})
+        if self.which == "hard":
+            fixed = fixed._replace(means=x.means, opacities=torch.full_like(x.opacities, _HARD_OPACITY))
+        else:
+            fixed = fixed._replace(opacities=x.opacities)
+        depth = step.render(step.view.camera, fixed, depth=True).depth
         assert depth is not None
         return depth
 
@@ -117,20 +119,3 @@ def patch_error(depth: Tensor, prior: Tensor, side: int, tolerance: float, *, ov
     difference = flat[0] - flat[1]
     beyond = difference.abs() > tolerance
     return difference[beyond].square().sum() / beyond.sum().clamp_min(1)
-
-
-def _hard(x: Params) -> Params:
-    """Return almost opaque Gaussians of which only the positions learn."""
-    opacities = torch.full_like(x.opacities, _HARD_OPACITY)
-    return _fixed(x)._replace(means=x.means, opacities=opacities)
-
-
-def _soft(x: Params) -> Params:
-    """Return the Gaussians, of which only the opacities learn."""
-    return _fixed(x)._replace(opacities=x.opacities)
-
-
-def _fixed(x: Params) -> Params:
-    """Return the Gaussians without gradients."""
-    names = ("opacities", "means", "scales", "quaternions", "sh")
-    return x._replace(**{name: getattr(x, name).detach() for name in names})

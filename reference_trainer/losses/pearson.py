@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import PriorTerm
-
-if TYPE_CHECKING:
-    from reference_trainer.scenes.scene import Scene
-    from reference_trainer.training.step import Step
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.step import Step
 
 __all__ = ["Pearson"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -11,9 +11,7 @@ from torch import Tensor
 from ca_reg.functional import expected_absolute_error
 from reference_trainer.losses.term import LossTerm
 from reference_trainer.render.engine import engine_for
-
-if TYPE_CHECKING:
-    from reference_trainer.training.step import Step
+from reference_trainer.training.step import Step
 
 __all__ = ["Photometric", "expected_photometric_loss", "photometric_loss", "ssim_map"]
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import abc
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 
 from ca_reg.schedules import Schedule, as_schedule
-
-if TYPE_CHECKING:
-    from reference_trainer.scenes.scene import Scene
-    from reference_trainer.training.step import Step
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.step import Step
 
 __all__ = ["LossTerm", "PriorTerm", "WeightedTerm"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -10,9 +10,7 @@ from torch import Tensor
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.photometric import Photometric
 from reference_trainer.losses.term import WeightedTerm
-
-if TYPE_CHECKING:
-    from reference_trainer.training.step import Step
+from reference_trainer.training.step import Step
 
 __all__ = ["Views"]
 

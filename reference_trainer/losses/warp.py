@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from kornia.filters import spatial_gradient
@@ -12,9 +12,7 @@ from torch import Tensor
 
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import WeightedTerm
-
-if TYPE_CHECKING:
-    from reference_trainer.training.step import Step
+from reference_trainer.training.step import Step
 
 __all__ = ["Warp", "edge_aware_smoothness", "warp_horizontally"]
 

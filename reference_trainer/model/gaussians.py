@@ -12,17 +12,12 @@ from torch import Tensor
 from ca_reg import Params
 from reference_trainer.camera import Camera
 
-__all__ = ["PARAMETERS", "SH_C0", "Gaussians", "inverse_sigmoid"]
+__all__ = ["PARAMETERS", "SH_C0", "Gaussians"]
 
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 """What every Gaussian has, by the names of the fields."""
 
 SH_C0 = 0.28209479177387814  # the constant band of the spherical harmonics: sqrt(1 / (4 pi))
-
-
-def inverse_sigmoid(x: Tensor) -> Tensor:
-    """Return the logit of ``x`` in (0, 1), any shape."""
-    return torch.log(x / (1 - x))
 
 
 @dataclass(frozen=True)

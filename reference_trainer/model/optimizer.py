@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -11,27 +10,7 @@ from torch import Tensor
 
 from reference_trainer.model.gaussians import Gaussians
 
-__all__ = ["GaussianOptimizer", "LearningRates"]
-
-
-@dataclass(frozen=True)
-class LearningRates:
-    """Adam's learning rate of each parameter, per step, and of what regularizers learn per Gaussian, by name.
-
-    That of the means is in world units and set at every step by the trainer; the others are the INRIA code's.
-    """
-
-    means: float
-    log_scales: float = 5e-3
-    quaternions: float = 1e-3
-    opacity_logits: float = 0.05
-    sh_dc: float = 2.5e-3
-    sh_rest: float = 2.5e-3 / 20
-    learned: Mapping[str, float] = field(default_factory=dict)
-
-    def of(self, name: str) -> float:
-        """Return the rate of a parameter as `Gaussians.named` calls it."""
-        return self.learned[name] if name in self.learned else getattr(self, name)
+__all__ = ["GaussianOptimizer"]
 
 
 class GaussianOptimizer:
@@ -39,11 +18,11 @@ class GaussianOptimizer:
 
     Args:
         gaussians: initial values; they are copied.
-        rates: learning rates.
+        rates: Adam's learning rate of each parameter, per step, by the names of `Gaussians.named`.
 
     Example:
         >>> start = Gaussians.from_points(torch.zeros(4, 3), torch.rand(4, 3), torch.ones(4), sh_degree=0)
-        >>> optimizer = GaussianOptimizer(start, LearningRates(means=1e-3))
+        >>> optimizer = GaussianOptimizer(start, {name: 1e-3 for name, _ in start.named()})
         >>> optimizer.gaussians.means.sum().backward()
         >>> optimizer.step()
         >>> optimizer.select(torch.tensor([0, 2]))
@@ -51,9 +30,9 @@ class GaussianOptimizer:
         2
     """
 
-    def __init__(self, gaussians: Gaussians, rates: LearningRates) -> None:
+    def __init__(self, gaussians: Gaussians, rates: Mapping[str, float]) -> None:
         self.gaussians = gaussians.map(lambda x: x.detach().clone().requires_grad_())
-        groups = [{"params": [x], "lr": rates.of(name), "name": name} for name, x in self.gaussians.named()]
+        groups = [{"params": [x], "lr": rates[name], "name": name} for name, x in self.gaussians.named()]
         self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def step(self) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from reference_trainer.evaluation.evaluate import Evaluation, evaluate
 from reference_trainer.evaluation.results import markdown_table
-from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
+from reference_trainer.evaluation.shares import Heat, all_but_highest
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.score_ply import place, scaled
@@ -30,7 +30,7 @@ def clean_ply(
     *,
     fraction: float = 0.1,
     refine: int = 100,
-    background: str = "black",
+    background: str = "auto",
     regularizer: str | None = None,
     device: str = "cpu",
     say: Callable[[str], None] = print,
@@ -69,10 +69,7 @@ def clean_ply(
     if model.for_rendering:
         raise ValueError(f"the opacities of {ply} are those of the test: give the PLY with plain ones.")
     views = [view.to(device) for view in placed.views["orbit" if scene is None else "train"]]
-    values = share_per_weight(mean_shares(model, views)[0], blend_weights(model, views))
-    first = values.argsort(descending=True, stable=True)[: round(fraction * len(values))]
-    keep = torch.ones_like(values, dtype=torch.bool)
-    keep[first[values[first] > 0]] = False
+    keep = all_but_highest(Heat.of(model, views).values, fraction)
     models = {"as it was": model, "taken out": replace(model, gaussians=model.gaussians[keep])}
     if scene is None:
         say("Without photographs nothing can close the holes: for that give the scene (--scene FOLDER).")
@@ -82,7 +79,7 @@ def clean_ply(
     *_, last = models.values()
     save_ply(scaled(last.gaussians, 1 / placed.enlarged), out, regularizer=last.regularizer, step=last.step)
     say(_table(found))
-    say(f"{out}: {len(last.gaussians)} of {len(values)} Gaussians")
+    say(f"{out}: {len(last.gaussians)} of {len(keep)} Gaussians")
     return found
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from reference_trainer.camera import Camera, pixels_of
+from reference_trainer.camera import pixels_of
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.scenes.scene import Scene
@@ -42,7 +42,7 @@ def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[st
             f"{name}: none of the {len(gaussians):,} Gaussians has an opacity of 1/255, all are invisible."
         )
     views = [*scene.train, *scene.test]
-    before = torch.stack([_depth(means, view.camera) >= NEAR_PLANE for view in views])
+    before = torch.stack([view.camera.project(means)[1] >= NEAR_PLANE for view in views])
     inside = torch.stack([pixels_of(means, view.camera)[2] for view in views]) & before
     seen = int(inside.any(0).sum())
     if seen < NEARLY_NONE * count:
@@ -63,12 +63,6 @@ def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[st
     if not blind:
         return []
     return [f"{len(blind)} of {len(views)} cameras see less than {NEARLY_NONE:.0%} of {name}: {', '.join(blind)}."]
-
-
-def _depth(means: Tensor, camera: Camera) -> Tensor:
-    """Return the distance along the viewing direction, shape (N,)."""
-    pose = camera.world_to_camera.to(means)
-    return means @ pose[2, :3] + pose[2, 3]
 
 
 def _text(point: Tensor) -> str:

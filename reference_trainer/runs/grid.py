@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,8 +99,10 @@ def run_grid(
             note(number, _read(run), "before")
         else:
             run.out.mkdir(parents=True, exist_ok=True)
-            how = (running.device, running.monitor_every, running.checkpoint_every, _lpips(running.lpips))
-            tasks[number] = Task(run.label, train_run, (*_where(run), *how, chosen_engine()))
+            lpips = running.lpips if running.lpips in (None, "installed") else str(Path(running.lpips).resolve())
+            how = {"device": running.device, "lpips": lpips, "monitor_every": running.monitor_every}
+            how["checkpoint_every"] = running.checkpoint_every
+            tasks[number] = Task(run.label, train_run, (*_where(run), chosen_engine(), how))
     numbers = list(tasks)
     for index, outcome in run_all(running.engine, list(tasks.values()), retries=running.retries, say=running.say):
         note(numbers[index], outcome, "now")
@@ -111,16 +113,9 @@ def run_grid(
 
 
 def train_run(
-    options: SceneOptions,
-    config: TrainConfig,
-    out: Path,
-    device: str,
-    monitor_every: int,
-    checkpoint_every: int,
-    lpips: str | None,
-    engine: str,
+    options: SceneOptions, config: TrainConfig, out: Path, engine: str, how: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Do or continue one run, in a worker; see `run_experiment`, and `use_engine` for what draws.
+    """Do or continue one run, in a worker; see `run_experiment` for how, and `use_engine` for what draws.
 
     Raises:
         FileNotFoundError: if the folder of the run is not there, because this machine does not share it.
@@ -131,15 +126,7 @@ def train_run(
             f"cluster share under the same path, and so must the scenes."
         )
     use_engine(engine)  # a machine of a cluster has an environment of its own
-    return run_experiment(
-        options,
-        config,
-        out,
-        device=device,
-        monitor_every=monitor_every,
-        checkpoint_every=checkpoint_every,
-        lpips=lpips,
-    )
+    return run_experiment(options, config, out, **how)
 
 
 def _read(run: Run) -> Value | Failure:
@@ -150,11 +137,6 @@ def _read(run: Run) -> Value | Failure:
 def _where(run: Run) -> tuple[SceneOptions, TrainConfig, Path]:
     """Return what a run is and where it lives; workers have other working directories."""
     return run.options.absolute(), run.config, run.out.resolve()
-
-
-def _lpips(option: str | None) -> str | None:
-    """Return the perceptual metric with an absolute path, if it is one."""
-    return option if option in (None, "installed") else str(Path(option).resolve())
 
 
 def _line(outcome: dict[str, Any] | Failure, when: str) -> str:

@@ -10,8 +10,9 @@ from pathlib import Path
 import torch
 
 from ca_reg.regularizers import parse
-from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric, evaluate
+from reference_trainer.evaluation.evaluate import Evaluation, evaluate
 from reference_trainer.evaluation.kept import PARTIAL
+from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.pictures import file_names, save_gif, save_png
 from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.evaluation.tables import evaluation_table
@@ -58,7 +59,7 @@ def measure(
     about: Mapping[str, object],
     samples: int = 5,
     seed: int = 0,
-    perceptual: PerceptualMetric | None = None,
+    perceptual: LPIPS | None = None,
     say: Say = print,
 ) -> Evaluation:
     """Measure a model at views; write ``evaluation.json``, ``evaluation.md`` and pictures, and print the table.

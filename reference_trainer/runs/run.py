@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAMonitor
-from reference_trainer.evaluation.evaluate import PerceptualMetric, evaluate, glance
+from reference_trainer.evaluation.evaluate import evaluate, glance
 from reference_trainer.evaluation.kept import PARTIAL
-from reference_trainer.evaluation.lpips import load_lpips
+from reference_trainer.evaluation.lpips import LPIPS, load_lpips
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
@@ -273,9 +273,7 @@ def _train(
         trainer.train(after_step=after_step, progress=progress)
 
 
-def _measure(
-    trainer: Trainer, out: Path, perceptual: PerceptualMetric | None, say: Callable[[str], None]
-) -> dict[str, Any]:
+def _measure(trainer: Trainer, out: Path, perceptual: LPIPS | None, say: Callable[[str], None]) -> dict[str, Any]:
     """Write the trained model, its pictures and its scores; return the results."""
     model = model_of(trainer)
     save_ply(model.gaussians, out / PLY, regularizer=model.regularizer, step=model.step)

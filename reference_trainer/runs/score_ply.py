@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from ca_reg.regularizers import parse
-from reference_trainer.evaluation.evaluate import Evaluation, PerceptualMetric
+from reference_trainer.evaluation.evaluate import Evaluation
+from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
-from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
+from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.frame_check import check_frame
 from reference_trainer.runs.measure import measure
@@ -100,11 +101,12 @@ def of_ply(
             raise ValueError(f"{ply} says what it was trained with: {error} Give --regularizer.") from error
     if baked > 0 and not loaded.for_rendering:
         gaussians = replace(
-            gaussians, opacity_logits=inverse_sigmoid((gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6))
+            gaussians, opacity_logits=torch.logit((gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6))
         )
         text = text or f"dropout({baked:g})"
-    bands = [degree for degree in range(gaussians.sh_degree + 1) if degree == 0 or _band(gaussians, degree).any()]
-    facts = PlyFacts(len(gaussians), gaussians.sh_degree, bands[-1], loaded.opacity_scale, loaded.for_rendering, text)
+    degrees = range(1, gaussians.sh_degree + 1)
+    used = max((d for d in degrees if gaussians.sh_rest[:, d**2 - 1 : (d + 1) ** 2 - 1].any()), default=0)
+    facts = PlyFacts(len(gaussians), gaussians.sh_degree, used, loaded.opacity_scale, loaded.for_rendering, text)
     model = TrainedModel(
         gaussians.to(device), background.to(device), text, loaded.step, for_rendering=loaded.for_rendering
     )
@@ -145,16 +147,16 @@ def place(
     ply: Path,
     where: SceneOptions | OrbitOptions,
     *,
-    background: str = "black",
+    background: str = "auto",
     regularizer: str | None = None,
     device: str = "cpu",
     say: Say = print,
 ) -> Placed:
     """Load the model of a PLY and the views of a scene, or cameras on an orbit; arguments and errors of `score_ply`."""
     scene = where.load() if isinstance(where, SceneOptions) else None
-    if scene is None and background not in BACKGROUNDS:
+    if scene is None and background not in ("auto", *BACKGROUNDS):
         raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {background!r}.")
-    color = torch.tensor(BACKGROUNDS[background]) if scene is None else scene.background
+    color = torch.tensor(BACKGROUNDS.get(background, BACKGROUNDS["black"])) if scene is None else scene.background
     model, facts = of_ply(ply, background=color, regularizer=regularizer, device=device)
     say(f"{ply}: {facts}")
     about: dict[str, object] = {"ply": asdict(facts)}
@@ -171,11 +173,11 @@ def score_ply(
     where: SceneOptions | OrbitOptions,
     out: Path | None = None,
     *,
-    background: str = "black",
+    background: str = "auto",
     regularizer: str | None = None,
     samples: int = 5,
     seed: int = 0,
-    perceptual: PerceptualMetric | None = None,
+    perceptual: LPIPS | None = None,
     device: str = "cpu",
     say: Say = print,
 ) -> Evaluation:
@@ -185,7 +187,7 @@ def score_ply(
         ply: the model, in the frame of the scene's cameras; for an orbit in any frame and of any size.
         where: the scene or the orbit.
         out: folder for the results; ``<ply>_evaluation`` by default.
-        background: of an orbit, ``"black"`` or ``"white"``; a scene has its own.
+        background: of an orbit, ``"black"``, also by default, or ``"white"``; a scene has its own.
         regularizer: as of `of_ply`.
         samples: K of the CA score.
         seed: of its masks.
@@ -228,11 +230,6 @@ def _on_orbit(model: TrainedModel, orbit: OrbitOptions, about: dict[str, object]
     views = [Viewpoint(f"{index:03d}", camera) for index, camera in enumerate(cameras)]
     found = {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged}
     return Placed(model, enlarged, {"orbit": views}, None, about | {"orbit": asdict(orbit) | found})
-
-
-def _band(gaussians: Gaussians, degree: int) -> Tensor:
-    """Return the coefficients of one band of spherical harmonics above 0."""
-    return gaussians.sh_rest[:, degree**2 - 1 : (degree + 1) ** 2 - 1]
 
 
 def scaled(gaussians: Gaussians, factor: float) -> Gaussians:

@@ -238,12 +238,11 @@ def _convergence(record: Record, error: str) -> tuple[NDArray[np.float64], NDArr
 
 
 def _report(records: Records) -> str:
-    """Return one row per estimator, and what follows; times are medians, errors root mean squares over the seeds."""
     return "\n".join(f"## {name}\n\n{_table(record)}" for name, record in records.items())
 
 
 def _table(record: Record) -> str:
-    """Return the table of one model."""
+    """Return one row per estimator, and what follows; times are medians, errors root mean squares over the seeds."""
     render = statistics.median(record["render_seconds"])
     rows: list[dict[str, object]] = []
     for m in record["estimators"]:

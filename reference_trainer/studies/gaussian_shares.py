@@ -127,8 +127,7 @@ def _correlations(
     from scipy.stats import spearmanr  # a second to import
 
     gaussians = model.gaussians
-    poses = [view.camera.world_to_camera.to(gaussians.means) for view in views]
-    depth = torch.stack([gaussians.means @ pose[2, :3] + pose[2, 3] for pose in poses]).mean(0)
+    depth = torch.stack([view.camera.project(gaussians.means)[1] for view in views]).mean(0)
     known = {"opacity": gaussians.opacities, "largest scale": gaussians.scales.amax(1), "mean depth": depth}
     known["blend weight"] = weights
     pairs = {name: (shares.cpu(), values.detach().cpu()) for name, values in known.items()}

@@ -102,23 +102,21 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
 
 
 def checkpoints(runs: Sequence[Path]) -> dict[str, Path]:
-    """Return the checkpoints of runs by name: the last three parts of the path, such as fern/dropout/seed_0.
+    """Return the checkpoints of runs by name: so many parts of their paths, from three on, as tell all of them apart.
 
     Raises:
-        ValueError: if there is no run, or two have the same name.
+        ValueError: if there is no run.
         FileNotFoundError: if a folder holds no run.
     """
-    found: dict[str, Path] = {}
-    for run in dict.fromkeys(run.resolve() for run in runs):
-        name = "/".join(run.parts[-3:])
-        if not (run / CHECKPOINT).exists():
-            raise FileNotFoundError(f"{run} holds no run (no {CHECKPOINT}): give the --out folder of ca-reg train.")
-        if name in found:
-            raise ValueError(f"two runs are called {name}: rename one, or study them in different folders.")
-        found[name] = run / CHECKPOINT
-    if not found:
+    if not runs:
         raise ValueError("expected at least 1 run, got none: give the --out folders of ca-reg train.")
-    return found
+    folders, parts = list(dict.fromkeys(run.resolve() for run in runs)), 3
+    for folder in folders:
+        if not (folder / CHECKPOINT).exists():
+            raise FileNotFoundError(f"{folder} holds no run (no {CHECKPOINT}): give the --out folder of ca-reg train.")
+    while len({folder.parts[-parts:] for folder in folders}) < len(folders):
+        parts += 1
+    return {"/".join(folder.parts[-parts:]): folder / CHECKPOINT for folder in folders}
 
 
 def _measured(

@@ -39,9 +39,8 @@ class TrainConfig:
     loss: str = "photometric"
     """Terms of the loss, such as "photometric(0.2) + co_adaptation(3.0)", or "my_module:MyTerm"."""
     density: str = "adaptive"
-    """Density control: "adaptive", "absgrad", "proximity", "ray_boxes", "mcmc", "share_pruning(every=500)",
-    "co_pruning(5.0)", "self_ensembling", or "my_module:MyStrategy"."""
-
+    """Density control, such as "absgrad" or "share_pruning(every=500)", or "my_module:MyStrategy"; `ca-reg names` lists
+    them."""
     fields: int = 1
     """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
     random_background: bool = False

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.model.optimizer import GaussianOptimizer, LearningRates
+from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.initial import initial_gaussians
@@ -49,15 +49,15 @@ class Field:
         known = start.learned  # of a model with the same regularizers
         learned = {name: known.get(name, torch.full((len(start),), x.start)) for name, x in learns.items()}
         start = replace(start, learned=learned)
-        rates = LearningRates(
-            means=config.means_rate_at(0) * scene.extent,
-            log_scales=config.scales_rate,
-            quaternions=config.quaternions_rate,
-            opacity_logits=config.opacity_rate,
-            sh_dc=config.color_rate,
-            sh_rest=config.color_rate / 20,
-            learned={name: learned.rate for name, learned in learns.items()},
-        )
+        rates = {
+            "means": config.means_rate_at(0) * scene.extent,
+            "log_scales": config.scales_rate,
+            "quaternions": config.quaternions_rate,
+            "opacity_logits": config.opacity_rate,
+            "sh_dc": config.color_rate,
+            "sh_rest": config.color_rate / 20,
+            **{name: learned.rate for name, learned in learns.items()},
+        }
         self.optimizer = GaussianOptimizer(start.to(device), rates)
         self.density = config.make_density(number)
         self.density.begin(config, scene, torch.device(device), len(start))

@@ -4,31 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.plan_rules import RULES, Finding
+from reference_trainer.training.plan_rules import RULES, PlanItem
 
 __all__ = ["Plan", "PlanItem", "make_plan"]
-
-
-@dataclass(frozen=True)
-class PlanItem:
-    """One thing that training could use.
-
-    Args:
-        name: what it is about.
-        decision: whether training uses it, uses less of it, or leaves it out.
-        reason: why, with the numbers seen in the scene.
-        changes: fields of `TrainConfig` that carry the decision out; empty where nothing has to change.
-    """
-
-    name: str
-    decision: Literal["used", "reduced", "left out"]
-    reason: str
-    changes: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -116,10 +99,8 @@ def _kept(config: TrainConfig, given: Collection[str]) -> set[str]:
     return {*given, *(name for name, value in vars(config).items() if value != default[name])}
 
 
-def _item(finding: Finding, config: TrainConfig, kept: Collection[str]) -> PlanItem:
-    """Turn a finding into a decision: what the user asked for stays."""
-    asked = {name: getattr(config, name) for name in finding.changes if name in kept}
-    if not asked:
-        return PlanItem(finding.name, finding.decision, finding.reason, finding.changes)
-    chosen = ", ".join(f"{name}={value}" for name, value in asked.items())
-    return PlanItem(finding.name, "used", f"asked for ({chosen}); the plan alone: {finding.reason}")
+def _item(found: PlanItem, config: TrainConfig, kept: Collection[str]) -> PlanItem:
+    """Return what a rule has found as a decision: what the user asked for stays."""
+    chosen = ", ".join(f"{name}={getattr(config, name)}" for name in found.changes if name in kept)
+    reason = f"asked for ({chosen}); the plan alone: {found.reason}"
+    return PlanItem(found.name, "used", reason) if chosen else found

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from reference_trainer.camera import pixels_of
 from reference_trainer.losses import Photometric
@@ -15,161 +14,172 @@ from reference_trainer.scenes.scene import PointCloud, Scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.initial import drawn_by_any, initial_gaussians
 
-__all__ = ["RULES", "Finding"]
+__all__ = ["RULES", "PlanItem"]
 
 
-class Finding(NamedTuple):
-    """What a rule would do: name, decision, the reason with the numbers seen, and the changed fields of the config."""
+@dataclass(frozen=True)
+class PlanItem:
+    """One thing that training could use; of a rule, what the plan alone would do.
+
+    Args:
+        name: what it is about.
+        decision: whether training uses it, uses less of it, or leaves it out.
+        reason: why, with the numbers seen in the scene.
+        changes: fields of `TrainConfig` that carry the decision out; empty where nothing has to change.
+    """
 
     name: str
     decision: Literal["used", "reduced", "left out"]
     reason: str
-    changes: Mapping[str, Any] = {}
+    changes: Mapping[str, Any] = field(default_factory=dict)
 
 
-def sh_bands(scene: Scene, config: TrainConfig) -> Finding:
+def sh_bands(scene: Scene, config: TrainConfig) -> PlanItem:
     """Bands of spherical harmonics: those that begin after the last step would stay 0.
 
     Lower degrees for few views save time, but were not shown to be as good.
     """
     name = "SH bands"
     if config.sh_degree == 0:
-        return Finding(name, "left out", "asked for (sh_degree=0)")
+        return PlanItem(name, "left out", "asked for (sh_degree=0)")
     if scene.start is not None:
-        return Finding(name, "used", f"all from the first step on: training starts from degree {scene.start.sh_degree}")
+        return PlanItem(
+            name, "used", f"all from the first step on: training starts from degree {scene.start.sh_degree}"
+        )
     reached = config.sh_degree_at(config.iterations)
     if reached < config.sh_degree:
         reason = f"bands above degree {reached} would begin after the last step, {config.iterations}, and stay 0"
-        return Finding(name, "reduced" if reached else "left out", reason, {"sh_degree": reached})
-    seen = int(_views_per_point(scene).median())
+        return PlanItem(name, "reduced" if reached else "left out", reason, {"sh_degree": reached})
+    positions = _points(scene).positions
+    seen = int(torch.stack([pixels_of(positions, view.camera)[2] for view in scene.train]).sum(0).median())
     sees = f"the median point is seen by {seen} of {len(scene.train)} training views"
-    return Finding(name, "used", f"{sees}; lower degrees are not known to end as well")
+    return PlanItem(name, "used", f"{sees}; lower degrees are not known to end as well")
 
 
-def alpha_masks(scene: Scene, config: TrainConfig) -> Finding:
+def alpha_masks(scene: Scene, config: TrainConfig) -> PlanItem:
     """Alpha masks: the pictures lie on the background already."""
     masks = [view.alpha for view in scene.train if view.alpha is not None]
     if not masks:
-        return Finding("alpha masks", "left out", "by construction: no training picture has one")
+        return PlanItem("alpha masks", "left out", "by construction: no training picture has one")
     empty = sum(float((alpha == 0).float().mean()) for alpha in masks) / len(masks)
     reason = f"by construction: the pictures, {empty:.0%} of them empty, lie on the background already"
-    return Finding("alpha masks", "left out", reason)
+    return PlanItem("alpha masks", "left out", reason)
 
 
-def background(scene: Scene, config: TrainConfig) -> Finding:
+def background(scene: Scene, config: TrainConfig) -> PlanItem:
     """The background is added behind the Gaussians, whatever its colour: it costs next to nothing."""
     colour = ", ".join(f"{value:g}" for value in scene.background.tolist())
-    return Finding("background", "used", f"({colour}) behind everything; adding it takes less than 1% of a step")
+    return PlanItem("background", "used", f"({colour}) behind everything; adding it takes less than 1% of a step")
 
 
-def depth_output(scene: Scene, config: TrainConfig) -> Finding:
+def depth_output(scene: Scene, config: TrainConfig) -> PlanItem:
     """No loss looks at depth."""
     asking = dict.fromkeys(type(term).__name__ for term in config.make_losses() if "depth" in term.needs)
     if asking:
-        return Finding("depth output", "used", f"asked for: {', '.join(asking)} looks at it")
-    return Finding("depth output", "left out", "by construction: no term of the loss looks at depth")
+        return PlanItem("depth output", "used", f"asked for: {', '.join(asking)} looks at it")
+    return PlanItem("depth output", "left out", "by construction: no term of the loss looks at depth")
 
 
-def distortion(scene: Scene, config: TrainConfig) -> Finding:
+def distortion(scene: Scene, config: TrainConfig) -> PlanItem:
     """Cameras are pinholes once they are loaded."""
     reason = "by construction: cameras are pinholes; the loader undoes it and says how far it goes"
-    return Finding("lens distortion", "left out", reason)
+    return PlanItem("lens distortion", "left out", reason)
 
 
-def densification(scene: Scene, config: TrainConfig) -> Finding:
+def densification(scene: Scene, config: TrainConfig) -> PlanItem:
     """Clones and splits."""
     name, points = "densification", _points(scene)
     until = config.densify_end
     if config.densify_every == 0:
-        return Finding(name, "left out", "asked for (densify_every=0)")
+        return PlanItem(name, "left out", "asked for (densify_every=0)")
     if until <= config.densify_from:
-        return Finding(name, "left out", f"by construction: it would begin at step {config.densify_from} of {until}")
+        return PlanItem(name, "left out", f"by construction: it would begin at step {config.densify_from} of {until}")
     pixels = sum(view.camera.width * view.camera.height for view in scene.train) / len(scene.train)
     reason = f"{len(points.positions)} initial points are {len(points.positions) / pixels:.2f} per pixel of a view"
-    return Finding(name, "used", f"{reason}; detail comes from clones and splits")
+    return PlanItem(name, "used", f"{reason}; detail comes from clones and splits")
 
 
-def opacity_reset(scene: Scene, config: TrainConfig) -> Finding:
+def opacity_reset(scene: Scene, config: TrainConfig) -> PlanItem:
     """Lowering all opacities."""
     name, first = "opacity reset", config.opacity_reset_from
     if config.opacity_reset_over_white and scene.is_white:
         first = min(first, config.densify_from)
     until = config.densify_end
     if not config.make_density().resets:
-        return Finding(name, "left out", f"by construction: density control by {config.density} has none")
+        return PlanItem(name, "left out", f"by construction: density control by {config.density} has none")
     if config.opacity_reset_every == 0:
-        return Finding(name, "left out", "asked for (opacity_reset_every=0)")
+        return PlanItem(name, "left out", "asked for (opacity_reset_every=0)")
     if first >= until:
-        return Finding(name, "left out", f"by construction: the first would be at step {first} of {until}")
-    return Finding(name, "used", f"first at step {first} of {config.iterations}")
+        return PlanItem(name, "left out", f"by construction: the first would be at step {first} of {until}")
+    return PlanItem(name, "used", f"first at step {first} of {config.iterations}")
 
 
-def dropped(scene: Scene, config: TrainConfig) -> Finding:
+def dropped(scene: Scene, config: TrainConfig) -> PlanItem:
     """Dropped Gaussians."""
     masks = config.make_regularizer().drops and not config.analytic
     reason = "what a mask drops is neither projected nor sorted in the step" if masks else "training draws no masks"
-    return Finding("dropped Gaussians", "left out", f"by construction: {reason}")
+    return PlanItem("dropped Gaussians", "left out", f"by construction: {reason}")
 
 
-def regularizer_inputs(scene: Scene, config: TrainConfig) -> Finding:
+def regularizer_inputs(scene: Scene, config: TrainConfig) -> PlanItem:
     """What the regularizers look at beside the opacities."""
     needed = ", ".join(config.make_regularizer().needs)
     if needed:
-        return Finding("inputs of the regularizers", "used", f"asked for: they need {needed}")
+        return PlanItem("inputs of the regularizers", "used", f"asked for: they need {needed}")
     reason = "by construction: they look at opacities alone, so neither neighbors nor depths are computed"
-    return Finding("inputs of the regularizers", "left out", reason)
+    return PlanItem("inputs of the regularizers", "left out", reason)
 
 
-def unseen(scene: Scene, config: TrainConfig) -> Finding:
+def unseen(scene: Scene, config: TrainConfig) -> PlanItem:
     """Initial Gaussians that have no pixel in a training view: they would stay as they are and fog the test views."""
     name = "Gaussians outside every view"
     start = initial_gaussians(scene, replace(config, initial_points="all"))
     outside = len(start) - int(drawn_by_any(start, scene.train).sum())
     counts = f"{outside} of {len(start)} initial Gaussians have no pixel in a training view"
     if outside == 0:
-        return Finding(name, "left out", f"by construction: {counts}")
-    return Finding(name, "left out", f"{counts}: no gradient ever reaches them", {"initial_points": "seen"})
+        return PlanItem(name, "left out", f"by construction: {counts}")
+    return PlanItem(name, "left out", f"{counts}: no gradient ever reaches them", {"initial_points": "seen"})
 
 
-def saturated(scene: Scene, config: TrainConfig) -> Finding:
+def saturated(scene: Scene, config: TrainConfig) -> PlanItem:
     """Pixels at the end of the range of the photograph."""
     share = sum(float((view.image >= 1).all(0).float().mean()) for view in scene.train) / len(scene.train)
     reason = f"{share:.1%} of the pixels are white; without them nothing would tell how bright these places are"
-    return Finding("saturated pixels", "used", reason)
+    return PlanItem("saturated pixels", "used", reason)
 
 
-def ssim_windows(scene: Scene, config: TrainConfig) -> Finding:
+def ssim_windows(scene: Scene, config: TrainConfig) -> PlanItem:
     """Parts of the picture where photograph and background are the same."""
     colour = scene.background[:, None, None]
     busy = [(view.image != colour).any(0) for view in scene.train]
     share = sum(float(part.any(1).float().mean() * part.any(0).float().mean()) for part in busy) / len(busy)
     if not any(isinstance(term, Photometric) and term.lambda_dssim > 0 for term in config.make_losses()):
-        return Finding("SSIM windows without change", "left out", "by construction: the loss has no SSIM")
+        return PlanItem("SSIM windows without change", "left out", "by construction: the loss has no SSIM")
     reason = f"the box around what differs from the background is {share:.0%} of a picture"
-    return Finding("SSIM windows without change", "used", f"{reason}; cutting it out gains nothing")
+    return PlanItem("SSIM windows without change", "used", f"{reason}; cutting it out gains nothing")
 
 
-def moments(scene: Scene, config: TrainConfig) -> Finding:
+def moments(scene: Scene, config: TrainConfig) -> PlanItem:
     """Exact mean and variance over masks."""
     if config.analytic:
-        return Finding("moments", "used", "asked for (analytic): every step trains on the expectation")
-    return Finding("moments", "left out", "by construction: a step needs none; the monitor measures at its own steps")
+        return PlanItem("moments", "used", "asked for (analytic): every step trains on the expectation")
+    return PlanItem("moments", "left out", "by construction: a step needs none; the monitor measures at its own steps")
 
 
-def initial_size(scene: Scene, config: TrainConfig) -> Finding:
+def initial_size(scene: Scene, config: TrainConfig) -> PlanItem:
     """The size of initial points. Distances between random points say nothing about a surface, and pile them up."""
     name, points = "size of initial points", _points(scene)
     count = len(points.positions)
     if scene.start is not None:
-        return Finding(name, "used", f"by construction: {count} Gaussians have sizes of their own")
+        return PlanItem(name, "used", f"by construction: {count} Gaussians have sizes of their own")
     if points.source != "random":
         size = f"as wide as {config.initial_scale:g} x the distance to their neighbours"
-        return Finding(name, "used", f"{count} measured points, {size}")
+        return PlanItem(name, "used", f"{count} measured points, {size}")
     reason = f"{count} random points as wide as the distance to their neighbours would pile up; half as wide is as good"
-    return Finding(name, "reduced", reason, {"initial_scale": 0.5})
+    return PlanItem(name, "reduced", reason, {"initial_scale": 0.5})
 
 
-RULES: tuple[Callable[[Scene, TrainConfig], Finding], ...] = (
+RULES: tuple[Callable[[Scene, TrainConfig], PlanItem], ...] = (
     sh_bands, alpha_masks, background, depth_output, distortion, densification, opacity_reset, dropped,
     regularizer_inputs, unseen, saturated, ssim_windows, moments, initial_size,
 )  # fmt: skip
@@ -180,8 +190,3 @@ def _points(scene: Scene) -> PointCloud:
     """The initial points, which `make_plan` has made sure of."""
     assert scene.points is not None
     return scene.points
-
-
-def _views_per_point(scene: Scene) -> Tensor:
-    """Number of training views whose picture holds a point, shape (N,)."""
-    return torch.stack([pixels_of(_points(scene).positions, view.camera)[2] for view in scene.train]).sum(0)

@@ -73,7 +73,7 @@ def gradient_noise_study(runs: Sequence[Path], *, draws: int = 64, dropout: floa
         device: where to render.
 
     Raises:
-        ValueError: if there is no run, two have the same name, or a setting is out of range.
+        ValueError: if there is no run, or a setting is out of range.
         FileNotFoundError: if a folder holds no run.
     """
     _check(draws, dropout)

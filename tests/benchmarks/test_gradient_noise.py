@@ -22,7 +22,7 @@ from benchmarks.gradient_noise_moments import (
 from ca_reg.functional import Multiplier, draw_keep_mask
 from reference_trainer.evaluation.results import write_json
 from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
-from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
+from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.rendering import render_moments_of
 from reference_trainer.runs.folder import CHECKPOINT
 from reference_trainer.runs.folder import CONFIG as RUN_CONFIG
@@ -49,7 +49,7 @@ def scene() -> tuple[Gaussians, list[View]]:
         means=s.means,
         log_scales=s.scales.log(),
         quaternions=s.quaternions,
-        opacity_logits=inverse_sigmoid(0.3 + 0.5 * s.opacities),
+        opacity_logits=torch.logit(0.3 + 0.5 * s.opacities),
         sh_dc=((s.colors - 0.5) / SH_C0)[:, None],
         sh_rest=0.1 * torch.randn(N, 3, 3, generator=g, dtype=torch.float64),
     )

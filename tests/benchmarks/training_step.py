@@ -11,7 +11,7 @@ import torch
 from benchmarks.workloads import Workload
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.losses.photometric import photometric_loss
-from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
+from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.both_engines import drawn_by
@@ -112,7 +112,7 @@ def scores(workload: Workload, engine: str) -> dict[str, Callable[[], object]]:
         means=w.means,
         log_scales=w.scales.log(),
         quaternions=w.quaternions,
-        opacity_logits=inverse_sigmoid(w.opacities),
+        opacity_logits=torch.logit(w.opacities),
         sh_dc=((w.colors - 0.5) / SH_C0)[:, None],
         sh_rest=w.colors.new_zeros(len(w.colors), 0, 3),
     )

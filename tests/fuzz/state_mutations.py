@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import io
 import json
 import random
@@ -140,11 +142,17 @@ def _setting(state: dict[str, Any], rng: random.Random) -> None:
     state["config"] = json.dumps(config)
 
 
+@functools.lru_cache(maxsize=1)
+def _content(data: bytes) -> Any:
+    """Return what is in a good file."""
+    return torch.load(io.BytesIO(data), weights_only=True)
+
+
 def _saved(change: Callable[[dict[str, Any], random.Random], None]) -> Callable[[bytes, random.Random], bytes]:
     """Make a mutation of a file out of one of its content."""
 
     def mutation(data: bytes, rng: random.Random) -> bytes:
-        state = torch.load(io.BytesIO(data), weights_only=True)
+        state = copy.deepcopy(_content(data))
         for _ in range(rng.choice((1, 1, 1, 2))):
             try:
                 change(state, rng)

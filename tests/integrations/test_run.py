@@ -5,102 +5,19 @@ import os
 import re
 import subprocess
 import sys
-import textwrap
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 import torch
+from launched import draws, launch, seen
 from stand_ins.inria import Model, make_rasterizer, make_render
 
 from ca_reg import Chain
 from ca_reg.integrations._script import find_script
-from ca_reg.integrations._sources import Sources, read_folder, read_script
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.integrations.run import main
-
-FILES = {
-    "diff_gaussian_rasterization.py": """
-        from stand_ins.inria import make_rasterizer
-
-        GaussianRasterizer = make_rasterizer()
-    """,
-    "scene/__init__.py": "from scene.gaussian_model import GaussianModel\n",
-    "scene/gaussian_model.py": """
-        from stand_ins.inria import Model
-
-        class GaussianModel(Model):
-            def update_learning_rate(self, iteration):
-                self.rate = 1e-3
-    """,
-    "gaussian_renderer/__init__.py": """
-        from diff_gaussian_rasterization import GaussianRasterizer
-        from stand_ins.inria import make_render
-
-        render = make_render(GaussianRasterizer)
-    """,
-    "train.py": """
-        import random
-        import sys
-
-        import torch
-        from gaussian_renderer import render
-        from scene import GaussianModel
-
-        def training(iterations):
-            gaussians = GaussianModel()
-            background = torch.zeros(3)
-            for iteration in range(1, iterations + 1):
-                gaussians.update_learning_rate(iteration)
-                package = render(gaussians.camera, gaussians, None, background)
-                render(gaussians.camera, gaussians, None, background)  # a second view
-                print("seen", int((package["radii"] > 0).sum()), torch.rand(1).item())
-            with torch.no_grad():
-                render(gaussians.camera, gaussians, None, background)
-
-        if __name__ == "__main__":
-            torch.manual_seed(0)
-            print("argv", sys.argv[1:], "path", sys.path[0], "file", __file__)
-            training(int(sys.argv[1]))
-            if sys.argv[2:] == ["--fail"]:
-                raise ValueError("a failure of their own")
-            if sys.argv[2:] == ["--interrupt"]:
-                raise KeyboardInterrupt
-            sys.exit(3 if sys.argv[2:] == ["--exit"] else 0)
-    """,
-}
-
-
-@pytest.fixture
-def repository(tmp_path, monkeypatch):
-    """A code base, with the state of the interpreter put back after the test."""
-    for name, text in FILES.items():
-        path = tmp_path / "repository" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(textwrap.dedent(text))
-    for name in ("argv", "path", "meta_path"):
-        monkeypatch.setattr(sys, name, list(getattr(sys, name)))
-    sys.path.insert(0, "")  # python -m puts the present folder there
-    modules = set(sys.modules)
-    yield tmp_path / "repository"
-    for name in set(sys.modules) - modules:
-        if name.partition(".")[0] in ("scene", "gaussian_renderer", "diff_gaussian_rasterization"):
-            del sys.modules[name]
-
-
-def launch(*arguments):
-    with pytest.raises(SystemExit) as ended:
-        main([str(x) for x in arguments])
-    return ended.value.code
-
-
-def seen(out):
-    return [int(line.split()[1]) for line in out.splitlines() if line.startswith("seen")]
-
-
-def draws(out):
-    return [line.split()[2] for line in out.splitlines() if line.startswith("seen")]
 
 
 def test_a_script_is_regularized_and_the_report_says_how(repository, tmp_path, capsys):
@@ -367,118 +284,12 @@ def test_a_script_that_calls_gsplat_is_told_from_the_others(tmp_path, capsys, re
     assert "renders with gsplat, for which there is no --scope" in capsys.readouterr().err
 
 
-def test_what_a_script_imports_is_read_also_through_the_files_beside_it(repository):
-    (repository / "scene" / "views.py").write_text("from .. import gsplat\nfrom . import others, views\n")
-    (repository / "scene" / "others.py").write_text("def late():\n    import far.away as near\n")
-    (repository / "broken.py").write_text("import (\n")
-    (repository / "other.py").write_text("import numpy.linalg, broken\nfrom scene import views\n")
-    expected = {"numpy", "broken", "scene", "stand_ins", "far"}
-    assert read_script(repository / "other.py").packages == expected
-    assert "diff_gaussian_rasterization" in read_script(repository / "train.py").packages
-    assert read_script("nowhere.train").packages == {"nowhere"}
-
-
-@pytest.mark.parametrize("reaches_up", [False, True])
-def test_a_script_that_reaches_above_its_folder_is_read_with_what_lies_there(repository, reaches_up):
-    script = repository / "scripts" / "train.py"
-    script.parent.mkdir()
-    script.write_text(reaches_up * "import sys; sys.path.append('..')\n" + "import scene.gaussian_model, train\n")
-    sources = read_script(script)
-    assert sources.root == (repository if reaches_up else script.parent).resolve()
-    assert sources.models == ["scene.gaussian_model:GaussianModel"] * reaches_up
-    assert ("diff_gaussian_rasterization" in sources.packages) == reaches_up
-
-
-def test_a_package_that_is_built_on_another_needs_it():
-    """torchmetrics requires torch, and tells so in what is installed with it."""
-    assert Sources({"torchmetrics", "nowhere"}).need("torch")
-    assert Sources({"gsplat"}).need("gsplat")
-    assert not Sources({"torchmetrics"}).need("gsplat")
-
-
 def test_an_installed_command_is_a_script_as_well(tmp_path, monkeypatch):
     assert find_script(Path("pytest")).read_text().startswith("#!")
     assert find_script(Path("no-such-command")) is None
     (tmp_path / "pytest").write_text("print()")
     monkeypatch.chdir(tmp_path)
     assert find_script(Path("pytest")) == Path("pytest")
-
-
-FORK = {
-    "surfel_rasterization.py": """
-        from stand_ins.inria import make_rasterizer
-
-        SurfelRasterizer = make_rasterizer()
-        SurfelRasterizationSettings = None
-    """,
-    "points/field.py": """
-        from stand_ins.inria import Model
-
-        class Base(Model):
-            def update_learning_rate(self, iteration):
-                self.rate = 1e-3
-
-        class Points(Base):
-            def update_learning_rate(self, iteration):
-                super().update_learning_rate(iteration)
-    """,
-    "fork.py": """
-        import sys
-        import torch
-        from points.field import Points
-        from stand_ins.inria import make_render
-        sys.path.append("packages")
-        from surfel_rasterization import SurfelRasterizer
-
-        points, render = Points(), make_render(SurfelRasterizer)
-        for iteration in range(1, 5):
-            {update}
-            package = render(points.camera, points, None, torch.zeros(3))
-            package["render"].sum().backward()
-            with torch.no_grad():
-                points._opacity.sub_(0.01)
-    """,
-}
-
-
-@pytest.mark.parametrize("update", ["points.update_learning_rate(iteration)", "pass"])
-@pytest.mark.parametrize("found", ["in the source", "by its name"])
-def test_rasterizer_model_and_steps_of_a_fork_are_found(repository, tmp_path, capsys, monkeypatch, update, found):
-    for name, text in FORK.items():
-        path = repository / ("packages" if "raster" in name else "") / name
-        path.parent.mkdir(exist_ok=True)
-        text = text.replace("{update}", update)
-        if update == "pass":
-            text = text.replace("update_learning_rate", "adapt")
-        path.write_text(textwrap.dedent(text))
-    options = ["--dropout", 0.5, "--report", tmp_path / "report.json"]
-    if found == "by its name":
-        path = repository / "fork.py"
-        path.write_text(path.read_text().replace("from surfel_rasterization import SurfelRasterizer",
-            "SurfelRasterizer = __import__('surfel_rasterization').SurfelRasterizer"))  # fmt: skip
-        options += ["--rasterizer", "surfel_rasterization:SurfelRasterizer"]
-    monkeypatch.chdir(repository)
-    main([str(x) for x in [*options, repository / "fork.py"]])
-    renders = json.loads((tmp_path / "report.json").read_text())["renders"]
-    assert (renders["regularized"], renders["first_step"], renders["last_step"]) == (4, 1, 4)
-    for name in ("surfel_rasterization", "points.field", "points"):
-        sys.modules.pop(name, None)
-
-
-def test_the_sources_of_extensions_and_hidden_folders_are_not_read(repository):
-    line = "from {} import GaussianRasterizer, PlaneRasterizationSettings as S, rasterize\n"
-    for folder in ("submodules/a", ".git", "tools", "diff_local"):
-        (repository / folder).mkdir(parents=True)
-        (repository / folder / "x.py").write_text(
-            line.format("diff_" + folder.rpartition("/")[2].strip(".").removeprefix("diff_"))
-        )
-    (repository / "tools" / "y.py").write_text("from diff_local import GaussianRasterizer\nimport (\n")
-    (repository / "diff_local" / "z.py").write_text("from diff_local import OwnRasterizer\n")
-    assert read_folder(repository).rasterizers == {"diff_tools": {"GaussianRasterizer", "PlaneRasterizationSettings"}}
-    assert read_folder(repository).classes == ["diff_tools:GaussianRasterizer"]
-    (repository / "diff_local" / "setup.py").touch()  # an extension that is installed from there
-    assert set(read_folder(repository).rasterizers) == {"diff_tools", "diff_local"}
-    assert read_folder(repository).models == ["scene.gaussian_model:GaussianModel"]
 
 
 @pytest.mark.parametrize(

@@ -273,7 +273,7 @@ def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch):
     ((ply, scene, out), named), ((other, orbit, folder), others) = asked
     assert (str(ply), scene.path, scene.images, scene.views, out) == ("a.ply", "garden", "images_8", 12, None)
     assert named == {"regularizer": "noise", "samples": 5, "seed": 0, "device": "cpu", "perceptual": None,
-                     "background": "black"}  # fmt: skip
+                     "background": "auto"}  # fmt: skip
     assert (str(other), orbit, str(folder)) == ("a.ply", OrbitOptions(3, 64, "z-up", 90.0), "o")
     assert others == {"regularizer": None, "samples": 7, "seed": 1, "device": "cpu", "background": "white",
                       "perceptual": None}  # fmt: skip

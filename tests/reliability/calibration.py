@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ca_reg import CAScore, MomentsFn, RenderFn
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.render import render, splat
+from reference_trainer.render import draw_masks, splat
 from reference_trainer.render.moments import render_moments
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.training.config import TrainConfig
@@ -83,21 +83,26 @@ def built_in_scene(dropout: float) -> Case:
 
 def gaussians_at_random(drop_rate: float, n: int = 12, size: float = 0.4) -> Case:
     """Return Gaussians at random places: the fewer they are, the longer the tails of what one render contributes."""
-    scene, renders = random_scene(n, 8, 6, 5, size=size), {}
+    scene = random_scene(n, 8, 6, 5, size=size)
     background = torch.ones(3, dtype=torch.float64)
+    model = 0.1 + 0.6 * scene.opacities
+    whole = splat(*scene[:3], model, scene.camera, colors=scene.colors)
 
-    def render_fn(opacity: Tensor, view: None) -> tuple[Tensor, Tensor]:
-        key = tuple(opacity.tolist())
-        if key not in renders:
-            out = render(*scene[:3], opacity, scene.camera, colors=scene.colors, background=background)
-            renders[key] = out.image, out.alpha
-        return renders[key]
+    class Renders:
+        """Many masks at a time."""
+
+        def many(self, opacities: Tensor, view: None) -> tuple[Tensor, Tensor]:
+            return draw_masks(whole, opacities, background=background)
+
+        def __call__(self, opacity: Tensor, view: None) -> tuple[Tensor, Tensor]:
+            images, alphas = self.many(opacity[None], view)
+            return images[0], alphas[0]
 
     def moments_fn(opacity: Tensor, view: None, multiplier: Any, behind: Tensor | None) -> Any:
         splats = splat(*scene[:3], opacity, scene.camera, colors=scene.colors)
         return render_moments(splats, multiplier, background=background if behind is None else behind)
 
-    return Case(render_fn, moments_fn, 0.1 + 0.6 * scene.opacities, None, {"drop_rate": drop_rate, "threshold": 0.5})
+    return Case(Renders(), moments_fn, model, None, {"drop_rate": drop_rate, "threshold": 0.5})
 
 
 MODELS: dict[str, Callable[[], Case]] = {

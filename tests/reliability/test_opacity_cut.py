@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 import torch
 
-from reference_trainer.model.gaussians import inverse_sigmoid
 from reference_trainer.render.constants import MIN_ALPHA
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.scene import Scene
@@ -25,7 +24,7 @@ def lowered(scene: Scene, opacity: float, steps: int, **settings: Any) -> tuple[
     """Lower all opacities, train, and tell which of the Gaussians ever received a gradient of their opacity."""
     config = TrainConfig(iterations=steps, opacity_reset_every=0, **{"densify_every": 0, **settings})
     trainer = Trainer(scene, config)
-    logits = inverse_sigmoid(torch.full((150,), opacity))
+    logits = torch.logit(torch.full((150,), opacity))
     trainer.optimizer.set_opacity_logits(logits, forget=True)
     reached, step = torch.zeros(150, dtype=torch.bool), trainer.optimizer.step
 

@@ -38,8 +38,8 @@ DENSER = 2
 """How many times the iterations, for the model of all photographs that depths are compared with."""
 _FIGURES = ("psnr", "ssim", "lpips", "ca", "ca_half", "ca_exact", "ca_exact_half", "cv",
             "depth_abs_rel", "depth_rmse")  # fmt: skip
-_COST = {"binocular": 2.0, "corgs": 3.3, "fsgs": 1.6, "dngaussian": 2.0, "photometric + views(3)": 4.0,
-         "photometric + consistency(0.4, 0.2)": 1.8}  # fmt: skip
+_STEP = 0.07
+"""About how many processor seconds a step takes of which nothing is known."""
 
 
 @dataclass(frozen=True)
@@ -162,23 +162,21 @@ def is_done(cell: Cell, rows: Mapping[str, Rows]) -> bool:
     return (row := rows[cell.scene].of(cell.setting).get(cell.seed)) is not None and cell.needs <= row.keys()
 
 
-def estimate(cell: Cell, grid: Grid, rows: Mapping[str, Rows]) -> float:
-    """Return about how many processor seconds a training and its evaluation take: as long as its like, if kept."""
-    scene, setting = grid.scenes[cell.scene], cell.setting
+def estimate(cell: Cell, rows: Mapping[str, Rows]) -> float:
+    """Return about how many processor seconds a training takes: as many a step as those of its like that are kept."""
+    setting = cell.setting
     like = [
         value(row, "seconds") / row["setting"]["iterations"]
         for row in rows[cell.scene].rows
         if all(row["setting"].get(name) == setting.get(name) for name in ("recipe", "loss"))
     ]
-    guess = scene.step * _COST.get(setting.get("loss", ""), _COST.get(setting["recipe"], 1.0))
-    views = scene.views * (1.0 + 2.0 * ("path" in cell.needs))
-    return float((mean_std(like)[0] if like else guess) * setting["iterations"] + views)
+    return float(mean_std(like or [_STEP])[0] * setting["iterations"])
 
 
 def listing(grid: Grid) -> str:
     """Return a line for each training: kept, or the processor minutes it may take; and the hours of claims and all."""
     rows, cells = rows_of(grid), declared(grid)
-    left = {cell.name: estimate(cell, grid, rows) / 3600 for cell in cells if not is_done(cell, rows)}
+    left = {cell.name: estimate(cell, rows) / 3600 for cell in cells if not is_done(cell, rows)}
     lines = [f"{cell.name}: " + (f"{60 * left[cell.name]:.0f} min" if cell.name in left else "kept") for cell in cells]
     for name, claim in grid.claims.items():
         of = [cell.name for cell in declared(replace(grid, claims={name: claim}))]

@@ -1,4 +1,4 @@
-"""Tables, verdicts and figures of the kept rows, and the pages of the docs that show them between marks."""
+"""Tables and verdicts of the kept rows, and the pages of the docs that show them between marks."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
-from reference_trainer.runs.figures import new_figure
 from reference_trainer.studies.paper.claims import CLAIMS, QUALITY, Check, Claim
 from reference_trainer.studies.paper.rows import Row, Rows, label, resolved, value
 from reference_trainer.studies.paper.scenes import SCENES
 from reference_trainer.studies.paper.verdict import Verdict, interval, overall, verdict
 
-__all__ = ["Kept", "claims_table", "details", "judged", "page", "sweeps"]
+__all__ = ["Kept", "claims_table", "details", "judged", "page"]
 
 _TITLES = {
     "test psnr": ("PSNR", 1.0), "test ssim": ("SSIM", 1.0), "test lpips": ("LPIPS", 1.0), "test ca": ("CA", 1e-3),
@@ -28,7 +27,6 @@ _TITLES = {
     "depth mae": ("MAE", 1.0), "depth log10": ("log10", 1.0),
 } | {f"path {sixth}": (f"CA at {sixth}/6", 1e-3) for sixth in range(1, 7)}  # fmt: skip
 _MARKS = re.compile(r"(<!-- paper (\w+)(?: ([\w-]+))?(?: (\d+))? -->\n).*?(<!-- end -->)", re.DOTALL)
-_AXES = {"4": ("views", "training views"), "7": ("dropout", "dropout rate"), "8": ("noise", "noise, sigma")}
 
 
 class Kept:
@@ -94,26 +92,6 @@ def details(name: str, kept: Kept) -> str:
             lines = [_line(check, apart, kept) for check in claim.checks if (apart := differences(check, scene, kept))]
             parts += ["".join(lines)] if lines else []
     return "\n".join(parts)
-
-
-def sweeps(kept: Kept, path: Path) -> None:
-    """Draw PSNR and CA against views, dropout rate and noise, of every scene that has them."""
-    with new_figure(path) as figure:
-        figure.set_size_inches(12, 6)
-        for column, (name, (word, title)) in enumerate(_AXES.items(), start=1):
-            for row, (of, unit) in enumerate((("test psnr", 1.0), ("test ca", 1e-3))):
-                axes = figure.add_subplot(2, 3, column + 3 * row, xlabel=title, ylabel=_TITLES[of][0])
-                for scene in kept.scenes:
-                    points = []
-                    for setting in CLAIMS[name].settings:
-                        at, rows = _place(setting, word), kept.of(scene, setting).values()
-                        if at is not None and rows:
-                            points.append((at, *interval([value(each, of) / unit for each in rows])))
-                    if len(points) > 2:
-                        x, y, error = zip(*sorted(points), strict=True)
-                        axes.errorbar(x, y, [0 if math.isinf(e) else e for e in error], marker="o", label=scene)
-                if axes.lines:
-                    axes.legend()
 
 
 def page(text: str, kept: Kept) -> str:
@@ -187,12 +165,3 @@ def _line(check: Check, of: Sequence[float], kept: Kept) -> str:
 def _name(setting: Mapping[str, object], kept: Kept) -> str:
     """Return what a setting is called among those of the same recipe."""
     return label(setting, {"recipe": kept.recipe})
-
-
-def _place(setting: Mapping[str, object], word: str) -> float | None:
-    """Return where a setting stands on the axis of views, dropout or noise; None beside it."""
-    regularizer = str(setting.get("regularizer", ""))
-    if word == "views":
-        return None if regularizer else float(str(setting.get("views", 3)))
-    found = re.fullmatch(rf"{word}\(([\d.]+)\)", regularizer)
-    return float(found[1]) if found else None if regularizer else 0.0

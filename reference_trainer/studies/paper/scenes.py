@@ -21,16 +21,12 @@ class PaperScene:
     Args:
         options: which views; the path of a declared one is its folder below that of the data.
         about: its protocol in words.
-        views: of the training and the test, which says how long the evaluation of a model takes.
-        step: processor seconds of a plain step, for the estimates.
         recipes: what can be trained on it; None for all.
         depth: the depth that recipes with a depth prior are given.
     """
 
     options: SceneOptions
     about: str = "a scene of one's own"
-    views: int = 6
-    step: float = 0.07
     recipes: tuple[str, ...] | None = None
     depth: str = "points"
 
@@ -61,7 +57,7 @@ _NEAR = {"images": "images", "split": "split_near", "points": "sparse_3near/0", 
 _DTU = {"split": "dtu", "points": "sparse_3views_dense/0", "downscale": 1.5}
 
 SCENES = {
-    "synthetic": PaperScene(SceneOptions(), "built in, 160x120, 3 and 3 views, true depth", 6, 0.03, depth="true"),
+    "synthetic": PaperScene(SceneOptions(), "built in, 160x120, 3 and 3 views, true depth", depth="true"),
     "fern": PaperScene(
         SceneOptions("fern", images="images_16", split="llff", points="sparse_3views_dense/0"),
         "LLFF, 252x189, 3 and 3 views, 15,000 stereo points of the training views",
@@ -69,30 +65,24 @@ SCENES = {
     "lego": PaperScene(
         SceneOptions("lego", downscale=1.5),
         "NeRF-synthetic, 267x267 over white, 8 and 25 views, 10,000 random points",
-        33,
-        0.04,
         ("3dgs", "binocular"),  # random points have no depth, and its cameras do not look to one side
     ),
     "dtu-scan65": PaperScene(
         SceneOptions("dtu-scan65", **_DTU),  # type: ignore[arg-type]
         "DTU, 267x200, views 25, 22, 28 and the 25 of the test, 8,000 stereo points of the training views; PSNR inside "
         "the masks, SSIM and LPIPS over the masked picture",
-        28,
     ),
     "fountain": PaperScene(
         SceneOptions("fountain", **_NEAR),  # type: ignore[arg-type]
         "256x171, near split of 3 and 2 views, 5,064 points of the training views",
-        5,
     ),
     "herz-jesu": PaperScene(
         SceneOptions("herz-jesu", **_NEAR),  # type: ignore[arg-type]
         "256x171, near split of 3 and 2 views, 3,484 points of the training views",
-        5,
     ),
     "dtu-scan24": PaperScene(
         SceneOptions("dtu-scan24", **_DTU),  # type: ignore[arg-type]
         "DTU, 256x256, the same views, 8,000 points; without masks, so that the table counts",
-        28,
     ),
 }
 """The declared scenes by name, the cheapest first."""

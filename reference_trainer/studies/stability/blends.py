@@ -48,7 +48,7 @@ def blend_cases() -> list[Case]:
         ),
         single(_BLEND, "equal depths", _one_plane),
         Case(_BLEND, "copies of one Gaussian, turned camera", _copies, (2.0, 7.0, 33.0, 300.0)),
-        Case(_BLEND, "depths that differ by 1 / x", _close_depths, decades(0, 7)),
+        Case(_BLEND, "depths that differ by 1 / x", lambda x: of_scene(stack(24, 0.5, spacing=1 / x)), decades(0, 7)),
         single(_BLEND, "no Gaussian", _nothing),
         single(_RANDOM, "all dropped", lambda: _masked(torch.zeros(24, dtype=torch.bool))),
         single(_RANDOM, "one left", lambda: _masked(torch.arange(24) == 5)),
@@ -58,7 +58,7 @@ def blend_cases() -> list[Case]:
         single(_RANDOM, "opacity noise of sigma 0", partial(_noise, 0.0)),
         Case(_RANDOM, "renders K of a score", _renders, (2.0, 100.0, 10_000.0), draws=False),
         single(_RANDOM, "K = 1", partial(_renders, 1.0), refused="the variance of one render", draws=False),
-        single(_RANDOM, "no visible pixel: no score, but a reason", _faint),
+        single(_RANDOM, "no visible pixel: no score, but a reason", partial(_opacities, 0.01)),
         single(_COLOR, "black background", partial(_colored, 0.0, 0.0)),
         *(
             Case(_COLOR, name, partial(_colored, x), decades(0, 30, 3), until=1e18, beyond="overflow", note=_SQUARES)
@@ -109,10 +109,6 @@ def _copies(count: float) -> Probe:
     scene = base_scene(n)
     same = {name: getattr(scene, name)[:1].expand(n, -1) for name in ("means", "quaternions", "scales")}
     return of_scene(scene.with_(**same, opacities=torch.full((n,), 0.3, dtype=torch.float64)))
-
-
-def _close_depths(x: float) -> Probe:
-    return of_scene(stack(24, 0.5, spacing=1.0 / x))
 
 
 def _nothing() -> Probe:
@@ -179,11 +175,6 @@ def _renders(count: float) -> Probe:
         return {"CA": torch.tensor([result.value, result.std_error if count > 2 else 0.0], dtype=torch.float64)}
 
     return Probe(lambda: score(torch.float32), lambda: score(torch.float64))
-
-
-def _faint() -> Probe:
-    scene = base_scene()
-    return of_scene(scene.with_(opacities=torch.full_like(scene.opacities, 0.01)))
 
 
 def _colored(share: float, background: float) -> Probe:

@@ -101,12 +101,8 @@ def _point(case: Case, magnitude: float) -> Record:
     else:
         reference = probe.reference()
         errors = {name: relative_error(x, reference[name]) for name, x in measured.items()}
-        wrong = [name for name, error in errors.items() if not error <= _tolerance(name)]
+        allowed = {name: GRADIENT_TOLERANCE if name.startswith("d ") else VALUE_TOLERANCE for name in errors}
+        wrong = [name for name, error in errors.items() if not error <= allowed[name]]
         if wrong:
             status = "not finite" if math.inf in map(errors.get, wrong) else "inexact"
     return {"magnitude": magnitude, "status": status, "errors": errors, "wrong": wrong, "message": message}
-
-
-def _tolerance(quantity: str) -> float:
-    """Return the largest error of a quantity that counts as right."""
-    return GRADIENT_TOLERANCE if quantity.startswith("d ") else VALUE_TOLERANCE

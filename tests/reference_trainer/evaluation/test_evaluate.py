@@ -13,7 +13,7 @@ from reference_trainer.evaluation.evaluate import Evaluation, ViewScores, evalua
 from reference_trainer.evaluation.metrics import DepthErrors, psnr, ssim
 from reference_trainer.evaluation.pictures import file_names
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.model.gaussians import Gaussians, inverse_sigmoid
+from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import render
 from reference_trainer.scenes.images import read_image
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
@@ -97,7 +97,7 @@ def test_outside_of_its_mask_a_view_does_not_count(tiny_scene, gaussians):
 
 
 def test_images_are_scaled_for_the_test_and_co_adaptation_is_not(tiny_scene, gaussians):
-    half = dataclasses.replace(gaussians, opacity_logits=inverse_sigmoid(0.5 * gaussians.opacities))
+    half = dataclasses.replace(gaussians, opacity_logits=torch.logit(0.5 * gaussians.opacities))
     plain = evaluate(TrainedModel(gaussians, tiny_scene.background), of_scene(tiny_scene))
     scaled = evaluate(TrainedModel(gaussians, tiny_scene.background, "dropout(0.5)"), of_scene(tiny_scene))
     halved = evaluate(TrainedModel(half, tiny_scene.background), of_scene(tiny_scene))
@@ -111,7 +111,7 @@ def test_images_are_scaled_for_the_test_and_co_adaptation_is_not(tiny_scene, gau
 def test_images_get_the_expected_noise_and_co_adaptation_does_not(tiny_scene, gaussians):
     mean = opacity_noise(gaussians.opacities.double().repeat(20_000, 1).flatten()[:, None], 0.8,
                          generator=torch.Generator().manual_seed(1))[0].view(-1, 150).mean(0)  # fmt: skip
-    drawn = dataclasses.replace(gaussians, opacity_logits=inverse_sigmoid(mean.float()))
+    drawn = dataclasses.replace(gaussians, opacity_logits=torch.logit(mean.float()))
     plain, scaled, sampled = (
         evaluate(model, of_scene(tiny_scene))
         for model in (

@@ -21,7 +21,6 @@ from reference_trainer.runs.compare import NAMED, compare, scene_folders, strate
 from reference_trainer.runs.compare_report import REPORT, TABLE, Comparison, report
 from reference_trainer.runs.engines.choice import choose_engine
 from reference_trainer.runs.engines.engine import Failure
-from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.grid import Running
 from reference_trainer.runs.measure import render_run
@@ -94,9 +93,10 @@ def test_the_options_hold_for_every_scene(tmp_path):
 def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
     """One run of eight fails; every scene has its own table and its own failures."""
 
-    def train(options, config, out, device, monitor_every, checkpoint_every, lpips, engine):
+    def train(options, config, out, engine, how):
         assert engine == chosen_engine()
-        assert (device, monitor_every, checkpoint_every, lpips) == ("cpu", 7, 9, str(Path("weights.pth").resolve()))
+        lpips = str(Path("weights.pth").resolve())
+        assert how == {"device": "cpu", "monitor_every": 7, "checkpoint_every": 9, "lpips": lpips}
         assert out.is_dir()
         assert out.is_absolute()
         if (options.path, config.dropout, config.seed) == ("synthetic", 0.2, 1):
@@ -237,7 +237,7 @@ def test_a_comparison_from_photographs_to_figures(tmp_path, options):
     run_experiment(options, configs["dropout"], tmp_path / "dropout" / "seed_0", monitor_every=3)
     before = (tmp_path / "dropout" / "seed_0" / RESULTS).stat().st_mtime_ns
     said: list[str] = []
-    running = Running(Processes(2), monitor_every=3, say=said.append)
+    running = Running(Here(), monitor_every=3, say=said.append)
     comparison = compare({tmp_path: options}, configs, [0, 1], running)[tmp_path]
     assert (tmp_path / "dropout" / "seed_0" / RESULTS).stat().st_mtime_ns == before
     assert {name: [run["config"]["seed"] for run in runs] for name, runs in comparison.runs.items()} == {

@@ -201,8 +201,8 @@ def test_the_background(tmp_path):
     white, _ = orbit(dark, tmp_path, "white", background="white")
     assert white.mean("orbit", "ca_neutral") == pytest.approx(black.mean("orbit", "ca_neutral"), rel=1e-4)
     assert white.mean("orbit", "ca_exact") != pytest.approx(black.mean("orbit", "ca_exact"), rel=0.05)
-    with pytest.raises(ValueError, match="one of black, white, got 'auto'"):
-        orbit(ball(), tmp_path, "auto", background="auto")
+    with pytest.raises(ValueError, match="one of black, white, got 'gray'"):
+        orbit(ball(), tmp_path, "gray", background="gray")
 
 
 def test_a_place_is_told_from_an_object(tmp_path):

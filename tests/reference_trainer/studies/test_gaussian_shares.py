@@ -13,7 +13,7 @@ from ca_reg import Reason
 from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.shares import blend_weights, colored_by, concentration, mean_effects, mean_shares
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.model.gaussians import SH_C0, Gaussians, inverse_sigmoid
+from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.measure import of_run
@@ -146,7 +146,7 @@ def test_blend_weights_are_those_of_brute_force():
         scene.means,
         scene.scales.log(),
         scene.quaternions,
-        inverse_sigmoid(scene.opacities),
+        torch.logit(scene.opacities),
         torch.zeros(n, 1, 3, dtype=torch.float64),
         torch.zeros(n, 0, 3, dtype=torch.float64),
     )
