@@ -1,4 +1,4 @@
-"""The loops in other processes: forked, spawned, without numba, at the end of the interpreter; Ray: test_compare.py."""
+"""The loops in other processes: forked, spawned, Ray's, without numba, and at the end of the interpreter."""
 
 import subprocess
 import sys
@@ -82,6 +82,23 @@ if __name__ == "__main__":
 """
     )
     subprocess.run([sys.executable, str(script)], env=subprocess_environment(), check=True, timeout=300)
+
+
+def test_ray_workers_draw_with_the_chosen_engine():
+    pytest.importorskip("numba")
+    pytest.importorskip("ray")
+    assert "done" in run(
+        DRAW
+        + """
+from reference_trainer.runs.engines.engine import Task, Value
+from reference_trainer.runs.engines.ray_cluster import RayCluster
+from reference_trainer.runs.engines.run_all import run_all
+expected = picture()
+answers = [answer for _, answer in run_all(RayCluster(2), [Task(str(i), picture, ()) for i in range(4)])]
+assert answers == [Value(expected)] * 4, answers
+print("done")
+"""
+    )
 
 
 def test_a_thread_that_outlives_the_main_one_still_draws():
