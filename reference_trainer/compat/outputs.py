@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any, NoReturn
 
@@ -31,8 +32,7 @@ _NAMES = {
 }
 _KINDS = {name: kind for kind, names in _NAMES.items() for name in names}
 _SCORES = {"accum_weights", "accum_count", "accum_blend", "accum_dist", "depths", "my_radii"}  # by Taming 3DGS's names
-_PREFIXES = ("rendered_", "render_", "rend_", "out_")
-_SUFFIXES = ("_image", "_img", "_map")
+_TELLING_NOTHING = re.compile(r"^(.*\.)?((rendered|render|rend|out)_)?|_(image|img|map)$")
 
 
 class Unknown:
@@ -130,16 +130,6 @@ def kinds_of(names: tuple[str, ...] | None, fields: set[str]) -> tuple[str | Non
 
 
 def _kind(name: str) -> str | None:
-    """Return what a value is by its name, or by those of its channels."""
-    parts = [_KINDS.get(_plain(part)) for part in name.split("+")]
+    """Return what a value is by its name, or by those of its channels; ``self.rendered_depth_map`` is a depth."""
+    parts = [_KINDS.get(_TELLING_NOTHING.sub("", part.lower())) for part in name.split("+")]
     return None if None in parts else "+".join(map(str, parts))
-
-
-def _plain(name: str) -> str:
-    """Return a name without what does not tell: ``self.rendered_depth_map`` is a depth."""
-    plain = name.lower().rpartition(".")[2]
-    for prefix in _PREFIXES:
-        plain = plain.removeprefix(prefix)
-    for suffix in _SUFFIXES:
-        plain = plain.removesuffix(suffix)
-    return plain

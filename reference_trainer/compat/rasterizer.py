@@ -87,17 +87,24 @@ class GaussianRasterizer(nn.Module):
             What the caller calls the members, see `kinds_of`; first, by default, the image (3, H, W), not clamped, and
             radii in pixels, shape (N,) int32, 0 for what is out of view. Depth and inverse depth are sums of weight
             times (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's sum of
-            weights over the pixels, shape (N,), pixels the number of those at which it is drawn, both without a
+            weights over the pixels, shape (N,), pixels (N, 1) the number of those at which it is drawn, both without a
             gradient; so are the scores of Taming 3DGS, see `contributions`. Normals, mean depth and distortion are
             those of `surface_planes`.
 
         Raises:
-            ValueError: if ``means2D`` has another shape, a covariance is given, or the outputs cannot be told.
+            ValueError: if ``means2D`` has another shape, a covariance is given, the outputs cannot be told, or a
+                further argument waits for a gradient of every Gaussian: zeros that require one.
         """
         settings, (n, columns) = self.raster_settings, means2D.shape
         names = self.outputs or names_of_results()
         kinds = kinds_of(names, {name for name in FIELDS if getattr(settings, name) is not None})
         parts = {part for kind in kinds if kind is not None for part in kind.split("+")}
+        for name, value in further.items():
+            if isinstance(value, Tensor) and value.requires_grad and len(value) == n and not value.any():
+                raise ValueError(
+                    f"the argument {name} of the rasterizer, zeros of shape {tuple(value.shape)}, waits for a gradient "
+                    "that only the CUDA code computes: run without --cpu, or switch off what asks for it."
+                )
         warn_of_ignored("argument", further)
         if n != len(means3D) or not 2 <= columns <= 4:
             raise ValueError(
@@ -149,7 +156,7 @@ class GaussianRasterizer(nn.Module):
             image = (rendering.alpha if settings.pixel_weights is None else settings.pixel_weights).view(drawn.shape)
             table = torch.stack([*contributions(splats, image), projection.depths.detach()])
             table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
-            found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": found["radii"], "pixels": table[1]}
+            found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": found["radii"], "pixels": table[1, :, None]}
         labels = (*(names or kinds), "radii")  # which a caller of one value alone does not name
         return tuple(_output(kind, label, found, drawn) for kind, label in zip(kinds, labels, strict=False))
 

@@ -44,4 +44,4 @@ def test_pixels_are_those_at_which_a_gaussian_is_drawn(settings_of):
         colors_precomp=scene.colors, scales=scene.scales, rotations=scene.quaternions,
     )  # fmt: skip
     weights, _ = brute_force(*scene[:4], torch.eye(30).double(), scene.camera)
-    assert torch.equal(pixels, (weights > 0).sum((1, 2)).double())
+    assert torch.equal(pixels, (weights > 0).sum((1, 2))[:, None].double())
