@@ -41,6 +41,7 @@ def render_fn(
         ValueError: when called, if ``render`` does not rasterize as many Gaussians as there are opacities.
 
     Example:
+        >>> import torch
         >>> from ca_reg import CAScore
         >>> class GaussianRasterizer(torch.nn.Module):
         ...     def forward(self, means3D, means2D, opacities):
