@@ -40,7 +40,7 @@ TRAINERS = {
     "--downscale-factor 1 --eval-mode interval --eval-interval 2 --auto-scale-poses False --center-method none "
     "--orientation-method none --assume-colmap-world-coordinate-convention False",
 }
-# The method of this package regularizes by itself.
+# The method of this package has dropout of its own.
 TRAINERS["splatfacto-ca"] = TRAINERS["splatfacto"].replace("{dropout} ns-train splatfacto", "ns-train splatfacto-ca")
 EXPORT = "ca_reg.integrations.run --cpu ns-export gaussian-splat --load-config {config} --output-dir {out}/export"
 PLYS = ("point_cloud", "splat")
@@ -84,7 +84,12 @@ def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Names
 
 def named(trainer: str, setting: str) -> dict[str, str]:
     """Return what a row is of."""
-    return {"recipe": f"{trainer} {SETTINGS[setting] if '{dropout}' in TRAINERS[trainer] else ''}".strip()}
+    return {"recipe": f"{trainer} {SETTINGS[setting]}".strip() if is_told(trainer) else trainer}
+
+
+def is_told(trainer: str) -> bool:
+    """Whether the launcher tells a trainer to drop Gaussians; else it always does."""
+    return "{dropout}" in TRAINERS[trainer]
 
 
 def main() -> None:
@@ -98,13 +103,17 @@ def main() -> None:
     add("--trainers", choices=TRAINERS, nargs="+", default=list(TRAINERS))
     add("--seeds", type=int, nargs="+", default=[0, 1, 2])
     add("--iterations", type=int, default=500)
-    add("--evaluator", default=sys.executable, help="another interpreter, where this one only trains")
+    add(
+        "--evaluator",
+        default=sys.executable,
+        help="the interpreter that evaluates, if another than the one that trains",
+    )
     add("--out", type=lambda path: Path(path).resolve(), default=Path("runs/side_by_side").resolve())
     args = parser.parse_args()
     rows = Rows(args.file, {"scene": args.scene.name, "machine": machine(), "usual": {}})
     for seed in args.seeds:
         for trainer in args.trainers:
-            for setting in SETTINGS if "{dropout}" in TRAINERS[trainer] else ("dropout",):
+            for setting in SETTINGS if is_told(trainer) else ["dropout"]:
                 if seed not in rows.of(named(trainer, setting)):
                     out = args.out / trainer / setting / str(seed)
                     shutil.rmtree(out, ignore_errors=True)
