@@ -153,7 +153,7 @@ class GaussianRasterizer(nn.Module):
         drawn = rendering.alpha.detach() > 0
         found["radii"] = visible_radii(means3D, rotations, scales, camera, blur=blur)
         if settings.pixel_weights is not None or "pixels" in parts:
-            image = (rendering.alpha if settings.pixel_weights is None else settings.pixel_weights).view(drawn.shape)
+            image = (rendering.alpha if settings.pixel_weights is None else settings.pixel_weights).reshape(drawn.shape)
             table = torch.stack([*contributions(splats, image), projection.depths.detach()])
             table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
             found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": found["radii"], "pixels": table[1, :, None]}
