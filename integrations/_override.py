@@ -22,7 +22,7 @@ class _Override(NamedTuple):
 
     rasterizers: tuple[type, ...]
     opacity: Tensor
-    calls: list[tuple[ForwardCall, Any]]
+    calls: list[ForwardCall]
 
 
 _current: ContextVar[_Override | None] = ContextVar("_current", default=None)
@@ -36,12 +36,11 @@ def is_overridden() -> bool:
 
 
 @contextmanager
-def override(rasterizers: Sequence[type], opacity: Tensor) -> Iterator[list[tuple[ForwardCall, Any]]]:
+def override(rasterizers: Sequence[type], opacity: Tensor) -> Iterator[list[ForwardCall]]:
     """Give the rasterizers these opacities in place of those that this thread calls them with.
 
     The classes are patched once for all threads, and put back when the last of them is done; renders of other threads
-    go through unchanged. The opacities are activated, of all Gaussians, (N,) or (N, 1). Yields the calls so far, each
-    with what it returned.
+    go through unchanged. The opacities are activated, of all Gaussians, (N,) or (N, 1). Yields the calls so far.
     """
     mine = _Override(tuple(rasterizers), opacity, [])
     with ExitStack() as undo:
@@ -89,9 +88,8 @@ def _make(rasterizer: type) -> Callable[[Callable[..., Any]], Callable[..., Any]
                     "give those of all Gaussians, and switch off any dropout of its own."
                 )
             call.arguments["opacities"] = mine.opacity.reshape(given.shape)
-            returned = call()
-            mine.calls.append((call, returned))
-            return returned
+            mine.calls.append(call)
+            return call()
 
         return with_other_opacities
 

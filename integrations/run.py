@@ -36,15 +36,7 @@ from .inria import DEFAULT_MODEL, RasterizerHook, Scope, Steps
 
 __all__ = ["main"]
 
-_OF_INRIA = (
-    "scope",
-    "rasterizer",
-    "outputs",
-    "steps",
-    "viewer",
-    "allow_zeros",
-)  # options that mean nothing to a script of gsplat's
-
+_OF_INRIA = ("scope", "rasterizer", "outputs", "steps", "viewer", "allow_zeros")  # mean nothing to gsplat's scripts
 _REPORTED = ("script", "arguments", "regularizer", "dropout", "noise", "start", "ramp", "scope", "seed", "cpu")
 
 
@@ -91,21 +83,16 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--start", type=int, default=0, metavar="STEP", help="first step with --dropout and --noise (default: 0)")
     add("--ramp", type=int, metavar="STEPS", help="raise both rates linearly from 0 over so many steps after --start")
     add(
-        "--scope",
-        choices=get_args(Scope),
-        default="main",
-        help="first training render of an iteration and its batch, or all",
+        "--scope", choices=get_args(Scope), default="main", help="first training render of a step and its batch, or all"
     )
     add("--seed", type=int, default=0, help="of masks and noise (default: 0); the script's random numbers are its own")
     add("--report", type=Path, metavar="FILE", help="write what was done as JSON, too")
     add(
-        "--cpu",
-        action="store_true",
-        help="run without CUDA: a stand-in for the rasterizer of the code base, or gsplat's",
+        "--cpu", action="store_true", help="run without CUDA, by a stand-in for the code base's rasterizer, or gsplat's"
     )
     add("--rasterizer", metavar="MODULE:CLASS", help="the class that renders, if it is not found in the source")
     add("--outputs", type=lambda text: tuple(text.split(",")), metavar="NAME,...", help="what the stand-in returns, if "
-        "the script's names for it do not tell, such as image,radii,depth,alpha")  # fmt: skip
+        "the script's names for it do not tell, such as image,radii,depth or image+normal+alpha,radii")  # fmt: skip
     add("--steps", choices=get_args(Steps), help="what tells the steps: calls of update_learning_rate, or changes of "
         "the parameters (default: the former if there is a class with that method)")  # fmt: skip
     add("--viewer", default="MiniCam", metavar="CLASS", help="class of a viewer's cameras (default: MiniCam), or none")

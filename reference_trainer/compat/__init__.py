@@ -1,5 +1,5 @@
 """Public interfaces of CUDA rasterizers, backed by the reference renderer, for repositories that expect CUDA."""
 
-from reference_trainer.compat.installation import install, stand_in, uninstall
+from reference_trainer.compat.installation import stand_in
 
-__all__ = ["install", "stand_in", "uninstall"]
+__all__ = ["stand_in"]

@@ -19,14 +19,14 @@ from reference_trainer.compat.extensions import distCUDA2, fused_ssim, make_modu
 from reference_trainer.compat.gsplat_functions import gsplat_functions
 from reference_trainer.compat.rasterizer import rasterizer_module
 
-__all__ = ["install", "install_in_worker", "stand_in", "uninstall"]
+__all__ = ["install_in_worker", "stand_in"]
 
 NVIDIA_SMI = """#!/bin/sh
 printf 'GPU 00000000:00:00.0\\n    FB Memory Usage\\n'
 for line in Total Reserved Used Free; do printf '        %s : 0 MiB\\n' $line; done
 """
 
-_active = ExitStack()
+_in_worker = ExitStack()
 
 
 class Rasterizers(NamedTuple):
@@ -34,19 +34,6 @@ class Rasterizers(NamedTuple):
 
     modules: dict[str, set[str]]
     outputs: tuple[str, ...] | None
-
-
-def install(
-    repository: str | Path | None = None, outputs: Sequence[str] | None = None, rasterizer: str | None = None
-) -> tuple[str, ...]:
-    """Do what `stand_in` does, until `uninstall`; same arguments and exceptions. Returns the names of the modules."""
-    names = _active.enter_context(stand_in(repository, outputs, rasterizer))
-    return names
-
-
-def uninstall() -> None:
-    """Undo `install`; nothing happens if nothing is installed."""
-    _active.close()
 
 
 @contextmanager
@@ -90,7 +77,7 @@ def stand_in(
     if present:
         raise RuntimeError(
             f"{', '.join(present)} {'is' if len(present) == 1 else 'are'} imported already: start a new process, and "
-            "install the stand-in before the repository is imported; or uninstall() an earlier one."
+            "install the stand-in before the repository is imported; or end an earlier one."
         )
     with cuda_on_cpu(), _importable(modules, expected), nullcontext() if expected else gsplat_functions():
         sys.modules.update(modules)
@@ -103,7 +90,7 @@ def stand_in(
 
 def install_in_worker(modules: dict[str, set[str]] | None, outputs: tuple[str, ...] | None) -> None:
     """Install the stand-ins in a worker process, for as long as it lives: what `Rasterizers` has; None for gsplat."""
-    _active.enter_context(cuda_on_cpu())
+    _in_worker.enter_context(cuda_on_cpu())
     sys.modules.update(_modules(None if modules is None else Rasterizers(modules, outputs)))
 
 

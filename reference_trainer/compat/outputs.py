@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-__all__ = ["SAY_IT", "Unknown", "kinds_of"]
+import torch
+from torch import Tensor
+
+__all__ = ["SAY_IT", "Picture", "Unknown", "kinds_of"]
 
 SAY_IT = (
     "say what it is with outputs=..., in the launcher --outputs: all values in their order, such as image,radii,depth, "
-    "of depth, inverse_depth, alpha, weights and surfels"
+    "of depth, inverse_depth, mean_depth, normal, distortion, alpha, weights, pixels and surfels, and + between those "
+    "that share one as its channels: image+normal+depth+alpha+distortion,radii"
 )
+_SURFELS = "depth+alpha+normal+mean_depth+distortion"  # seven planes of 2DGS
 _NAMES = {
     "image": {"image", "color", "colour", "rgb"},
     "radii": {"radii"},
     "depth": {"depth"},
     "inverse_depth": {"inverse_depth", "inv_depth", "invdepth", "inverse_depths", "inv_depths", "invdepths"},
     "alpha": {"alpha", "alphas", "acc", "accumulation", "opacity", "silhouette"},
+    "normal": {"normal", "normals"},
+    "mean_depth": {"mean_depth"},
+    "distortion": {"distortion"},
     "weights": {"weights", "gs_w"},
-    "surfels": {"surfels", "allmap"},  # seven planes of 2DGS
+    "pixels": {"pixels"},
+    _SURFELS: {"surfels", "allmap"},
 }
 _KINDS = {name: kind for kind, names in _NAMES.items() for name in names}
 _SCORES = {"accum_weights", "accum_count", "accum_blend", "accum_dist", "depths", "my_radii"}  # by Taming 3DGS's names
-_PREFIXES = ("rendered_", "render_", "rend_", "out_")
-_SUFFIXES = ("_image", "_img", "_map")
+_TELLING_NOTHING = re.compile(r"^(.*\.)?((rendered|render|rend|out)_)?|_(image|img|map)$")
 
 
 class Unknown:
@@ -53,12 +62,34 @@ class Unknown:
         next(x for x in values + lists if isinstance(x, cls))._refuse()
 
 
+class Picture(Tensor):
+    """Planes (C, H, W) that refuse, by ValueError, to be asked for a channel which they do not have.
+
+    A slice of a tensor that lies beyond it would be empty without a word. What is computed from planes is a tensor.
+    """
+
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+
+    def __getitem__(self, index: Any) -> Tensor:
+        """Return what a tensor would."""
+        first = index[0] if isinstance(index, tuple) and index else index
+        last = max(first.start or 0, (first.stop or 1) - 1) if isinstance(first, slice) else first
+        if isinstance(last, int) and last >= len(self):
+            raise ValueError(
+                f"channel {last} of a picture is asked for, of which the stand-in rasterizer draws {len(self)} "
+                f"channels: {SAY_IT}; what is none of these needs CUDA."
+            )
+        return super().__getitem__(index)
+
+
 for _operator in ("getitem", "len", "iter", "bool", "gt", "lt", "add", "mul", "truediv", "radd", "rmul", "neg"):
     setattr(Unknown, f"__{_operator}__", Unknown._refuse)
 
 
 def kinds_of(names: tuple[str, ...] | None, fields: set[str]) -> tuple[str | None, ...]:
     """Return what the values are; None for an unknown one. Image and radii come first if no name says otherwise.
+
+    What has several in its channels has their names with a + between them.
 
     Args:
         names: by which the caller calls the values; None if it does not take them apart.
@@ -74,6 +105,8 @@ def kinds_of(names: tuple[str, ...] | None, fields: set[str]) -> tuple[str | Non
         ('image', 'radii', 'depth', None)
         >>> kinds_of(("count", "score", "rendered_image", "radii"), set())
         (None, None, 'image', 'radii')
+        >>> kinds_of(("rendered_image+normal", "radii"), set())
+        ('image+normal', 'radii')
         >>> kinds_of(("rendered_image", "radii", "depth_image"), {"antialiasing"})
         ('image', 'radii', 'inverse_depth')
     """
@@ -89,18 +122,14 @@ def kinds_of(names: tuple[str, ...] | None, fields: set[str]) -> tuple[str | Non
     if len(names) == 3 and "antialiasing" in fields:
         return (*first, "inverse_depth")
     scores = _SCORES if "pixel_weights" in fields else set()
-    kinds = [name if name in scores else _KINDS.get(_plain(name)) for name in names]
+    kinds = [name if name in scores else _kind(name) for name in names]
     for place, kind in enumerate(first):
-        if kind not in kinds:
+        if all(kind not in (known or "").split("+") for known in kinds):
             kinds[place : place + 1] = [kind]
     return tuple(kinds)
 
 
-def _plain(name: str) -> str:
-    """Return a name without what does not tell: ``self.rendered_depth_map`` is a depth."""
-    plain = name.lower().rpartition(".")[2]
-    for prefix in _PREFIXES:
-        plain = plain.removeprefix(prefix)
-    for suffix in _SUFFIXES:
-        plain = plain.removesuffix(suffix)
-    return plain
+def _kind(name: str) -> str | None:
+    """Return what a value is by its name, or by those of its channels; ``self.rendered_depth_map`` is a depth."""
+    parts = [_KINDS.get(_TELLING_NOTHING.sub("", part.lower())) for part in name.split("+")]
+    return None if None in parts else "+".join(map(str, parts))

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from reference_trainer.compat.antialiasing import filtered
 from reference_trainer.compat.contributions import contributions
 from reference_trainer.compat.extensions import make_module
-from reference_trainer.compat.outputs import Unknown, kinds_of
+from reference_trainer.compat.outputs import Picture, Unknown, kinds_of
 from reference_trainer.compat.radii import in_front, visible_radii
 from reference_trainer.compat.settings import GaussianRasterizationSettings, camera_of, warn_of_ignored
-from reference_trainer.compat.surfels import surfel_planes
+from reference_trainer.compat.surfels import surface_planes
 from reference_trainer.compat.unpacking import names_of_results
 from reference_trainer.model.relocation import compute_relocation
 from reference_trainer.render import draw, splat
@@ -26,7 +26,7 @@ __all__ = ["GaussianRasterizer", "rasterizer_module"]
 
 FIELDS = ("antialiasing", "confidence", "pixel_weights")  # of the settings, which tell what the outputs are
 SCORES = ("accum_weights", "accum_count", "accum_blend", "accum_dist", "depths")
-DEPTHS = {"depth", "surfels"}
+SURFACES = {"normal", "mean_depth", "distortion"}
 FLOOR = 2.5e-5  # INRIA's least share of the area, of antialiasing
 FLOOR_OF_MIP = 1e-6  # that of Mip-Splatting
 
@@ -87,15 +87,24 @@ class GaussianRasterizer(nn.Module):
             What the caller calls the members, see `kinds_of`; first, by default, the image (3, H, W), not clamped, and
             radii in pixels, shape (N,) int32, 0 for what is out of view. Depth and inverse depth are sums of weight
             times (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's sum of
-            weights over the pixels, shape (N,), without a gradient; so are the scores of Taming 3DGS, see
-            `contributions`. Surfels are the seven planes of `surfel_planes`.
+            weights over the pixels, shape (N,), pixels (N, 1) the number of those at which it is drawn, both without a
+            gradient; so are the scores of Taming 3DGS, see `contributions`. Normals, mean depth and distortion are
+            those of `surface_planes`.
 
         Raises:
-            ValueError: if ``means2D`` has another shape, a covariance is given, or the outputs cannot be told.
+            ValueError: if ``means2D`` has another shape, a covariance is given, the outputs cannot be told, or a
+                further argument waits for a gradient of every Gaussian: zeros that require one.
         """
         settings, (n, columns) = self.raster_settings, means2D.shape
         names = self.outputs or names_of_results()
         kinds = kinds_of(names, {name for name in FIELDS if getattr(settings, name) is not None})
+        parts = {part for kind in kinds if kind is not None for part in kind.split("+")}
+        for name, value in further.items():
+            if isinstance(value, Tensor) and value.requires_grad and len(value) == n and not value.any():
+                raise ValueError(
+                    f"the argument {name} of the rasterizer, zeros of shape {tuple(value.shape)}, waits for a gradient "
+                    "that only the CUDA code computes: run without --cpu, or switch off what asks for it."
+                )
         warn_of_ignored("argument", further)
         if n != len(means3D) or not 2 <= columns <= 4:
             raise ValueError(
@@ -125,35 +134,31 @@ class GaussianRasterizer(nn.Module):
         # Zeros are added, whose gradient is that of the positions.
         projection = splats.projection
         splats = splats._replace(projection=projection._replace(means=projection.means + (sink - sink.detach())[:, :2]))
-        inverse = "inverse_depth" in kinds
+        inverse, surfaces = "inverse_depth" in parts, not SURFACES.isdisjoint(parts)
         depths = projection.depths.reciprocal() if inverse else projection.depths  # sorted already, these are summed
         rendering = draw(
             splats._replace(projection=splats.projection._replace(depths=depths)),
             background=settings.bg,
-            depth=inverse or not DEPTHS.isdisjoint(kinds),
+            depth=inverse or surfaces or "depth" in parts,
         )
         if columns == 4:
             rendering = with_absolute_gradients(rendering, sink[:, 2:], settings.bg)
-        found: dict[str, Tensor] = {"alpha": rendering.alpha[None]}
+        found: dict[str, Tensor] = {"image": rendering.image, "alpha": rendering.alpha[None]}
         if rendering.depth is not None:
             found["inverse_depth" if inverse else "depth"] = rendering.depth[None]
-        if "weights" in kinds:
+        if "weights" in parts:
             found["weights"] = means3D.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
-        if "surfels" in kinds:
-            found["surfels"] = surfel_planes(rendering._replace(splats=splats), means3D, rotations, camera)
-        radii = visible_radii(means3D, rotations, scales, camera, blur=blur)
-        if settings.pixel_weights is not None:
-            sums = contributions(splats, settings.pixel_weights.reshape(camera.height, camera.width))
-            table = torch.stack([*sums, projection.depths.detach()])
-            table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
-            found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": radii}
-        labels = (*(names or kinds), "radii")  # which a caller of one value alone does not name
+        if surfaces and not inverse:
+            found |= surface_planes(rendering._replace(splats=splats), means3D, rotations, scales, camera)
         drawn = rendering.alpha.detach() > 0
-        found = {
-            name: _returned(x, drawn) if x.shape[-2:] == drawn.shape else x
-            for name, x in {**found, "image": rendering.image}.items()
-        } | {"radii": radii}
-        return tuple(found.get(str(kind), Unknown(str(label))) for kind, label in zip(kinds, labels, strict=False))
+        found["radii"] = visible_radii(means3D, rotations, scales, camera, blur=blur)
+        if settings.pixel_weights is not None or "pixels" in parts:
+            image = (rendering.alpha if settings.pixel_weights is None else settings.pixel_weights).reshape(drawn.shape)
+            table = torch.stack([*contributions(splats, image), projection.depths.detach()])
+            table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
+            found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": found["radii"], "pixels": table[1, :, None]}
+        labels = (*(names or kinds), "radii")  # which a caller of one value alone does not name
+        return tuple(_output(kind, label, found, drawn) for kind, label in zip(kinds, labels, strict=False))
 
     def _axes(
         self, scales: Tensor | None, rotations: Tensor | None, covariances: Tensor | None
@@ -168,16 +173,21 @@ class GaussianRasterizer(nn.Module):
         return lengths * self.raster_settings.scale_modifier, rotations
 
 
-def _returned(plane: Tensor, drawn: Tensor) -> Tensor:
-    """Return a plane (..., H, W) as CUDA code would.
+def _output(kind: str | None, label: str | None, found: dict[str, Tensor], drawn: Tensor) -> Tensor | Unknown:
+    """Return a value as CUDA code would, planes (..., H, W) one behind the other; by its label if one was not found.
 
-    It is a copy, which the caller may write over (DNGaussian). Its gradient counts only where something is drawn: that
-    of depth / alpha, say, is nan elsewhere (2DGS).
+    Planes are a copy, which the caller may write over (DNGaussian). Their gradient counts only where something is
+    drawn: that of depth / alpha, say, is nan elsewhere (2DGS).
     """
-    plane = plane.clone()
-    if plane.requires_grad:
-        plane.register_hook(lambda gradient: torch.where(drawn, gradient, 0.0))  # type: ignore[no-untyped-call]
-    return plane
+    parts = str(kind).split("+")
+    if not found.keys() >= set(parts):
+        return Unknown(str(label))
+    if found[parts[0]].shape[-2:] != drawn.shape:
+        return found[parts[0]]
+    planes = torch.cat([found[part] for part in parts])
+    if planes.requires_grad:
+        planes.register_hook(lambda gradient: torch.where(drawn, gradient, 0.0))  # type: ignore[no-untyped-call]
+    return planes.as_subclass(Picture)
 
 
 def _weighted(x: Tensor, weight: Tensor) -> Tensor:

@@ -40,6 +40,8 @@ TRAINERS = {
     "--downscale-factor 1 --eval-mode interval --eval-interval 2 --auto-scale-poses False --center-method none "
     "--orientation-method none --assume-colmap-world-coordinate-convention False",
 }
+# The method of this package has dropout of its own.
+TRAINERS["splatfacto-ca"] = TRAINERS["splatfacto"].replace("{dropout} ns-train splatfacto", "ns-train splatfacto-ca")
 EXPORT = "ca_reg.integrations.run --cpu ns-export gaussian-splat --load-config {config} --output-dir {out}/export"
 PLYS = ("point_cloud", "splat")
 EVALUATE = "reference_trainer.cli evaluate --ply {ply} --scene {scene} --images {images} --out {out}/evaluation"
@@ -53,8 +55,8 @@ def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Names
     folder = vars(args).get(trainer, out)
     names = vars(args) | {"out": out, "seed": seed, "dropout": SETTINGS[setting]}
 
-    def call(command: str, **further: object) -> float:
-        timed = [sys.executable, str(TIMED), str(out / "times.json"), str(seed)]
+    def call(command: str, python: str = sys.executable, **further: object) -> float:
+        timed = [python, str(TIMED), str(out / "times.json"), str(seed)]
         timed += command.format(**names, **further).split()
         with (out / "log").open("a") as log:
             subprocess.run(timed, cwd=folder, env=environment, stdout=log, stderr=log, check=True)
@@ -66,7 +68,7 @@ def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Names
         for config in out.rglob("config.yml"):
             call(EXPORT, config=config)
         (ply,) = (path for path in out.rglob("*.ply") if path.stem in (*PLYS, f"point_cloud_{args.iterations - 1}"))
-        call(EVALUATE + (" --regularizer dropout(0.2)" if SETTINGS[setting] else ""), ply=ply)
+        call(EVALUATE + (" --regularizer dropout(0.2)" if SETTINGS[setting] else ""), args.evaluator, ply=ply)
         result = out / "evaluation" / "evaluation.json"
     found = json.loads(result.read_text("utf-8"))
     test = {name: found["mean"]["test"][name] for name in ("psnr", "ssim", "ca", "ca_exact_half")}
@@ -82,7 +84,12 @@ def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Names
 
 def named(trainer: str, setting: str) -> dict[str, str]:
     """Return what a row is of."""
-    return {"recipe": f"{trainer} {SETTINGS[setting]}".strip()}
+    return {"recipe": f"{trainer} {SETTINGS[setting]}".strip() if is_told(trainer) else trainer}
+
+
+def is_told(trainer: str) -> bool:
+    """Whether the launcher tells a trainer to drop Gaussians; else it always does."""
+    return "{dropout}" in TRAINERS[trainer]
 
 
 def main() -> None:
@@ -96,12 +103,17 @@ def main() -> None:
     add("--trainers", choices=TRAINERS, nargs="+", default=list(TRAINERS))
     add("--seeds", type=int, nargs="+", default=[0, 1, 2])
     add("--iterations", type=int, default=500)
+    add(
+        "--evaluator",
+        default=sys.executable,
+        help="the interpreter that evaluates, if another than the one that trains",
+    )
     add("--out", type=lambda path: Path(path).resolve(), default=Path("runs/side_by_side").resolve())
     args = parser.parse_args()
     rows = Rows(args.file, {"scene": args.scene.name, "machine": machine(), "usual": {}})
     for seed in args.seeds:
         for trainer in args.trainers:
-            for setting in SETTINGS:
+            for setting in SETTINGS if is_told(trainer) else ["dropout"]:
                 if seed not in rows.of(named(trainer, setting)):
                     out = args.out / trainer / setting / str(seed)
                     shutil.rmtree(out, ignore_errors=True)

@@ -1,5 +1,6 @@
 """What the table of other trainers is made with: other seeds, times of steps, and rows of what is finished."""
 
+import argparse
 import json
 import random
 import sys
@@ -46,10 +47,35 @@ def test_what_is_kept_is_not_measured_again(tmp_path, monkeypatch):
         return {"setting": side_by_side.named(trainer, setting), "seed": seed, "gaussians": 9}
 
     monkeypatch.setattr(side_by_side, "train", train)
-    options = ["", str(tmp_path / "rows.json"), "--out", str(tmp_path / "out"), "--trainers", "gsplat", "--seeds"]
+    options = ["", str(tmp_path / "rows.json"), "--out", str(tmp_path / "out")]
+    options += ["--trainers", "gsplat", "splatfacto-ca", "--seeds"]
     for name in ("scene", "train", "both", "3DGS", "gsplat"):
         options[1:1] = [f"--{name}", str(tmp_path)]
     for seeds in (["0"], ["0", "1"]):
         monkeypatch.setattr(sys, "argv", [*options, *seeds])
         side_by_side.main()
-    assert asked == [("gsplat", setting, seed) for seed in (0, 1) for setting in ("plain", "dropout")]
+    runs = [("gsplat", "plain"), ("gsplat", "dropout"), ("splatfacto-ca", "dropout")]
+    assert asked == [(*run, seed) for seed in (0, 1) for run in runs]
+
+
+def test_another_interpreter_may_evaluate(tmp_path, monkeypatch):
+    called = []
+
+    def run(command, **_):
+        called.append((command[0], *command[4:6]))
+        if command[0] == "evaluating":
+            (tmp_path / "evaluation").mkdir()
+            test = dict.fromkeys(("psnr", "ssim", "ca", "ca_exact_half"), 1.0)
+            found = {"mean": {"test": test}, "gaussians": 7}
+            (tmp_path / "evaluation" / "evaluation.json").write_text(json.dumps(found))
+        (tmp_path / "times.json").write_text(json.dumps({"seconds": 4.0}))
+        (tmp_path / "splat.ply").touch()
+
+    monkeypatch.setattr(side_by_side.subprocess, "run", run)
+    given = {"scene": "fern", "images": "images", "both": "both", "iterations": 5, "evaluator": "evaluating"}
+    row = side_by_side.train("splatfacto-ca", "dropout", 2, tmp_path, argparse.Namespace(**given))
+    assert called == [
+        (sys.executable, "ca_reg.integrations.run", "--cpu"),
+        ("evaluating", "reference_trainer.cli", "evaluate"),
+    ]
+    assert (row["setting"], row["seed"], row["gaussians"], row["pace"]) == ({"recipe": "splatfacto-ca"}, 2, 7, 1.0)

@@ -41,34 +41,6 @@ def test_the_score_is_that_of_the_plain_renderer(form, named):
     assert vars(rasterizer)["forward"] is forward
 
 
-@pytest.mark.parametrize(("form", "calls"), [("plain", 6), ("inverse-depth", 6), ("weights", 6), ("depth-alpha", 4)])
-def test_the_second_pass_stops_once_the_alpha_is_known(form, calls):
-    """Three renders: twice as many passes, or one more if a member of the tuple proves to be the alpha."""
-    model, rasterizer, count = Model(), make_rasterizer(form), []
-    forward = rasterizer.forward
-
-    def counted(
-        self,
-        means3D,
-        means2D,
-        opacities,
-        shs=None,
-        colors_precomp=None,
-        scales=None,
-        rotations=None,
-        cov3D_precomp=None,
-    ):
-        count.append(1)
-        return forward(self, means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
-
-    rasterizer.forward = counted
-    fn = render_fn(make_render(rasterizer), model, PIPE, BACKGROUND, rasterizer=rasterizer)
-    for factor in (0.0, 0.5, 1.0):  # the first picture is empty: depth and alpha are the same
-        opacity = factor * model.get_opacity.detach()
-        torch.testing.assert_close(fn(opacity, model.camera)[1], reference(model)(opacity, model.camera)[1])
-    assert len(count) == calls + (form == "depth-alpha")
-
-
 def test_an_installed_hook_does_not_touch_scores_nor_lose_its_place(monkeypatch):
     model, rasterizer = Model(), make_rasterizer()
     render = make_render(rasterizer)

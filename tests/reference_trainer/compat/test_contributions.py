@@ -34,3 +34,14 @@ def test_scores_are_sums_over_the_pixels_at_which_a_gaussian_is_drawn(settings_o
     torch.testing.assert_close(depths[seen], local[seen, 2], rtol=1e-12, atol=0)
     assert 5 < seen.sum() < n
     assert torch.equal(my_radii, radii)
+
+
+def test_pixels_are_those_at_which_a_gaussian_is_drawn(settings_of):
+    scene = random_scene(30, 21, 17, seed=11, size=0.05)
+    rasterizer = rasterizer_module("diff_gaussian_rasterization").GaussianRasterizer(settings_of(scene.camera))
+    _, _, pixels = rasterizer(
+        means3D=scene.means, means2D=torch.zeros_like(scene.means), opacities=scene.opacities[:, None],
+        colors_precomp=scene.colors, scales=scene.scales, rotations=scene.quaternions,
+    )  # fmt: skip
+    weights, _ = brute_force(*scene[:4], torch.eye(30).double(), scene.camera)
+    assert torch.equal(pixels, (weights > 0).sum((1, 2))[:, None].double())

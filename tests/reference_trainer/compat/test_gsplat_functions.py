@@ -7,7 +7,7 @@ import torch
 from oracles import random_scene
 from stand_ins.gsplat import intrinsics
 
-from reference_trainer.compat import install, stand_in, uninstall
+from reference_trainer.compat import stand_in
 
 gsplat = pytest.importorskip("gsplat")
 N, WIDTH, HEIGHT = 80, 24, 18
@@ -67,16 +67,13 @@ def test_everything_is_replaced_everywhere_and_restored():
         )  # fmt: skip
 
     before = functions()
-    install()
-    try:
+    with stand_in():
         within = functions()
         assert all(a is not b for a, b in zip(within, before, strict=True))
         assert within[0] is within[1]
         ran = []
         assert distributed.cli(lambda *given: ran.append(given), "settings", verbose=True)
         assert ran == [(0, 0, 1, "settings")]
-    finally:
-        uninstall()
     assert functions() == before
     assert {"fused_ssim", "gsplat.csrc"}.isdisjoint(sys.modules)
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from reference_trainer.compat.outputs import Unknown, kinds_of
+from reference_trainer.compat.outputs import Picture, Unknown, kinds_of
 
 
 @pytest.mark.parametrize(
@@ -16,9 +16,10 @@ from reference_trainer.compat.outputs import Unknown, kinds_of
         ("color, radii, invdepths", (), ("inverse_depth",)),
         ("rendered_image, radii, rendered_depth, rendered_alpha", ("confidence",), ("depth", "alpha")),
         ("rendered_image, radii, depth, self.render_alphas", (), ("depth", "alpha")),
-        ("image, radii, allmap", (), ("surfels",)),
+        ("image, radii, allmap", (), ("depth+alpha+normal+mean_depth+distortion",)),
         ("image, radii, gs_w", (), ("weights",)),
         ("image, radii, is_used", (), (None,)),
+        ("image, radii, depth+is_used", (), (None,)),
         ("image, radii, counts, depths, accum_weights", (), (None, None, None)),
         ("image, radii, counts, depths, accum_weights", ("pixel_weights",), (None, "depths", "accum_weights")),
         ("image, radii, _, _", (), (None, None)),
@@ -37,6 +38,7 @@ def test_values_are_told_by_their_names_and_by_the_settings(names, fields, kinds
         ("gaussians_count, important_score, rendered_image, radii", (None, None, "image", "radii")),
         ("rendering, counts, radii", ("image", None, "radii")),
         ("0, 1, 2", ("image", "radii", None)),
+        ("color+normals+depth, radii, pixels", ("image+normal+depth", "radii", "pixels")),
     ],
 )
 def test_image_and_radii_are_where_their_names_are(names, kinds):
@@ -69,3 +71,19 @@ def test_an_unknown_value_is_refused_once_it_is_used(use):
     held = {"kept": Unknown("counts")}["kept"]
     with pytest.raises(ValueError, match=r"output counts is used, .* --outputs"):
         use(held)
+
+
+@pytest.mark.parametrize("index", [3, slice(3, 6), slice(2, 5), (8, slice(None)), (slice(3, None), 0), (7, ..., None)])
+def test_a_channel_that_a_picture_does_not_have_is_asked_for_by_its_number(index):
+    with pytest.raises(ValueError, match=r"channel [3-8] .* draws 3 channels: .* --outputs: .* image\+normal"):
+        torch.zeros(3, 4, 5).as_subclass(Picture)[index]
+
+
+def test_a_picture_is_a_tensor_otherwise():
+    plain = torch.rand(3, 4, 5, requires_grad=True)
+    picture = (2 * plain).as_subclass(Picture)
+    for index in (0, -1, slice(None), slice(0, 3), slice(1, -1), (..., 0), (0, 3), plain > 0.5, None, [2, 0]):
+        assert torch.equal(picture[index], (2 * plain)[index])
+    assert type(picture * 1) is type(picture.detach()) is torch.Tensor
+    picture[0].sum().backward()
+    assert torch.equal(plain.grad, torch.tensor([2.0, 0, 0])[:, None, None].expand(3, 4, 5))

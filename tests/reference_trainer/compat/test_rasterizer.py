@@ -258,6 +258,13 @@ def test_unknown_arguments_are_ignored_with_one_warning(settings_of):
     assert torch.equal(images[0], _call(settings_of(scene.camera), scene, nothing_of_the_test=None)[0])
 
 
+def test_zeros_that_wait_for_a_gradient_of_every_gaussian_are_refused(settings_of):
+    scene = random_scene(5, 8, 8, seed=3)
+    sink = torch.zeros(5, 3, 3, requires_grad=True) + 0
+    with pytest.raises(ValueError, match=r"argument splits of the rasterizer, zeros of shape \(5, 3, 3\), waits for a"):
+        _call(settings_of(scene.camera), scene, splits=sink)
+
+
 def test_a_package_has_the_names_that_are_asked_for_and_refuses_others():
     module = rasterizer_module("my_rasterization", {"PlaneRasterizer", "PlaneRasterizationSettings"})
     assert issubclass(module.PlaneRasterizer, torch.nn.Module)

@@ -4,6 +4,7 @@ import itertools
 
 import torch
 from oracles import brute_force, random_scene
+from scipy.spatial.transform import Rotation
 
 from reference_trainer.compat.rasterizer import rasterizer_module
 
@@ -53,3 +54,27 @@ def test_pixels_without_surfels_have_no_gradient_that_is_nan(settings_of):
     assert means.grad.isfinite().all()
     assert means.grad.any()
     assert quaternions.grad.isfinite().all()
+
+
+def test_further_channels_of_the_image_are_those_of_the_planes(settings_of):
+    scene = random_scene(12, 14, 9, seed=5, size=0.2)
+    lengths = scene.scales * torch.tensor([1.0, 0.0, 1.0])  # flat along the second axis
+
+    def draw(*outputs):
+        module = rasterizer_module("diff_gaussian_rasterization", outputs=outputs)
+        return module.GaussianRasterizer(settings_of(scene.camera))(
+            means3D=scene.means, means2D=torch.zeros_like(scene.means), opacities=scene.opacities[:, None],
+            colors_precomp=scene.colors, scales=lengths, rotations=scene.quaternions,
+        )  # fmt: skip
+
+    picture, radii = draw("image+normal+depth+alpha+distortion", "radii")
+    apart = draw("image", "radii", "normal", "depth", "alpha", "distortion")
+    assert torch.equal(picture, torch.cat([apart[0], *apart[2:]]))
+    assert torch.equal(radii, apart[1])
+    weights, _ = brute_force(*scene[:2], lengths, scene.opacities, torch.eye(12).double(), scene.camera)
+    pose = scene.camera.world_to_camera
+    local = scene.means @ pose[:3, :3].T + pose[:3, 3]
+    axes = Rotation.from_quat(scene.quaternions.numpy(), scalar_first=True).as_matrix()[:, :, 1]
+    normals = torch.from_numpy(axes) @ pose[:3, :3].T
+    normals = normals * -(normals * local).sum(1, keepdim=True).sign()
+    torch.testing.assert_close(picture[3:6], torch.einsum("nhw,nc->chw", weights, normals), rtol=0, atol=1e-9)
