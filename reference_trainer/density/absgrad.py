@@ -89,10 +89,9 @@ class AbsGradDensity(AdaptiveDensity):
     def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:
         """Count both gradients of what was drawn."""
         super().observe(splats, camera)
-        drawn = splats.lists.touched
         absolute: Tensor = splats.projection.means.absgrad  # type: ignore[union-attr]
-        norms = screen_norm(absolute[drawn], camera.width, camera.height)
-        self.absolute_sum[splats.indices[drawn]] += norms.to(self.absolute_sum)
+        norms = screen_norm(absolute, camera.width, camera.height)
+        self.absolute_sum.index_add_(0, splats.indices, norms.to(self.absolute_sum))
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the counts."""

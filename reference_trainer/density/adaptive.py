@@ -88,8 +88,7 @@ class AdaptiveDensity(DensityStrategy):
         """Count the gradients of what was drawn."""
         gradient = splats.projection.means.grad
         assert gradient is not None
-        drawn = splats.lists.touched
-        self.statistics.update(splats.indices[drawn], gradient[drawn], camera.width, camera.height)
+        self.statistics.update(splats.indices, splats.lists.touched, gradient, camera.width, camera.height)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the counts."""

@@ -12,9 +12,7 @@ __all__ = ["DensityStatistics", "screen_norm"]
 
 def screen_norm(gradient: Tensor, width: int, height: int) -> Tensor:
     """Return the norms (M,) of gradients per pixel (M, 2), per half an image size (INRIA's device coordinates)."""
-    half_size = gradient.new_tensor([0.5 * width, 0.5 * height])
-    norms: Tensor = (gradient * half_size).norm(dim=1)
-    return norms
+    return torch.hypot(0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
 
 
 @dataclass
@@ -38,17 +36,18 @@ class DensityStatistics:
         """Return empty statistics of ``count`` Gaussians."""
         return cls(*(torch.zeros(count, device=device) for _ in range(2)))
 
-    def update(self, indices: Tensor, gradient: Tensor, width: int, height: int) -> None:
+    def update(self, indices: Tensor, drawn: Tensor, gradient: Tensor, width: int, height: int) -> None:
         """Count one step.
 
         Args:
-            indices: the Gaussians that were drawn, shape (M,).
-            gradient: of the loss with respect to their projected centres, per pixel, shape (M, 2).
+            indices: the Gaussians that may have been drawn, each once, shape (M,).
+            drawn: which of them were, shape (M,) bool.
+            gradient: of the loss with respect to their projected centres, per pixel, 0 of the others, shape (M, 2).
             width: image width, pixels.
             height: image height, pixels.
         """
-        self.gradient_sum[indices] += screen_norm(gradient, width, height).to(self.gradient_sum)
-        self.steps[indices] += 1
+        self.gradient_sum.index_add_(0, indices, screen_norm(gradient, width, height).to(self.gradient_sum))
+        self.steps.index_add_(0, indices, drawn.to(self.steps))
 
     def __getitem__(self, index: Tensor) -> DensityStatistics:
         """Return those of some Gaussians."""

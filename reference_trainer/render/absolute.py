@@ -17,16 +17,8 @@ def splat_weights(splats: Splats) -> Tensor:
     """Sum every splat's blend weight, alpha times transmittance, over the pixels of the picture; shape (M,)."""
     colors = torch.zeros_like(splats.colors).requires_grad_()
     with torch.enable_grad():
-        red = draw(_detached(splats)._replace(colors=colors)).image[0].sum()
+        red = draw(splats._replace(colors=colors)).image[0].sum()
     return torch.autograd.grad(red, colors)[0][:, 0]
-
-
-def _detached(splats: Splats) -> Splats:
-    return splats._replace(
-        projection=type(splats.projection)(*(x.detach() for x in splats.projection)),
-        opacities=splats.opacities.detach(),
-        colors=splats.colors.detach(),
-    )
 
 
 class _AbsoluteGradients(torch.autograd.Function):
@@ -64,6 +56,5 @@ def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tens
     depth = torch.zeros_like(rendering.alpha) if rendering.depth is None else rendering.depth
     behind = rendering.image.new_zeros(3) if background is None else background.detach().to(rendering.image)
     drawn = torch.cat([rendering.image, depth[None], rendering.alpha[None]])
-    splats = _detached(rendering.splats)
-    drawn = _AbsoluteGradients.apply(drawn, sink, splats, behind)  # type: ignore[no-untyped-call]
+    drawn = _AbsoluteGradients.apply(drawn, sink, rendering.splats, behind)  # type: ignore[no-untyped-call]
     return rendering._replace(image=drawn[:3], alpha=drawn[4], depth=None if rendering.depth is None else drawn[3])
