@@ -3,6 +3,5 @@
 import os
 
 # PyTorch's own threads otherwise spin for milliseconds after every operation, on the processors that the threads of the
-# loops, and other programs, need. It counts where this package is imported before PyTorch, and in every process that is
-# started from here.
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+# loops need. It counts where this package is imported before PyTorch, and in every process that is started from here.
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")

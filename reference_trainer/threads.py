@@ -8,10 +8,10 @@ from contextlib import contextmanager
 
 __all__ = ["chosen_threads", "thread_count", "threads_for"]
 
-PIXELS_PER_THREAD = 23_000
-"""Below twice this a picture gets one thread: the smallest at which a second was measured to pay has 47,628 pixels. The
-steps of small ones are many operations of microseconds, at the end of each of which the threads wait for each other,
-and where another process has a processor of theirs, for the system to take it away (docs/reliability.md)."""
+PIXELS_PER_THREAD = 65_536
+"""Below twice this a picture gets one thread. Its steps are many operations of microseconds, at the end of each of
+which the threads wait for each other: a second one gains little on an idle machine, and where another process has its
+processor they wait until the system takes that away (a step at 96x64 takes 14 times as long, docs/reliability.md)."""
 
 
 def chosen_threads() -> int | None:
