@@ -7,7 +7,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render import Rendering, draw
-from reference_trainer.render.eager.projection import rotation_matrices
+from reference_trainer.rotations import rotation_matrices
 
 __all__ = ["FAR", "NEAR", "surface_planes"]
 

@@ -86,10 +86,10 @@ class AdaptiveDensity(DensityStrategy):
 
     def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:
         """Count the gradients of what was drawn."""
-        means, drawn = splats.projection.means, splats.lists.touched
+        means = splats.projection.means
         assert means.grad is not None
-        absolute = means.absgrad[drawn] if "absgrad" in self.needs else None  # type: ignore[union-attr]
-        self.statistics.update(splats.indices[drawn], means.grad[drawn], camera.width, camera.height, absolute)
+        absolute = means.absgrad if "absgrad" in self.needs else None  # type: ignore[union-attr]
+        self.statistics.update(splats.indices, splats.lists.touched, means.grad, camera.width, camera.height, absolute)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the counts."""

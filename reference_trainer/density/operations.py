@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.model.optimizer import GaussianOptimizer
-from reference_trainer.render.eager.projection import rotation_matrices
+from reference_trainer.rotations import rotation_matrices
 from reference_trainer.training.errors import TrainingStoppedError
 
 __all__ = [

@@ -34,21 +34,29 @@ class DensityStatistics:
         return cls(*(torch.zeros(count, device=device) for _ in range(2 + absolute)))
 
     def update(
-        self, indices: Tensor, gradient: Tensor, width: int, height: int, absolute: Tensor | None = None
+        self,
+        indices: Tensor,
+        drawn: Tensor,
+        gradient: Tensor,
+        width: int,
+        height: int,
+        absolute: Tensor | None = None,
     ) -> None:
         """Count one step.
 
         Args:
-            indices: the Gaussians that were drawn, shape (M,).
-            gradient: of the loss with respect to their projected centres, per pixel, shape (M, 2).
+            indices: the Gaussians that may have been drawn, each once, shape (M,).
+            drawn: which of them were, shape (M,) bool.
+            gradient: of the loss with respect to their projected centres, per pixel, 0 of the others, shape (M, 2).
             width: image width, pixels.
             height: image height, pixels.
             absolute: the sums over the pixels of the absolute gradients, shape (M, 2).
         """
         for total, x in ((self.gradient_sum, gradient), (self.absolute_sum, absolute)):
             if total is not None and x is not None:
-                total[indices] += (x * x.new_tensor([0.5 * width, 0.5 * height])).norm(dim=1).to(total)
-        self.steps[indices] += 1
+                norms = torch.hypot(0.5 * width * x[:, 0], 0.5 * height * x[:, 1])
+                total.index_add_(0, indices, norms.to(total))
+        self.steps.index_add_(0, indices, drawn.to(self.steps))
 
     def named(self) -> dict[str, Tensor]:
         """Return what there is, by name."""

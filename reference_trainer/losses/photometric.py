@@ -74,7 +74,7 @@ def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -
         torch.Size([3, 16, 16])
     """
     _check_lambda(lambda_dssim)
-    similarity, error = ssim_map(image, target).mean(), (image - target).abs().mean()
+    similarity, error = ssim_map(image, target).mean(), torch.nn.functional.l1_loss(image, target)
     return error * (1 - lambda_dssim) + (1 - similarity) * lambda_dssim
 
 

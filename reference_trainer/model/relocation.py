@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from reference_trainer.render.eager.projection import rotation_matrices
+from reference_trainer.rotations import rotation_matrices
 
 __all__ = ["compute_relocation", "quat_scale_to_covar_preci"]
 

@@ -17,30 +17,27 @@ def splat_weights(splats: Splats) -> Tensor:
     """Sum every splat's blend weight, alpha times transmittance, over the pixels of the picture; shape (M,)."""
     colors = torch.zeros_like(splats.colors).requires_grad_()
     with torch.enable_grad():
-        red = draw(_detached(splats)._replace(colors=colors)).image[0].sum()
+        red = draw(splats._replace(colors=colors)).image[0].sum()
     return torch.autograd.grad(red, colors)[0][:, 0]
-
-
-def _detached(splats: Splats) -> Splats:
-    return splats._replace(
-        projection=type(splats.projection)(*(x.detach() for x in splats.projection)),
-        opacities=splats.opacities.detach(),
-        colors=splats.colors.detach(),
-    )
 
 
 class _AbsoluteGradients(torch.autograd.Function):
     """The picture unchanged; on the way back the sums of absolute gradients go to an input of their own."""
 
     @staticmethod
-    def forward(ctx: Any, drawn: Tensor, sink: Tensor, *rest: Any) -> Tensor:
-        splats, values, background = rest
-        ctx.sums = splats.engine.absolute_gradients(splats, values, background, drawn)
+    def forward(ctx: Any, drawn: Tensor, sink: Tensor, splats: Splats, background: Tensor) -> Tensor:
+        ctx.splats, ctx.background = splats, torch.nn.functional.pad(background, (0, 1))[:, None, None]
+        ctx.save_for_backward(drawn)
         return drawn.view_as(drawn)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return gradients[0], ctx.sums(gradients[0]), None, None, None
+        # The light that is left shows the background: without it, its gradient is one more of alpha.
+        (drawn,), (gradient,) = ctx.saved_tensors, gradients
+        black = torch.cat([drawn[:4] - (1 - drawn[4]) * ctx.background, drawn[4:]])
+        of_alpha = gradient[4:] - (gradient[:4] * ctx.background).sum(0, keepdim=True)
+        sums = ctx.splats.engine.absolute_gradients(ctx.splats, black, torch.cat([gradient[:4], of_alpha]))
+        return gradient, sums, None, None
 
 
 def absgrad_sink(means: Tensor) -> Tensor:
@@ -56,12 +53,8 @@ def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tens
     They become the gradient of ``sink`` (M, 2).
     The values of the sink do not matter. The background (3,) of the image is black by default.
     """
-    splats, shown = _detached(rendering.splats), rendering.depth
-    values = torch.cat([splats.colors, splats.projection.depths[:, None]], 1)
-    behind = values.new_zeros(4)
-    if background is not None:
-        behind[:3] = background.detach()
-    depth = torch.zeros_like(rendering.alpha) if shown is None else shown
+    depth = torch.zeros_like(rendering.alpha) if rendering.depth is None else rendering.depth
+    behind = rendering.image.new_zeros(3) if background is None else background.detach().to(rendering.image)
     drawn = torch.cat([rendering.image, depth[None], rendering.alpha[None]])
-    drawn = _AbsoluteGradients.apply(drawn, sink, splats, values, behind)  # type: ignore[no-untyped-call]
-    return rendering._replace(image=drawn[:3], alpha=drawn[4], depth=None if shown is None else drawn[3])
+    drawn = _AbsoluteGradients.apply(drawn, sink, rendering.splats, behind)  # type: ignore[no-untyped-call]
+    return rendering._replace(image=drawn[:3], alpha=drawn[4], depth=None if rendering.depth is None else drawn[3])

@@ -5,6 +5,7 @@ A nan would not be seen otherwise: a Gaussian whose depth is nan is not in front
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -12,9 +13,9 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import MAX_ROUNDING
-from reference_trainer.render.splats import Projection
+from reference_trainer.render.splats import Projection, Splats
 
-__all__ = ["NotFiniteError", "check_background", "check_projection"]
+__all__ = ["NotFiniteError", "check_projection", "checked_background", "either"]
 
 
 class NotFiniteError(ValueError):
@@ -23,19 +24,20 @@ class NotFiniteError(ValueError):
 
 @torch.no_grad()
 def check_projection(
-    finite: bool, projection: Projection, colors: Tensor, inputs: Mapping[str, Tensor], camera: Camera
+    total: Tensor, projection: Projection, colors: Tensor, inputs: Mapping[str, Tensor], camera: Camera
 ) -> None:
     """Raise unless all numbers are finite and the world is not too far from its origin for their precision.
 
-    ``finite`` says whether what decides about who is drawn, depths and opacities, and all that is projected are; only
-    where they are not are the inputs, by name and of all Gaussians, looked at one by one.
+    ``total`` is the sum of what decides about who is drawn, depths and opacities. Only where that and all that is
+    projected add up to no finite number are the inputs, by name and of all Gaussians, looked at one by one.
 
     Raises:
         NotFiniteError: if an input is nan or infinite, or so large that the projection is; names it.
         ValueError: if the rounding of the coordinates moves Gaussians by more than `MAX_ROUNDING`.
     """
-    if not finite:
-        _refuse((projection.means, projection.covariances, colors), inputs, camera)
+    results = (projection.means, projection.covariances, colors)
+    if not bool(sum((x.sum() for x in results), total).isfinite()):  # one wait for a GPU
+        _refuse(results, inputs, camera)
     # At what share of its mean depth the scene lies from the origin of the world.
     share = float(camera.position.abs().amax() / projection.depths.mean())
     rounding = 0.5 * torch.finfo(colors.dtype).eps * share * max(camera.fx, camera.fy)
@@ -47,12 +49,26 @@ def check_projection(
         )
 
 
-def check_background(background: Tensor) -> None:
-    """Raise `NotFiniteError` unless the colour behind everything is finite."""
+def either(sh: Tensor | None, sh_degree: int | None, colors: Tensor | None) -> tuple[Tensor, int | None]:
+    """Return coefficients and their highest band, or colours and None; raise unless one of the two is given."""
+    if sh is None and colors is not None:
+        return colors, None
+    if sh is None or colors is not None:
+        raise ValueError("give either sh (N, K, 3) or colors (N, 3), not both and not neither.")
+    return sh, math.isqrt(sh.shape[1]) - 1 if sh_degree is None else sh_degree
+
+
+def checked_background(background: Tensor | None, splats: Splats, *shapes: tuple[int, ...]) -> Tensor:
+    """Return the colour behind everything, black if there is none, of one of some shapes; raise unless it is finite."""
+    if background is None:
+        return splats.colors.new_zeros(3)
+    if background.shape not in shapes:
+        raise ValueError(f"background must have shape {' or '.join(map(str, shapes))}, got {tuple(background.shape)}.")
     if count := int((~background.isfinite()).sum()):
         raise NotFiniteError(
             f"background must be finite, got nan or infinity in {count} of {background.numel()} numbers."
         )
+    return background.to(splats.colors)
 
 
 def _refuse(results: tuple[Tensor, ...], inputs: Mapping[str, Tensor], camera: Camera) -> None:

@@ -6,7 +6,6 @@ import functools
 import importlib.util
 import os
 import warnings
-from collections.abc import Callable
 from importlib.metadata import version
 from typing import Protocol
 
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.eager.engine import TorchEngine
-from reference_trainer.render.splats import MomentImages, Splats
+from reference_trainer.render.splats import MomentImages, Projection, Splats, TileLists
 
 __all__ = ["ENGINES", "Engine", "chosen_engine", "describe_engine", "engine_for", "use_engine"]
 
@@ -34,11 +33,20 @@ class Engine(Protocol):
 
     name: str
 
-    def splat(self, inputs: dict[str, Tensor], camera: Camera, degree: int) -> Splats:
-        """Project the Gaussians that can be seen, colour them, and list them per tile, after `check_projection`.
+    def project(
+        self, inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
+    ) -> tuple[Projection, Tensor]:
+        """Project M of N Gaussians, the ``indices`` (M,), and evaluate their colours, (M, 3).
 
         The inputs are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh (N, K, 3), of
-        which the bands up to ``degree`` are used, or colors (N, 3), by name.
+        which the bands up to ``degree`` are used, or colors (N, 3) of no degree, by name.
+        """
+
+    def bin(self, projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
+        """List the Gaussians of every tile, given their activated opacities (M,).
+
+        A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the rectangle spanned by the
+        tile's pixel centres. The test is exact: within a row of tiles, an ellipse covers an interval of columns.
         """
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
@@ -50,13 +58,11 @@ class Engine(Protocol):
     def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
         """Draw splats with K other opacities, (K, M), as in `masked`: images (K, 3, H, W), alphas; no gradients."""
 
-    def absolute_gradients(
-        self, splats: Splats, values: Tensor, background: Tensor, drawn: Tensor
-    ) -> Callable[[Tensor], Tensor]:
-        """Return what sums the absolute gradients that pixels give to the positions (AbsGS), (M, 2), without a graph.
+    def absolute_gradients(self, splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
+        """Sum the absolute gradients that pixels give to the positions (AbsGS), (M, 2), without a graph.
 
-        The values (M, 4), colours and depth, were drawn over the background (4,); ``drawn`` is their picture and the
-        accumulated alpha, (5, H, W), and what is returned takes the gradient of a loss with respect to that.
+        ``drawn`` are colours and depth over black and the accumulated alpha, (5, H, W), and ``gradient`` is that of a
+        loss with respect to them.
         """
 
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:

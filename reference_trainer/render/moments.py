@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
-from reference_trainer.render.checks import check_background
+from reference_trainer.render.checks import checked_background
 from reference_trainer.render.splats import MomentImages, Splats
 
 __all__ = ["render_moments", "variance_shares"]
@@ -76,14 +76,10 @@ def variance_shares(
 
 
 def _behind(background: Tensor | None, splats: Splats) -> Tensor:
-    """Return what is behind the last splat, (3, H, W), given one colour (3,), one for each pixel, or None for black."""
+    """Return what is behind the last splat, (3, H, W)."""
     shape = (3, splats.lists.height, splats.lists.width)
-    if background is None:
-        return splats.colors.new_zeros(shape)
-    check_background(background)
-    if background.shape not in (shape, shape[:1]):
-        raise ValueError(f"background must have shape (3,) or {shape}, got {tuple(background.shape)}.")
-    return (background if background.ndim == 3 else background[:, None, None]).to(splats.colors).expand(shape)
+    found = checked_background(background, splats, (3,), shape)
+    return (found if found.ndim == 3 else found[:, None, None]).expand(shape)
 
 
 def _factors(multiplier: Multiplier, splats: Splats) -> Tensor:

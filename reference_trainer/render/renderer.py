@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.checks import check_background
+from reference_trainer.render.checks import check_projection, checked_background, either
+from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.engine import engine_for
 from reference_trainer.render.splats import Rendering, Splats
 
@@ -38,23 +37,27 @@ def splat(
         NotFiniteError: if an input that decides about the view is nan or infinite. What is behind the camera, or
             dropped, may be so but for its place and opacity.
     """
-    if (sh is None) == (colors is None):
-        raise ValueError("give either sh (N, K, 3) or colors (N, 3), not both and not neither.")
+    values, degree = either(sh, sh_degree, colors)
     n = means.shape[0]
     if opacities.shape not in ((n,), (n, 1)):
         raise ValueError(f"opacities must have shape ({n},) or ({n}, 1), got {tuple(opacities.shape)}.")
     named = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities.reshape(n)}
-    degree = 0
-    if sh is not None:
-        degree = math.isqrt(sh.shape[1]) - 1 if sh_degree is None else sh_degree
-        named["sh"] = sh[:, : (degree + 1) ** 2]
-    elif colors is not None:
-        named["colors"] = colors
+    named |= {"colors": values} if degree is None else {"sh": values[:, : (degree + 1) ** 2]}
     inputs = {name: _working(name, x, means.dtype) for name, x in named.items()}
     # Mixed precision would move means by pixels: its products have 8 bits.
     with torch.autocast(means.device.type, enabled=False):
-        dtype = inputs["means"].dtype
-        return engine_for(means.device, dtype).splat(inputs, camera.to(means.device, dtype), degree)
+        camera, opacities = camera.to(means.device, inputs["means"].dtype), inputs["opacities"]
+        engine = engine_for(means.device, inputs["means"].dtype)
+        with torch.no_grad():
+            depths = inputs["means"] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+            indices = torch.nonzero((depths > NEAR_PLANE) & (opacities >= MIN_ALPHA)).squeeze(1)
+        projection, shown = engine.project(inputs, indices, camera, degree)
+        check_projection(depths.sum() + opacities.detach().sum(), projection, shown, inputs, camera)
+        if indices.shape[0] < n:
+            opacities = opacities.index_select(0, indices)
+        with torch.no_grad():
+            lists = engine.bin(projection, opacities, camera.width, camera.height)
+        return Splats(indices, projection, opacities, shown, lists, engine)
 
 
 def _working(name: str, x: Tensor, dtype: torch.dtype) -> Tensor:
@@ -116,7 +119,9 @@ def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = Fals
     if splats.projection.means.requires_grad:
         splats.projection.means.retain_grad()
     with torch.autocast(splats.opacities.device.type, enabled=False):
-        image, alpha, depths = splats.engine.composite(splats, _behind(background, splats), depth=depth)
+        image, alpha, depths = splats.engine.composite(
+            splats, checked_background(background, splats, (3,)), depth=depth
+        )
     return Rendering(image, alpha, depths, splats)
 
 
@@ -135,12 +140,4 @@ def draw_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None =
     """
     lower = opacities[:, splats.indices].to(splats.opacities.dtype)
     with torch.autocast(lower.device.type, enabled=False):
-        return splats.engine.composite_masks(splats, lower, _behind(background, splats))
-
-
-def _behind(background: Tensor | None, splats: Splats) -> Tensor:
-    """Return the colour behind everything, (3,)."""
-    if background is None:
-        return splats.colors.new_zeros(3)
-    check_background(background)
-    return background.to(splats.colors)
+        return splats.engine.composite_masks(splats, lower, checked_background(background, splats, (3,)))

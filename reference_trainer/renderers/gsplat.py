@@ -9,7 +9,6 @@ There are no moments: analytic training and exact scores use this package's rend
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -18,6 +17,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
+from reference_trainer.render.checks import either
 from reference_trainer.render.constants import DILATION, NEAR_PLANE
 
 __all__ = ["GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
@@ -87,26 +87,23 @@ def render_by(
         TypeError: if the Gaussians are not float32, the only kind that gsplat knows.
         ValueError: if not exactly one of ``sh`` and ``colors`` is given.
     """
-    if (sh is None) == (colors is None):
-        raise ValueError("give either sh (N, K, 3) or colors (N, 3), not both and not neither.")
+    values, degree = either(sh, sh_degree, colors)
     if means.dtype != torch.float32:
         raise TypeError(f"the gsplat renderer knows float32 only, got {means.dtype}: use the torch renderer.")
-    if sh is not None and sh_degree is None:
-        sh_degree = math.isqrt(sh.shape[1]) - 1
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
     images, alphas, info = rasterization(
         means=means,
         quats=quaternions,
         scales=scales,
         opacities=opacities.reshape(-1),
-        colors=colors if sh is None else sh,
+        colors=values,
         viewmats=camera.world_to_camera.to(means)[None],
         Ks=means.new_tensor(intrinsics)[None],
         width=camera.width,
         height=camera.height,
         near_plane=NEAR_PLANE,
         eps2d=DILATION,
-        sh_degree=None if sh is None else sh_degree,
+        sh_degree=degree,
         packed=True,  # the projected means of M Gaussians, as the gradient is wanted, not those of a batch of views
         backgrounds=None if background is None else background.to(means)[None],
         render_mode="RGB+D" if depth else "RGB",

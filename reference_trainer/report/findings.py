@@ -17,8 +17,8 @@ from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.shares import Heat, concentration
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
-from reference_trainer.render.eager.projection import rotation_matrices
 from reference_trainer.report.packing import jpeg, numbers
+from reference_trainer.rotations import rotation_matrices
 from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 from reference_trainer.scenes.splits import evenly_spaced

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.eager.projection import rotation_matrices
+from reference_trainer.rotations import rotation_matrices
 
 __all__ = [
     "CAMERA_MODELS", "ColmapCamera", "ColmapImage", "ColmapModel", "ColmapPoints", "PointRecords", "add_camera",

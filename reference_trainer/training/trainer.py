@@ -172,7 +172,7 @@ class Trainer:
                 field.optimizer.step()
         self.step += 1
         with torch.no_grad():
-            mse = torch.mean((steps[0].image.clamp(0, 1) - steps[0].view.image) ** 2).item()
+            mse = torch.nn.functional.mse_loss(steps[0].image.clamp(0, 1), steps[0].view.image).item()
         steps.clear()  # each step knows all of them: in a cycle their graphs would wait for the garbage collector
         return value, mse
 

@@ -22,7 +22,7 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import NotFiniteError
-from reference_trainer.render.eager.projection import rotation_matrices
+from reference_trainer.rotations import rotation_matrices
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.threads import threads_for

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 from unittest import mock
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from benchmarks.workloads import Workload
 from reference_trainer.render import splat
+from reference_trainer.render.engine import engine_for
 from reference_trainer.studies.both_engines import drawn_by
 from reference_trainer.studies.clocks import Clock
 
@@ -64,8 +64,7 @@ def staged(workload: Workload, engine: str, clock: Clock) -> Staged:
 
         return call
 
-    room = importlib.import_module(f"reference_trainer.render.{'eager' if engine == 'torch' else engine}.engine")
-    with drawn_by(engine), mock.patch.object(room, "bin_gaussians", timed(room.bin_gaussians)):
+    with drawn_by(engine), mock.patch.object(room := engine_for(colors.device, colors.dtype), "bin", timed(room.bin)):
         times = [clock()]
         p = leaves
         splats = splat(p["means"], p["quaternions"], p["scales"], p["opacities"], workload.camera, colors=colors)

@@ -64,7 +64,7 @@ def test_masking_with_zeroed_radii_is_removing_the_gaussians(form, device):
         # The reference trainer's own statistics, given the visible subset, in pixels.
         seen = full_radii.nonzero().squeeze(1)
         per_pixel = full_points[seen, :2] / torch.tensor([16.0, 12.0], device=device)
-        ours.update(seen, per_pixel, 32, 24)
+        ours.update(seen, torch.ones_like(seen, dtype=torch.bool), per_pixel, 32, 24)
         with torch.no_grad():
             unmasked = render(model.camera, model, PIPE, black)["radii"]
         naive.add(points, unmasked > 0, unmasked)

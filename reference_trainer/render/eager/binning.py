@@ -12,11 +12,7 @@ __all__ = ["bin_gaussians"]
 
 
 def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
-    """List the Gaussians of every tile.
-
-    A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the rectangle spanned by the
-    tile's pixel centres. The test is exact: within a strip of tiles, an ellipse covers an interval of columns.
-    """
+    """List the Gaussians of every tile, see `Engine.bin`."""
     device = opacities.device
     order = torch.argsort(projection.depths, stable=True)
     mean_x, mean_y = projection.means[order].unbind(-1)

@@ -8,35 +8,9 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
 from reference_trainer.render.splats import Projection
+from reference_trainer.rotations import rotations
 
-__all__ = ["project", "rotation_matrices"]
-
-_NO_DIRECTION = 1e-30  # a quaternion well below this is taken for 0
-
-
-def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Turn quaternions (N, 4) into rotation matrices (N, 3, 3).
-
-    Convention: wxyz; they are normalised here, whatever their norm. That of 0 is the identity, with a gradient of 0.
-
-    Example:
-        >>> rotation_matrices(torch.tensor([[2.0, 0.0, 0.0, 0.0]]))[0].tolist()
-        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    """
-    return _rotations(quaternions).permute(2, 0, 1)
-
-
-def _rotations(quaternions: Tensor) -> Tensor:
-    """Turn quaternions (N, 4) into rotation matrices (3, 3, N): long last axes are several times faster on a CPU."""
-    # Divided by the largest component first: the squares of the norm would overflow from 1e19 on, or underflow.
-    largest = quaternions.detach().abs().amax(1).clamp_(min=_NO_DIRECTION)
-    w, x, y, z = torch.nn.functional.normalize(quaternions.T / largest, dim=0).unbind(0)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows).view(3, 3, -1)
+__all__ = ["project"]
 
 
 def project(
@@ -63,7 +37,7 @@ def project(
     # The two rows of (Jacobian x view rotation), then of (Jacobian x view rotation x Gaussian axes), each (3, M).
     row_x = (camera.fx / z) * (right - slope_x.clamp(-limit_x, limit_x) * forward)
     row_y = (camera.fy / z) * (down - slope_y.clamp(-limit_y, limit_y) * forward)
-    axes = _rotations(quaternions) * scales.T
+    axes = rotations(quaternions) * scales.T
     row_x, row_y = (row_x[:, None] * axes).sum(0), (row_y[:, None] * axes).sum(0)
     xx, xy, yy = (row_x * row_x).sum(0) + dilation, (row_x * row_y).sum(0), (row_y * row_y).sum(0) + dilation
     # The determinant as a sum of squares (Cauchy-Binet): xx yy - xy^2 would cancel for needles. Divided by yy before it

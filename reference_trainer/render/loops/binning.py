@@ -89,9 +89,7 @@ def _measure(
         ellipse = ellipses[i]
         ellipse[0], ellipse[1], ellipse[5], ellipse[7] = x, y, limit, f4(row)
         ellipse[2], ellipse[3], ellipse[4] = factors[i, 0], factors[i, 1], factors[i, 2]
-        ellipse[6] = covariances[i, 1] * math.sqrt(
-            limit / covariances[i, 0]
-        )  # the dy at which it reaches furthest right
+        ellipse[6] = covariances[i, 1] * math.sqrt(limit / covariances[i, 0])  # dy where it is furthest right
 
 
 @kernel
@@ -151,10 +149,7 @@ def _ends(counts: Array) -> Array:
 
 
 def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
-    """List the Gaussians of every tile: those whose 1/255 ellipse meets the rectangle of the tile's pixel centres.
-
-    The opacities (M,) are activated.
-    """
+    """List the Gaussians of every tile, see `Engine.bin`."""
     m, f, c, z = (x.detach().numpy() for x in projection)
     o = opacities.detach().numpy()
     count, tiles, order = m.shape[0], -(-width // TILE) * -(-height // TILE), _nearest_first(z)

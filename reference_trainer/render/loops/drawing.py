@@ -6,7 +6,6 @@ back as well: what lies behind a splat is what was drawn less what has been pass
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -121,12 +120,8 @@ def _masked(
                     shown += entries[k, 9 + picture] > _ZERO
                 kept[shown] = last_entry  # which is nowhere seen
                 for k in range(0, shown, 2):
-                    a, b, alpha_a, alpha_b = (
-                        entries[kept[k]],
-                        entries[kept[k + 1]],
-                        alphas[kept[k]],
-                        alphas[kept[k + 1]],
-                    )
+                    a, b = entries[kept[k]], entries[kept[k + 1]]
+                    alpha_a, alpha_b = alphas[kept[k]], alphas[kept[k + 1]]
                     red_a, green_a, blue_a, red_b, green_b, blue_b = a[6], a[7], a[8], b[6], b[7], b[8]
                     factor_a, factor_b = a[9 + picture], b[9 + picture]
                     for p in range(PIXELS):
@@ -200,13 +195,14 @@ def _make_backward(absolute: bool) -> Any:
 _backward, _absolute = _make_backward(False), _make_backward(True)
 
 
-def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> Tensor:
-    """Draw splats with K other opacities, (K, M): the light left, and the image, (K, 4, H, W); no gradients."""
+def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw all in one pass, see `Engine.composite_masks`: what does not depend on the opacity is evaluated once."""
     highest = opacities.amax(0)
     table = tiles.make_table(splats._replace(opacities=highest), (opacities / highest).T)
     drawn = tiles.whole_tiles(splats.lists, len(opacities), 4)
     tiles.over_tiles(_masked, splats.lists, table, background, drawn)
-    return splats.lists.cut(drawn)
+    drawn = splats.lists.cut(drawn)
+    return drawn[:, 1:], 1 - drawn[:, 0]
 
 
 class _Composite(torch.autograd.Function):
@@ -229,26 +225,24 @@ class _Composite(torch.autograd.Function):
         return None, to_background, *tiles.geometry_gradients(table, tiles.sum_rows(rows, ctx.lists))
 
 
-def composite(splats: Splats, background: Tensor) -> Tensor:
-    """Draw splats over a background (3,): the light left at every pixel, 1 - alpha, and the image, (4, H, W)."""
+def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Draw splats front to back, see `Engine.composite`; depth as the red of a second picture."""
     p = splats.projection
-    drawn: Tensor = _Composite.apply(  # type: ignore[no-untyped-call]
+    drawn = _Composite.apply(  # type: ignore[no-untyped-call]
         splats, background, p.means, p.factors, splats.opacities, splats.colors
     )
-    return splats.lists.cut(drawn)
+    light, image = torch.split(splats.lists.cut(drawn), [1, 3])
+    if not depth:
+        return image, 1 - light[0], None
+    red = torch.nn.functional.pad(p.depths[:, None], (0, 2))
+    return image, 1 - light[0], composite(splats._replace(colors=red), torch.zeros_like(background), depth=False)[0][0]
 
 
-def absolute_gradients(
-    splats: Splats, values: Tensor, _background: Tensor, drawn: Tensor
-) -> Callable[[Tensor], Tensor]:
-    """Return what sums the absolute gradients of positions, see `Engine.absolute_gradients`."""
-    lists, table = splats.lists, tiles.make_table(splats._replace(colors=values))
-    images = lists.padded(torch.cat([1 - drawn[4:], drawn[:4]]))
-
-    def sums(gradient: Tensor) -> Tensor:
-        rows, upstream = table.new_empty(lists.gaussians.shape[0], 2), torch.cat([-gradient[4:], gradient[:4]])
-        assert lists.slots is not None
-        tiles.over_tiles(_absolute, lists, lists.slots, table, images, lists.padded(upstream), rows)
-        return tiles.sum_rows(rows, lists)
-
-    return sums
+def absolute_gradients(splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
+    """Sum the absolute gradients of positions, see `Engine.absolute_gradients`."""
+    lists, table = splats.lists, tiles.make_table(splats, splats.projection.depths[:, None])
+    images, upstream = torch.cat([1 - drawn[4:], drawn[:4]]), torch.cat([-gradient[4:], gradient[:4]])
+    rows = table.new_empty(lists.gaussians.shape[0], 2)
+    assert lists.slots is not None
+    tiles.over_tiles(_absolute, lists, lists.slots, table, lists.padded(images), lists.padded(upstream), rows)
+    return tiles.sum_rows(rows, lists)

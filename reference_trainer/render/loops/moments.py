@@ -105,7 +105,7 @@ def _make_backward(complete: bool) -> Any:
         With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
         hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}: walked back to front, as division would fail at 0.
         """
-        kept = np.empty(tiles.longest_list(first, last, starts) * size * PIXELS, f4)
+        kept = np.empty(np.diff(starts[first : last + 1]).max() * size * PIXELS, f4)
         s = np.empty(_SIZE, f4)  # in which _VARIANCE is its gradient
         for tile in range(first, last):
             s[_LIGHT : _LIGHT + PIXELS] = _ONE

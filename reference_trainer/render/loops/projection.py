@@ -12,37 +12,17 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.compiled.compiling import inlined, kernel
 from reference_trainer.compiled.threads import in_threads
-from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
+from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
 from reference_trainer.render.loops.harmonics import basis, basis_gradient
 from reference_trainer.render.splats import Projection
 
-__all__ = ["project", "visible"]
+__all__ = ["project"]
 
 Array = Any
 f4 = np.float32
 _ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
-_DILATION, _NEAR, _MIN = f4(DILATION), f4(NEAR_PLANE), f4(MIN_ALPHA)
-_INFINITY = f4(np.inf)  # nan and infinity are not below it; math.isfinite is optimized away
+_DILATION = f4(DILATION)
 _NO_DIRECTION = f4(1e-30)  # a quaternion well below this is taken for 0
-
-
-@kernel
-def _visible(first: int, last: int, means: Array, opacities: Array, view: Array, seen: Array) -> bool:
-    """Note who is in front of the near plane and not too faint; return whether all depths and opacities are finite."""
-    finite = True
-    for i in range(first, last):
-        depth = view[2, 0] * means[i, 0] + view[2, 1] * means[i, 1] + view[2, 2] * means[i, 2] + view[2, 3]
-        seen[i] = depth > _NEAR and opacities[i] >= _MIN
-        finite = finite and abs(depth + opacities[i]) < _INFINITY
-    return finite
-
-
-def visible(means: Tensor, opacities: Tensor, camera: Camera) -> tuple[Tensor, bool]:
-    """Return who of N Gaussians can be seen, shape (M,), and whether all depths and opacities are finite."""
-    seen = np.empty(means.shape[0], np.bool_)
-    arrays = (x.contiguous().numpy() for x in (means, opacities, camera.world_to_camera))
-    finite = all(in_threads(_visible, means.shape[0], *arrays, seen, least=32768))
-    return torch.from_numpy(np.flatnonzero(seen)), finite
 
 
 @inlined
@@ -146,9 +126,8 @@ def _forward(
     first: int, last: int, indices: Array, means: Array, quaternions: Array, scales: Array, sh: Array, degree: int,
     view: Array, lens: Array, position: Array, centers: Array, factors: Array, covariances: Array, depths: Array,
     colors: Array,
-) -> bool:  # fmt: skip
-    """Project and colour; return whether all results are finite."""
-    finite = True
+) -> None:  # fmt: skip
+    """Project and colour."""
     values = np.empty(16, f4)
     for k in range(first, last):
         i = indices[k]
@@ -159,11 +138,9 @@ def _forward(
         factors[k, 0], factors[k, 1], factors[k, 2] = l11, -xy * (l22 * l22) * l11, l22
         covariances[k, 0], covariances[k, 1], covariances[k, 2] = xx, xy, yy
         depths[k] = z
-        total = centers[k, 0] + centers[k, 1] + xx + xy + yy
         if degree < 0:
             for c in range(3):
                 colors[k, c] = sh[i, 0, c]
-                total += sh[i, 0, c]
         else:
             direction, _ = _towards(means, i, position)
             basis(direction[0], direction[1], direction[2], degree, values)
@@ -171,10 +148,7 @@ def _forward(
                 color = _HALF
                 for j in range((degree + 1) * (degree + 1)):
                     color += values[j] * sh[i, j, c]
-                colors[k, c] = color if not color < _ZERO else _ZERO
-                total += color  # as it was: the clamp would make black of minus infinity
-        finite = finite and abs(total) < _INFINITY
-    return finite
+                colors[k, c] = color if not color < _ZERO else _ZERO * color  # nan of minus infinity
 
 
 @kernel
@@ -207,20 +181,16 @@ def _backward(
         to_ux = _plus(_plus(_cross(w, to_cross), _TWO * to_xx, ux), to_xy, uy)
         to_uy = _plus(_plus(_times(l22, to_w), _TWO * to_yy, uy), to_xy, ux)
         # u_j = scale_j sum_k row_k matrix_kj, for both rows
-        vx, vy = (
-            (to_ux[0] * s[0], to_ux[1] * s[1], to_ux[2] * s[2]),
-            (to_uy[0] * s[0], to_uy[1] * s[1], to_uy[2] * s[2]),
-        )
+        vx = to_ux[0] * s[0], to_ux[1] * s[1], to_ux[2] * s[2]
+        vy = to_uy[0] * s[0], to_uy[1] * s[1], to_uy[2] * s[2]
         to_row_x = _dot(matrix[0:3], vx), _dot(matrix[3:6], vx), _dot(matrix[6:9], vx)
         to_row_y = _dot(matrix[0:3], vy), _dot(matrix[3:6], vy), _dot(matrix[6:9], vy)
         for j in range(3):
             column = (matrix[j], matrix[3 + j], matrix[6 + j])
             to_scales[i, j] = to_ux[j] * _dot(row_x, column) + to_uy[j] * _dot(row_y, column)
-        r0, r1, r2 = (
-            _plus(_times(row_x[0], vx), row_y[0], vy),
-            _plus(_times(row_x[1], vx), row_y[1], vy),
-            _plus(_times(row_x[2], vx), row_y[2], vy),
-        )
+        r0 = _plus(_times(row_x[0], vx), row_y[0], vy)
+        r1 = _plus(_times(row_x[1], vx), row_y[1], vy)
+        r2 = _plus(_times(row_x[2], vx), row_y[2], vy)
         x12, x20, x01 = r2[1] - r1[2], r0[2] - r2[0], r1[0] - r0[1]
         y12, y20, y01 = r2[1] + r1[2], r0[2] + r2[0], r1[0] + r0[1]
         to_qw = _TWO * (qx * x12 + qy * x20 + qz * x01)
@@ -268,23 +238,23 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, indices: Tensor, camera: Camera,
         degree: int,
-    ) -> tuple[Any, ...]:  # fmt: skip
+    ) -> tuple[Tensor, ...]:  # fmt: skip
         count = indices.shape[0]
         limits = (0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
         lens = [camera.fx, camera.fy, camera.cx, camera.cy, *(FRUSTUM_MARGIN * limit for limit in limits)]
         arrays = (x.detach().contiguous().numpy() for x in (indices, means, quaternions, scales, sh))
         view = (x.contiguous().numpy() for x in (camera.world_to_camera, camera.position))
         ctx.arguments = (*arrays, degree, next(view), np.array(lens, f4), next(view))
-        outputs = [means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,))]
-        finite = all(in_threads(_forward, count, *ctx.arguments, *(x.numpy() for x in outputs), least=4096))
+        outputs = tuple(means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,)))
+        in_threads(_forward, count, *ctx.arguments, *(x.numpy() for x in outputs), least=4096)
         ctx.save_for_backward(outputs[-1])
         ctx.mark_non_differentiable(outputs[2])
-        return (*outputs, finite)
+        return outputs
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
         (colors,) = ctx.saved_tensors
-        to_centers, to_factors, _, to_depths, to_colors, _ = gradients
+        to_centers, to_factors, _, to_depths, to_colors = gradients
         upstream = tuple(x.contiguous().numpy() for x in (colors, to_centers, to_factors, to_depths, to_colors))
         inputs = [torch.zeros(x.shape) for x in ctx.arguments[1:5]]
         outputs = tuple(x.numpy() for x in inputs)
@@ -293,13 +263,12 @@ class _Project(torch.autograd.Function):
 
 
 def project(
-    means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, indices: Tensor, camera: Camera, degree: int
-) -> tuple[Projection, Tensor, bool]:
-    """Project M of N Gaussians; return also their colours (M, 3), and whether all numbers are finite.
-
-    The arguments are those of `reference_trainer.render.render`; ``sh`` may be colours, (N, 1, 3), of degree -1.
-    """
-    *projection, colors, finite = _Project.apply(  # type: ignore[no-untyped-call]
-        means, quaternions, scales, sh, indices, camera, degree
+    inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
+) -> tuple[Projection, Tensor]:
+    """Project and colour Gaussians, see `Engine.project`."""
+    # Colours are coefficients (N, 1, 3) of degree -1.
+    sh, band = (inputs["colors"][:, None], -1) if degree is None else (inputs["sh"], degree)
+    *projection, colors = _Project.apply(  # type: ignore[no-untyped-call]
+        inputs["means"], inputs["quaternions"], inputs["scales"], sh, indices, camera, band
     )
-    return Projection(*projection), colors, finite
+    return Projection(*projection), colors

@@ -18,7 +18,7 @@ from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
     "CHUNK", "PIXELS", "X", "Y", "absolute_slopes", "alpha_at", "clamped", "footprint", "footprint_gradient",
-    "footprint_of", "geometry_gradients", "is_faint", "load", "longest_list", "make_table", "over_tiles",
+    "footprint_of", "geometry_gradients", "is_faint", "load", "make_table", "over_tiles",
     "read_entries", "store", "sum_rows", "whole_tiles",
 ]  # fmt: skip
 
@@ -83,15 +83,6 @@ def geometry_gradients(table: Tensor, sums: Tensor) -> tuple[Tensor, Tensor, Ten
     """Return the gradients of means, factors, opacities and colours, given those of a table's rows (M, 9 or more)."""
     # A splat that a mask has dropped has no logarithm, and a gradient of 0.
     return sums[:, :2], sums[:, 2:5], sums[:, 5] / table[:, 5].exp2().clamp_min(MIN_ALPHA), sums[:, 6:9]
-
-
-@inlined
-def longest_list(first: Any, last: Any, starts: Any) -> Any:
-    """Return the length of the longest list of some tiles."""
-    longest = 0
-    for tile in range(first, last):
-        longest = max(longest, starts[tile + 1] - starts[tile])
-    return longest
 
 
 @inlined

@@ -48,8 +48,10 @@ def test_absgrad_counts_sums_of_absolute_values_of_what_was_drawn(tiny_scene):
         with torch.no_grad():
             out = render_gaussians(drawn, step.view.camera, trainer.background, sh_degree=step.sh_degree)
         image = out.image - step.view.image
-        upstream = torch.cat([image.sign() / image.numel(), torch.zeros_like(out.alpha)[None]])
-        sums = TorchEngine().absolute_gradients(out.splats, out.splats.colors, trainer.background, out.image)(upstream)
+        of_image = image.sign() / image.numel()
+        of_alpha = -(of_image * trainer.background[:, None, None]).sum(0)  # the light that is left shows the background
+        upstream = torch.cat([of_image, torch.stack([torch.zeros_like(of_alpha), of_alpha])])
+        sums = TorchEngine().absolute_gradients(out.splats, out.image, upstream)
         half = torch.tensor([step.view.camera.width / 2, step.view.camera.height / 2])
         expected[out.splats.indices] += (sums * half).norm(dim=1).double()
         counts[out.splats.indices[out.splats.lists.touched]] += 1

@@ -169,20 +169,20 @@ def test_extreme_opacities_stay_finite_under_decay_and_reset(logit):
 def test_gradients_are_counted_in_half_image_sizes_and_averaged_over_the_steps_that_drew_them():
     statistics = DensityStatistics.zeros(3)
     gradient = torch.tensor([[3e-2, 0.0], [0.0, 4e-2]])
-    statistics.update(torch.tensor([0, 2]), gradient, width=200, height=50)
-    statistics.update(torch.tensor([2]), torch.tensor([[3e-2, 4e-2]]), width=200, height=200)
+    statistics.update(torch.tensor([0, 2]), torch.tensor([True, True]), gradient, width=200, height=50)
+    later = torch.tensor([[0.0, 0.0], [3e-2, 4e-2]])
+    statistics.update(torch.tensor([1, 2]), torch.tensor([False, True]), later, width=200, height=200)
     torch.testing.assert_close(statistics.mean_gradient, torch.tensor([3.0, 0.0, (1.0 + 5.0) / 2]))
     assert statistics.steps.tolist() == [1, 0, 2]
 
 
-def drawn(scene, gaussians: Gaussians, view, opacities) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render with gradients as the trainer does; return indices and gradients of what was drawn."""
+def seen_in(scene, gaussians: Gaussians, view, opacities) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Render with gradients as the trainer does; return indices, which of them were drawn, and gradients."""
     gaussians = gaussians.map(lambda x: x.detach().clone().requires_grad_())
     rendering = render_gaussians(gaussians, view.camera, scene.background, opacities=opacities)
     (rendering.image - view.image).square().sum().backward()
     splats = rendering.splats
-    touched = splats.lists.touched
-    return splats.indices[touched], splats.projection.means.grad[touched]
+    return splats.indices, splats.lists.touched, splats.projection.means.grad
 
 
 def test_dropped_gaussians_leave_no_trace(tiny_scene):
@@ -195,9 +195,9 @@ def test_dropped_gaussians_leave_no_trace(tiny_scene):
         keep = torch.rand(150, generator=g) >= 0.3
         where = keep.nonzero().squeeze(1)
         size = (view.camera.width, view.camera.height)
-        with_dropped.update(*drawn(tiny_scene, model, view, model.opacities * keep), *size)
-        index, gradient = drawn(tiny_scene, model[keep], view, None)
-        expected.update(where[index], gradient, *size)
+        with_dropped.update(*seen_in(tiny_scene, model, view, model.opacities * keep), *size)
+        index, drawn, gradient = seen_in(tiny_scene, model[keep], view, None)
+        expected.update(where[index[drawn]], drawn[drawn], gradient[drawn], *size)
     assert torch.equal(with_dropped.steps, expected.steps)
     torch.testing.assert_close(with_dropped.gradient_sum, expected.gradient_sum, rtol=1e-4, atol=1e-7)
     assert int((with_dropped.steps == 0).sum()) > 0
@@ -210,6 +210,7 @@ def test_dropout_does_not_dilute_the_mean_gradient():
     g = torch.Generator().manual_seed(0)
     for _ in range(40):
         index = (torch.rand(50, generator=g) >= 0.5).nonzero().squeeze(1)
-        statistics.update(index, torch.tensor([[0.01, 0.0]]).expand(len(index), 2), 200, 100)
+        gradient = torch.tensor([[0.01, 0.0]]).expand(len(index), 2)
+        statistics.update(index, torch.ones_like(index, dtype=torch.bool), gradient, 200, 100)
     assert int(statistics.steps.max()) < 40  # everyone was dropped at times
     torch.testing.assert_close(statistics.mean_gradient, torch.ones(50))

@@ -10,7 +10,8 @@ from oracles import random_scene
 from reference_trainer.camera import Camera
 from reference_trainer.compat.radii import SMALLEST_SPREAD, longer_radii
 from reference_trainer.render import splat
-from reference_trainer.render.eager.projection import project, rotation_matrices
+from reference_trainer.render.eager.projection import project
+from reference_trainer.rotations import rotation_matrices
 
 
 def in_front(n, seed):

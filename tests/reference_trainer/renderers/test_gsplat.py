@@ -45,9 +45,8 @@ def rendered(renderer, scene, **options):
 def counted(out, camera):
     """What the trainer enters into the densification statistics."""
     statistics = DensityStatistics.zeros(N, out.image.device)
-    splats, drawn = out.splats, out.splats.lists.touched
-    gradient = splats.projection.means.grad[drawn]
-    statistics.update(splats.indices[drawn], gradient, camera.width, camera.height)
+    indices, drawn, gradient = out.splats.indices, out.splats.lists.touched, out.splats.projection.means.grad
+    statistics.update(indices, drawn, gradient, camera.width, camera.height)
     return statistics
 
 
