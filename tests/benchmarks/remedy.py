@@ -5,12 +5,14 @@
 
 The first arm is the reference. An arm is a list of settings of the training, such as "dropout=0.2; iterations=3000".
 ``choose`` measures held-out views that are like training views, and never a test view; ``final`` the test views. What
-is measured is kept: the same command continues, and further arms, scenes and seeds are added.
+is measured is kept: the same command continues, and further arms, scenes and seeds are added. ``table FILE`` prints
+those of a file: docs/data/remedy.json has what docs/remedy.md shows.
 """
 
 from __future__ import annotations
 
 import ast
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -48,10 +50,11 @@ SCENES = {
 
 CHOOSING = tuple(SCENES)[:3]
 _Views = Literal["choose", "final"]
+_Table = Literal["table"]
 
 
 def main(
-    views: Annotated[_Views, tyro.conf.Positional],
+    views: Annotated[_Views | _Table, tyro.conf.Positional],
     arms: Annotated[tuple[str, ...], tyro.conf.Positional],
     scenes: tuple[str, ...] = CHOOSING,
     seeds: int = 3,
@@ -61,13 +64,17 @@ def main(
     """Train every arm on every scene with every seed, and compare each with the first arm.
 
     Args:
-        views: what is measured: "choose" for held-out views that are like training views, "final" for the test views.
-        arms: settings of the training, such as "dropout=0.2; loss=photometric + co_adaptation(3.0)".
+        views: what is measured: "choose" for held-out views that are like training views, "final" for the test views;
+            "table" for what is in files.
+        arms: settings of the training, such as "dropout=0.2; loss=photometric + co_adaptation(3.0)", or the files.
         scenes: of the protocol.
         seeds: number of seeds; of all scenes and arms the first comes first.
         data: folder of the scenes.
         out: folder for the JSON and the table.
     """
+    if views == "table":
+        print("\n".join(_report(json.loads(Path(file).read_text("utf-8"))["records"]) for file in arms))
+        return
     run_study(remedy_study(views, arms, scenes=scenes, seeds=seeds, data=data), out)
 
 
@@ -176,11 +183,11 @@ def _report(records: Records) -> str:
                 for name, (title, unit) in _COLUMNS.items()
             }
             rows.append(
-                {"arm": f"`{text}`"} | means
+                {"arm": f"`{text}`", "seeds": str(len(by_seed))} | means
                 | {"difference": ", ".join(f"{gain:+.3f}" for gain in gains), "mean ± s. e.": _mean_and_error(gains)}
                 | {"time": f"{mean_std(times)[0]:.2f}"}
             )  # fmt: skip
-        parts += [f"## {scene}", markdown_table(rows, list(rows[0])).rstrip()]
+        parts += [f"**{scene}**", markdown_table(rows, list(rows[0])).rstrip()]
     return "\n\n".join(parts) + "\n"
 
 
