@@ -32,7 +32,7 @@ from reference_trainer.studies.study import Record, Records, Study, run_study
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["SCENES", "arm", "held_out", "remedy_study"]
+__all__ = ["SCENES", "arm", "held_out", "overview", "remedy_study"]
 
 COMMON = {"iterations": 1_500, "opacity_reset_every": 0}
 """What all trainings share, if an arm does not say otherwise."""
@@ -73,7 +73,7 @@ def main(
         out: folder for the JSON and the table.
     """
     if views == "table":
-        print("\n".join(_report(json.loads(Path(file).read_text("utf-8"))["records"]) for file in arms))
+        print("\n".join(overview(json.loads(Path(file).read_text("utf-8"))["records"]) for file in arms))
         return
     run_study(remedy_study(views, arms, scenes=scenes, seeds=seeds, data=data), out)
 
@@ -189,6 +189,28 @@ def _report(records: Records) -> str:
             )  # fmt: skip
         parts += [f"**{scene}**", markdown_table(rows, list(rows[0])).rstrip()]
     return "\n\n".join(parts) + "\n"
+
+
+def overview(records: Sequence[Record]) -> str:
+    """Return one table: what every arm gains over the first on each scene, and its ratios to it, the best first."""
+    of = {(record["arm"], record["scene"], record["seed"]): record for record in records}
+    scenes, reference = list(dict.fromkeys(record["scene"] for record in records)), records[0]["arm"]
+    rows = []
+    for text in dict.fromkeys(record["arm"] for record in records if record["arm"] != reference):
+        row, means = {"setting": f"`{text}`"}, []
+        pairs = {scene: [(x, y) for (a, s, seed), x in of.items() if (a, s) == (text, scene)
+                         and (y := of.get((reference, scene, seed)))] for scene in scenes}  # fmt: skip
+        for scene, both in pairs.items():
+            gains = [x["psnr"] - y["psnr"] for x, y in both]
+            row[scene] = f"{_mean_and_error(gains)} ({len(gains)})" if gains else "-"
+            means += [mean_std(gains)[0]] if gains else []
+        row["mean"] = f"{mean_std(means)[0]:+.3f}" if len(means) == len(scenes) else "-"
+        for name, title in (("ca_exact", "CA"), ("gaussians", "Gaussians"), ("processor_seconds", "time")):
+            ratios = [mean_std(x[name] / y[name] for x, y in both)[0] for both in pairs.values() if both]
+            row[title] = f"{mean_std(ratios)[0]:.2f}"
+        rows.append((mean_std(means)[0], row))
+    rows.sort(key=lambda each: (each[1]["mean"] != "-", each[0]), reverse=True)
+    return markdown_table([row for _, row in rows], ["setting", *scenes, "mean", "CA", "Gaussians", "time"])
 
 
 _COLUMNS = {

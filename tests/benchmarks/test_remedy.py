@@ -1,5 +1,8 @@
 """The paired study: views that choose are no test views, differences are of the same seed, and what is kept."""
 
+import json
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -53,3 +56,23 @@ def test_what_is_trained_alike_differs_by_nothing_and_is_kept(tmp_path, monkeypa
     again: list[str] = []
     assert run_study(study, tmp_path, say=again.append) == records
     assert not any(line.startswith("[") for line in again)
+
+
+def test_the_overview_has_means_of_pairs_and_says_where_a_scene_lacks():
+    rows = [("a", "s", 0, 20.0), ("b", "s", 0, 21.0), ("a", "t", 0, 30.0), ("a", "t", 1, 32.0), ("b", "t", 0, 32.0),
+            ("b", "t", 1, 33.0), ("c", "s", 0, 29.0)]  # fmt: skip
+    records = [
+        {"scene": scene, "arm": arm, "seed": seed, "psnr": psnr, "ca_exact": 1e-3 if arm == "a" else 5e-4,
+         "gaussians": 1000, "processor_seconds": 10.0} for arm, scene, seed, psnr in rows
+    ]  # fmt: skip
+    _, _, *lines = remedy.overview(records).splitlines()
+    assert lines == [
+        "| `b` | +1.000 (1) | +1.500 ± 0.500 (2) | +1.250 | 0.50 | 1.00 | 1.00 |",
+        "| `c` | +9.000 (1) | - | - | 0.50 | 1.00 | 1.00 |",
+    ]
+
+
+def test_the_page_shows_the_table_of_the_data():
+    docs = Path(__file__).parents[2] / "docs"
+    table = remedy.overview(json.loads((docs / "data" / "remedy.json").read_text("utf-8"))["records"])
+    assert table in (docs / "remedy.md").read_text("utf-8")
