@@ -75,7 +75,7 @@ def blocks(lists: TileLists, device: torch.device) -> Iterator[Block]:
     """Iterate over all tiles with a non-empty list; a list that alone is too long makes a block of its own."""
     pairs = BLOCK_PAIRS_CPU if device.type == "cpu" else BLOCK_PAIRS_CUDA
     lengths, tiles = torch.sort(lists.lengths, descending=True, stable=True)
-    sizes = lengths.tolist()
+    sizes = lengths.cpu().tolist()
     end = next((i for i, n in enumerate(sizes) if n == 0), len(sizes))
     first = 0
     while first < end:
