@@ -6,7 +6,8 @@
 The first arm is the reference. An arm is a list of settings of the training, such as "dropout=0.2; iterations=3000".
 ``choose`` measures held-out views that are like training views, and never a test view; ``final`` the test views. What
 is measured is kept: the same command continues, and further arms, scenes and seeds are added. ``table FILE`` prints
-those of a file: docs/data/remedy.json has what docs/remedy.md shows.
+those of a file, against the first arm or ``--reference``: docs/data/remedy.json and remedy_final.json have what
+docs/remedy.md shows.
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ def main(
     seeds: int = 3,
     data: str = "../shared/data",
     out: Path = Path("runs/remedy"),
+    reference: str = "",
 ) -> None:
     """Train every arm on every scene with every seed, and compare each with the first arm.
 
@@ -71,9 +73,10 @@ def main(
         seeds: number of seeds; of all scenes and arms the first comes first.
         data: folder of the scenes.
         out: folder for the JSON and the table.
+        reference: arm that a table compares with, the first of the file by default.
     """
     if views == "table":
-        print("\n".join(overview(json.loads(Path(file).read_text("utf-8"))["records"]) for file in arms))
+        print("\n".join(overview(json.loads(Path(file).read_text("utf-8"))["records"], reference) for file in arms))
         return
     run_study(remedy_study(views, arms, scenes=scenes, seeds=seeds, data=data), out)
 
@@ -191,10 +194,10 @@ def _report(records: Records) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def overview(records: Sequence[Record]) -> str:
-    """Return one table: what every arm gains over the first on each scene, and its ratios to it, the best first."""
+def overview(records: Sequence[Record], reference: str = "") -> str:
+    """Return one table: what every arm gains on each scene over one, the first, and its ratios to it, the best first."""
     of = {(record["arm"], record["scene"], record["seed"]): record for record in records}
-    scenes, reference = list(dict.fromkeys(record["scene"] for record in records)), records[0]["arm"]
+    scenes, reference = list(dict.fromkeys(record["scene"] for record in records)), reference or records[0]["arm"]
     rows = []
     for text in dict.fromkeys(record["arm"] for record in records if record["arm"] != reference):
         row, means = {"setting": f"`{text}`"}, []

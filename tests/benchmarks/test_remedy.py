@@ -70,9 +70,19 @@ def test_the_overview_has_means_of_pairs_and_says_where_a_scene_lacks():
         "| `b` | +1.000 (1) | +1.500 ± 0.500 (2) | +1.250 | 0.50 | 1.00 | 1.00 |",
         "| `c` | +9.000 (1) | - | - | 0.50 | 1.00 | 1.00 |",
     ]
+    assert "| `a` | -1.000 (1) | -1.500 ± 0.500 (2) | -1.250 | 2.00 | 1.00 | 1.00 |" in remedy.overview(records, "b")
 
 
-def test_the_page_shows_the_table_of_the_data():
+@pytest.mark.parametrize(
+    ("file", "reference"),
+    [
+        ("remedy", ""),
+        ("remedy_final", ""),
+        ("remedy_final", "dropout=0.2; opacity_decay=0.995; iterations=2100"),
+        ("remedy_final", "dropout=0.2; opacity_decay=0.995"),
+    ],
+)
+def test_the_page_shows_the_tables_of_the_data(file, reference):
     docs = Path(__file__).parents[2] / "docs"
-    table = remedy.overview(json.loads((docs / "data" / "remedy.json").read_text("utf-8"))["records"])
+    table = remedy.overview(json.loads((docs / "data" / f"{file}.json").read_text("utf-8"))["records"], reference)
     assert table in (docs / "remedy.md").read_text("utf-8")
