@@ -82,14 +82,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--noise", type=float, metavar="SIGMA", help="standard deviation of the relative opacity noise, e.g. 0.8")
     add("--start", type=int, default=0, metavar="STEP", help="first step with --dropout and --noise (default: 0)")
     add("--ramp", type=int, metavar="STEPS", help="raise both rates linearly from 0 over so many steps after --start")
-    add(
-        "--scope", choices=get_args(Scope), default="main", help="first training render of a step and its batch, or all"
-    )
+    add("--scope", choices=get_args(Scope), default="main", help="a step's first training render and its batch, or all")
     add("--seed", type=int, default=0, help="of masks and noise (default: 0); the script's random numbers are its own")
     add("--report", type=Path, metavar="FILE", help="write what was done as JSON, too")
-    add(
-        "--cpu", action="store_true", help="run without CUDA, by a stand-in for the code base's rasterizer, or gsplat's"
-    )
+    add("--cpu", action="store_true", help="run without CUDA, by a stand-in for the code base's rasterizer or gsplat's")
     add("--rasterizer", metavar="MODULE:CLASS", help="the class that renders, if it is not found in the source")
     add("--outputs", type=lambda text: tuple(text.split(",")), metavar="NAME,...", help="what the stand-in returns, if "
         "the script's names for it do not tell, such as image,radii,depth or image+normal+alpha,radii")  # fmt: skip
@@ -119,9 +115,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     options.gsplat = not of_inria and sources.need("gsplat")
     meaningless = [name for name in _OF_INRIA if getattr(options, name) != parser.get_default(name)]
     if options.gsplat and meaningless:
-        parser.error(
-            f"{options.script} renders with gsplat, for which there is no --{meaningless[0].replace('_', '-')}"
-        )
+        parser.error(f"{options.script} is one of gsplat's, for which there is no --{meaningless[0].replace('_', '-')}")
     if options.patience < 0:
         parser.error("--patience must be at least 0")
     if options.report is not None:
@@ -184,6 +178,11 @@ def _reported(options: argparse.Namespace, hook: Hook | None) -> Iterator[None]:
             raise
     except BaseException as error:
         ended = f"{type(error).__name__}: {error}".rstrip(": ")
+        if options.cpu and isinstance(error, ModuleNotFoundError):
+            problem = (
+                f"There is no module {error.name}: install it, name its class if it rasterizes (--rasterizer "
+                f"{error.name}:CLASS), or put a file in its place, beside the script, with what that calls of it"
+            )
         raise
     finally:
         report: dict[str, Any] = {name: getattr(options, name) for name in _REPORTED}

@@ -6,9 +6,11 @@ import random
 import sys
 import textwrap
 
+import numpy as np
 import torch
+from PIL import Image
 
-from benchmarks import side_by_side
+from benchmarks import side_by_side, trainers
 from benchmarks.timed import main
 
 
@@ -44,18 +46,48 @@ def test_what_is_kept_is_not_measured_again(tmp_path, monkeypatch):
 
     def train(trainer, setting, seed, out, args):
         asked.append((trainer, setting, seed))
-        return {"setting": side_by_side.named(trainer, setting), "seed": seed, "gaussians": 9}
+        return {"setting": trainers.named(trainer, setting), "seed": seed, "gaussians": 9}
 
     monkeypatch.setattr(side_by_side, "train", train)
-    options = ["", str(tmp_path / "rows.json"), "--out", str(tmp_path / "out")]
-    options += ["--trainers", "gsplat", "splatfacto-ca", "--seeds"]
-    for name in ("scene", "train", "both", "3DGS", "gsplat"):
-        options[1:1] = [f"--{name}", str(tmp_path)]
+    (tmp_path / "llff").mkdir()
+    (tmp_path / "llff" / "poses_bounds.npy").touch()  # the scene for the repositories is written already
+    options = ["", str(tmp_path / "rows.json"), "--scene", str(tmp_path), "--out", str(tmp_path)]
+    options += ["--trainers", "AbsGS", "DropGaussian", "splatfacto-ca", "fsgs: FSGS", "--seeds"]
     for seeds in (["0"], ["0", "1"]):
         monkeypatch.setattr(sys, "argv", [*options, *seeds])
         side_by_side.main()
-    runs = [("gsplat", "plain"), ("gsplat", "dropout"), ("splatfacto-ca", "dropout")]
+    runs = [("AbsGS", "plain"), ("AbsGS", "dropout"), ("DropGaussian", "plain"), ("DropGaussian", "noise")]
+    runs += [("splatfacto-ca", "dropout"), ("fsgs: FSGS", "plain")]
     assert asked == [(*run, seed) for seed in (0, 1) for run in runs]
+
+
+def test_every_command_line_is_complete():
+    names = {"scene": "s", "images": "i", "out": "o", "forks": "f", "both": "b", "fork_scene": "l", "seed": 7}
+    for trainer, command in trainers.TRAINERS.items():
+        told = command.format(**names, **trainers.steps(300), option="--dropout 0.2").split()
+        own = trainer in ("splatfacto-ca", "Co-Adaptation-of-3DGS --dropout_factor 0.2")
+        assert (told.count("--dropout"), told.count("--seed"), told[told.index("--seed") + 1]) == (1 - own, 1, "7")
+        assert "300" in told
+        assert own == (trainers.named(trainer, "dropout") == {"recipe": trainer})
+    assert len({trainers.TRAINERS[name] for name in trainers.TRAINERS}) == len(trainers.TRAINERS)
+
+
+def test_depth_of_a_network_that_is_downloaded_is_that_of_files(tmp_path, monkeypatch):
+    (tmp_path / "depth").mkdir()
+    for number in (2, 1):
+        Image.fromarray(np.full((2, 3), number, np.uint8)).save(tmp_path / "depth" / f"{number}.png")
+    script = """
+        import pathlib, sys, torch
+        network = torch.hub.load("someone/MiDaS", "DPT")
+        depths = [network(torch.zeros(1, 3, 2, 3)) for _ in range(3)]
+        assert all(depth.shape == (1, 2, 3) for depth in depths)
+        pathlib.Path(sys.argv[1]).write_text(str([depth.mean().item() for depth in depths]))
+    """
+    (tmp_path / "a_loader.py").write_text(textwrap.dedent(script))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "argv", [])
+    main(str(tmp_path / "times.json"), "0", "a_loader", str(tmp_path / "seen"), "-s", str(tmp_path))
+    assert (tmp_path / "seen").read_text() == "[1.0, 2.0, 1.0]"
 
 
 def test_another_interpreter_may_evaluate(tmp_path, monkeypatch):
@@ -69,7 +101,8 @@ def test_another_interpreter_may_evaluate(tmp_path, monkeypatch):
             found = {"mean": {"test": test}, "gaussians": 7}
             (tmp_path / "evaluation" / "evaluation.json").write_text(json.dumps(found))
         (tmp_path / "times.json").write_text(json.dumps({"seconds": 4.0}))
-        (tmp_path / "splat.ply").touch()
+        (tmp_path / "export").mkdir(exist_ok=True)
+        (tmp_path / "export" / "splat.ply").touch()
 
     monkeypatch.setattr(side_by_side.subprocess, "run", run)
     given = {"scene": "fern", "images": "images", "both": "both", "iterations": 5, "evaluator": "evaluating"}

@@ -93,6 +93,15 @@ def test_the_report_comes_however_the_script_ends(repository, tmp_path, capsys, 
     assert "1 renders regularized" in capsys.readouterr().err
 
 
+def test_a_missing_extension_is_named_with_the_ways_out(repository, capsys):
+    (repository / "train.py").write_text("import an_extension._C\n")
+    with pytest.raises(ModuleNotFoundError):
+        main(["--cpu", str(repository / "train.py")])
+    assert re.search(
+        r"ERROR: There is no module an_extension: install.*--rasterizer an_extension:CLASS", capsys.readouterr().err
+    )
+
+
 def test_a_script_that_does_not_render_is_an_error(repository, tmp_path, capsys):
     (repository / "other.py").write_text("print('done')\n")
     report = tmp_path / "report.json"
@@ -281,7 +290,7 @@ def test_a_script_that_calls_gsplat_is_told_from_the_others(tmp_path, capsys, re
     assert all(a < 0.8 * b for a, b in zip(seen(regularized.out), seen(plain), strict=True))
     assert draws(plain) == draws(regularized.out)
     assert launch("--scope", "all", "--dropout", 0.5, script) == 2
-    assert "renders with gsplat, for which there is no --scope" in capsys.readouterr().err
+    assert "is one of gsplat's, for which there is no --scope" in capsys.readouterr().err
 
 
 def test_an_installed_command_is_a_script_as_well(tmp_path, monkeypatch):
