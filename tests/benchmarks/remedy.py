@@ -195,7 +195,7 @@ def _report(records: Records) -> str:
 
 
 def overview(records: Sequence[Record], reference: str = "") -> str:
-    """Return one table: what every arm gains on each scene over one, the first, and its ratios to it, the best first."""
+    """Return one table: what every arm gains on each scene over one (the first), and its ratios to it, best first."""
     of = {(record["arm"], record["scene"], record["seed"]): record for record in records}
     scenes, reference = list(dict.fromkeys(record["scene"] for record in records)), reference or records[0]["arm"]
     rows = []
