@@ -76,7 +76,7 @@ class TileLists:
     def padded(self, image: Tensor) -> Tensor:
         """Return an image (..., H, W) with zeros up to the borders of the tiles."""
         missing = (0, TILE * self.columns - self.width, 0, TILE * self.rows - self.height)
-        return torch.nn.functional.pad(image, missing)
+        return torch.nn.functional.pad(image, missing) if any(missing) else image
 
     def cut(self, image: Tensor) -> Tensor:
         """Return the part (..., H, W) of an image of whole tiles."""

@@ -46,7 +46,7 @@ def _have_ended(state: Any) -> Any:
 
 
 @inlined
-def _finish(state: Any, background: Any, drawn: Any, tile: Any, columns: Any) -> None:
+def _finish(state: Any, background: Any, light: Any, image: Any, tile: Any, columns: Any) -> None:
     """Put the background behind a tile, and the tile into the picture."""
     for p in range(PIXELS):
         through = abs(state[_LIGHT + p])
@@ -54,13 +54,15 @@ def _finish(state: Any, background: Any, drawn: Any, tile: Any, columns: Any) ->
         state[_RED + p] += through * background[0]
         state[_GREEN + p] += through * background[1]
         state[_BLUE + p] += through * background[2]
-    tiles.store(state, _LIGHT, drawn, tile, columns)
+    tiles.store(state, _LIGHT, light, tile, columns)
+    tiles.store(state, _RED, image, tile, columns)
 
 
 @kernel
 def _forward(
-    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array, drawn: Array
-) -> None:
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array, light: Array,
+    image: Array,
+) -> None:  # fmt: skip
     s, entries = np.empty(4 * PIXELS, f4), np.empty((CHUNK + 1, 9), f4)
     for tile in range(first, last):
         s[:] = _ZERO
@@ -80,7 +82,7 @@ def _forward(
                     s[_LIGHT + p] = rest
             if _have_ended(s):
                 break
-        _finish(s, background, drawn, tile, columns)
+        _finish(s, background, light, image, tile, columns)
 
 
 @inlined
@@ -92,10 +94,11 @@ def _lowered(alpha: Any, factor: Any) -> Any:
 
 @kernel
 def _masked(
-    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array, drawn: Array
-) -> None:
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array,
+    lights: Array, images: Array,
+) -> None:  # fmt: skip
     """Draw K pictures of the same lists; what is more in the table are factors of the alphas in each."""
-    count = drawn.shape[0]
+    count = images.shape[0]
     states, ended, kept = np.empty((count, 4 * PIXELS), f4), np.empty(count, np.bool_), np.empty(CHUNK + 1, np.int64)
     entries, alphas = np.empty((CHUNK + 1, table.shape[1]), f4), np.empty((CHUNK + 1, PIXELS), f4)
     for tile in range(first, last):
@@ -133,7 +136,7 @@ def _masked(
                         s[_LIGHT + p] = rest
                 ended[picture] = _have_ended(s)
         for picture in range(count):
-            _finish(states[picture], background, drawn[picture], tile, columns)
+            _finish(states[picture], background, lights[picture], images[picture], tile, columns)
 
 
 def _make_backward(absolute: bool) -> Any:
@@ -141,13 +144,15 @@ def _make_backward(absolute: bool) -> Any:
 
     @kernel
     def _backward(
-        first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array, drawn: Array,
-        upstream: Array, rows: Array,
+        first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array, light: Array,
+        image: Array, to_light: Array, to_image: Array, rows: Array,
     ) -> None:  # fmt: skip
         s, d = np.empty(7 * PIXELS, f4), np.empty(5 * PIXELS, f4)
         for tile in range(first, last):
-            tiles.load(upstream, tile, columns, s, _LIGHT)
-            tiles.load(drawn, tile, columns, d, _LIGHT)
+            tiles.load(to_light, tile, columns, s, _LIGHT)
+            tiles.load(to_image, tile, columns, s, _RED)
+            tiles.load(light, tile, columns, d, _LIGHT)
+            tiles.load(image, tile, columns, d, _RED)
             for p in range(PIXELS):
                 of_colors = s[_RED + p] * d[_RED + p] + s[_GREEN + p] * d[_GREEN + p] + s[_BLUE + p] * d[_BLUE + p]
                 s[_BEHIND + p] = of_colors + s[_LIGHT + p] * d[_LIGHT + p]
@@ -199,39 +204,38 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
     """Draw all in one pass, see `Engine.composite_masks`: what does not depend on the opacity is evaluated once."""
     highest = opacities.amax(0)
     table = tiles.make_table(splats._replace(opacities=highest), (opacities / highest).T)
-    drawn = tiles.whole_tiles(splats.lists, len(opacities), 4)
-    tiles.over_tiles(_masked, splats.lists, table, background, drawn)
-    drawn = splats.lists.cut(drawn)
-    return drawn[:, 1:], 1 - drawn[:, 0]
+    lights, images = (tiles.whole_tiles(splats.lists, len(opacities), channels) for channels in (1, 3))
+    tiles.over_tiles(_masked, splats.lists, table, background, lights, images)
+    return splats.lists.cut(images), 1 - splats.lists.cut(lights[:, 0])
 
 
 class _Composite(torch.autograd.Function):
-    """Of a table of splats: what light is left, and their image over the background, (4, whole tiles)."""
+    """Of a table of splats: what light is left, (1, H, W), and their image over the background."""
 
     @staticmethod
-    def forward(ctx: Any, splats: Splats, background: Tensor, *_differentiable: Tensor) -> Tensor:
+    def forward(ctx: Any, splats: Splats, background: Tensor, *_differentiable: Tensor) -> tuple[Tensor, Tensor]:
         table, ctx.lists = tiles.make_table(splats), splats.lists
-        drawn = tiles.whole_tiles(ctx.lists, 4)
-        tiles.over_tiles(_forward, ctx.lists, table, background, drawn)
-        ctx.save_for_backward(table, drawn)
-        return drawn
+        light, image = (tiles.whole_tiles(ctx.lists, channels) for channels in (1, 3))
+        tiles.over_tiles(_forward, ctx.lists, table, background, light, image)
+        ctx.save_for_backward(table, light, image)
+        return ctx.lists.cut(light), ctx.lists.cut(image)
 
     @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        table, drawn = ctx.saved_tensors
+    def backward(ctx: Any, to_light: Tensor, to_image: Tensor) -> tuple[Tensor | None, ...]:
+        table, light, image = ctx.saved_tensors
+        upstream = ctx.lists.padded(to_light), ctx.lists.padded(to_image)
         rows = table.new_empty(ctx.lists.gaussians.shape[0], 9)
-        tiles.over_tiles(_backward, ctx.lists, ctx.lists.slots, table, drawn, upstream, rows)
-        to_background = (upstream[1:] * drawn[:1]).sum((1, 2)) if ctx.needs_input_grad[1] else None
-        return None, to_background, *tiles.geometry_gradients(table, tiles.sum_rows(rows, ctx.lists))
+        tiles.over_tiles(_backward, ctx.lists, ctx.lists.slots, table, light, image, *upstream, rows)
+        to_background = (upstream[1] * light).sum((1, 2)) if ctx.needs_input_grad[1] else None
+        return None, to_background, *tiles.sum_rows(rows, table, ctx.lists)[:4]
 
 
 def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
     """Draw splats front to back, see `Engine.composite`; depth as the red of a second picture."""
     p = splats.projection
-    drawn = _Composite.apply(  # type: ignore[no-untyped-call]
+    light, image = _Composite.apply(  # type: ignore[no-untyped-call]
         splats, background, p.means, p.factors, splats.opacities, splats.colors
     )
-    light, image = torch.split(splats.lists.cut(drawn), [1, 3])
     if not depth:
         return image, 1 - light[0], None
     red = torch.nn.functional.pad(p.depths[:, None], (0, 2))
@@ -241,8 +245,8 @@ def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tenso
 def absolute_gradients(splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
     """Sum the absolute gradients of positions, see `Engine.absolute_gradients`."""
     lists, table = splats.lists, tiles.make_table(splats, splats.projection.depths[:, None])
-    images, upstream = torch.cat([1 - drawn[4:], drawn[:4]]), torch.cat([-gradient[4:], gradient[:4]])
     rows = table.new_empty(lists.gaussians.shape[0], 2)
     assert lists.slots is not None
-    tiles.over_tiles(_absolute, lists, lists.slots, table, lists.padded(images), lists.padded(upstream), rows)
-    return tiles.sum_rows(rows, lists)
+    images = (lists.padded(x) for x in (1 - drawn[4:], drawn[:4], -gradient[4:], gradient[:4]))
+    tiles.over_tiles(_absolute, lists, lists.slots, table, *images, rows)
+    return torch.segment_reduce(rows, "sum", offsets=lists.offsets)

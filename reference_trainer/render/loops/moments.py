@@ -182,13 +182,15 @@ def _make_backward(complete: bool) -> Any:
 _backward, _complete_backward = _make_backward(False), _make_backward(True)
 
 
-def _gradients(lists: TileLists, table: Tensor, behind: Tensor, upstream: Sequence[Tensor], complete: bool) -> Any:
-    """Return the gradients of the table's rows and their shares, (M, 12), and of what is behind."""
+def _gradients(
+    lists: TileLists, table: Tensor, behind: Tensor, upstream: Sequence[Tensor], complete: bool
+) -> list[Tensor]:
+    """Return the gradients of splats, of their multipliers with the shares, (M, 3), and of what is behind."""
     rows, to_behind = table.new_empty(lists.gaussians.shape[0], 12), torch.empty_like(behind)
     assert lists.slots is not None
     kernel = _complete_backward if complete else _backward
     tiles.over_tiles(kernel, lists, lists.slots, table, behind, *upstream, rows, to_behind)
-    return tiles.sum_rows(rows, lists), to_behind
+    return [*tiles.sum_rows(rows, table, lists), to_behind]
 
 
 class _Moments(torch.autograd.Function):
@@ -208,8 +210,8 @@ class _Moments(torch.autograd.Function):
         table, behind = ctx.saved_tensors
         complete = gradients[2] is not None or ctx.needs_input_grad[1]
         upstream = [torch.zeros_like(behind) if x is None else x for x in gradients]
-        sums, to_behind = _gradients(ctx.lists, table, behind, upstream, complete)
-        return None, sums[:, 9:11], to_behind, *tiles.geometry_gradients(table, sums)
+        *of_splats, more, to_behind = _gradients(ctx.lists, table, behind, upstream, complete)
+        return None, more[:, :2], to_behind, *of_splats
 
 
 def moments(splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
@@ -227,5 +229,5 @@ def shares(splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) 
     lists, table = splats.lists, tiles.make_table(splats, multiplier)
     upstream = lists.padded((weights / 3).expand(3, -1, -1))
     nothing = torch.zeros_like(upstream)
-    sums: Tensor = _gradients(lists, table, lists.padded(behind), (nothing, upstream, nothing), complete=True)[0]
-    return sums[:, 11].double()
+    *_, more, _ = _gradients(lists, table, lists.padded(behind), (nothing, upstream, nothing), complete=True)
+    return more[:, 2].double()

@@ -18,8 +18,7 @@ from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
     "CHUNK", "PIXELS", "X", "Y", "absolute_slopes", "alpha_at", "clamped", "footprint", "footprint_gradient",
-    "footprint_of", "geometry_gradients", "is_faint", "load", "make_table", "over_tiles",
-    "read_entries", "store", "sum_rows", "whole_tiles",
+    "footprint_of", "is_faint", "load", "make_table", "over_tiles", "read_entries", "store", "sum_rows", "whole_tiles",
 ]  # fmt: skip
 
 Array = Any
@@ -36,6 +35,7 @@ Y = np.repeat(np.arange(TILE, dtype=f4) - f4((TILE - 1) / 2), TILE)
 
 _ZERO, _ONE, _TWO, _MAX = f4(0), f4(1), f4(2), f4(MAX_ALPHA)
 _HALF = f4(0.5 * np.log2(np.e))  # exp(-x / 2) = 2^(-_HALF x)
+_LEAST = f4(MIN_ALPHA)
 _FAINT = f4(np.log2(MIN_ALPHA))
 _ABSENT = f4(-1e4)  # binary logarithm of an opacity that is 0 everywhere
 
@@ -44,10 +44,29 @@ _P0, _P1, _P2 = f4(1.00000007165467), f4(0.69314696706436), f4(0.24022119723882)
 _P3, _P4, _P5 = f4(0.05550713274154), f4(0.00967554133273), f4(0.00132764717803)
 
 
-def make_table(splats: Splats, *more: Tensor) -> Tensor:
+def make_table(splats: Splats, more: Tensor | None = None) -> Tensor:
     """Return x, y, l11, l21, l22, log2 of the opacity, red, green, blue, and more of M splats, shape (M, 9 or more)."""
-    projection, logarithms = splats.projection, torch.log2(splats.opacities)[:, None]
-    return torch.cat([projection.means, projection.factors, logarithms, splats.colors, *more], dim=1).detach()
+    opacities = splats.opacities.detach()
+    more = opacities.new_empty(len(opacities), 0) if more is None else more
+    table = opacities.new_empty(len(opacities), 9 + more.shape[1])
+    columns = (splats.projection.means, splats.projection.factors, opacities, splats.colors, more)
+    arrays = (x.detach().contiguous().numpy() for x in (*columns, table))
+    in_threads(_fill_table, len(table), *arrays, least=4096)
+    return table
+
+
+@kernel
+def _fill_table(
+    first: int, last: int, means: Array, factors: Array, opacities: Array, colors: Array, more: Array, table: Array
+) -> None:
+    for i in range(first, last):
+        row = table[i]
+        row[0], row[1] = means[i, 0], means[i, 1]
+        row[2], row[3], row[4] = factors[i, 0], factors[i, 1], factors[i, 2]
+        row[5] = np.log2(opacities[i])
+        row[6], row[7], row[8] = colors[i, 0], colors[i, 1], colors[i, 2]
+        for column in range(more.shape[1]):
+            row[9 + column] = more[i, column]
 
 
 def whole_tiles(lists: TileLists, *channels: int) -> Tensor:
@@ -61,28 +80,36 @@ def over_tiles(kernel: Any, lists: TileLists, *arguments: Tensor) -> None:
     in_threads(kernel, lists.columns * lists.rows, lists.columns, *arrays, least=16)
 
 
-def sum_rows(rows: Tensor, lists: TileLists) -> Tensor:
-    """Add up the rows of every Gaussian's entries, (P, C), always in the same order; shape (M, C)."""
+def sum_rows(rows: Tensor, table: Tensor, lists: TileLists) -> list[Tensor]:
+    """Add up the rows of every splat's entries, (P, 9 or more), always in the same order.
+
+    Returns the gradients of means, factors, opacities and colours, and the sums of the columns that are left.
+    """
     assert lists.offsets is not None
-    sums = rows.new_empty(lists.offsets.shape[0] - 1, rows.shape[1])
-    in_threads(_sum_rows, sums.shape[0], lists.offsets.numpy(), rows.numpy(), sums.numpy(), least=4096)
+    sums = [table.new_empty(len(table), *shape) for shape in ((2,), (3,), (), (3,), (rows.shape[1] - 9,))]
+    arrays = (x.numpy() for x in (lists.offsets, rows, table, *sums))
+    in_threads(_sum_rows, len(table), *arrays, least=4096)
     return sums
 
 
 @kernel
-def _sum_rows(first: int, last: int, offsets: Array, rows: Array, sums: Array) -> None:
+def _sum_rows(
+    first: int, last: int, offsets: Array, rows: Array, table: Array, to_means: Array, to_factors: Array,
+    to_opacities: Array, to_colors: Array, more: Array,
+) -> None:  # fmt: skip
+    total = np.empty(rows.shape[1], f4)
     for i in range(first, last):
-        for column in range(rows.shape[1]):
-            sums[i, column] = 0
+        total[:] = _ZERO
         for row in range(offsets[i], offsets[i + 1]):
             for column in range(rows.shape[1]):
-                sums[i, column] += rows[row, column]
-
-
-def geometry_gradients(table: Tensor, sums: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the gradients of means, factors, opacities and colours, given those of a table's rows (M, 9 or more)."""
-    # A splat that a mask has dropped has no logarithm, and a gradient of 0.
-    return sums[:, :2], sums[:, 2:5], sums[:, 5] / table[:, 5].exp2().clamp_min(MIN_ALPHA), sums[:, 6:9]
+                total[column] += rows[row, column]
+        to_means[i, 0], to_means[i, 1] = total[0], total[1]
+        to_factors[i, 0], to_factors[i, 1], to_factors[i, 2] = total[2], total[3], total[4]
+        # A splat that a mask has dropped has no logarithm, and a gradient of 0.
+        to_opacities[i] = total[5] / max(np.exp2(table[i, 5]), _LEAST)
+        to_colors[i, 0], to_colors[i, 1], to_colors[i, 2] = total[6], total[7], total[8]
+        for column in range(more.shape[1]):
+            more[i, column] = total[9 + column]
 
 
 @inlined
