@@ -80,6 +80,7 @@ def test_the_overview_has_means_of_pairs_and_says_where_a_scene_lacks():
         ("remedy_final", ""),
         ("remedy_final", "dropout=0.2; opacity_decay=0.995; iterations=2100"),
         ("remedy_final", "dropout=0.2; opacity_decay=0.995"),
+        ("remedy_default", "dropout=0.2; iterations=3000; opacity_reset_every=3000"),
     ],
 )
 def test_the_page_shows_the_tables_of_the_data(file, reference):
