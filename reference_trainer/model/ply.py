@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,7 +32,7 @@ class PlyModel:
     """What a PLY file holds.
 
     Args:
-        gaussians: the Gaussians, float32 on the CPU, exactly as stored.
+        gaussians: the Gaussians, float32 on the CPU, exactly as stored but for a ``filter_3D``, which is applied.
         opacity_scale: the factor that is already part of the stored opacities, 1.0 if none is: a model trained with
             dropout ``p`` and saved with ``bake_p=p`` has ``1 - p`` here and must not be scaled again.
         for_rendering: whether the file was saved with ``opacities=``: those in it are to be rendered as they are, and
@@ -107,7 +106,8 @@ def save_ply(
         logits, comments = _logits(opacities.detach(), len(gaussians)), [f"comment {_FOR_RENDERING}"]
     elif bake_p:
         # The decimal of 1 - 0.2 is written, not the neighbouring double that the subtraction gives.
-        logits, comments = _scaled_logits(logits, 1 - bake_p), [f"comment {_SCALED} {round(1 - bake_p, 12)}"]
+        factor = torch.tensor(1 - bake_p, dtype=torch.float64)
+        logits, comments = _scaled_logits(logits, factor), [f"comment {_SCALED} {round(1 - bake_p, 12)}"]
     if regularizer:
         comments.append(f"comment {_TRAINED_WITH} {step} {' '.join(regularizer.split())}")
     n, rest = len(gaussians), gaussians.sh_rest.detach().transpose(1, 2)  # [N, 3, K]
@@ -129,9 +129,9 @@ def save_ply(
 def load_ply(path: str | Path) -> PlyModel:
     """Read Gaussians from a 3DGS PLY file: binary of either byte order or ASCII, properties in any order and type.
 
-    Normals and unknown properties are ignored. Spherical harmonics may have any degree from 0 to 3. The 3D filter of
-    Mip-Splatting changes scales and opacities, so a file with one is refused rather than drawn without it; compressed
-    files are refused as well.
+    Normals and unknown properties are ignored. Spherical harmonics may have any degree from 0 to 3. A ``filter_3D``
+    is applied to scales and opacities, as the 3D smoothing filter of Mip-Splatting (arXiv:2311.16493) defines it: each
+    Gaussian is convolved with a normalized isotropic one of that standard deviation. Compressed files are refused.
 
     Raises:
         ValueError: if the file is no such PLY, is shorter than its header says, or holds values that are not finite;
@@ -148,19 +148,19 @@ def load_ply(path: str | Path) -> PlyModel:
     missing = [name for name in required if name not in properties]
     if missing:
         raise ValueError(f"{path} is not a 3D Gaussian Splatting PLY: its vertices lack {', '.join(missing)}.")
-    if "filter_3D" in properties:
-        raise ValueError(
-            f"{path} has scales and opacities that need its filter_3D (Mip-Splatting): give the fused PLY, which "
-            "create_fused_ply.py of that code base writes."
-        )
     if len(rest) not in (0, 9, 24, 45):
         raise ValueError(f"{path} has {len(rest)} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45.")
 
+    log_scales, logits = columns(_SCALES), columns(["opacity"])[:, 0]
+    if "filter_3D" in properties:
+        wider = torch.logaddexp(2 * log_scales.double(), 2 * columns(["filter_3D"]).double().log()) / 2
+        logits = _scaled_logits(logits, (log_scales - wider).sum(dim=1).exp()).float()  # by the ratio of the volumes
+        log_scales = wider.float()
     gaussians = Gaussians(
         means=columns(_MEANS),
-        log_scales=columns(_SCALES),
+        log_scales=log_scales,
         quaternions=columns(_ROTATIONS),
-        opacity_logits=columns(["opacity"])[:, 0],
+        opacity_logits=logits,
         sh_dc=columns(_DC)[:, None, :],
         sh_rest=columns(rest).reshape(len(vertices.rows), 3, len(rest) // 3).transpose(1, 2).contiguous(),
         learned={
@@ -186,12 +186,12 @@ def _logits(opacities: Tensor, count: int) -> Tensor:
     return torch.logit(opacities.double())
 
 
-def _scaled_logits(logits: Tensor, factor: float) -> Tensor:
+def _scaled_logits(logits: Tensor, factor: Tensor) -> Tensor:
     """Return ``logit(factor * sigmoid(logits))`` in float64, without the cancellation of ``1 - x``."""
     logits = logits.double()
     opaque, clear = logsigmoid(logits), logsigmoid(-logits)
-    denominator = torch.logaddexp(opaque + math.log1p(-factor), clear)  # 1 - f s = (1 - f) s + (1 - s)
-    return opaque + math.log(factor) - denominator
+    denominator = torch.logaddexp(opaque + torch.log1p(-factor), clear)  # 1 - f s = (1 - f) s + (1 - s)
+    return opaque + factor.log() - denominator
 
 
 def _opacity_scale(comments: list[str], path: Path) -> float:

@@ -54,4 +54,7 @@ def write_scene(scene: Scene, folder: Path) -> None:
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
     for ply in (sparse / "points3D.ply", folder / "3_views/dense/fused.ply"):
         ply.write_bytes(header.encode() + rows.tobytes())
+    np.save(sparse / "confidence_dsp.npy", np.zeros((len(rows), 1)))  # of the points, for InstantSplat
+    if not (folder / "sparse_3").exists():
+        (folder / "sparse_3").symlink_to("sparse")
     np.save(folder / "poses_bounds.npy", np.tile([0.0] * 15 + list(depth_bounds(scene)), (len(scene.train), 1)))

@@ -52,12 +52,13 @@ def test_what_is_kept_is_not_measured_again(tmp_path, monkeypatch):
     (tmp_path / "llff").mkdir()
     (tmp_path / "llff" / "poses_bounds.npy").touch()  # the scene for the repositories is written already
     options = ["", str(tmp_path / "rows.json"), "--scene", str(tmp_path), "--out", str(tmp_path)]
-    options += ["--trainers", "AbsGS", "DropGaussian", "splatfacto-ca", "fsgs: FSGS", "--seeds"]
+    options += ["--trainers", "AbsGS", "DropGaussian", "3DGS", "splatfacto-ca", "fsgs: FSGS", "--seeds"]
     for seeds in (["0"], ["0", "1"]):
         monkeypatch.setattr(sys, "argv", [*options, *seeds])
         side_by_side.main()
-    runs = [("AbsGS", "plain"), ("AbsGS", "dropout"), ("DropGaussian", "plain"), ("DropGaussian", "noise")]
-    runs += [("splatfacto-ca", "dropout"), ("fsgs: FSGS", "plain")]
+    runs = [("AbsGS", "plain"), ("AbsGS", "dropout"), ("AbsGS", "noise"), ("DropGaussian", "plain")]
+    runs += [("DropGaussian", "noise"), ("3DGS", "plain"), ("3DGS", "dropout"), ("splatfacto-ca", "dropout")]
+    runs += [("fsgs: FSGS", "plain")]
     assert asked == [(*run, seed) for seed in (0, 1) for run in runs]
 
 

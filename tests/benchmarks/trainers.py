@@ -20,6 +20,22 @@ _FORK = (
     "--densification_interval {sixth} "
 )
 
+_FORKS = {  # and the options of each
+    "Co-Adaptation-of-3DGS": "--n_views 3 --shift_cam_start {two_thirds} --dropout_factor 0",
+    "Binocular3DGS": "--n_views 3 --shift_cam_start {two_thirds}",
+    "AbsGS": "",
+    "MVGS": "--mv 2",
+    "DropGaussian": "--n_views 3",
+    "CoR-GS": "--n_views 3 --gaussiansN 2 --coreg",
+    "FSGS": "--n_views 3",
+    "gaussian-splatting": "",
+    "3dgs-mcmc": "--init_type sfm --cap_max 20000",
+    "taming-3dgs": "--densify_until_iter {n} --percent_dense 0.07 --budget 2 --mode multiplier --cams 3",
+    "LightGaussian": f"--prune_iterations {_NEVER}",  # its pruning counts Gaussians, which is refused by name
+    "InstantSplat": "--n_views 3",
+    "mip-splatting": "",
+    "RaDe-GS": "",
+}
 # Each with its own settings, but for where densification begins, and what would leave the coordinates of the scene.
 TRAINERS = {
     "ca-reg": f"{_OURS}--densify-from 100 --densify-gradient 0.0002 --seed {{seed}} {{option}}",
@@ -34,18 +50,10 @@ TRAINERS = {
     "--pipeline.model.background-color black --data {both} colmap --colmap-path sparse/0 --images-path images "
     "--downscale-factor 1 --eval-mode interval --eval-interval 2 --auto-scale-poses False --center-method none "
     "--orientation-method none --assume-colmap-world-coordinate-convention False",
-} | {
-    name: f"{_LAUNCHED}{{forks}}/{name}/train.py {_FORK}{options}"
-    for name, options in {
-        "Co-Adaptation-of-3DGS": "--n_views 3 --shift_cam_start {two_thirds} --dropout_factor 0",
-        "Binocular3DGS": "--n_views 3 --shift_cam_start {two_thirds}",
-        "AbsGS": "",
-        "MVGS": "--mv 2",
-        "DropGaussian": "--n_views 3",
-        "CoR-GS": "--n_views 3 --gaussiansN 2 --coreg",
-        "FSGS": "--n_views 3",
-    }.items()
 }
+TRAINERS |= {name: f"{_LAUNCHED}{{forks}}/{name}/train.py {_FORK}{options}" for name, options in _FORKS.items()}
+TRAINERS["3dgs-mcmc"] = TRAINERS["3dgs-mcmc"].replace("--port 0 ", "")
+TRAINERS["LightGaussian"] = TRAINERS["LightGaussian"].replace("train.py", "train_densify_prune.py")
 # Those that drop Gaussians themselves.
 TRAINERS["splatfacto-ca"] = TRAINERS["splatfacto"].replace("{option} ns-train splatfacto", "ns-train splatfacto-ca")
 TRAINERS["Co-Adaptation-of-3DGS --dropout_factor 0.2"] = (
@@ -109,7 +117,9 @@ def settings(trainer: str) -> Sequence[str]:
         return ["dropout"]
     if ": " in trainer:
         return ["plain"]
-    return ["plain", "noise" if trainer == "DropGaussian" else "dropout"]  # which refuses a second dropout
+    if trainer == "DropGaussian":  # which refuses a second dropout
+        return ["plain", "noise"]
+    return list(OPTIONS) if trainer in _FORKS else ["plain", "dropout"]
 
 
 def named(trainer: str, setting: str) -> dict[str, str]:

@@ -235,11 +235,44 @@ def test_a_compressed_ply_says_what_to_do(tmp_path):
         load_ply(tmp_path / "a.compressed.ply")
 
 
-def test_a_model_that_needs_a_filter_is_not_drawn_without_it(tmp_path):
-    lines = ["ply", "format ascii 1.0", "element vertex 1"]
-    lines += [f"property float {name}" for name in [*BASE, "filter_3D"]]
-    (tmp_path / "mip.ply").write_text("\n".join([*lines, "end_header", " ".join(["0"] * 15), ""]))
-    with pytest.raises(ValueError, match=r"filter_3D \(Mip-Splatting\): give the fused PLY"):
+def write_with_filter(path: Path, gaussians: Gaussians, width: float) -> None:
+    save_ply(gaussians, path)
+    head, body = path.read_bytes().split(b"end_header\n")
+    rows = torch.frombuffer(bytearray(body), dtype=torch.float32).reshape(len(gaussians), -1)
+    rows = torch.cat([rows, torch.full((len(gaussians), 1), width)], dim=1)
+    path.write_bytes(head + b"property float filter_3D\nend_header\n" + rows.numpy().tobytes())
+
+
+@pytest.mark.parametrize("width", [0.02, 1.0])
+def test_the_filter_of_mip_splatting_blurs_every_gaussian(tmp_path, width):
+    gaussians = make(6, 1)
+    write_with_filter(tmp_path / "mip.ply", gaussians, width)
+    loaded = load_ply(tmp_path / "mip.ply").gaussians
+    # A Gaussian and an isotropic one are products over the axes: the blur is a sum along each, at 0 and at one width.
+    scales, wide = gaussians.scales.double()[..., None], loaded.scales.double()[..., None]
+    step = width / 50
+    at = torch.arange(-500, 501, dtype=torch.float64) * step
+    kernel = torch.exp(-((at / width) ** 2) / 2)
+    kernel /= kernel.sum()
+    peaks = (torch.exp(-((at / scales) ** 2) / 2) * kernel).sum(dim=2)
+    beside = (torch.exp(-(((wide - at) / scales) ** 2) / 2) * kernel).sum(dim=2)
+    torch.testing.assert_close(beside / peaks, torch.full_like(peaks, -0.5).exp(), rtol=1e-5, atol=0)
+    expected = torch.sigmoid(gaussians.opacity_logits.double()) * peaks.prod(dim=1)
+    torch.testing.assert_close(loaded.opacities.double(), expected, rtol=1e-5, atol=0)
+    assert_equal(replace(loaded, log_scales=gaussians.log_scales, opacity_logits=gaussians.opacity_logits), gaussians)
+
+
+def test_a_filter_of_no_width_changes_nothing(tmp_path):
+    gaussians = replace(make(4), opacity_logits=torch.tensor([-80.0, 0.5, 80.0, float("inf")]))
+    write_with_filter(tmp_path / "mip.ply", gaussians, 0.0)
+    loaded = load_ply(tmp_path / "mip.ply").gaussians
+    torch.testing.assert_close(loaded.opacity_logits, gaussians.opacity_logits, rtol=1e-6, atol=0)
+    assert_equal(replace(loaded, opacity_logits=gaussians.opacity_logits), gaussians)
+
+
+def test_a_filter_that_is_no_width_is_an_error(tmp_path):
+    write_with_filter(tmp_path / "mip.ply", make(2), -1.0)
+    with pytest.raises(ValueError, match="not finite in log_scales"):
         load_ply(tmp_path / "mip.ply")
 
 
