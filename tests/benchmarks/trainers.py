@@ -117,9 +117,7 @@ def settings(trainer: str) -> Sequence[str]:
         return ["dropout"]
     if ": " in trainer:
         return ["plain"]
-    if trainer == "DropGaussian":  # which refuses a second dropout
-        return ["plain", "noise"]
-    return list(OPTIONS) if trainer in _FORKS else ["plain", "dropout"]
+    return ["plain", "noise"] if trainer == "DropGaussian" else list(OPTIONS)  # which refuses a second dropout
 
 
 def named(trainer: str, setting: str) -> dict[str, str]:
