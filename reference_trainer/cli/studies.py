@@ -86,7 +86,7 @@ class Paper:
     """
 
     claims: tuple[str, ...] = ()
-    """1 to 17, or systems, schemes, views, many-views, neighbors, guided; by default all."""
+    """1 to 17, or exact, systems, schemes, views, many-views, neighbors, guided; by default all."""
     scenes: tuple[str, ...] = ()
     """Of the declared scenes, on which not every claim is tested; by default all."""
     data: Path = Path("../shared/data")
@@ -102,6 +102,8 @@ class Paper:
     """List the trainings, which are kept and how long the others may take; train nothing."""
     pages: tuple[Path, ...] = ()
     """Write what is kept between the marks of these Markdown files; train nothing."""
+    figure: Path | None = None
+    """Draw what dropout and noise change by their strength and the number of views into this PNG; train nothing."""
     out: Path = Path("runs/paper")
     """Folder for the trainings at work, which are removed when they are kept."""
     rows: Path | None = None
@@ -129,7 +131,11 @@ class Paper:
         kept = Kept(rows, self.recipe, self.iterations)
         for path in self.pages:
             write_text(path, page(path.read_text("utf-8"), kept))
-        if self.pages:
+        if self.figure is not None:
+            from reference_trainer.studies.paper.figure import gains_figure
+
+            gains_figure(kept, self.figure)
+        if self.pages or self.figure:
             return
         if self.list:
             print(listing(grid))

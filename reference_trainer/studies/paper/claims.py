@@ -10,7 +10,7 @@ from typing import Any
 
 from reference_trainer.studies.paper.scenes import SCENES
 
-__all__ = ["CLAIMS", "QUALITY", "Check", "Claim", "Setting", "chosen"]
+__all__ = ["CLAIMS", "GAINS", "QUALITY", "Check", "Claim", "Setting", "chosen"]
 
 Setting = Mapping[str, Any]
 """What a training changes of its recipe: fields of `TrainConfig`, ``recipe`` if it is another than that of the study,
@@ -94,11 +94,12 @@ def _falling(of: str, settings: Sequence[Setting]) -> tuple[Check, ...]:
 _EVERY = tuple(SCENES)
 _PLAIN, _DROPOUT, _NOISE, _BOTH = map(_with, ("", "dropout(0.2)", "noise(0.8)", "dropout(0.2) + noise(0.8)"))
 _THREE = (_PLAIN, _DROPOUT, _NOISE)
-_VIEWS = (_with(views=2), _PLAIN, *(_with(views=n) for n in (6, 9, 17)))
-_MANY = tuple(_with(views=n) for n in (24, 48))
-_SLIGHT, _DROPPED, _MANY_SLIGHT, _MANY_DROPPED = (
-    tuple({**_with(f"dropout({p})"), **each} for each in views) for views in (_VIEWS, _MANY) for p in (0.1, 0.2)
-)
+_BY_VIEWS = {
+    p: {n: _with(f"dropout({p})" if p else "", **({} if n == 3 else {"views": n})) for n in (2, 3, 6, 9, 17, 24, 48)}
+    for p in (0.0, 0.1, 0.2)
+}
+_VIEWS, _SLIGHT, _DROPPED = (tuple(of.values())[:5] for of in _BY_VIEWS.values())
+_MANY, _MANY_SLIGHT, _MANY_DROPPED = (tuple(of.values())[5:] for of in _BY_VIEWS.values())
 _RATE = {0.0: _PLAIN} | {p: _with(f"dropout({p})") for p in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)}
 _SIGMA = {0.0: _PLAIN} | {s: _with(f"noise({s})") for s in (0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)}
 _DEGREES = tuple(_with(sh_degree=degree) for degree in (0, 1, 2))
@@ -176,6 +177,8 @@ CLAIMS = {
     "17": Claim("absolute gradients lower the CA of Binocular3DGS; without its opacity decay it rises",
                 "1.95 -> 1.59; 4.83", (_BINOCULAR, _ABSOLUTE, _LASTING),
                 (_lower(_CA, _ABSOLUTE, _BINOCULAR), _higher(_CA, _LASTING, _BINOCULAR))),
+    "exact": Claim("the exact score beside the paper's protocol", "", _THREE,
+                   shows=(_CA, "test ca_exact", "test ca_exact_half", "train ca", "train ca_exact"), scenes=_EVERY),
     "systems": Claim("five systems, each plain, with dropout and with noise", "the main table", _SYSTEMS),
     "further": Claim("further systems, likewise", "", _FURTHER, scenes=("synthetic", "fern")),
     "schemes": Claim("the field's schemes side by side", "", _SCHEMES),
@@ -190,6 +193,16 @@ CLAIMS = {
                     (_higher(_PSNR, _TIERS, _DROPOUT),)),
 }  # fmt: skip
 """The seventeen claims by their number, then what the field asks beside them."""
+
+GAINS: Mapping[str, Mapping[str, Mapping[float, tuple[Setting, Setting]]]] = {
+    "dropout rate": {"": {p: (each, _PLAIN) for p, each in _RATE.items()}},
+    "scale of opacity noise": {"": {s: (each, _PLAIN) for s, each in _SIGMA.items()}},
+    "training views": {
+        name: {views: (each, {k: x for k, x in each.items() if k == "views"}) for views, each in of.items()}
+        for name, of in (("dropout 0.1", _BY_VIEWS[0.1]), ("dropout 0.2", _BY_VIEWS[0.2]))
+    },
+}
+"""What changes along an axis, by the name of a line: a setting at each place, and what it is compared with there."""
 
 
 def chosen(names: Sequence[str], scenes: Sequence[str] | None = None) -> dict[str, Claim]:

@@ -13,11 +13,12 @@ from reference_trainer.studies.paper.rows import Row, Rows, label, resolved, val
 from reference_trainer.studies.paper.scenes import SCENES
 from reference_trainer.studies.paper.verdict import Verdict, interval, overall, verdict
 
-__all__ = ["Kept", "claims_table", "details", "judged", "page"]
+__all__ = ["Kept", "claims_table", "details", "differences", "judged", "page"]
 
 _TITLES = {
     "test psnr": ("PSNR", 1.0), "test ssim": ("SSIM", 1.0), "test lpips": ("LPIPS", 1.0), "test ca": ("CA", 1e-3),
-    "train ca": ("CA, training views", 1e-3), "test ca_exact_half": ("exact CA at 1/2", 1e-3),
+    "train ca": ("CA, training views", 1e-3), "test ca_exact": ("exact CA", 1e-3),
+    "train ca_exact": ("exact CA, training views", 1e-3), "test ca_exact_half": ("exact CA at 1/2", 1e-3),
     "train ca_exact_half": ("exact CA at 1/2, training views", 1e-3), "test cv": ("CV", 1.0),
     "train cv": ("CV, training views", 1.0), "gaussians": ("Gaussians, k", 1e3), "seconds": ("processor s", 1.0),
     "pace": ("s/iteration", 1.0),

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import math
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -19,12 +20,15 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.runs import grid as grid_module
 from reference_trainer.runs.engines.engine import Failure
+from reference_trainer.runs.figures import new_figure
 from reference_trainer.runs.grid import Running
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.paper import cells as cells_module
+from reference_trainer.studies.paper import figure as figure_module
 from reference_trainer.studies.paper.cells import Grid, declared, depths, estimate, is_done, renders, rows_of, run_cells
 from reference_trainer.studies.paper.claims import CLAIMS, Check, Claim, chosen
+from reference_trainer.studies.paper.figure import gains_figure
 from reference_trainer.studies.paper.page import Kept, claims_table, details, judged, page
 from reference_trainer.studies.paper.rows import Rows, config_of, resolved, value
 from reference_trainer.studies.paper.scenes import SCENES, chosen_scenes
@@ -245,6 +249,30 @@ def test_a_mark_names_one_comparison_and_its_iterations(kept):
         rows.add({**row(25.0), "setting": resolved(setting, "3dgs", 100)})
     assert page(text, kept).count("| 1 | 25 |") == 2
     assert "Not yet measured." in page(text.replace("100", "50"), kept)
+
+
+def test_the_figure_draws_means_of_differences_where_three_places_are_kept(kept, monkeypatch):
+    gained = [0.5, 0.4, 0.9]
+    rows = Rows(kept.folder / "a.json")
+    for seed, plain in enumerate((20.0, 20.2, 19.9)):
+        rows.add(row(plain + gained[seed], seed, regularizer="dropout(0.1)"))
+    drawn = []
+
+    @contextmanager
+    def held(path):
+        with new_figure(path) as figure:
+            yield figure
+        drawn.append(figure)
+
+    monkeypatch.setattr(figure_module, "new_figure", held)
+    gains_figure(Kept(kept.folder), kept.folder / "gains.png")
+    assert [len(panel.containers) for panel in drawn[0].axes] == [1, 0, 0, 0, 0, 0]  # other scenes have two places
+    (bars,) = drawn[0].axes[0].containers
+    line, _, (errors,) = bars
+    assert bars.get_label() == "a"
+    assert np.allclose(line.get_xydata(), [(0.0, 0.0), (0.1, np.mean(gained)), (0.2, 1.0)])
+    assert np.allclose(np.ptp(errors.get_segments()[1], 0), (0.0, 4 * np.std(gained, ddof=1) / math.sqrt(3)))
+    assert (kept.folder / "gains.png").stat().st_size > 1_000
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "docs").glob("*.md")), ids=lambda path: path.name)
