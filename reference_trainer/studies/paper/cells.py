@@ -15,7 +15,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ca_reg.functional import Multiplier
 from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.metrics import depth_errors, psnr
 from reference_trainer.evaluation.results import mean_std
@@ -212,15 +211,19 @@ def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, dev
 
 
 def renders(model: TrainedModel, view: View, seed: int, draws: int = 5) -> dict[str, float]:
-    """Return the PSNR of a model of dropout by how it is rendered, beside scaled opacities, which is that of the test.
+    """Return the PSNR of a model of dropout or noise by how it is rendered.
 
-    "one" is a render with one mask, in mean over the draws; "five" the mean of the draws; "mean" the exact mean.
+    "one" is a render under one draw, in mean over the draws; "five" the mean of the draws; "mean" the exact mean;
+    "scaled" a render with the mean opacities, which after dropout is that of the test.
     """
-    opacities, p = model.gaussians.opacities, model.dropout
-    generator = torch.Generator(opacities.device).manual_seed(seed)
-    keep = torch.rand(draws, len(opacities), generator=generator, device=opacities.device) >= p
-    images = MaskedRenders(model).many(opacities * keep, view)[0]
-    pictures = {"five": images.mean(0), "mean": model.moments(opacities, view, Multiplier.dropout(p)).mean}
+    x = model.gaussians.params(view.camera, step=model.step)
+    generator = torch.Generator(x.opacities.device).manual_seed(seed)
+    drawn = torch.stack([model.chain.regularize(x, generator).opacities for _ in range(draws)])
+    images = MaskedRenders(model).many(drawn, view)[0]
+    factors = model.chain.multiplied(x)
+    assert factors is not None
+    pictures = {"five": images.mean(0), "mean": model.moments(factors[0].opacities, view, factors[1]).mean,
+                "scaled": model.render(factors[0].opacities * factors[1].mean, view)[0]}  # fmt: skip
     found = {name: psnr(image.clamp(0, 1), view.image, view.mask) for name, image in pictures.items()}
     return {"one": mean_std(psnr(image.clamp(0, 1), view.image, view.mask) for image in images)[0]} | found
 

@@ -24,6 +24,7 @@ _TITLES = {
     "pace": ("s/iteration", 1.0),
     "test depth_abs_rel": ("depth AbsRel", 1.0), "test depth_rmse": ("depth RMSE", 1.0),
     "renders one": ("A: one render", 1.0), "renders five": ("B: mean of five", 1.0),
+    "renders scaled": ("scaled opacities", 1.0),
     "renders mean": ("D: exact mean", 1.0), "depth abs_rel": ("AbsRel", 1.0), "depth rmse": ("RMSE", 1.0),
     "depth mae": ("MAE", 1.0), "depth log10": ("log10", 1.0),
 } | {f"path {sixth}": (f"CA at {sixth}/6", 1e-3) for sixth in range(1, 7)}  # fmt: skip
@@ -114,12 +115,18 @@ def page(text: str, kept: Kept) -> str:
             body = details(name, of) or "Not yet measured.\n"
         else:
             found = {key: details(key, of) for key in CLAIMS}
-            headed = [f"## {key}. {CLAIMS[key].says}\n\n{text}" for key, text in found.items() if text]
+            headed = [f"## {_heading(key)}\n\n{text}" for key, text in found.items() if text]
             missing = ", ".join(key for key, text in found.items() if not text)
             body = "\n".join([*headed, f"Not yet measured: {missing}.\n"] if missing else headed)
         return f"{match[1]}{body}{match[5]}"
 
     return _MARKS.sub(made, text)
+
+
+def _heading(name: str) -> str:
+    """Return a claim with its number, another comparison without its name."""
+    says = CLAIMS[name].says
+    return f"{name}. {says}" if name.isdigit() else says[0].upper() + says[1:]
 
 
 def _rows(rows: Rows) -> str:

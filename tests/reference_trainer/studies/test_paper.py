@@ -308,6 +308,19 @@ def test_the_mean_of_all_masks_is_what_the_exact_render_is():
     # 400 draws: the mean image errs by a twentieth of the deviation of one, and its PSNR by hundredths of a decibel.
     assert found["five"] == pytest.approx(found["mean"], abs=0.1)
     assert found["one"] < found["five"]
+    scaled = brute_force(*(x.double() for x in (s.means, s.quaternions, s.scales, 0.8 * s.opacities, s.colors)), camera)
+    assert found["scaled"] == pytest.approx(psnr(scaled[0].clamp(0, 1), photograph), rel=1e-5)
+
+
+def test_the_renders_of_a_model_of_noise():
+    """Its mean opacities are those of the module with ``scale``; its exact mean is that of many draws."""
+    s, model = few()
+    photograph = torch.rand(3, 12, 16, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    view = View("v", s.camera.to(dtype=torch.float64), photograph)
+    found = renders(dataclasses.replace(model, regularizer="noise(0.8)"), view, 0, draws=400)
+    assert found["five"] == pytest.approx(found["mean"], abs=0.1)  # as above
+    test = dataclasses.replace(model, regularizer="noise(0.8, scale=True)").test_rendering(view)
+    assert found["scaled"] == pytest.approx(psnr(test.image.clamp(0, 1), photograph), rel=1e-5)
 
 
 def test_depth_is_compared_with_another_model_where_that_is_opaque_and_the_mask_counts():
