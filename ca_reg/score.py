@@ -74,7 +74,7 @@ class CAScore:
       this fraction of the score. One more render, with all opacities times ``1 - drop_rate``, is the expected image up
       to the renderer's clamp and cut-off of small alphas: its alpha decides the region. The error is itself estimated,
       to 18 % or better. Where a dozen Gaussians make the picture, stopping where it looks small makes scores too low
-      by up to 0.6 of it; docs/results.md has the calibration.
+      by up to 0.6 of it; docs/studies.md has the calibration.
 
     Convention: ``opacity`` is activated, in [0, 1], (N,) or (N, 1), and neither scaled nor dropped; images are
     (3, H, W), or (H, W, 3) with ``layout="HWC"``. Regularizers inside the callable must be off.

@@ -1,11 +1,13 @@
-"""What the site needs beside MkDocs: docstrings as griffe expects them, and formulas as MathML, without scripts."""
+"""What the site needs beside MkDocs: the README as its start, docstrings as griffe expects them, formulas as MathML."""
 
 import contextlib
 import html
 import re
+from pathlib import Path
 
 import griffe
 from latex2mathml.converter import convert
+from mkdocs.structure.pages import Page
 
 
 class Docstrings(griffe.Extension):
@@ -29,6 +31,15 @@ def _link(obj: griffe.Object, short: str, name: str) -> str:
     with contextlib.suppress(griffe.NameResolutionError):
         name = obj.resolve(name)
     return f'<autoref identifier="{name}" optional><code>{text}</code></autoref>'
+
+
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
+    """Give the start page the README up to its mark, with the links, which lie in this folder."""
+    if page.file.src_uri != "index.md":
+        return markdown
+    shown, rest = Path("README.md").read_text("utf-8").split("<!-- the site ends here -->")
+    links = "\n".join(re.findall(r"^\[.*", rest, re.MULTILINE))
+    return markdown + shown + links.replace(": docs/", ": ").replace(": CHANGELOG", ": changelog")
 
 
 def on_page_content(content: str, **_: object) -> str:

@@ -26,7 +26,7 @@ class OpacityNoise(ParameterNoise):
     :func:`~ca_reg.functional.expected_opacity` at the present ``sigma``. The clamp makes that mean differ from the
     opacity (0.72 for an opacity of 1 at ``sigma = 0.8``), so the model was fitted with other opacities than those of
     ``eval()`` without it. Of models that were trained at ``sigma = 0.8`` it raises the test PSNR by 0.47 dB on fern and
-    0.50 dB on lego, see docs/results.md. The training is the same. Then the noise comes first,
+    0.50 dB on lego, see docs/studies.md. The training is the same. Then the noise comes first,
     ``nn.Sequential(OpacityNoise(0.8, scale=True), GaussianDropout(0.2))``: in training the order of the two does not
     matter, because a factor of 0 or 1 commutes with the clamp; in evaluation the noise must see the plain opacities.
 

@@ -19,7 +19,7 @@ class SharePruning(AdaptiveDensity):
 
     Every ``every`` steps between ``densify_from`` and ``densify_until`` the ``fraction`` of the Gaussians goes whose
     `ca_reg.attribute` shares, summed over the training views, are highest in relation to their blend weights; those
-    without a share stay. No published method: the criterion of docs/results.md that lowered the score most at equal
+    without a share stay. No published method: the criterion of docs/studies.md that lowered the score most at equal
     count, applied to a finished model there. It costs an exact score, its shares and a backward pass for every
     training view each time.
 

@@ -76,7 +76,7 @@ def test_an_adaptive_score_takes_the_region_of_the_expected_image():
     score = CAScore(render, regularizer=ByDepth(), relative_error=0.2, threshold=0.1)
     result = score(Params(OPACITY, means=MEANS), None)
     exact = CAScore(exact=ListMoments(lists), regularizer=ByDepth(), threshold=0.1)(Params(OPACITY, means=MEANS), None)
-    assert abs(result.value - exact.value) < 5 * result.std_error + 0.6 * exact.value  # a single pixel: docs/results.md
+    assert abs(result.value - exact.value) < 5 * result.std_error + 0.6 * exact.value  # a single pixel: docs/studies.md
 
 
 def test_the_protocol_is_the_score_of_uniform_dropout():
