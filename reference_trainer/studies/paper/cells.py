@@ -193,6 +193,7 @@ def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, dev
         for split in ("test", "train")
     }
     machine = {"commit": _commit(), "version": results["machine"]["ca_reg"], "cpu": results["machine"]["cpu"]}
+    machine |= {"lpips": metric} if (metric := results.get("perceptual_metric")) else {}
     row: Row = {"setting": dict(cell.setting), "seed": cell.seed, **means, "gaussians": results["gaussians"],
                 "seconds": results["processor_seconds"]}  # fmt: skip
     if "path" in cell.needs:
