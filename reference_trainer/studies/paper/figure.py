@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from reference_trainer.runs.figures import new_figure
 from reference_trainer.studies.paper.claims import GAINS, Check
 from reference_trainer.studies.paper.page import Kept, differences
 from reference_trainer.studies.paper.verdict import interval
-
-if TYPE_CHECKING:  # an extra
-    from matplotlib.axes import Axes
 
 __all__ = ["gains_figure"]
 
@@ -23,43 +18,52 @@ _FIGURES = ("test psnr", "PSNR, dB more than without", 1.0), ("test ca_exact_hal
 def gains_figure(kept: Kept, path: Path) -> None:
     """Draw what is kept of `GAINS`: differences of PSNR and of the exact score, with two standard errors, by scene.
 
-    A line needs three places; at strength 0 there is no difference. A single seed has no error bar.
+    A line needs three places, a panel a line; at strength 0 there is no difference. A single seed has no error bar.
 
     Args:
         kept: the rows.
         path: the PNG or SVG to write.
 
     Raises:
+        ValueError: if there is no line.
         ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
     """
+    panels = {axis: [_lines(axis, of, unit, kept) for of, _, unit in _FIGURES] for axis in GAINS}
+    panels = {axis: of for axis, of in panels.items() if any(of)}
+    if not panels:
+        raise ValueError(
+            f"{kept.folder} has no setting at three strengths or numbers of views: there is no line to draw."
+        )
     with new_figure(path) as figure:
-        figure.set_size_inches(12, 6.5)
-        panels = figure.subplots(len(_FIGURES), len(GAINS), sharex="col", sharey="row")
-        for row, (of, title, unit) in zip(panels, _FIGURES, strict=True):
+        figure.set_size_inches(1.5 + 4.5 * len(panels), 7)
+        grid = figure.subplots(len(_FIGURES), len(panels), sharex="col", sharey="row", squeeze=False)
+        for row, (_, title, _) in zip(grid, _FIGURES, strict=True):
             row[0].set_ylabel(title)
-            for ax, lines in zip(row, GAINS.values(), strict=True):
+        for column, (axis, of) in zip(grid.T, panels.items(), strict=True):
+            for ax, lines in zip(column, of, strict=True):
                 ax.axhline(0, color="0.6", linewidth=0.8)
-                for style, (name, places) in zip(("-", "--"), lines.items(), strict=False):
-                    for color, scene in enumerate(kept.scenes):
-                        checks = {x: Check(of, *pair, relative=unit != 1) for x, pair in places.items()}
-                        label = f"{scene} {name}".strip()
-                        _line(ax, checks, scene, kept, unit, label=label, color=f"C{color}", linestyle=style)
-        for ax, (axis, lines) in zip(panels[-1], GAINS.items(), strict=True):
-            ax.set_xlabel(axis)
-            ticks = sorted({x for places in lines.values() for x in places})
+                for label, places in lines.items():
+                    means, errors = zip(*places.values(), strict=True)
+                    ax.errorbar([*places], means, errors, label=label, marker=".", capsize=2)
+            ticks = sorted({x for lines in of for places in lines.values() for x in places})
             if ticks[0] > 0:  # numbers of views
                 ax.set_xscale("log")
                 ax.set_xticks(ticks, labels=[f"{x:g}" for x in ticks])
                 ax.minorticks_off()
-            if ax.get_legend_handles_labels()[0]:
-                ax.legend(fontsize="small")
+            ax.set_xlabel(axis)
+            column[0].legend(fontsize="small")
 
 
-def _line(ax: Axes, checks: Mapping[float, Check], scene: str, kept: Kept, unit: float, **style: Any) -> None:
-    """Draw the mean differences of one scene in units, those that are measured."""
-    found = {x: differences(check, scene, kept) for x, check in checks.items()}
-    drawn = {x: interval(seeds) for x, seeds in found.items() if seeds}
-    if len(drawn) > 2:
-        means, errors = ([y / unit for y in of] for of in zip(*drawn.values(), strict=True))
-        bars = [error if math.isfinite(error) else 0.0 for error in errors]
-        ax.errorbar([*drawn], means, bars, marker=".", capsize=2, **style)
+def _lines(axis: str, of: str, unit: float, kept: Kept) -> dict[str, dict[float, tuple[float, float]]]:
+    """Return the lines of a panel by label: mean and two standard errors in units, at each place that is kept."""
+    lines = {}
+    for name, pairs in GAINS[axis].items():
+        for scene in kept.scenes:
+            found = {x: differences(Check(of, *pair, relative=unit != 1), scene, kept) for x, pair in pairs.items()}
+            ends = {x: interval(seeds) for x, seeds in found.items() if seeds}
+            places = {
+                x: (mean / unit, error / unit if math.isfinite(error) else 0.0) for x, (mean, error) in ends.items()
+            }
+            if len(places) > 2:
+                lines[f"{scene} {name}".strip()] = places
+    return lines
