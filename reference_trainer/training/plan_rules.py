@@ -199,7 +199,7 @@ DROPOUT_GAINS = {
     3: {"fern": 1.1, "the built-in scene": 1.2},
     6: {"fern": 0.5, "the built-in scene": 0.3},
     9: {"fern": 0.0, "the built-in scene": 0.3},
-    17: {"fern": -0.3, "the built-in scene": -0.5},
+    17: {"fern": -0.3, "the built-in scene": -0.3},
     24: {"the built-in scene": -0.2},
     48: {"the built-in scene": -0.4},
 }
