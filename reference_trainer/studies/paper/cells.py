@@ -192,8 +192,8 @@ def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, dev
         split: {name: x for name in _FIGURES if (x := results["mean"].get(split, {}).get(name)) is not None}
         for split in ("test", "train")
     }
-    machine = {"commit": _commit(), "version": results["machine"]["ca_reg"], "cpu": results["machine"]["cpu"]}
-    machine |= {"lpips": metric} if (metric := results.get("perceptual_metric")) else {}
+    origin = {"commit": _commit(), "version": results["machine"]["ca_reg"], "cpu": results["machine"]["cpu"]}
+    origin |= {"lpips": metric} if (metric := results.get("perceptual_metric")) else {}
     row: Row = {"setting": dict(cell.setting), "seed": cell.seed, **means, "gaussians": results["gaussians"],
                 "seconds": results["processor_seconds"]}  # fmt: skip
     if "path" in cell.needs:
@@ -208,7 +208,7 @@ def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, dev
             if "depth" in cell.needs:
                 truth = None if views[0].depth is not None else model_of(load_run(dense, device))
                 row["depth"] = _mean([depths(model, view, truth) for view in views])
-    return {**_rounded(row), **machine}
+    return {**_rounded(row), **origin}
 
 
 def renders(model: TrainedModel, view: View, seed: int, draws: int = 5) -> dict[str, float]:
