@@ -86,7 +86,7 @@ class Paper:
     """
 
     claims: tuple[str, ...] = ()
-    """1 to 17, or exact, scaled, systems, schemes, views, many-views, neighbors, guided; by default all."""
+    """1 to 17, or comparisons by the names with which --list ends; by default all."""
     scenes: tuple[str, ...] = ()
     """Of the declared scenes, on which not every claim is tested; by default all."""
     data: Path = Path("../shared/data")
