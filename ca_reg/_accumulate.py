@@ -100,7 +100,7 @@ class Deviations:
 
         With e_1 .. e_K the deviations as vectors over pixels and channels, and means taken over these, the variance of
         that estimate is ``Var(mean(e e)) / K + 2 E mean(e e')^2 / (K (K - 1))`` for two independent deviations e and e'
-        (Hoeffding 1948, sec. 5). Neighbours in the row of renders stand for the pairs. The second term is all there is
+        (Hoeffding 1948, sec. 5). Neighbors in the row of renders stand for the pairs. The second term is all there is
         where half of some Gaussians are dropped that do not overlap: every mask is then equally far from the mean. An
         image that is not quite the expected one makes the error larger, as a rule.
         """

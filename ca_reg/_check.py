@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "Rate", "check_count", "check_draw", "check_finite", "check_opacity", "check_opacity_range", "check_per_gaussian",
-    "check_rate", "is_zero",
+    "Rate", "check_count", "check_finite", "check_opacity", "check_opacity_range", "check_per_gaussian", "check_rate",
+    "is_zero", "rate_like",
 ]  # fmt: skip
 
 Rate = float | Tensor
@@ -42,8 +42,9 @@ def check_opacity_range(opacity: Tensor, upper: float = 1.0) -> None:
         return
     low, high = (float(x) for x in torch.aminmax(opacity.detach()))
     if not (low >= 0.0 and high <= upper and math.isfinite(high)):
+        allowed = "at least 0" if math.isinf(upper) else f"in [0, {upper:g}]"
         raise ValueError(
-            f"opacity must be activated, in [0, {upper:g}], got values from {low:g} to {high:g}; "
+            f"opacity must be activated, {allowed}, got values from {low:g} to {high:g}; "
             "pass torch.sigmoid(logits), what the rasterizer receives, not the raw parameter."
         )
 
@@ -95,14 +96,12 @@ def check_count(x: Any, name: str, *, minimum: int) -> None:
         raise ValueError(f"{name} must be at least {minimum}, got {x}.")
 
 
-def check_draw(generator: torch.Generator | None) -> None:
-    """Raise if random numbers are drawn from ``generator`` while gradients are computed: they would be other ones."""
-    if generator is not None and torch._C._current_graph_task_id() != -1:
-        raise RuntimeError(
-            "a draw with generator= was repeated during backward(): torch.utils.checkpoint restores the global random "
-            "state and no other, so the gradient would be that of another draw. Draw outside the checkpointed function "
-            "and give it keep= or noise=, or leave out generator."
-        )
+def rate_like(p: Rate, opacity: Tensor) -> Rate:
+    """Return rates that multiply opacities (N,) or (N, 1): a tensor (N,) in their shape and type, a number as it is."""
+    if not (isinstance(p, Tensor) and p.ndim):
+        return p
+    check_per_gaussian(p, opacity, "p")
+    return p.view_as(opacity).to(opacity.dtype)
 
 
 def is_zero(rate: Rate) -> bool:

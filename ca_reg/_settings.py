@@ -51,6 +51,7 @@ def make_settings(
     ``given`` are samples, ddof, relative_error and max_samples, each None if it is to be found.
     """
     if drop_rate is not None:
+        check_finite(drop_rate, "drop_rate")
         check_rate(drop_rate, "drop_rate")
     check_finite(threshold, "threshold")
     check_count(seed, "seed", minimum=0)
@@ -85,5 +86,5 @@ def _method(exact: bool, neutral: bool, relative_error: float | None) -> Method:
     if exact:
         return "exact_neutral" if neutral else "exact"
     if neutral:
-        raise ValueError("neutral needs exact: compositing over the expected colour takes a renderer with moments.")
+        raise ValueError("neutral needs exact: compositing over the expected color takes a renderer with moments.")
     return "sampling" if relative_error is None else "adaptive"

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
+from ca_reg.params import Params
 from ca_reg.reason import Reason
 from ca_reg.result import CAResult
 from ca_reg.score import CAScore, ExactView
@@ -72,7 +73,7 @@ class CATotalEffects(NamedTuple):
     result: CAResult
 
 
-def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor, view: Any) -> CAAttribution:
+def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, view: Any) -> CAAttribution:
     """Measure a view exactly and split the score over the Gaussians.
 
     Costs the score and one call of ``shares_fn``.
@@ -114,7 +115,7 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor, view: Any) -
     return CAAttribution(shares.to(torch.float64), result)
 
 
-def total_effects(score: CAScore, opacity: Tensor, view: Any) -> CATotalEffects:
+def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATotalEffects:
     """Measure a view exactly and find by how much the score would fall if a single Gaussian were certain.
 
     Costs the score and a backward pass through its moments callable, which must be differentiable in the multiplier: it
@@ -158,7 +159,7 @@ def total_effects(score: CAScore, opacity: Tensor, view: Any) -> CATotalEffects:
     return CATotalEffects((gradient * spread.detach()).to(torch.float64), result)
 
 
-def _measure(score: CAScore, opacity: Tensor, view: Any, name: str) -> ExactView:
+def _measure(score: CAScore, opacity: Tensor | Params, view: Any, name: str) -> ExactView:
     """Call an exact score, and keep the multiplier and the background that it asked for."""
     if score.exact is None:
         raise ValueError(

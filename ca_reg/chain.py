@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -81,35 +82,38 @@ class Chain(Regularizer):
 
     def regularize(self, x: Params, generator: torch.Generator | None = None) -> Params:
         """Let every member draw in its turn, each for what those before it left."""
-        draws, keep = [], None
+        draws: list[Draw | None] = []
         for member in self:
-            if not member.training:
+            if member.training:
+                x = member.regularize(x, generator)
+                draws.append(member.last)
+            else:
                 member.check_needs(x)
                 x = member.expected(x)
-                continue
-            x = member.regularize(x, generator)
-            draws.append(member.last)
-            if member.keep is not None:
-                keep = member.keep if keep is None else keep & member.keep
-        self.last = Draw(tuple(draws), keep)
+                draws.append(None)
+        self.last = _together(draws)
         return x
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw for every member."""
-        self.regularize(x, generator)
-        assert self.last is not None
-        return self.last
+        """Draw for every member, whatever its mode."""
+        draws = []
+        for member in self:
+            draws.append(member.draw(x, generator))
+            x = member.replay(x, draws[-1])
+        return _together(draws)
 
     def replay(self, x: Params, draw: Draw) -> Params:
-        """Apply the draws of the members that are in ``train()``."""
-        for member, own in zip((member for member in self if member.training), draw.value, strict=True):
-            x = member.replay(x, own)
+        """Apply the draws of the members, and the test-time value of those that were in ``eval()``."""
+        for member, own in zip(self, draw.value, strict=True):
+            x = member.expected(x) if own is None else member.replay(x, own)
         return x
 
     def expected(self, x: Params) -> Params:
         """Return the test-time value of all members."""
         means = [member for member in self if member.renders_mean]
-        if len(means) > 1 and (both := _multiplied(means, x)) is not None:
+        for member in means:
+            member.check_needs(x)
+        if len(means) > 1 and (both := _multiplied(means, x, test=True)) is not None:
             x = both[0]._replace(opacities=both[0].opacities * both[1].mean)
         else:
             for member in means:
@@ -191,11 +195,17 @@ def _flatten(module: nn.Module) -> list[Regularizer]:
     return [module if isinstance(module, Regularizer) else Foreign(module)]
 
 
-def _multiplied(members: list[Regularizer], x: Params) -> tuple[Params, Multiplier] | None:
+def _together(draws: Sequence[Draw | None]) -> Draw:
+    """Return one draw of all members: a Gaussian is kept if none of them drops it."""
+    kept = [draw.keep for draw in draws if draw is not None and draw.keep is not None]
+    return Draw(tuple(draws), functools.reduce(torch.logical_and, kept) if kept else None)
+
+
+def _multiplied(members: list[Regularizer], x: Params, *, test: bool = False) -> tuple[Params, Multiplier] | None:
     """Compose multipliers."""
     total = Multiplier(1.0, 0.0)
     for member in members:
-        one = member.multiplied(x)
+        one = member.test_multiplied(x) if test else member.multiplied(x)
         if one is None:
             return None
         x, total = one[0], total * one[1]

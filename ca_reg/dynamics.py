@@ -61,7 +61,7 @@ def plot_dynamics(
 ) -> tuple[Axes, Axes]:
     """Draw co-adaptation (left axis, solid) and PSNR (right axis, dotted) against the step.
 
-    One colour per run and group of views; nan leaves a gap. The runs are one log or log directory, or several by label;
+    One color per run and group of views; nan leaves a gap. The runs are one log or log directory, or several by label;
     they are drawn on ``ax``, by default in a new figure. Returns the axes of co-adaptation and those of PSNR.
 
     Raises:

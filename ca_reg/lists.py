@@ -219,7 +219,7 @@ def _blocks(lists: PixelLists, multiplier: Multiplier, background: Tensor | None
 
 
 def _behind(lists: PixelLists, background: Tensor | None) -> Tensor:
-    """Return the colour behind every pixel, shape (H * W, 3)."""
+    """Return the color behind every pixel, shape (H * W, 3)."""
     if background is None:
         background = lists.colors.new_zeros(3) if lists.background is None else lists.background
     shape = (3, lists.height, lists.width)

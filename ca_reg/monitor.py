@@ -127,9 +127,11 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
             What was logged, or None if it was not the turn.
 
         Raises:
-            TypeError: as for a call of the score.
-            ValueError: as for a call of the score, or if the monitor is closed.
+            TypeError: as for a call of the score, or if ``step`` is not an integer.
+            ValueError: as for a call of the score, if ``step`` is negative, or if the monitor is closed.
         """
+        check_count(step, "step", minimum=0)
+        step = int(step)
         if step % self.every or step <= self._last_step:
             return None
         if self._file.closed:

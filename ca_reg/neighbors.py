@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ CHUNK_ROWS = 256  # of the sorted points; more of them span a wider strip, fewer
 def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Find the nearest other points of every point, exactly.
 
-    On a CPU SciPy's tree finds those of many points, if SciPy is installed (``pip install ca_reg[neighbors]``), in a
+    SciPy's tree finds those of many points, on the CPU, if SciPy is installed (``pip install ca_reg[neighbors]``), in a
     time that grows as N log N; otherwise a search along one axis does, whose time grows nearly as N squared. The two
     may tell ties apart differently.
 
@@ -42,7 +43,7 @@ def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     n = points.shape[0]
     if points.ndim != 2 or points.shape[1] != 3 or n <= count:
         raise ValueError(f"points must have shape (N, 3) with N > {count}, got {tuple(points.shape)}.")
-    if points.device.type == "cpu" and n >= TREE_FROM:
+    if n >= TREE_FROM:
         with suppress(ImportError):
             return _by_tree(points, count)
     return _along_an_axis(points, count)
@@ -52,13 +53,17 @@ def _by_tree(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Query SciPy's tree for one more neighbor and take out the point itself."""
     from scipy.spatial import cKDTree
 
-    coordinates = points.double().numpy()
+    coordinates = _on_cpu(points)
     distances, numbers = cKDTree(coordinates).query(coordinates, count + 1, workers=torch.get_num_threads())
     found, places = torch.from_numpy(distances), torch.from_numpy(numbers)
     others = places != torch.arange(len(points))[:, None]
     others[others.all(1), -1] = False  # among more than `count` points at one place it may not have found itself
     shape = (len(points), count)
-    return found[others].view(shape).square_().to(points.dtype), places[others].view(shape)
+    return found[others].view(shape).square_().to(points), places[others].view(shape).to(points.device)
+
+
+def _on_cpu(points: Tensor) -> Any:
+    return points.detach().cpu().double().numpy()
 
 
 def _along_an_axis(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -95,7 +100,7 @@ def _search(ordered: Tensor, start: int, stop: int, low: int, high: int, count: 
 def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
     """Return how far the nearest of other points is from every point; shapes (N, D), (M, D) and (N,).
 
-    On a CPU SciPy's tree finds it among many points, as in `nearest_neighbors`; otherwise all distances are computed.
+    SciPy's tree finds it among many points, as in `nearest_neighbors`; otherwise all distances are computed.
 
     Raises:
         ValueError: if a shape is wrong, or there are no other points.
@@ -107,12 +112,12 @@ def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
     if points.ndim != 2 or others.ndim != 2 or points.shape[1] != others.shape[1] or len(others) < 1:
         shapes = f"{tuple(points.shape)} and {tuple(others.shape)}"
         raise ValueError(f"expected points (N, D) and at least one other, (M, D), got {shapes}.")
-    if points.device.type == "cpu" and len(others) >= TREE_FROM:
+    if len(others) >= TREE_FROM:
         with suppress(ImportError):
             from scipy.spatial import cKDTree
 
-            found = cKDTree(others.double().numpy()).query(points.double().numpy(), workers=torch.get_num_threads())
-            return torch.from_numpy(found[0]).to(points.dtype)
+            found, _ = cKDTree(_on_cpu(others)).query(_on_cpu(points), workers=torch.get_num_threads())
+            return torch.from_numpy(found).to(points)
     rows = torch.split(points, max(1, CHUNK_ELEMENTS // len(others)))
     return torch.cat([torch.cdist(x, others, compute_mode="donot_use_mm_for_euclid_dist").amin(1) for x in rows])
 

@@ -21,10 +21,10 @@ class Params(NamedTuple):
 
     Attributes:
         opacities: in [0, 1], shape (N,).
-        means: centres, world units, shape (N, 3).
+        means: centers, world units, shape (N, 3).
         scales: standard deviations along the axes, world units, shape (N, 3).
         quaternions: orientations, shape (N, 4).
-        sh: spherical-harmonic colours, the constant band first, shape (N, K, 3).
+        sh: spherical-harmonic colors, the constant band first, shape (N, K, 3).
         view_matrix: of the camera that is rendered, shape (4, 4); of the first one if there are several.
         learned: what the regularizers learn per Gaussian, by name, each (N,).
         step: the training step, which schedules follow.

@@ -29,7 +29,7 @@ class PenalizedRender(NamedTuple):
 
 
 class CAPenalty(Scheduled):
-    """Render what dropout training sees on average, and penalise what it sees vary.
+    """Render what dropout training sees on average, and penalize what it sees vary.
 
     For the mean squared error, the expected loss of dropout training is the loss of the expected render plus the mean
     variance of its pixels, exactly:
@@ -47,8 +47,8 @@ class CAPenalty(Scheduled):
 
     ``image`` is also the render for test time, the one with all opacities multiplied by the mean of the multiplier. The
     two are equal but for what the renderer does to large and small alphas (for a mean of at most 1, and with R the
-    range of the colours and the background): its clamp at 0.99 comes before the factor here and after it there, which
-    moves a colour by at most ``R / 99``, whatever the length of the list; its cut-off at 1/255 leaves out splats of
+    range of the colors and the background): its clamp at 0.99 comes before the factor here and after it there, which
+    moves a color by at most ``R / 99``, whatever the length of the list; its cut-off at 1/255 leaves out splats of
     scaled opacity, ``R / 255`` at most for each. ``train()`` and ``eval()`` make no difference. No Gaussian is dropped,
     so density control needs no masked radii.
 
@@ -132,7 +132,7 @@ class CAPenalty(Scheduled):
     def forward(self, opacity: Tensor, view: Any, background: Tensor | None = None) -> PenalizedRender:
         """Render the moments of one view, with gradients.
 
-        View and background are passed on to ``moments_fn`` as they are: None for the model's own background, one colour
+        View and background are passed on to ``moments_fn`` as they are: None for the model's own background, one color
         (3,), or an image.
 
         Raises:

@@ -24,8 +24,8 @@ class Reason(Enum):
         "there is nothing to measure",
     )
     NOT_FINITE = (
-        "NaN or infinity in an alpha, or in a colour where the alpha is not 0",
-        "look at the colours and opacities of the model: the training has diverged or the renderer is at fault",
+        "NaN or infinity in an alpha, or in a color where the alpha is not 0",
+        "look at the colors and opacities of the model: the training has diverged or the renderer is at fault",
     )
     NO_VIEWS = ("no view was measured", "call update(opacity, view) before compute()")
 

@@ -91,8 +91,8 @@ class Registry(Generic[T]):
         """
         if not text.strip():
             return []
-        # module:Class is no Python, module.Class is.
-        source = re.sub(r"(?<=\w):(?=[A-Za-z_])", ".", text.strip())
+        # module:Class is no Python, module.Class is; what stands in quotation marks stays.
+        source = re.sub(r"('[^']*'|\"[^\"]*\")|(?<=\w):(?=[A-Za-z_])", lambda found: found[1] or ".", text.strip())
         try:
             node: ast.expr = ast.parse(source, mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
@@ -128,16 +128,20 @@ class Registry(Generic[T]):
         except (TypeError, ValueError) as error:
             raise ValueError(f"{ast.unparse(node)!r:.200}: {error}") from error
 
-    def _arguments(self, call: ast.Call) -> tuple[list[Any], dict[str, Any]]:
+    def _arguments(self, call: ast.Call) -> tuple[list[Any], dict[Any, Any]]:
         """Evaluate arguments: literals, and calls of the values of the registry."""
-        named = {keyword.arg: self._value(keyword.value) for keyword in call.keywords if keyword.arg}
+        named = {keyword.arg: self._value(keyword.value) for keyword in call.keywords}
         return [self._value(argument) for argument in call.args], named
 
     def _value(self, node: ast.expr) -> Any:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in self._values:
             arguments, named = self._arguments(node)
             return self._values[node.func.id](*arguments, **named)
-        return ast.literal_eval(node)
+        try:
+            return ast.literal_eval(node)
+        except ValueError as error:
+            known = ", ".join([*self._values, "Python's literals"])
+            raise ValueError(f"{ast.unparse(node)!r:.80} is none of {known}.") from error
 
     def _form(self) -> str:
         example = f"{next(iter(self._factories), 'name')}(...)"

@@ -90,6 +90,10 @@ class Regularizer(Scheduled):
         """
         return None
 
+    def test_multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
+        """Return what the mean at test time is of: :meth:`multiplied`, unless training looks at former steps."""
+        return self.multiplied(x)
+
     def regularize(self, x: Params, generator: torch.Generator | None = None) -> Params:
         """Draw, remember the draw in :attr:`last`, and apply it; what trainers and hooks call.
 

@@ -33,7 +33,7 @@ class CASettings:
     Args:
         method: ``"sampling"``, the paper's protocol with a fixed number of renders; ``"adaptive"``, as many renders as
             the error asks for; ``"exact"``, the limit of infinitely many, from the moments of the renderer; or
-            ``"exact_neutral"``, the same over the expected colour of each pixel instead of the background.
+            ``"exact_neutral"``, the same over the expected color of each pixel instead of the background.
         samples: number of renders K; None for adaptive scores too, where it is decided at each view.
         drop_rate: fraction of the Gaussians that is dropped in each; None where a regularizer decides.
         regularizer: what drew instead of a dropout at the drop rate; None for that.
@@ -140,9 +140,9 @@ class CAResult(_Score):
     visible: Tensor
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the standard deviation of every pixel as a heat map; pixels that do not count stay grey.
+        """Draw the standard deviation of every pixel as a heat map; pixels that do not count stay gray.
 
-        The map shows the root of ``variance``, in units of colour: a few pixels hold most of the variance and would
+        The map shows the root of ``variance``, in units of color: a few pixels hold most of the variance and would
         leave the rest black.
 
         Drawn on ``ax``, by default in a new figure; returned for titles and ``ax.figure.savefig(path)``.

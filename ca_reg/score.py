@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
 from ca_reg._accumulate import Deviations, RenderMoments
-from ca_reg._check import check_count, check_opacity, check_opacity_range, check_rate
+from ca_reg._check import check_count, check_finite, check_opacity, check_opacity_range, check_rate
+from ca_reg._random import seeded
 from ca_reg._settings import GROUPS, LEAST, ROUND, make_settings
 from ca_reg.functional import Multiplier
 from ca_reg.params import Params
@@ -51,7 +51,7 @@ class CAScore:
     One view is rendered ``samples`` times, each time without a random subset of the Gaussians. The score is the
     variance of these renders, per pixel and channel, averaged over RGB and over the pixels whose accumulated alpha
     exceeds ``threshold`` in every render. The defaults are the protocol of the authors' released code: 5 renders, drop
-    rate ``1 - (1 - p)/2``, alpha above 0.8, population variance, opacities not scaled and without noise, colours not
+    rate ``1 - (1 - p)/2``, alpha above 0.8, population variance, opacities not scaled and without noise, colors not
     clamped.
 
     Read the numbers with their error. At 5 samples a single pixel's variance is known to about 70 %; the mean over an
@@ -68,8 +68,8 @@ class CAScore:
 
     - *Exact*: give ``exact`` if the renderer offers moments (:func:`ca_reg.functional.pixel_moments`). Nothing is
       sampled, the error is 0, and neither the seed nor the index of the view matters. With ``neutral`` each pixel is
-      composited over its own expected colour (:func:`ca_reg.functional.neutral_background`), so that a hole no longer
-      shows the background, and only disagreement between the colours of the Gaussians counts.
+      composited over its own expected color (:func:`ca_reg.functional.neutral_background`), so that a hole no longer
+      shows the background, and only disagreement between the colors of the Gaussians counts.
     - *Adaptive*: give ``relative_error``. From 16 renders on, 8 are added at a time until the standard error is at most
       this fraction of the score. One more render, with all opacities times ``1 - drop_rate``, is the expected image up
       to the renderer's clamp and cut-off of small alphas: its alpha decides the region. The error is itself estimated,
@@ -94,7 +94,7 @@ class CAScore:
         ddof: the variance divides by ``samples - ddof``: 0 as in the released code, 1 for an unbiased estimate. By
             default 0; always 1 for adaptive scores, whose expectation would depend on the number of renders otherwise.
         layout: order of the axes of the images, ``"CHW"`` or ``"HWC"``.
-        alpha_fn: for renderers that return no alpha: ``alpha_fn(opacity, view)`` renders the same view with all colours
+        alpha_fn: for renderers that return no alpha: ``alpha_fn(opacity, view)`` renders the same view with all colors
             1 over a background of 0, or returns an alpha of its own. It is called once per render and so doubles the
             cost; if it is given, an alpha from ``render_fn`` is not used. The two may share an output buffer.
         seed: seed of the masks. They are drawn on the CPU from (seed, view index) alone: the same on every device, and
@@ -112,7 +112,7 @@ class CAScore:
         ValueError: if one is out of range, or does not apply to the method.
 
     Example:
-        A wall of ten layers of different grey; with a layer missing the next one shows through.
+        A wall of ten layers of different gray; with a layer missing the next one shows through.
 
         >>> def render_fn(opacity: Tensor, view: None) -> tuple[Tensor, Tensor]:
         ...     transmittance = torch.cumprod(1 - opacity, 0)
@@ -129,8 +129,6 @@ class CAScore:
         >>> adaptive.samples in range(16, 257, 8)
         True
     """
-
-    higher_is_better = False
 
     def __init__(
         self,
@@ -163,7 +161,12 @@ class CAScore:
         if exact is not None and alpha_fn is not None:
             raise ValueError("alpha_fn does not apply to an exact score, whose moments hold the expected alpha.")
         check_layout(layout)
+        check_finite(p, "p")
         check_rate(p)
+        if not (regularizer is None or isinstance(regularizer, Regularizer)):
+            raise TypeError(
+                f"regularizer must be a ca_reg.Regularizer, got {type(regularizer).__name__}: wrap it in ca_reg.Chain."
+            )
         if regularizer is None:
             drop_rate = 1.0 - (1.0 - p) / 2.0 if drop_rate is None else drop_rate
         elif p != 0 or drop_rate is not None:
@@ -215,13 +218,13 @@ class CAScore:
 
     def _params(self, given: Tensor | Params) -> Params:
         """Check what a score is asked of, and return all that is known of the Gaussians, without gradients."""
-        x = given if isinstance(given, Params) else Params(given)
+        x = given if isinstance(given, Params) else Params(given, step=self.regularizer.step)
         check_opacity(x.opacities)
         check_opacity_range(x.opacities)
         self.regularizer.check_needs(x)
         return x._replace(opacities=x.opacities.detach())
 
-    def update(self, opacity: Tensor, view: Any, *, index: int | None = None) -> CAResult:
+    def update(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> CAResult:
         """Measure one view and count it in the mean that :meth:`compute` returns.
 
         Args:
@@ -241,7 +244,7 @@ class CAScore:
         return result
 
     def compute(self) -> CASummary:
-        """Return the mean over the views counted so far; over those of all ranks if torch.distributed is initialised.
+        """Return the mean over the views counted so far; over those of all ranks if torch.distributed is initialized.
 
         Views without visible pixels have no share in the mean; ``empty_views`` counts them. The standard error is that
         of the mean over the masks, the views held fixed. On several ranks every rank must call this.
@@ -365,16 +368,18 @@ class CAScore:
 
     def _drawn(self, x: Params, index: int, count: int) -> Iterator[Tensor]:
         """Yield the opacities of one view under one random draw after the other, each time a new tensor."""
-        generator = torch.Generator()
-        entropy = np.random.SeedSequence([self.seed, index]).generate_state(1, np.uint64)
-        generator.manual_seed(int(entropy[0] >> np.uint64(1)))
-        flat = _flat(x)
+        generator, flat = seeded(self.seed, index), _flat(x)
         for _ in range(count):
-            drawn = self.regularizer.replay(flat, self.regularizer.draw(flat, generator)).opacities
+            drawn, *others = self.regularizer.replay(flat, self.regularizer.draw(flat, generator))
+            if any(a is not b for a, b in zip(others, flat[1:], strict=True)):
+                raise ValueError(
+                    f"{type(self.regularizer).__name__} changes more than opacities, which is all that render_fn is "
+                    "given: leave out of the score what does."
+                )
             yield (drawn.clone() if drawn is flat.opacities else drawn).view_as(x.opacities)
 
     def _renders(self, render_fn: RenderFn, drawn: Iterator[Tensor], view: Any) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield colours and alpha with one masked opacity after the other, as many at once as the renderer offers."""
+        """Yield colors and alpha with one masked opacity after the other, as many at once as the renderer offers."""
         many = getattr(render_fn, "many", None)
         if many is None or self.alpha_fn is not None:
             yield from (self._render(render_fn, opacity, view) for opacity in drawn)
@@ -383,7 +388,7 @@ class CAScore:
                 yield from (self._read(x) for x in zip(*many(torch.stack(some), view), strict=True))
 
     def _render(self, render_fn: RenderFn, opacity: Tensor, view: Any) -> tuple[Tensor, Tensor]:
-        """Render colours (3, H, W) and alpha (H, W) with masked opacities."""
+        """Render colors (3, H, W) and alpha (H, W) with masked opacities."""
         if self.alpha_fn is not None:
             # Copies: the second pass may fill the buffer of the first, and either may edit its opacities in place.
             image = read_rendering(render_fn(opacity.clone(), view), layout=self.layout).image.clone()
@@ -392,13 +397,13 @@ class CAScore:
         return self._read(render_fn(opacity, view))
 
     def _read(self, returned: Any) -> tuple[Tensor, Tensor]:
-        """Read colours (3, H, W) and alpha (H, W) off what a renderer has returned."""
+        """Read colors (3, H, W) and alpha (H, W) off what a renderer has returned."""
         image, read_alpha = read_rendering(returned, layout=self.layout)
         if read_alpha is None:
             raise ValueError(
                 "render_fn returned an image without an alpha, which the visible region needs. Do one of three: return "
                 "(image, alpha); return a mapping or object with an alpha named alpha, rendered_alpha or accumulation; "
-                "or give CAScore an alpha_fn(opacity, view) that renders all colours 1 on a background of 0."
+                "or give CAScore an alpha_fn(opacity, view) that renders all colors 1 on a background of 0."
             )
         return image.contiguous(), read_alpha.to(image.device)
 
@@ -423,7 +428,7 @@ def view_position(count: int, group: dist.ProcessGroup | None = None) -> int:
 
 
 def _finite(colors: Tensor, alpha: Tensor, cover: Tensor, threshold: float) -> tuple[Tensor, bool]:
-    """Return colours (3, H, W) with 0 for those that are not finite, and whether these matter, or one in alpha (H, W).
+    """Return colors (3, H, W) with 0 for those that are not finite, and whether these matter, or one in alpha (H, W).
 
     They do unless alpha is 0 there and ``cover`` (H, W) at most the threshold; some renderers divide 0 by 0 where
     nothing covers a pixel. They always do if no pixel is left.

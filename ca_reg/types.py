@@ -61,11 +61,11 @@ class MomentsFn(Protocol):
     It renders what :class:`RenderFn` does, but over all draws of an independent random factor on the alpha of every
     splat (:func:`ca_reg.functional.pixel_moments` in every pixel), and returns a mapping or an object with
 
-    - ``mean``: expected colours over the background, (3, H, W), or (H, W, 3) as the layout says;
-    - ``variance``: variances of the colours, same shape;
+    - ``mean``: expected colors over the background, (3, H, W), or (H, W, 3) as the layout says;
+    - ``variance``: variances of the colors, same shape;
     - ``alpha_mean``: expected accumulated alpha, (H, W), (1, H, W) or (H, W, 1); a score needs it, a penalty does not.
 
-    ``background`` is None for the model's own, one colour of shape (3,), or an image, one colour for each pixel. No
+    ``background`` is None for the model's own, one color of shape (3,), or an image, one color for each pixel. No
     early stop is allowed that ignores the factors: splats behind an opaque surface shine through its dropped ones.
 
     Example:
@@ -125,7 +125,7 @@ def read_rendering(result: Any, *, layout: Layout = "CHW") -> Rendering:
 
 
 def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Tensor:
-    """Read the accumulated alpha off a white-on-black render, whose colours are all 1 over a background of 0.
+    """Read the accumulated alpha off a white-on-black render, whose colors are all 1 over a background of 0.
 
     The result may also be the alpha itself, (H, W), (1, H, W) or (H, W, 1). Returned is (H, W), the size of the image.
 
@@ -228,7 +228,7 @@ def _as_tensor(x: Any, name: str) -> Tensor:
         raise TypeError(f"{name} of a render callable must be a torch tensor or a numpy array, got {type(x).__name__}.")
     if not x.is_floating_point():
         raise TypeError(
-            f"{name} of a render callable must be floating point with colours in [0, 1], got {x.dtype}; "
+            f"{name} of a render callable must be floating point with colors in [0, 1], got {x.dtype}; "
             "return the raw render, not the 8-bit picture."
         )
     return x[0] if x.ndim == 4 and x.shape[0] == 1 else x

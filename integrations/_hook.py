@@ -60,8 +60,8 @@ class Hook(abc.ABC):
         return f"{shortfall} {self._explain()}" if shortfall else None
 
     def __enter__(self) -> Self:
-        """Install the hook."""
-        return self.install()
+        """Install the hook, unless it is."""
+        return self.install() if self._handle is None else self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -121,7 +121,7 @@ def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
         TypeError, ValueError: if no tuple came, or none of its members counts the Gaussians.
     """
     if not isinstance(returned, tuple):
-        raise TypeError(f"the rasterizer returned {type(returned).__name__}, expected a tuple with colours and radii.")
+        raise TypeError(f"the rasterizer returned {type(returned).__name__}, expected a tuple with colors and radii.")
     count = len(keep)
     shapes = ((count,), (count, 1), (count, 2))
     counts = [isinstance(x, Tensor) and not x.dtype.is_floating_point and x.shape in shapes for x in returned]
@@ -141,7 +141,7 @@ def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
 
 
 def white_alpha(call: ForwardCall) -> Tensor:
-    """Measure the accumulated alpha (H, W) of a call: all colours 1 over a background of 0, opacities as they are."""
+    """Measure the accumulated alpha (H, W) of a call: all colors 1 over a background of 0, opacities as they are."""
     settings = call.rasterizer.raster_settings
     opacities: Tensor = call.arguments["opacities"]
     before = dict(call.arguments)

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from ._call import Call, chain_of
 from ._hook import Hook
-from ._tally import Skip, Tally
+from ._tally import Tally
 
 __all__ = ["Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized"]
 
@@ -137,11 +137,6 @@ class Regularized:
         """Number of training calls that were regularized; not of those at a rate of 0."""
         return self.tally.regularized
 
-    @property
-    def evaluated(self) -> int:
-        """Number of calls that were rendered as evaluation."""
-        return self.tally.scaled + self.tally.skipped[Skip.NOTHING_TO_SCALE]
-
     def __call__(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Rasterize with regularized opacities; takes and returns what ``rasterization`` does."""
         out: tuple[Any, ...] = self._eager(args, kwargs, trains=self.regularizer.training)
@@ -249,9 +244,6 @@ class Installation(Hook):
         while self._replaced:
             (holder, name), original = self._replaced.popitem()
             setattr(importlib.import_module(holder), name, original)
-
-    def __enter__(self) -> Self:
-        return self
 
     def _explain(self) -> str:
         return (

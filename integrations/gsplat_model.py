@@ -23,7 +23,7 @@ _ALL = 2**31 - 1  # batches of Gaussians per tile: all of them
 class GsplatView(NamedTuple):
     """A camera in gsplat's terms.
 
-    Convention: OpenCV camera, half-pixel centres.
+    Convention: OpenCV camera, half-pixel centers.
 
     Attributes:
         viewmat: world to camera, shape (4, 4).
@@ -50,8 +50,8 @@ class GsplatModel:
         quats: orientation, wxyz, shape (N, 4).
         scales: standard deviations, activated, shape (N, 3).
         colors: RGB, shape (N, 3), or with ``sh_degree`` the spherical harmonics, shape (N, K, 3).
-        sh_degree: highest band to evaluate; None for colours.
-        background: colour behind everything, shape (3,); None for black.
+        sh_degree: highest band to evaluate; None for colors.
+        background: color behind everything, shape (3,); None for black.
         near_plane: as in ``gsplat.rasterization``.
         eps2d: as in ``gsplat.rasterization``.
         antialiased: whether the model was trained with ``rasterize_mode="antialiased"``.
@@ -138,7 +138,7 @@ class GsplatModel:
         return {"viewmats": view.viewmat[None], "Ks": view.K[None], "width": view.width, "height": view.height}
 
     def _colors(self, gsplat: Any, view: GsplatView) -> Tensor:
-        """Colours towards a view, (N, 3)."""
+        """Colors towards a view, (N, 3)."""
         if self.sh_degree is None:
             return self.colors
         harmonics = gsplat.spherical_harmonics
@@ -179,7 +179,7 @@ def _pairs(
 
 @functools.lru_cache
 def _largest_alpha(device: torch.device) -> float:
-    """The clamp of this gsplat (0.999 up to 1.5, then 0.99), read off an opaque splat over the centre of a pixel."""
+    """The clamp of this gsplat (0.999 up to 1.5, then 0.99), read off an opaque splat over the center of a pixel."""
     one, eye = torch.ones(1, 3, device=device), torch.eye(4, device=device)
     intrinsics = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]], device=device)
     model = GsplatModel(one * eye[2, :3], eye[:1], one, one)

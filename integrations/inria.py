@@ -12,10 +12,11 @@ import functools
 from collections.abc import Iterable
 from typing import Any, Literal, Self, get_args
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ca_reg._check import check_count
+from ca_reg._random import seeded
 from ca_reg.chain import Foreign
 
 from ._call import chain_of
@@ -121,6 +122,7 @@ class RasterizerHook(Hook):
                     "repeats the draws of a step and leaves the global random numbers alone. Add generator=None to it, "
                     "and draw from it."
                 )
+        check_count(seed, "seed", minimum=0)
         self._scope = scope
         self._seed = int(seed)
         self._rasterizer = rasterizer
@@ -232,8 +234,7 @@ class RasterizerHook(Hook):
         """Make a call with regularized Gaussians, and hide the dropped ones from densification."""
         step = field.training_step
         # The same for every render of an iteration, so that all of them drop the same Gaussians.
-        entropy = np.random.SeedSequence([self._seed, field.index, step]).generate_state(1, np.uint64)
-        generator = torch.Generator(call.arguments["opacities"].device).manual_seed(int(entropy[0]) >> 1)
+        generator = seeded(self._seed, field.index, step, device=call.arguments["opacities"].device)
         self._chain.train().set_step(step)
         keep = call.train(self._chain, step, self.tally, generator)
         self.note_regularized()

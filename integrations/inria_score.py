@@ -29,7 +29,7 @@ def render_fn(
         render: ``render(view, gaussians, pipe, background)`` of the code base.
         gaussians: its model.
         pipe: its pipeline settings.
-        background: colour, shape (3,).
+        background: color, shape (3,).
         rasterizer: the class that ``render`` uses; by default those that are installed.
 
     Returns:

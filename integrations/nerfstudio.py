@@ -5,7 +5,7 @@ Nothing has to be imported: where both packages are installed, ``ns-train splatf
 ``--pipeline.model.ca-samples`` beside the options of splatfacto. Evaluation images are logged with ``ca``,
 ``ca_std_error`` and ``ca_visible``, the share of the pixels that count; where that is 0, ``ca`` is nan.
 
-The score is the paper's, with half of the Gaussians that training left, except that splatfacto clamps its colours.
+The score is the paper's, with half of the Gaussians that training left, except that splatfacto clamps its colors.
 Exported PLY files hold the opacities as trained; viewers other than nerfstudio's have to scale them by 1 - dropout.
 
 The names of this module are made when they are asked for:

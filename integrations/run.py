@@ -126,6 +126,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--rasterizer must be module:Class, got {options.rasterizer}")
     if options.outputs is not None and not options.cpu:
         parser.error("--outputs is about the stand-in, which --cpu asks for")
+    if options.dropout is None and options.noise is None and (options.start or options.ramp is not None):
+        parser.error("--start and --ramp are about --dropout and --noise: give --regularizer a schedule of its own")
     try:
         options.hook = _hook(options)
     except (TypeError, ValueError) as error:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ca_reg import CAScore, CASummary, RenderFn
+from ca_reg import CAScore, CASummary, Params, RenderFn
 from ca_reg.result import ViewTally
 from ca_reg.score import view_position
 
@@ -90,14 +90,14 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
         digits = torch.tensor(divmod(next(_numbers), 4096), dtype=torch.float64)
         self.add_state("identity", default=digits, dist_reduce_fx="max")
 
-    def forward(self, opacity: Tensor, view: Any, *, index: int | None = None) -> Tensor:
+    def forward(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> Tensor:
         """Measure one view, count it, and return its score as a scalar; arguments as for :meth:`update`."""
         # The base class resets for the time of the call, and with it the count of the updates.
         index = self._position(self.update_count) if index is None else index
         value: Tensor = super().forward(opacity, view, index=index)
         return value
 
-    def update(self, opacity: Tensor, view: Any, *, index: int | None = None) -> None:
+    def update(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> None:
         """Measure one view and count it; arguments as for :meth:`ca_reg.CAScore.update`.
 
         Raises:

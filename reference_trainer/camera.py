@@ -15,7 +15,7 @@ __all__ = ["Camera", "pixels_of"]
 class Camera:
     """A pinhole camera: pose, intrinsics and image size.
 
-    Convention: OpenCV (x right, y down, z forward). Pixel centres lie at half-integers: the centre of the pixel in row
+    Convention: OpenCV (x right, y down, z forward). Pixel centers lie at half-integers: the center of the pixel in row
     ``i`` and column ``j`` projects to ``(j + 0.5, i + 0.5)``, so the image spans ``[0, width] x [0, height]``.
 
     Args:
@@ -58,7 +58,7 @@ class Camera:
 
     @property
     def position(self) -> Tensor:
-        """Camera centre in world coordinates, shape (3,)."""
+        """Camera center in world coordinates, shape (3,)."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.T @ translation
 

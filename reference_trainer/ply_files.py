@@ -1,4 +1,4 @@
-"""The vertices of a PLY file, whatever they mean: points with colours, or Gaussians."""
+"""The vertices of a PLY file, whatever they mean: points with colors, or Gaussians."""
 
 from __future__ import annotations
 

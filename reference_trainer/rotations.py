@@ -13,7 +13,7 @@ _NO_DIRECTION = 1e-30  # a quaternion well below this is taken for 0
 def rotation_matrices(quaternions: Tensor) -> Tensor:
     """Turn quaternions (N, 4) into rotation matrices (N, 3, 3).
 
-    Convention: wxyz; they are normalised here, whatever their norm. That of 0 is the identity, with a gradient of 0.
+    Convention: wxyz; they are normalized here, whatever their norm. That of 0 is the identity, with a gradient of 0.
 
     Example:
         >>> rotation_matrices(torch.tensor([[2.0, 0.0, 0.0, 0.0]]))[0].tolist()

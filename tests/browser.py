@@ -99,7 +99,7 @@ class Page:
         return base64.b64decode(self("Page.captureScreenshot", captureBeyondViewport=whole)["data"])
 
     def picture(self) -> torch.Tensor:
-        """Return the window as colours (3, H, W) in [0, 1]."""
+        """Return the window as colors (3, H, W) in [0, 1]."""
         with Image.open(BytesIO(self.screenshot())) as file:
             return torch.from_numpy(np.array(file.convert("RGB"))).permute(2, 0, 1) / 255
 

@@ -17,7 +17,7 @@ class Case(NamedTuple):
         engine: its name.
         dtype: of the tensors.
         device: where they are.
-        pixel: largest error of a colour, an alpha or a variance of numbers in [0, 1].
+        pixel: largest error of a color, an alpha or a variance of numbers in [0, 1].
         gradient: largest error of a gradient relative to its norm.
         crossing: the share of pixels at which a splat within rounding of the 1/255 cut may fall on its other side;
             there a pixel is off by up to 1/255.

@@ -55,7 +55,7 @@ def brute_force(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Composite every Gaussian at every pixel, one after the other, straight from the definitions.
 
-    Returns the colour sums (C, H, W) and the accumulated alpha (H, W); differentiable by autograd.
+    Returns the color sums (C, H, W) and the accumulated alpha (H, W); differentiable by autograd.
     """
     rotation, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     y, x = torch.meshgrid(
@@ -85,8 +85,8 @@ def brute_force(
              torch.stack([zero, camera.fy / pz, -camera.fy * v / pz])]
         )  # fmt: skip
         projected = jacobian @ rotation @ covariance @ rotation.T @ jacobian.T + blur * torch.eye(2, dtype=means.dtype)
-        centre = torch.stack([camera.fx * px / pz + camera.cx, camera.fy * py / pz + camera.cy])
-        offset = pixels - centre
+        center = torch.stack([camera.fx * px / pz + camera.cx, camera.fy * py / pz + camera.cy])
+        offset = pixels - center
         power = -0.5 * ((offset @ torch.linalg.inv(projected)) * offset).sum(-1)
         raw = opacities[i] * torch.exp(power)
         alpha = raw + (raw.clamp(max=0.99) - raw).detach()  # the gradient passes through the clamp

@@ -19,4 +19,4 @@ def pytest_cmdline_main(config):
     if option.numprocesses is None and option.dist == "no" and not (option.tx or attended or files):
         option.numprocesses, option.maxprocesses = "auto", option.maxprocesses or WORKERS
     if option.numprocesses and option.dist == "no":
-        option.dist = "worksteal"  # neighbours stay together, and with them what a file's fixtures have made
+        option.dist = "worksteal"  # neighbors stay together, and with them what a file's fixtures have made

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ca_reg._check import Rate, check_count, check_draw, check_opacity, check_per_gaussian, check_rate, is_zero
+from ca_reg._check import Rate, check_count, check_opacity, check_per_gaussian, check_rate, is_zero, rate_like
+from ca_reg._random import draw_numbers
 
 __all__ = ["apply_dropout", "draw_keep_mask", "gaussian_dropout"]
 
@@ -31,7 +32,7 @@ def draw_keep_mask(
 
     Raises:
         TypeError: if ``n`` is not an integer or ``p`` not a number.
-        ValueError: if ``n`` is negative or ``p`` outside [0, 1).
+        ValueError: if ``n`` is negative, ``p`` outside [0, 1), or not one number per Gaussian.
         RuntimeError: if the draw with a generator is repeated during ``backward()``.
 
     Example:
@@ -41,11 +42,11 @@ def draw_keep_mask(
     """
     check_count(n, "n", minimum=0)
     check_rate(p)
-    check_draw(generator)
-    source = device if generator is None else generator.device
-    uniform = torch.rand(n, generator=generator, dtype=torch.float32, device=source)
-    keep = uniform >= (p.to(source) if isinstance(p, Tensor) and p.ndim else p)
-    return keep if device is None else keep.to(device)
+    uniform = draw_numbers(torch.rand, n, generator, device)
+    if isinstance(p, Tensor) and p.ndim:
+        check_per_gaussian(p, uniform, "p")
+        p = p.to(uniform.device)
+    return uniform >= p
 
 
 def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: bool = False) -> Tensor:
@@ -85,7 +86,7 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: b
         raise TypeError(f"keep must be a bool tensor, got {keep.dtype}; compare with a threshold to get a mask.")
     # Not a product: 0 * inf and 0 * nan would leak into what is dropped, forward and backward.
     masked = opacity.masked_fill(~keep.view_as(opacity), 0.0)
-    return masked * (1.0 / (1.0 - p)) if compensate else masked
+    return masked * (1.0 / (1.0 - rate_like(p, opacity))) if compensate else masked
 
 
 def gaussian_dropout(

@@ -1,8 +1,8 @@
 """Pixel losses in expectation over the random factors, from the mean and the variance of the pixel alone.
 
-Training with sampled dropout or noise minimises the expectation of the loss of one draw, with the noise of that draw in
+Training with sampled dropout or noise minimizes the expectation of the loss of one draw, with the noise of that draw in
 every gradient. With the exact moments of a pixel (:func:`~ca_reg.functional.pixel_moments`) the expectation itself can
-be minimised: of the squared error exactly, of the absolute error as far as the pixel is normally distributed.
+be minimized: of the squared error exactly, of the absolute error as far as the pixel is normally distributed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def expected_squared_error(mean: Tensor, variance: Tensor, target: Tensor) -> Te
     """Return ``E (x - t)^2 = (mean - t)^2 + variance``, pixel by pixel.
 
     Exact for every distribution of ``x``: the bias-variance decomposition. Its average is what dropout training
-    minimises on average when the loss is the mean squared error.
+    minimizes on average when the loss is the mean squared error.
 
     All are floating-point tensors of one shape, else a TypeError or ValueError is raised; the variance is at least 0.
 

@@ -10,7 +10,7 @@ independent of everything behind it. Hence, by the law of total variance and per
 with ``mu_{n+1} = b`` and ``V_{n+1} = 0``. ``V_1`` is the limit of the paper's co-adaptation at the pixel for infinitely
 many samples. From the front it reads ``sum_i v alpha_i^2 (c_i - mu_{i+1})^2 S_i``, where ``S_i`` is the product of the
 brackets of all splats in front: a sum of non-negative terms, one per splat, without the cancellation of a difference of
-mean squares. A splat counts by how much its colour differs from the expected colour behind it.
+mean squares. A splat counts by how much its color differs from the expected color behind it.
 
 Limits: the factors must be independent, one per Gaussian (not one per anchor or cluster). The variance is that over all
 draws, whereas the paper's score takes only pixels that stay covered in every sample. Renderers cut alphas below 1/255,
@@ -32,7 +32,7 @@ __all__ = [
 
 
 class PixelMoments(NamedTuple):
-    """Mean and variance over the random factors, (..., C) for colours, (...) for the accumulated alpha."""
+    """Mean and variance over the random factors, (..., C) for colors, (...) for the accumulated alpha."""
 
     mean: Tensor
     variance: Tensor
@@ -44,20 +44,20 @@ def pixel_moments(
     """Return the exact mean and variance of pixels under a random factor per splat.
 
     Exact up to rounding, in float32 and float64, and differentiable in every tensor. The variance is the sum of
-    :func:`contributions`. In float32 squares overflow from colours of 1e19 on.
+    :func:`contributions`. In float32 squares overflow from colors of 1e19 on.
 
     Convention: splats are ordered by depth, the nearest first.
 
     Args:
         alphas: alpha of each splat at the pixel, in [0, 1], shape (..., n). A zero stands for no splat, so lists of
             different lengths are padded with zeros.
-        colors: their colours, finite also in the padding, shape (..., n, C), same dtype.
+        colors: their colors, finite also in the padding, shape (..., n, C), same dtype.
         multiplier: moments of the factor. Tensors in it must broadcast to the shape of ``alphas``.
-        background: colour behind the last splat, shape (C,) or (..., C); None for zero.
+        background: color behind the last splat, shape (C,) or (..., C); None for zero.
 
     Raises:
         TypeError: if an argument is not a tensor, or the dtypes are not float32 or float64, or differ.
-        ValueError: if the shapes do not match, an alpha is outside [0, 1], or a colour is nan or infinite.
+        ValueError: if the shapes do not match, an alpha is outside [0, 1], or a color is nan or infinite.
 
     Example:
         >>> alphas = torch.tensor([0.5, 0.5])
@@ -76,7 +76,7 @@ def contributions(
 
     The contributions are at least 0 and sum to the variance, so added up over pixels by the index of the Gaussian they
     attribute the whole score. The i-th one is the part of the variance that is due to the factor of splat i, given
-    those in front, averaged over those behind; splats behind it matter only by their expected colour.
+    those in front, averaged over those behind; splats behind it matter only by their expected color.
 
     Arguments, order and errors are those of :func:`pixel_moments`. Returns shape (..., n, C), 0 in the padding.
 
@@ -106,7 +106,7 @@ def neutral_background(alphas: Tensor, colors: Tensor, multiplier: Multiplier) -
     """Return the background that leaves the mean as it is: the ``b`` for which the expected pixel is ``b`` itself.
 
     Over a fixed background a pixel varies also because dropped splats open a hole. Composited over its own expected
-    colour a hole shows what was expected there, and only disagreement between the colours of the splats counts; the
+    color a hole shows what was expected there, and only disagreement between the colors of the splats counts; the
     variance no longer depends on the choice of a background. From ``mu_1 = sum_i w_i c_i + (1 - sum_i w_i) b`` with the
     expected blend weights ``w_i = m alpha_i prod_{j<i} (1 - m alpha_j)``, the condition ``mu_1 = b`` gives
 
@@ -138,7 +138,7 @@ def first_order_variance(alphas: Tensor, colors: Tensor, multiplier: Multiplier)
     """Return the paper's closed form ``v sum_i (c_i alpha_i)^2`` (appendix, Eq. ca_final, where v is ``p (1 - p)``).
 
     An approximation, for comparison with :func:`pixel_moments`. It drops the transmittance, so that hidden splats count
-    like visible ones, and what lies behind a splat, so that its colour counts instead of its contrast; there is no
+    like visible ones, and what lies behind a splat, so that its color counts instead of its contrast; there is no
     background. It is right for a single splat over black and in the limit of small accumulated alpha over black, and
     otherwise mostly too large, the more so the longer the list.
 
@@ -164,7 +164,7 @@ def _moments(
     spread = _per_splat(multiplier.variance, alphas, "variance") * alphas.square()
     means = [_background(background, alphas, colors)]
     for weight, color in zip(reversed(expected.unbind(-1)), reversed(colors.unbind(-2)), strict=True):
-        # lerp and not a sum of products: equal colours then have no contrast at all, not one of rounding errors.
+        # lerp and not a sum of products: equal colors then have no contrast at all, not one of rounding errors.
         means.append(torch.lerp(means[-1], color, weight[..., None]))
     mean = torch.stack(means[::-1], dim=-2)
     weight = spread * _product_in_front((1.0 - expected).square() + spread)
@@ -204,7 +204,7 @@ def _background(background: Tensor | None, alphas: Tensor, colors: Tensor) -> Te
 
 
 def _check_lists(alphas: Tensor, colors: Tensor) -> None:
-    """Raise unless alphas and colours are what :func:`pixel_moments` asks for."""
+    """Raise unless alphas and colors are what :func:`pixel_moments` asks for."""
     from kornia.core.check import KORNIA_CHECK_IS_TENSOR
 
     _check_alphas(alphas)
@@ -212,7 +212,7 @@ def _check_lists(alphas: Tensor, colors: Tensor) -> None:
     if colors.shape[:-1] != alphas.shape:
         raise ValueError(
             f"colors must have the shape of alphas and a last axis of channels, {(*alphas.shape, 'C')}, "
-            f"got {tuple(colors.shape)}; expand the colours if the pixels share them."
+            f"got {tuple(colors.shape)}; expand the colors if the pixels share them."
         )
     if colors.dtype != alphas.dtype:
         raise TypeError(f"colors and alphas must have the same dtype, got {colors.dtype} and {alphas.dtype}.")

@@ -113,11 +113,11 @@ class Multiplier:
         give it those. The result is then the factor of what the renderer is to be given, ``min(o, 1)``; times
         ``Multiplier.dropout(p)``, without its ``compensate``, it is that of both.
 
-        Left out is what the renderer does to the noisy alpha. With R the range of the colours and the background:
+        Left out is what the renderer does to the noisy alpha. With R the range of the colors and the background:
 
-        - its clamp at 0.99 moves each sampled colour, hence the mean and the standard deviation of the pixel, by at
+        - its clamp at 0.99 moves each sampled color, hence the mean and the standard deviation of the pixel, by at
           most ``R / 99``, whatever the length of the list;
-        - its cut-off of alphas below 1/255 moves a sampled colour by at most ``R / 255`` for each splat that the noise
+        - its cut-off of alphas below 1/255 moves a sampled color by at most ``R / 255`` for each splat that the noise
           takes across the cut-off.
 
         Args:

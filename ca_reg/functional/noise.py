@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ca_reg._check import Rate, check_count, check_draw, check_finite, check_opacity, check_per_gaussian, is_zero
+from ca_reg._check import Rate, check_count, check_finite, check_opacity, check_per_gaussian, is_zero
+from ca_reg._random import draw_numbers
 
 __all__ = ["apply_opacity_noise", "draw_opacity_noise", "opacity_noise"]
 
@@ -43,13 +44,8 @@ def draw_opacity_noise(
     """
     check_count(n, "n", minimum=0)
     check_finite(sigma, "sigma", minimum=0.0)
-    check_draw(generator)
-    source = device if generator is None else generator.device
-    noise = torch.randn(n, generator=generator, dtype=torch.float32, device=source)
-    if clip:
-        noise = noise.clamp(-1.0, 1.0)
-    noise = noise * sigma
-    return noise if device is None else noise.to(device)
+    noise = draw_numbers(torch.randn, n, generator, device)
+    return (noise.clamp(-1.0, 1.0) if clip else noise) * sigma
 
 
 def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:

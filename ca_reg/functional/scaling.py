@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ca_reg._check import Rate, check_finite, check_opacity, check_opacity_range, check_rate, is_zero
+from ca_reg._check import Rate, check_finite, check_opacity, check_opacity_range, check_rate, is_zero, rate_like
 from ca_reg.functional.multipliers import Multiplier
 
 __all__ = ["expected_opacity", "scale_opacity"]
@@ -23,7 +23,7 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
 
     Raises:
         TypeError: if ``opacity`` is not a floating-point tensor.
-        ValueError: if its shape is neither (N,) nor (N, 1), or ``p`` is outside [0, 1).
+        ValueError: if its shape is neither (N,) nor (N, 1), or ``p`` is outside [0, 1) or not one number per Gaussian.
 
     Example:
         >>> import torch
@@ -32,7 +32,7 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
     """
     check_opacity(opacity)
     check_rate(p)
-    return opacity if is_zero(p) else opacity * (1.0 - p)
+    return opacity if is_zero(p) else opacity * (1.0 - rate_like(p, opacity))
 
 
 def expected_opacity(opacity: Tensor, sigma: float, *, clip: bool = False) -> Tensor:

@@ -1,4 +1,4 @@
-"""Colour variance: how much the colours that make up a pixel differ."""
+"""Color variance: how much the colors that make up a pixel differ."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["ColorVariance", "color_variance"]
 
 
 class ColorVariance(NamedTuple):
-    """Colour variance of an image and of its pixels.
+    """Color variance of an image and of its pixels.
 
     The value is the mean over the covered pixels, a scalar, nan if there are none, which the reason then says. The
     variance of a pixel, (...), is the mean over RGB, 0 where nothing covers it; covered, (...) bool, are the pixels
@@ -27,7 +27,7 @@ class ColorVariance(NamedTuple):
 
 
 def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
-    """Measure the colour variance CV of pixels from the splats that are blended into them (paper, appendix, CV metric).
+    """Measure the color variance CV of pixels from the splats that are blended into them (paper, appendix, CV metric).
 
     Per pixel and channel ``sum_i w_i (c_i - m)^2 / sum_i w_i`` with the weighted mean ``m``: the paper's
     ``E[c^2] - E[c]^2`` without its cancellation. Differentiable in both arguments.
@@ -37,11 +37,11 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
     Args:
         weights: blend weights ``w_i = alpha_i T_i``, at least 0, shape (..., n). A zero stands for no splat, so lists
             of different lengths are padded with zeros.
-        colors: their colours, shape (..., n, 3).
+        colors: their colors, shape (..., n, 3).
 
     Raises:
         TypeError: if an argument is not a tensor.
-        ValueError: if the shapes do not match, a weight is negative, or one or a colour is NaN or infinite.
+        ValueError: if the shapes do not match, a weight is negative, or one or a color is NaN or infinite.
 
     Example:
         >>> weights = torch.tensor([[0.5, 0.5], [0.3, 0.0], [0.0, 0.0]])
@@ -57,7 +57,7 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
     if colors.shape[:-1] != weights.shape:
         raise ValueError(
             f"colors must have the shape of weights and a last axis of 3, {(*weights.shape, 3)}, "
-            f"got {tuple(colors.shape)}; expand the colours if the pixels share them."
+            f"got {tuple(colors.shape)}; expand the colors if the pixels share them."
         )
     if not bool(((weights >= 0) & weights.isfinite()).all()):
         raise ValueError(
@@ -70,7 +70,7 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
     share = (weights / torch.where(covered, total, 1.0)[..., None])[..., None]
     mean = (share * colors).sum(-2, keepdim=True)
     variance = (share * (colors - mean).square()).sum(-2).mean(-1)
-    # What is not finite in the colours reaches the variance, also with a weight of 0: the small map tells of the large.
+    # What is not finite in the colors reaches the variance, also with a weight of 0: the small map tells of the large.
     if not bool(variance.isfinite().all()) and not bool(colors.isfinite().all()):
         raise ValueError("colors must be finite, got NaN or infinity.")
     reason = Reason.OK if bool(covered.any()) else Reason.EMPTY

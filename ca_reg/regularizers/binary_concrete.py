@@ -8,7 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from ca_reg._check import Rate, check_draw
+from ca_reg._check import Rate
+from ca_reg._random import draw_numbers
 from ca_reg.functional import Multiplier
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Regularizer
@@ -60,10 +61,7 @@ class BinaryConcrete(Regularizer):
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw ``logit u`` of every Gaussian, float32."""
-        check_draw(generator)
-        device = x.opacities.device
-        u = torch.rand(len(x.opacities), generator=generator, device=device if generator is None else generator.device)
-        return Draw(u.to(device).logit())
+        return Draw(draw_numbers(torch.rand, len(x.opacities), generator, x.opacities.device).logit())
 
     def replay(self, x: Params, draw: Draw) -> Params:
         """Multiply by the soft mask."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ca_reg._check import Rate, check_rate
+from ca_reg._check import Rate
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Given
 from ca_reg.regularizers.independent import IndependentDropout
@@ -30,7 +30,7 @@ class GaussianDropout(IndependentDropout):
     are then not looked at, and a schedule draws also where its rate is 0. Inside ``torch.utils.checkpoint`` draw
     without ``generator``, or outside and give ``keep``. :class:`OpacityNoise` does the same.
 
-    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call checks this.
+    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call refuses those below 0, as logits are.
 
     Args:
         p: drop rate in [0, 1), or a schedule of it. The paper uses 0.2.
@@ -66,9 +66,6 @@ class GaussianDropout(IndependentDropout):
     def p(self) -> float:
         """The drop rate at the present step."""
         return self._present_rate()
-
-    def _check_rate(self, rate: float, name: str) -> None:
-        check_rate(rate, name)
 
     def forward(  # type: ignore[override]
         self, opacity: Given, *, keep: Tensor | None = None, generator: torch.Generator | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ca_reg import functional
-from ca_reg._check import Rate, is_zero
+from ca_reg._check import Rate, check_rate, is_zero
 from ca_reg.functional import Multiplier
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Regularizer
@@ -75,7 +75,16 @@ class IndependentDropout(Regularizer):
 
     def multiplied(self, x: Params) -> tuple[Params, Multiplier]:
         """Return the opacities of survivors, and the factor 0 or 1: exact where a rasterizer clamps the alpha, too."""
-        rates = self.rates(x)
+        return self._multiplied(x, self.rates(x))
+
+    def test_multiplied(self, x: Params) -> tuple[Params, Multiplier]:
+        """Return the same at the rates of the test."""
+        return self._multiplied(x, self.test_rates(x))
+
+    def _multiplied(self, x: Params, rates: Rate) -> tuple[Params, Multiplier]:
         if self.compensate:
             x = x._replace(opacities=x.opacities / (1.0 - rates))
         return x, Multiplier.dropout(rates)
+
+    def _check_rate(self, rate: float, name: str) -> None:
+        check_rate(rate, name)

@@ -30,7 +30,7 @@ class OpacityNoise(ParameterNoise):
     ``nn.Sequential(OpacityNoise(0.8, scale=True), GaussianDropout(0.2))``: in training the order of the two does not
     matter, because a factor of 0 or 1 commutes with the clamp; in evaluation the noise must see the plain opacities.
 
-    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call checks this.
+    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call refuses those below 0, as logits are.
 
     Args:
         sigma: standard deviation of the relative noise, at least 0, or a schedule of it.

@@ -39,7 +39,7 @@ class ErrorRuntime:
 
 @dataclass(frozen=True)
 class Attribution:
-    """Which Gaussians hold the co-adaptation: shares of the exact score, as numbers, pictures and a coloured PLY."""
+    """Which Gaussians hold the co-adaptation: shares of the exact score, as numbers, pictures and a colored PLY."""
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""

@@ -14,7 +14,7 @@ from reference_trainer.losses.photometric import ssim_map
 
 __all__ = ["distCUDA2", "fused_ssim", "make_module"]
 
-BORDER = 5  # pixels that the 11 x 11 window reaches beyond its centre
+BORDER = 5  # pixels that the 11 x 11 window reaches beyond its center
 
 
 def make_module(name: str, **members: Any) -> ModuleType:
@@ -26,7 +26,7 @@ def make_module(name: str, **members: Any) -> ModuleType:
 
 
 def distCUDA2(points: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-    """Return mean squared distances to the three nearest neighbours, shape (N,).
+    """Return mean squared distances to the three nearest neighbors, shape (N,).
 
     To callers that take the result apart, as those of FSGS and CoR-GS do, their numbers come with it: (N, 3) int32.
     """

@@ -55,10 +55,10 @@ def visible_radii(
     front = torch.nonzero(in_front(means, camera)).squeeze(1)
     camera = camera.to(means.device, means.dtype)
     splats = project(means[front], quaternions[front], scales[front], camera, dilation=blur)
-    centre = splats.means - 0.5  # in the INRIA code pixel centres are integers
-    tiles = centre.new_tensor([-(-camera.width // CUDA_TILE), -(-camera.height // CUDA_TILE)])
+    center = splats.means - 0.5  # in the INRIA code pixel centers are integers
+    tiles = center.new_tensor([-(-camera.width // CUDA_TILE), -(-camera.height // CUDA_TILE)])
     extents = longer_radii(splats.covariances, SMALLEST_SPREAD)
-    first = ((centre - extents[:, None]) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
-    last = ((centre + extents[:, None] + CUDA_TILE - 1) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
+    first = ((center - extents[:, None]) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
+    last = ((center + extents[:, None] + CUDA_TILE - 1) / CUDA_TILE).trunc().clamp(min=0.0).minimum(tiles)
     radii[front] = torch.where((last > first).all(-1), extents, 0.0).to(torch.int32)
     return radii

@@ -52,7 +52,7 @@ def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterizat
 
     Returns:
         The function. It raises ValueError, by name, for arguments that the renderer has not: cameras other than
-        pinholes, an ``eps2d`` above 0.3, covariances, batches of scenes, features that are no colours, ``distributed``,
+        pinholes, an ``eps2d`` above 0.3, covariances, batches of scenes, features that are no colors, ``distributed``,
         the unscented transform, and gradients of the poses.
 
     Example:
@@ -173,7 +173,7 @@ def _look(given: SimpleNamespace, number: int, means: Tensor, scales: Tensor, un
 
 
 def _colors(given: SimpleNamespace, number: int) -> dict[str, Any]:
-    """Return the colours of a camera as arguments of `splat`."""
+    """Return the colors of a camera as arguments of `splat`."""
     if "RGB" not in given.render_mode:
         return {"colors": torch.zeros_like(given.means)}
     shared = given.colors.ndim == (2 if given.sh_degree is None else 3)

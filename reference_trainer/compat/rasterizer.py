@@ -34,13 +34,13 @@ FLOOR_OF_MIP = 1e-6  # that of Mip-Splatting
 class GaussianRasterizer(nn.Module):
     """Renders one view as a rasterizer of the INRIA family would.
 
-    The gradient of ``means2D`` is that of the projected positions, in normalised device coordinates (the picture spans
+    The gradient of ``means2D`` is that of the projected positions, in normalized device coordinates (the picture spans
     [-1, 1]): half the width and height times the gradient per pixel. Its values are not read. With four columns, the
     last two receive the sums over the pixels of its absolute values (AbsGS).
 
     Two things differ from the CUDA code. A splat is drawn wherever its alpha reaches 1/255; there it ends at the tiles
-    that meet a square of three standard deviations. And quaternions are normalised here, so that their gradient has no
-    component along them; the repositories normalise them before the call, with the same effect.
+    that meet a square of three standard deviations. And quaternions are normalized here, so that their gradient has no
+    component along them; the repositories normalize them before the call, with the same effect.
 
     Args:
         raster_settings: of the view.
@@ -78,7 +78,7 @@ class GaussianRasterizer(nn.Module):
     ) -> tuple[Any, ...]:
         """Render Gaussians: world coordinates (N, 3), opacities (N, 1) or (N,), scales (N, 3), rotations wxyz (N, 4).
 
-        ``means2D`` (N, 3), or (N, 4) for AbsGS, receives the screen-space gradients. Colours are spherical-harmonic
+        ``means2D`` (N, 3), or (N, 4) for AbsGS, receives the screen-space gradients. Colors are spherical-harmonic
         coefficients ``shs`` (N, K, 3), whose first band may stand apart in ``dc`` (N, 1, 3), or ``colors_precomp`` (N,
         3). Scales (N, 2) are those of surfels (2DGS), which are drawn as flat Gaussians. Further arguments are left
         out, with a warning unless they are None.
@@ -128,7 +128,7 @@ class GaussianRasterizer(nn.Module):
         if settings.antialiasing or settings.kernel_size is not None:
             floor = FLOOR if settings.antialiasing else FLOOR_OF_MIP
             splats = filtered(splats, means3D, rotations, scales, camera, blur=blur, floor=floor)
-        # Pixels per unit of normalised device coordinates, for every column.
+        # Pixels per unit of normalized device coordinates, for every column.
         half = [0.5 * camera.width, 0.5 * camera.height, 0.5 * camera.width, 0.5 * camera.height]
         sink = means2D.index_select(0, splats.indices) * means2D.new_tensor(half[:columns])
         # Zeros are added, whose gradient is that of the positions.

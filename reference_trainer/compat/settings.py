@@ -77,7 +77,7 @@ def _warn(kind: str, name: str) -> None:
 def camera_of(settings: GaussianRasterizationSettings) -> Camera:
     """Return the camera of a rasterizer call.
 
-    The principal point is the projection matrix's: the picture's centre in the INRIA code, elsewhere in some forks.
+    The principal point is the projection matrix's: the picture's center in the INRIA code, elsewhere in some forks.
 
     Raises:
         ValueError: if the projection matrix is no pinhole camera with the fields of view of the settings.

@@ -18,7 +18,7 @@ __all__ = ["AbsGradDensity"]
 
 
 class AbsGradDensity(AdaptiveDensity):
-    """Clones by the gradient of the projected centre, splits by the sum of its absolute values over the pixels (AbsGS).
+    """Clones by the gradient of the projected center, splits by the sum of its absolute values over the pixels (AbsGS).
 
     A Gaussian that is too large is pulled to different sides by different pixels, and the pulls cancel: AbsGS (Ye et
     al. 2024) splits where ``mean over the steps of |(sum |g_x|, sum |g_y|)|`` is large, the sums over the pixels. All

@@ -22,7 +22,7 @@ __all__ = ["AdaptiveDensity"]
 
 
 class AdaptiveDensity(DensityStrategy):
-    """Clones and splits where the gradient of the projected centres is large, prunes what is faint, resets opacities.
+    """Clones and splits where the gradient of the projected centers is large, prunes what is faint, resets opacities.
 
     All thresholds and steps are those of `TrainConfig`; ``opacity_decay`` below 1 makes it Binocular3DGS's. Dropped
     Gaussians are not counted in that step; they are pruned, reset and decayed by their plain opacities as all others.

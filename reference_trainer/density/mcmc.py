@@ -27,7 +27,7 @@ class MCMCDensity(DensityStrategy):
     When the schedule densifies, every Gaussian with an opacity of at most ``prune_opacity`` becomes a copy of a live
     one drawn by opacity, and then ``growth`` times as many are drawn among all, up to ``max_gaussians``; the n at one
     place get the opacity ``1 - (1 - o)^(1/n)`` and the scales of equation 9, so that they look as the one did, and
-    those drawn begin with a cleared optimizer. After every step all centres move by ``Sigma xi``, xi normal with the
+    those drawn begin with a cleared optimizer. After every step all centers move by ``Sigma xi``, xi normal with the
     standard deviation ``noise x (rate of the means) x sigmoid(100 (0.005 - o))``: only the faint feel it.
 
     Of `TrainConfig` it reads seed, schedule (``densify_from``, ``_until``, ``_every``), ``prune_opacity``,
@@ -56,7 +56,7 @@ class MCMCDensity(DensityStrategy):
 
     @torch.no_grad()
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
-        """Relocate and grow as the schedule says for the steps that are done, and move the centres."""
+        """Relocate and grow as the schedule says for the steps that are done, and move the centers."""
         if self.is_due(step):
             refuse_not_finite(optimizer, step)
             generator = stream(self.config.seed, step, "relocation", self.device)

@@ -85,7 +85,7 @@ def worst_region(error: Tensor, height: int, width: int) -> Tensor:
         width: of a region, pixels.
 
     Returns:
-        Centres of the pixels at the corners, (x, y): upper left and right, lower left and right, shape (4, 2). The
+        Centers of the pixels at the corners, (x, y): upper left and right, lower left and right, shape (4, 2). The
         right and lower ones are those behind the last pixel of the region.
 
     Example:

@@ -32,7 +32,7 @@ class SelfEnsembling(CoPruning):
     Every ``every`` steps the first field is rendered at the same `pseudo_cameras`. From ``start`` to ``stop`` the
     standard deviation over this and the last two times, mean over the channels and over 5 x 5 pixels, tells where it is
     uncertain: where that exceeds ``least`` and all but the ``share`` of a picture's largest. The other field's
-    Gaussians whose centre lies within such a picture, nearer to an uncertain pixel than the root of their radius in
+    Gaussians whose center lies within such a picture, nearer to an uncertain pixel than the root of their radius in
     pixels, get the noise of `SEGSNoise`, for good, and the optimizer forgets the geometry of all. The root, for the
     source compares a squared distance with a radius. It keeps two pictures of every view, also in checkpoints.
 

@@ -18,8 +18,8 @@ class DensityStatistics:
     dropped Gaussians were counted with their zero gradient, the threshold would in effect rise by 1 / (1 - p).
 
     Args:
-        gradient_sum: summed norms of the loss gradient with respect to the projected centre, in units of half the image
-            size per unit (the INRIA code's normalised device coordinates), shape (N,).
+        gradient_sum: summed norms of the loss gradient with respect to the projected center, in units of half the image
+            size per unit (the INRIA code's normalized device coordinates), shape (N,).
         steps: the number of steps that drew it, shape (N,).
         absolute_sum: as ``gradient_sum``, of absolute gradients; None where they are not looked at.
     """
@@ -47,7 +47,7 @@ class DensityStatistics:
         Args:
             indices: the Gaussians that may have been drawn, each once, shape (M,).
             drawn: which of them were, shape (M,) bool.
-            gradient: of the loss with respect to their projected centres, per pixel, 0 of the others, shape (M, 2).
+            gradient: of the loss with respect to their projected centers, per pixel, 0 of the others, shape (M, 2).
             width: image width, pixels.
             height: image height, pixels.
             absolute: the sums over the pixels of the absolute gradients, shape (M, 2).

@@ -88,7 +88,7 @@ class DensityStrategy(abc.ABC):
         """Look at a render whose gradients have been computed.
 
         Args:
-            splats: what was drawn; ``splats.projection.means.grad`` is the gradient per pixel of the projected centres.
+            splats: what was drawn; ``splats.projection.means.grad`` is the gradient per pixel of the projected centers.
             camera: of the render.
         """
 

@@ -1,4 +1,4 @@
-"""Measure a model at views: image quality where there is a photograph, co-adaptation and colour variance anywhere."""
+"""Measure a model at views: image quality where there is a photograph, co-adaptation and color variance anywhere."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from reference_trainer.scenes.scene import View, Viewpoint
 __all__ = ["Evaluation", "ViewScores", "ca_picture", "error_picture", "evaluate", "glance"]
 
 CA_PICTURE_RANGE = 0.02
-"""Variance that gets the brightest colour in CA heat maps."""
+"""Variance that gets the brightest color in CA heat maps."""
 ERROR_PICTURE_RANGE = 0.25
-"""Absolute error, the mean of the channels, that gets the brightest colour."""
+"""Absolute error, the mean of the channels, that gets the brightest color."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ViewScores:
     ``ca`` is the paper's protocol; ``ca_half`` the same at a drop rate of 0.5 for every model, which compares models of
     different dropout rates on equal terms; ``ca_exact`` the limit for infinitely many samples, at the drop rate of
     ``ca`` and over the pixels whose expected alpha is above 0.8; ``ca_exact_half`` the same at a drop rate of 0.5;
-    ``ca_neutral`` that of ``ca_exact`` with every pixel over its own expected colour, which the background has no part
+    ``ca_neutral`` that of ``ca_exact`` with every pixel over its own expected color, which the background has no part
     in; ``visible`` the share of pixels that ``ca`` covers; ``covered`` the mean alpha of the test-time image;
     ``depth_abs_rel`` to ``depth_log10`` the `DepthErrors` of the test-time image where the true depth is known;
     ``ca_reason`` why ``ca`` is nan, if it is.
@@ -240,7 +240,7 @@ def _maps(results: Mapping[str, CAResult]) -> dict[str, Tensor]:
 
 
 def ca_picture(result: CAResult) -> Tensor:
-    """Return the variance of a score as a picture (3, H, W), grey where a pixel does not count."""
+    """Return the variance of a score as a picture (3, H, W), gray where a pixel does not count."""
     return heat_map(result.variance.masked_fill(~result.visible, math.nan).float(), CA_PICTURE_RANGE)
 
 

@@ -46,7 +46,7 @@ LPIPS_HINT = (
 )
 _WHEEL, _WHEEL_FILE = "stlpips-pytorch", "alex_shift_tolerant.pth"
 _MINIMUM_SIZE = 32  # pixels; below, the trunk pools its map away
-# Mean and deviation of ImageNet's colours, moved from [0, 1] to [-1, 1]: constants of LPIPS 0.1.
+# Mean and deviation of ImageNet's colors, moved from [0, 1] to [-1, 1]: constants of LPIPS 0.1.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 
@@ -54,7 +54,7 @@ _SCALE = (0.458, 0.448, 0.450)
 class LPIPS:
     """Learned perceptual distance between two images (Zhang et al. 2018; shift-tolerant: Ghildyal and Liu 2022).
 
-    Features of five stages of a network are normalised over the channels; their squared differences are weighted,
+    Features of five stages of a network are normalized over the channels; their squared differences are weighted,
     averaged over the pixels and summed. Numbers of different variants, which ``name`` tells apart, are not comparable.
 
     Convention: images come in [0, 1]. The shift-tolerant variant maps them to [-1, 1], as it was trained. Plain LPIPS

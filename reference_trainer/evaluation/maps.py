@@ -1,4 +1,4 @@
-"""Maps beside the picture: how much the blended colours differ, and the paper's form of co-adaptation."""
+"""Maps beside the picture: how much the blended colors differ, and the paper's form of co-adaptation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["color_variance_map", "first_order_map"]
 
 @torch.no_grad()
 def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
-    """Measure how much the colours blended at each pixel differ (paper, appendix, CV metric).
+    """Measure how much the colors blended at each pixel differ (paper, appendix, CV metric).
 
     Returns:
         The variance, mean over RGB, shape (H, W), and where any splat contributes, shape (H, W) bool; the variance is 0

@@ -20,8 +20,8 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     Over several images report the mean of their values, as the papers do, not the PSNR of the pooled error.
 
     Args:
-        image: colours in [0, 1], shape (3, H, W).
-        target: colours in [0, 1], shape (3, H, W).
+        image: colors in [0, 1], shape (3, H, W).
+        target: colors in [0, 1], shape (3, H, W).
         mask: of the pixels that count, in [0, 1], shape (H, W): those of DTU's object, which are 1 to 8 bits.
 
     Returns:
@@ -49,8 +49,8 @@ def ssim(image: Tensor, target: Tensor) -> float:
     border instead, so its numbers differ.
 
     Args:
-        image: colours in [0, 1], shape (3, H, W).
-        target: colours in [0, 1], shape (3, H, W).
+        image: colors in [0, 1], shape (3, H, W).
+        target: colors in [0, 1], shape (3, H, W).
 
     Returns:
         A number in [-1, 1], computed in float64: in float32 it can exceed 1.

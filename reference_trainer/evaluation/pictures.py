@@ -23,7 +23,7 @@ PANEL = "_panel"
 
 _GAP = 4  # pixels between pictures
 _LABEL_HEIGHT = 16  # pixels; the built-in font of pillow is about 11 high
-_UNDEFINED = 0.5  # grey of values that are not finite: no colour of the map
+_UNDEFINED = 0.5  # gray of values that are not finite: no color of the map
 
 
 def file_names(views: Sequence[str]) -> list[str]:
@@ -84,10 +84,10 @@ def as_pillow(image: Tensor) -> Any:
 
 
 def heat_map(values: Tensor, vmax: float) -> Tensor:
-    """Colour numbers (H, W) from 0 (black) through red to ``vmax`` (pale yellow): matplotlib's "inferno".
+    """Color numbers (H, W) from 0 (black) through red to ``vmax`` (pale yellow): matplotlib's "inferno".
 
-    Numbers beyond the ends take the end colours; those that are not finite (a pixel without a score) are grey. Use one
-    ``vmax`` for all maps that are to be compared. The colours are (3, H, W) in [0, 1], float32, on the CPU.
+    Numbers beyond the ends take the end colors; those that are not finite (a pixel without a score) are gray. Use one
+    ``vmax`` for all maps that are to be compared. The colors are (3, H, W) in [0, 1], float32, on the CPU.
 
     Raises:
         ValueError: if ``values`` is not (H, W) or ``vmax`` is not positive.
@@ -106,17 +106,17 @@ def heat_map(values: Tensor, vmax: float) -> Tensor:
     values = values.detach().to("cpu", torch.float64)
     defined = values.isfinite()
     index = (torch.where(defined, values, 0) / vmax).clamp(0, 1).mul(255).round().long()
-    colours = torch.where(defined[..., None], table[index], torch.tensor(_UNDEFINED))
-    return colours.permute(2, 0, 1).contiguous()
+    colors = torch.where(defined[..., None], table[index], torch.tensor(_UNDEFINED))
+    return colors.permute(2, 0, 1).contiguous()
 
 
 def heat_colors(values: Tensor, low: float, high: float) -> Tensor:
-    """Return a colour per value, shape (N, 3), in [0, 1] on the CPU.
+    """Return a color per value, shape (N, 3), in [0, 1] on the CPU.
 
     Args:
         values: at least 0, may be infinite, shape (N,).
-        low: the value that gets the darkest colour, as do all below it; positive.
-        high: the value that gets the brightest colour, as do all above it. In between the scale is logarithmic.
+        low: the value that gets the darkest color, as do all below it; positive.
+        high: the value that gets the brightest color, as do all above it. In between the scale is logarithmic.
     """
     along = (values.clamp(low, high) / low).log() / math.log(high / low)
     return heat_map(along[None], 1.0)[:, 0].T
@@ -129,7 +129,7 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
     ``columns`` all pictures stand in one row.
 
     Returns:
-        Colours in [0, 1], shape (3, H', W'), on the CPU, rounded to bytes.
+        Colors in [0, 1], shape (3, H', W'), on the CPU, rounded to bytes.
 
     Raises:
         ValueError: if there is no image, the sizes or the numbers differ, or ``columns`` is not positive.

@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 PER_WEIGHT_SCALE = (0.1, 10.0)
-"""Ends of the colour scale of shares per blend weight, in units of the mean."""
+"""Ends of the color scale of shares per blend weight, in units of the mean."""
 
 _TOP = (0.001, 0.01, 0.1)
 
@@ -79,7 +79,7 @@ class Heat:
 def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:
     """Return the weight with which every Gaussian enters the test-time renders, summed over all pixels and views.
 
-    The image is linear in the colours, so the weights are the gradient of its sum: no approximation.
+    The image is linear in the colors, so the weights are the gradient of its sum: no approximation.
 
     Args:
         model: what to measure.
@@ -124,7 +124,7 @@ def all_but_highest(values: Tensor, fraction: float) -> Tensor:
 
 
 def colored_by(gaussians: Gaussians, values: Tensor, low: float, high: float) -> Gaussians:
-    """Return the same Gaussians with a colour that tells a value, see `heat_colors`, the same from every direction."""
+    """Return the same Gaussians with a color that tells a value, see `heat_colors`, the same from every direction."""
     colors = heat_colors(values, low, high).to(gaussians.sh_dc)
     return replace(gaussians, sh_dc=((colors - 0.5) / SH_C0)[:, None], sh_rest=torch.zeros_like(gaussians.sh_rest))
 

@@ -34,7 +34,7 @@ class TrainedModel:
 
     Args:
         gaussians: the parameters.
-        background: colour behind them, shape (3,).
+        background: color behind them, shape (3,).
         regularizer: what it was trained with, an expression of `ca_reg.regularizers.parse`; it decides what is rendered
             at test time, and the drop rate of the paper's CA protocol.
         step: of the training, which schedules follow.
@@ -142,7 +142,7 @@ class TrainedModel:
 class MaskedRenders:
     """The render callable of a `CAScore` over a model that does not change.
 
-    Projection, colours, tile lists and their order are made once for a view, for all Gaussians, and the masks of a view
+    Projection, colors, tile lists and their order are made once for a view, for all Gaussians, and the masks of a view
     are drawn in one pass. The images are those of `TrainedModel.render`.
 
     Args:

@@ -41,7 +41,7 @@ def measured_views(scene: Scene, say: Callable[[str], None]) -> dict[str, Sequen
     """Return the views of a scene that a model is measured at, by split: ``"train"`` and ``"test"``.
 
     Where all photographs are trained on, which is said, viewpoints without one take the place of the test views:
-    ``"between"``, half the way from each training camera to its nearest neighbour, and ``"around"``, as far away on the
+    ``"between"``, half the way from each training camera to its nearest neighbor, and ``"around"``, as far away on the
     other side. The orientation turns on at the same rate. A single camera has neither.
     """
     if scene.test:

@@ -57,7 +57,7 @@ def dark_background(image: Tensor, threshold: float) -> Tensor:
     """Return 1 where all channels of a pixel and of the 49 above it are below a threshold, shape (H, W), else 0.
 
     Args:
-        image: colours in [0, 1], shape (3, H, W).
+        image: colors in [0, 1], shape (3, H, W).
         threshold: above 0.
 
     Example:

@@ -19,7 +19,7 @@ __all__ = ["CoAdaptation"]
 
 
 class CoAdaptation(WeightedTerm):
-    """``weight`` times the mean variance of the colours when each Gaussian is dropped with a rate of its own.
+    """``weight`` times the mean variance of the colors when each Gaussian is dropped with a rate of its own.
 
     The variance needs no photograph, so it may be taken where there is none: at virtual views. In an analytic step that
     of its expectation at the training view is taken, which costs nothing; else the moments are rendered, which takes

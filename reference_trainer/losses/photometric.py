@@ -18,7 +18,7 @@ __all__ = ["Photometric", "expected_photometric_loss", "photometric_loss", "ssim
 _RADIUS = 5
 _SIGMA = 1.5
 _SIDE = [math.exp(-(offset**2) / (2 * _SIGMA**2)) for offset in range(_RADIUS + 1)]
-_WEIGHTS = [weight / (2 * sum(_SIDE) - 1) for weight in _SIDE]  # of the window's centre and one side; they add up to 1
+_WEIGHTS = [weight / (2 * sum(_SIDE) - 1) for weight in _SIDE]  # of the window's center and one side; they add up to 1
 _C1 = 0.01**2
 _C2 = 0.03**2
 
@@ -53,7 +53,7 @@ def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -
     """Return ``(1 - lambda) mean|image - target| + lambda (1 - SSIM)``, the loss of Kerbl et al. 2023, equation 7.
 
     Args:
-        image: a rendering, shape (3, H, W), colours in [0, 1] (values outside are allowed), floating point.
+        image: a rendering, shape (3, H, W), colors in [0, 1] (values outside are allowed), floating point.
         target: the photograph, same shape, dtype and device; a constant.
         lambda_dssim: weight of the structural term, in [0, 1].
 
@@ -204,10 +204,10 @@ def _blur(maps: Tensor) -> Tensor:
 
         return blur(maps, _WEIGHTS)
     # Sums of shifted slices: on a CPU faster than a depthwise convolution, whose speed depends on the memory layout.
-    centre, *sides = _WEIGHTS
+    center, *sides = _WEIGHTS
     for axis in (-2, -1):
         size = maps.shape[axis]
-        blurred = maps * centre
+        blurred = maps * center
         for offset, weight in enumerate(sides[: size - 1], start=1):
             length = size - offset
             blurred.narrow(axis, offset, length).add_(maps.narrow(axis, 0, length), alpha=weight)

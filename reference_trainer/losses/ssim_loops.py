@@ -48,7 +48,7 @@ def blur(maps: Tensor, weights: list[float]) -> Tensor:
 
     Args:
         maps: float32, on the processor.
-        weights: of the window's centre and of the pixels to one side of it.
+        weights: of the window's center and of the pixels to one side of it.
     """
     images = maps.contiguous().view(-1, *maps.shape[-2:])
     blurred = torch.empty_like(images)

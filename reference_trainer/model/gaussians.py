@@ -24,7 +24,7 @@ SH_C0 = 0.28209479177387814  # the constant band of the spherical harmonics: sqr
 class Gaussians:
     """N Gaussians as raw parameters, the way the INRIA code and the PLY files hold them.
 
-    Convention: quaternions are wxyz and need not be normalised; spherical-harmonic colours add 0.5 after evaluation;
+    Convention: quaternions are wxyz and need not be normalized; spherical-harmonic colors add 0.5 after evaluation;
     opacities and scales are stored as logits and logarithms.
 
     Args:
@@ -32,7 +32,7 @@ class Gaussians:
         log_scales: logarithms of the standard deviations along the axes, shape (N, 3).
         quaternions: orientation, wxyz, shape (N, 4).
         opacity_logits: logits of the opacities, shape (N,).
-        sh_dc: constant colour coefficients, shape (N, 1, 3).
+        sh_dc: constant color coefficients, shape (N, 1, 3).
         sh_rest: the other coefficients, shape (N, (degree + 1)^2 - 1, 3).
         learned: what regularizers learn per Gaussian, by name, each (N,).
 
@@ -74,11 +74,11 @@ class Gaussians:
             positions: world coordinates, shape (N, 3).
             colors: RGB in [0, 1], shape (N, 3).
             distances: standard deviation of each Gaussian, positive, shape (N,).
-            sh_degree: degree of the colour's spherical harmonics, 0 to 3.
+            sh_degree: degree of the color's spherical harmonics, 0 to 3.
             opacity: opacity of each, in (0, 1).
 
         Raises:
-            ValueError: if a position or colour is not finite, a distance not positive and finite, the opacity not in
+            ValueError: if a position or color is not finite, a distance not positive and finite, the opacity not in
                 (0, 1), or as the class does.
         """
         n = positions.shape[0]
@@ -123,7 +123,7 @@ class Gaussians:
 
     @property
     def sh(self) -> Tensor:
-        """All colour coefficients, shape (N, (degree + 1)^2, 3)."""
+        """All color coefficients, shape (N, (degree + 1)^2, 3)."""
         return torch.cat([self.sh_dc, self.sh_rest], dim=1)
 
     def params(self, camera: Camera | None = None, *, step: int = 0) -> Params:

@@ -105,7 +105,7 @@ def save_ply(
             raise ValueError("bake_p scales the opacities of the Gaussians, opacities replaces them: give one of them.")
         logits, comments = _logits(opacities.detach(), len(gaussians)), [f"comment {_FOR_RENDERING}"]
     elif bake_p:
-        # The decimal of 1 - 0.2 is written, not the neighbouring double that the subtraction gives.
+        # The decimal of 1 - 0.2 is written, not the neighboring double that the subtraction gives.
         factor = torch.tensor(1 - bake_p, dtype=torch.float64)
         logits, comments = _scaled_logits(logits, factor), [f"comment {_SCALED} {round(1 - bake_p, 12)}"]
     if regularizer:

@@ -27,7 +27,7 @@ def render_gaussians(
     absgrad: bool = False,
     renderer: Callable[..., Any] = render,
 ) -> Rendering:
-    """Render Gaussians, or what is to be rendered of them, such as what a regularizer returned, over a colour (3,).
+    """Render Gaussians, or what is to be rendered of them, such as what a regularizer returned, over a color (3,).
 
     Opacities (N,), activated, take the place of the model's own; ``sh_degree`` is the highest band to use, by default
     all; with ``depth`` it is accumulated as well; with ``absgrad``, of renderers that are capable of it,
@@ -56,7 +56,7 @@ def render_moments_of(
 ) -> tuple[MomentImages, Splats]:
     """Render the exact moments of a model under random factors on its alphas, given their moments.
 
-    The background has shape (3,), or (3, H, W). Returned with the moments is what was drawn; its projected centres keep
+    The background has shape (3,), or (3, H, W). Returned with the moments is what was drawn; its projected centers keep
     their gradient.
     """
     splats = splat(**arguments(model), camera=camera, sh_degree=sh_degree)

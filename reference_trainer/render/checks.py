@@ -50,7 +50,7 @@ def check_projection(
 
 
 def either(sh: Tensor | None, sh_degree: int | None, colors: Tensor | None) -> tuple[Tensor, int | None]:
-    """Return coefficients and their highest band, or colours and None; raise unless one of the two is given."""
+    """Return coefficients and their highest band, or colors and None; raise unless one of the two is given."""
     if sh is None and colors is not None:
         return colors, None
     if sh is None or colors is not None:
@@ -59,7 +59,7 @@ def either(sh: Tensor | None, sh_degree: int | None, colors: Tensor | None) -> t
 
 
 def checked_background(background: Tensor | None, splats: Splats, *shapes: tuple[int, ...]) -> Tensor:
-    """Return the colour behind everything, black if there is none, of one of some shapes; raise unless it is finite."""
+    """Return the color behind everything, black if there is none, of one of some shapes; raise unless it is finite."""
     if background is None:
         return splats.colors.new_zeros(3)
     if background.shape not in shapes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 NEAR_PLANE: Final = 0.2
-"""Gaussians whose centre is nearer along the camera's z axis are not drawn: their linearised projection explodes."""
+"""Gaussians whose center is nearer along the camera's z axis are not drawn: their linearised projection explodes."""
 
 DILATION: Final = 0.3
 """Added to the diagonal of every projected covariance, square pixels: no splat is thinner than about one pixel."""

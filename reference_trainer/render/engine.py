@@ -36,7 +36,7 @@ class Engine(Protocol):
     def project(
         self, inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
     ) -> tuple[Projection, Tensor]:
-        """Project M of N Gaussians, the ``indices`` (M,), and evaluate their colours, (M, 3).
+        """Project M of N Gaussians, the ``indices`` (M,), and evaluate their colors, (M, 3).
 
         The inputs are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh (N, K, 3), of
         which the bands up to ``degree`` are used, or colors (N, 3) of no degree, by name.
@@ -46,7 +46,7 @@ class Engine(Protocol):
         """List the Gaussians of every tile, given their activated opacities (M,).
 
         A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the rectangle spanned by the
-        tile's pixel centres. The test is exact: within a row of tiles, an ellipse covers an interval of columns.
+        tile's pixel centers. The test is exact: within a row of tiles, an ellipse covers an interval of columns.
         """
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
@@ -61,14 +61,14 @@ class Engine(Protocol):
     def absolute_gradients(self, splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
         """Sum the absolute gradients that pixels give to the positions (AbsGS), (M, 2), without a graph.
 
-        ``drawn`` are colours and depth over black and the accumulated alpha, (5, H, W), and ``gradient`` is that of a
+        ``drawn`` are colors and depth over black and the accumulated alpha, (5, H, W), and ``gradient`` is that of a
         loss with respect to them.
         """
 
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Return mean and variance of every pixel under random factors on the alphas of the full model.
 
-        The multiplier is mean and variance of every splat's factor, (M, 2), and ``behind`` the colours behind
+        The multiplier is mean and variance of every splat's factor, (M, 2), and ``behind`` the colors behind
         everything, (3, H, W).
         """
 

@@ -21,7 +21,7 @@ def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor
     Args:
         splats: of the full model, with its plain opacities.
         multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,), one value each.
-        background: fixed colour behind everything, shape (3,), or one for each pixel, (3, H, W); black by default.
+        background: fixed color behind everything, shape (3,), or one for each pixel, (3, H, W); black by default.
 
     Raises:
         ValueError: if the background has another shape, or is not finite.

@@ -25,7 +25,7 @@ def splat(
     sh_degree: int | None = None,
     colors: Tensor | None = None,
 ) -> Splats:
-    """Project Gaussians, evaluate their colours and list them per tile.
+    """Project Gaussians, evaluate their colors and list them per tile.
 
     Gaussians that cannot be seen (behind the near plane, or with an opacity below `MIN_ALPHA`, such as dropped ones)
     are left out before the projection and cost nothing. The arguments are those of `render`.
@@ -82,19 +82,19 @@ def render(
 ) -> Rendering:
     """Render 3D Gaussians; differentiable in every tensor.
 
-    Convention: OpenCV camera, half-pixel centres, wxyz quaternions; the constants of the INRIA rasterizer. The work is
+    Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA rasterizer. The work is
     done in float64 if the means are, else in float32: also for float16 and bfloat16 inputs, and inside torch.autocast.
 
     Args:
         means: world coordinates, shape (N, 3).
-        quaternions: orientation, need not be normalised, shape (N, 4).
+        quaternions: orientation, need not be normalized, shape (N, 4).
         scales: standard deviations along the axes, positive, shape (N, 3).
         opacities: activated, in [0, 1], shape (N,) or (N, 1).
         camera: the view.
         sh: spherical-harmonic coefficients, shape (N, K, 3), or
         sh_degree: highest band to evaluate; all of ``sh`` by default.
-        colors: colours, shape (N, 3).
-        background: colour behind everything, shape (3,); black by default.
+        colors: colors, shape (N, 3).
+        background: color behind everything, shape (3,); black by default.
         depth: whether to accumulate depth as well.
 
     Returns:

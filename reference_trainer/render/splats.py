@@ -91,7 +91,7 @@ class TileLists:
 
 
 class Splats(NamedTuple):
-    """Gaussians made ready for one camera: M of N are projected, coloured, and listed per tile."""
+    """Gaussians made ready for one camera: M of N are projected, colored, and listed per tile."""
 
     indices: Tensor  # which of the N, (M,)
     projection: Projection
@@ -105,7 +105,7 @@ class Rendering(NamedTuple):
     """A rendered view.
 
     Args:
-        image: colours over the background, not clamped, shape (3, H, W).
+        image: colors over the background, not clamped, shape (3, H, W).
         alpha: accumulated alpha, shape (H, W).
         depth: sum of weight times camera depth, not divided by alpha, shape (H, W); None unless asked for.
         splats: what was drawn. ``splats.projection.means`` keeps its gradient (pixels) for densification.
@@ -120,6 +120,6 @@ class Rendering(NamedTuple):
 class MomentImages(NamedTuple):
     """Moments of every pixel over the random factors."""
 
-    mean: Tensor  # expected colours over the background, (3, H, W)
-    variance: Tensor  # of the colours, at least 0, (3, H, W)
+    mean: Tensor  # expected colors over the background, (3, H, W)
+    variance: Tensor  # of the colors, at least 0, (3, H, W)
     alpha_mean: Tensor  # expected accumulated alpha, (H, W)

@@ -54,12 +54,12 @@ class Findings:
         """Return the model as the page draws it: arrays of little-endian numbers in base64.
 
         ``geometry`` holds 16 float32 per Gaussian: position (3), opacity, covariance (xx, xy, xz, yy, yz, zz), rank by
-        share per weight in [0, 1), 0, colour of the heat (3), 0. ``colors`` holds the coefficients of the spherical
+        share per weight in [0, 1), 0, color of the heat (3), 0. ``colors`` holds the coefficients of the spherical
         harmonics, (N, (degree + 1)^2, 3) in float16. ``held`` is the part of the score that the highest ranks hold, for
         0, 1, ... 100 % of the Gaussians.
 
         Args:
-            low: share per weight that gets the darkest colour.
+            low: share per weight that gets the darkest color.
             high: the one that gets the brightest.
         """
         gaussians, n = self.model.gaussians, len(self.model.gaussians)

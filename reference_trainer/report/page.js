@@ -46,7 +46,7 @@ $("kind").oninput = () => {
 };
 $("kind").oninput();
 $("ranges").append(make("span", { className: "quiet" }, `Black is 0; pale yellow is an error of ${data.ends.error} or a `
-  + `variance of ${data.ends.ca} (exact, half of the Gaussians left out), or more; grey does not count for the score.`));
+  + `variance of ${data.ends.ca} (exact, half of the Gaussians left out), or more; gray does not count for the score.`));
 
 // The models, and one camera for all of them.
 const camera = {}, models = [];

@@ -42,7 +42,7 @@ def write_report(
     """Write a page about runs on one scene that opens without a server and without a network.
 
     It shows what was trained on what, the scores, CA and PSNR against the step, every model to turn around (all
-    together) in its colours or in the heat of its co-adaptation, the views as photograph, render, error and CA map, and
+    together) in its colors or in the heat of its co-adaptation, the views as photograph, render, error and CA map, and
     how few Gaussians hold how much of the score. The heat is the share of the exact score at drop rate 1/2 per blend
     weight, over the views of the page, on one logarithmic scale for all runs around the mean of the first. What a run
     lacks is left out, and the page says so.

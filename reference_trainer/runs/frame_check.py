@@ -21,7 +21,7 @@ NEARLY_NONE = 0.01
 def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[str]:
     """Count the Gaussians in the pictures of a scene's cameras, before anything is rendered.
 
-    Gaussians count by their centres: at least 0.2 in front of the camera, where the renderer begins, and inside the
+    Gaussians count by their centers: at least 0.2 in front of the camera, where the renderer begins, and inside the
     picture. Those of an opacity below 1/255 are never drawn and do not count.
 
     Args:

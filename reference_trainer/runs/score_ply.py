@@ -79,7 +79,7 @@ def of_ply(
 
     Args:
         ply: the model.
-        background: colour behind it, shape (3,).
+        background: color behind it, shape (3,).
         regularizer: what the model was trained with, instead of what the PLY says.
         device: where to render.
 
@@ -208,9 +208,9 @@ def score_ply(
             "An orbit sees the model from where no photograph may have been taken: compare these scores with others "
             "from the same cameras alone; for those of the scene's own views give the scene (--scene FOLDER)."
         )
-    elif _worse_than_one_colour(result, scene):
+    elif _worse_than_one_color(result, scene):
         say(
-            f"Every training view is further from its photograph than a picture of one colour would be: {ply} is not "
+            f"Every training view is further from its photograph than a picture of one color would be: {ply} is not "
             f"in the frame of {scene.name}, or not a model of it. The PSNR says nothing, CA is that of these views."
         )
     return result
@@ -239,8 +239,8 @@ def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
     )
 
 
-def _worse_than_one_colour(result: Evaluation, scene: Scene) -> bool:
-    """Whether no training view is nearer to its photograph than the photograph's mean colour is."""
+def _worse_than_one_color(result: Evaluation, scene: Scene) -> bool:
+    """Whether no training view is nearer to its photograph than the photograph's mean color is."""
 
     def of_mean(view: View) -> float:
         return psnr(view.image.mean((1, 2), keepdim=True).expand_as(view.image), view.image)

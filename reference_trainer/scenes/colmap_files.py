@@ -201,7 +201,7 @@ def read_points_text(path: Path) -> ColmapPoints:
             words = line.split(maxsplit=8)
             color = [int(word) for word in words[4:7]]
             if not all(0 <= x <= 255 for x in color):
-                raise ValueError(f"a colour must be three numbers from 0 to 255, got {color}.")
+                raise ValueError(f"a color must be three numbers from 0 to 255, got {color}.")
             float(words[7])  # the reprojection error, which nobody here uses, but which must be there
             track = _numbers(words[8] if len(words) > 8 else "", int).reshape(-1, 2)[:, 0]
             points.add(int(words[0]), [float(word) for word in words[1:4]], color, track)

@@ -57,7 +57,7 @@ _MODELS: dict[int | str, CameraModel] = {k: m for n, m in enumerate(CAMERA_MODEL
 class ColmapCamera(NamedTuple):
     """Intrinsics of one camera: the pinhole part at the origin of the world, float64, and the distortion beside it.
 
-    Convention: half-pixel centres, as in the rest of the program; the distortion is in COLMAP's order, empty for the
+    Convention: half-pixel centers, as in the rest of the program; the distortion is in COLMAP's order, empty for the
     pinhole models.
     """
 
@@ -173,11 +173,11 @@ class PointRecords:
         """Take in a point, and the numbers of the images in its track.
 
         Raises:
-            ValueError: if it has not three coordinates and three colours.
-            OverflowError: if a number is beyond 64 bits, or a colour no byte.
+            ValueError: if it has not three coordinates and three colors.
+            OverflowError: if a number is beyond 64 bits, or a color no byte.
         """
         if len(position) != 3 or len(color) != 3:
-            raise ValueError(f"a point has three coordinates and three colours, got {[*position]} and {[*color]}.")
+            raise ValueError(f"a point has three coordinates and three colors, got {[*position]} and {[*color]}.")
         self._ids.append(number)
         self._positions.extend(position)
         self._colors.extend(color)

@@ -125,7 +125,7 @@ def read_depth(path: str | Path) -> Tensor:
     picture = np.squeeze(array)
     if picture.ndim != 2 or picture.dtype.kind not in "fiu":
         raise ValueError(
-            f"{path} must hold one number for each pixel, shape (H, W), got {array.shape} of {array.dtype}: a coloured "
+            f"{path} must hold one number for each pixel, shape (H, W), got {array.shape} of {array.dtype}: a colored "
             "picture of depth cannot be read back."
         )
     depth = torch.from_numpy(picture.astype(np.float32))

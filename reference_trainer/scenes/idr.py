@@ -25,7 +25,7 @@ def read_idr(path: str | Path, folder: str | Path) -> list[Frame]:
     """Read the cameras of ``cameras_sphere.npz`` and pair them with the images of a folder, sorted by name.
 
     Convention: ``world_mat_<i>`` is K [R | t], world to pixels of the pictures on the disk, with OpenCV axes; K has its
-    pixel centres where the pictures have them. ``scale_mat_<i>`` maps the unit sphere onto that around the object. The
+    pixel centers where the pictures have them. ``scale_mat_<i>`` maps the unit sphere onto that around the object. The
     world stays as it is, millimetres for DTU, as do COLMAP files beside it; the sphere gives the depth bounds.
     If the folder holds fewer images than there are cameras, their names must be numbers, and these count; else they
     belong together in sorted order. A folder ``mask`` beside the file holds the masks.

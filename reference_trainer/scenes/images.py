@@ -29,14 +29,14 @@ _BAND = 100_000  # pixels that are converted at a time
 def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
     """Read an 8-bit image file.
 
-    Convention: alpha is straight, as PNG defines it: the colours are not multiplied by it. An orientation tag is
+    Convention: alpha is straight, as PNG defines it: the colors are not multiplied by it. An orientation tag is
     ignored, as COLMAP does, because the cameras belong to the stored pixels.
 
     Args:
         path: the file: PNG, JPEG, BMP, TIFF or WebP, which its content tells and not its name.
 
     Returns:
-        Colours in [0, 1], shape (3, H, W), float32, and the coverage in [0, 1], shape (H, W), or None if the file has
+        Colors in [0, 1], shape (3, H, W), float32, and the coverage in [0, 1], shape (H, W), or None if the file has
         no transparency.
 
     Raises:

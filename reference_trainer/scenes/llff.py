@@ -22,7 +22,7 @@ def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
 
     Convention: each row holds a (3, 5) matrix, row by row, and the nearest and farthest depth. The matrix is
     [R | t | (height, width, focal length)], camera to world, with the camera's axes down, right, back. The principal
-    point is the centre of the picture. The frames' cameras are OpenCV and world to camera.
+    point is the center of the picture. The frames' cameras are OpenCV and world to camera.
 
     Raises:
         FileNotFoundError: if the file or the folder is missing.

@@ -16,7 +16,7 @@ from reference_trainer.scenes.options import World
 __all__ = ["BoundingSphere", "bounding_sphere", "look_at", "orbit_views"]
 
 ELEVATION = math.radians(20)
-"""Height of the cameras over the horizon of the centre: objects are mostly looked at from a little above."""
+"""Height of the cameras over the horizon of the center: objects are mostly looked at from a little above."""
 
 INSIDE = 0.98
 """Share of the opacity that the picture must hold; stray Gaussians far away would make the object tiny otherwise."""
@@ -28,7 +28,7 @@ place with surroundings and no object: objects have 1.6 to 1.9 (a plant, a mesh,
 
 @dataclass(frozen=True)
 class BoundingSphere:
-    """The part of a model that is to be looked at: its centre (3,), float64, and radius, in world units.
+    """The part of a model that is to be looked at: its center (3,), float64, and radius, in world units.
 
     It may be the middle of a place with surroundings, such as a room, and not an object as a whole.
     """
@@ -50,10 +50,10 @@ def orbit_views(
     world: World = "y-down",
     arc: float = 2 * math.pi,
 ) -> list[Camera]:
-    """Place cameras on a circle around a model, all looking at its centre.
+    """Place cameras on a circle around a model, all looking at its center.
 
     The `bounding_sphere` takes the share ``fill`` of the shorter side of the picture. In a y-down world the first
-    camera of a full circle looks along +z, the others follow at equal angles towards the side of +x; an arc is centred
+    camera of a full circle looks along +z, the others follow at equal angles towards the side of +x; an arc is centered
     on that first camera and has a camera at both ends.
 
     Convention: the world is y down and z forward (OpenCV) unless told otherwise, as captures mostly have it: a PLY does
@@ -108,9 +108,9 @@ def orbit_views(
 def bounding_sphere(means: Tensor, opacities: Tensor) -> BoundingSphere:
     """Find where the Gaussians of a model are; a few stray ones do not matter.
 
-    Of an object, the centre is that of the box between the quantiles 1 - `INSIDE` and `INSIDE` of each coordinate, and
+    Of an object, the center is that of the box between the quantiles 1 - `INSIDE` and `INSIDE` of each coordinate, and
     the radius the quantile `INSIDE` of the distances from it. Of a place with `SURROUNDINGS`, where that sphere would
-    be the room, the centre is the median and the radius twice that of half of the opacity. All is weighted by opacity,
+    be the room, the center is the median and the radius twice that of half of the opacity. All is weighted by opacity,
     activated, (N,) or (N, 1); the means (N, 3) are finite world coordinates.
 
     Raises:

@@ -112,16 +112,16 @@ def colmap_points(folder: Path) -> PointCloud | None:
 
 
 def ply_points(path: str | Path, *, seen_by: frozenset[str] | None = None) -> PointCloud:
-    """Read the vertices of a PLY file: a point cloud, or the centres and plain colours of a 3DGS model.
+    """Read the vertices of a PLY file: a point cloud, or the centers and plain colors of a 3DGS model.
 
     Args:
-        path: a PLY file, binary or ASCII, whose first element is ``vertex`` with at least ``x y z``. Its colours are
-            ``red green blue``: bytes, or floats up to 1 or up to 255; or ``f_dc_0`` to ``f_dc_2``; else grey.
+        path: a PLY file, binary or ASCII, whose first element is ``vertex`` with at least ``x y z``. Its colors are
+            ``red green blue``: bytes, or floats up to 1 or up to 255; or ``f_dc_0`` to ``f_dc_2``; else gray.
         seen_by: names of the images that it was made from, where that is known, for a PLY file does not say.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is truncated, not a PLY, or has no points with finite positions and fitting colours.
+        ValueError: if the file is truncated, not a PLY, or has no points with finite positions and fitting colors.
     """
     path = Path(path)
     if not path.is_file():
@@ -136,12 +136,12 @@ def ply_points(path: str | Path, *, seen_by: frozenset[str] | None = None) -> Po
     if len(positions) == 0 or not bool(positions.isfinite().all()):
         raise ValueError(f"{path} must hold points with finite positions; it has {len(positions)} points.")
     if not bool(((colors >= 0) & (colors <= 1)).all()):
-        raise ValueError(f"{path} must have colours as bytes, or as floats from 0 to 1 or to 255.")
+        raise ValueError(f"{path} must have colors as bytes, or as floats from 0 to 1 or to 255.")
     return PointCloud(positions, colors, source=str(path), seen_by=seen_by)
 
 
 def _colors(vertices: PlyVertices) -> Tensor:
-    """Return the colours, in [0, 1] if they are any, shape (N, 3)."""
+    """Return the colors, in [0, 1] if they are any, shape (N, 3)."""
     rgb, band = ("red", "green", "blue"), ("f_dc_0", "f_dc_1", "f_dc_2")
     if vertices.kinds.keys() >= set(rgb):
         colors = vertices.columns(rgb)

@@ -22,7 +22,7 @@ CameraPath = Literal["line", "arc"]
 def pseudo_cameras(scene: Scene) -> Callable[[torch.Generator], Camera]:
     """Return a function that draws cameras at random among the training cameras, as CoR-GS does on LLFF and DTU.
 
-    A camera stands anywhere in the box of the training cameras that is centred on their mean position, its edges along
+    A camera stands anywhere in the box of the training cameras that is centered on their mean position, its edges along
     the axes of their mean orientation, and looks at one point on the mean axis, at the depth
     ``1 / (0.25 / (0.9 near) + 0.75 / (5 far))``. Size and focal lengths are those of the first training camera, the
     principal point is the picture's middle. ``near`` and ``far`` are `depth_bounds` of the initial points; the sources

@@ -16,9 +16,9 @@ BLENDER_BOX = 1.3  # half the edge of the box that holds every NeRF-synthetic ob
 
 
 def random_points(train: Sequence[Frame], count: int, generator: torch.Generator) -> PointCloud:
-    """Draw grey points where the training cameras look.
+    """Draw gray points where the training cameras look.
 
-    They fill the NeRF-synthetic box if its centre lies in all training pictures and all training cameras stand outside
+    They fill the NeRF-synthetic box if its center lies in all training pictures and all training cameras stand outside
     it, else the cameras' frusta, between the scene file's depth bounds where it has them.
     """
     cameras = [frame.camera for frame in train]
@@ -32,7 +32,7 @@ def random_points(train: Sequence[Frame], count: int, generator: torch.Generator
 
 
 def _looks_at_box(frame: Frame) -> bool:
-    """Whether the camera stands outside the NeRF-synthetic box and has its centre, the origin, in the picture."""
+    """Whether the camera stands outside the NeRF-synthetic box and has its center, the origin, in the picture."""
     camera = frame.camera
     (u, v), depth = camera.project(torch.zeros(3))
     outside = float(camera.position.abs().max()) > BLENDER_BOX and depth > 0
@@ -40,7 +40,7 @@ def _looks_at_box(frame: Frame) -> bool:
 
 
 def random_points_in_box(count: int, half_size: float, *, generator: torch.Generator | None = None) -> PointCloud:
-    """Draw grey points uniformly in a cube around the origin whose edge is twice ``half_size``, world units."""
+    """Draw gray points uniformly in a cube around the origin whose edge is twice ``half_size``, world units."""
     positions = (2 * torch.rand(count, 3, generator=generator) - 1) * half_size
     return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
 
@@ -53,7 +53,7 @@ def random_points_in_frusta(
     far: float | None = None,
     generator: torch.Generator | None = None,
 ) -> PointCloud:
-    """Draw grey points that some camera sees: uniform over its picture, and in inverse depth between two bounds.
+    """Draw gray points that some camera sees: uniform over its picture, and in inverse depth between two bounds.
 
     The bounds are in world units. Without them, the point closest to all optical axes is looked for; near and far are a
     quarter of its median depth and four times that.
@@ -81,13 +81,13 @@ def random_points_in_frusta(
 def _focus_depth(cameras: Sequence[Camera]) -> float:
     """Median depth of the point with the least summed squared distance to the optical axes."""
     axes = torch.stack([camera.forward.double() for camera in cameras])
-    centres = torch.stack([camera.position.double() for camera in cameras])
+    centers = torch.stack([camera.position.double() for camera in cameras])
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     normal = across.sum(0)
     # The smallest eigenvalue is the summed squared sine of the axes' angles to their common direction.
     if torch.linalg.eigvalsh(normal)[0] > 1e-6 * len(cameras):
-        point = torch.linalg.solve(normal, (across @ centres[:, :, None]).sum(0)[:, 0])
-        depth = float(((point - centres) * axes).sum(1).median())
+        point = torch.linalg.solve(normal, (across @ centers[:, :, None]).sum(0)[:, 0])
+        depth = float(((point - centers) * axes).sum(1).median())
         if depth > 0:
             return depth
     raise ValueError(

@@ -14,7 +14,7 @@ from reference_trainer.scenes.textures import Texture
 
 __all__ = ["Box", "Round", "Solid", "nearest_hit", "render_solids"]
 
-SAMPLES = 3  # a side per pixel; odd, so that one ray passes through the pixel centre and gives its depth
+SAMPLES = 3  # a side per pixel; odd, so that one ray passes through the pixel center and gives its depth
 SHADOW_OFFSET = 1e-3  # shadow rays start this far off the surface, lest rounding make it shadow itself
 AMBIENT = 0.3
 GAMMA = 2.2
@@ -67,7 +67,7 @@ class Box:
         return like.new_tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]])
 
     def local(self, points: Tensor) -> Tensor:
-        """Return world points (R, 3) in the box's own coordinates, centred and along its axes."""
+        """Return world points (R, 3) in the box's own coordinates, centered and along its axes."""
         return (points - points.new_tensor(self.center)) @ self._axes(points).T
 
     def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
@@ -98,9 +98,9 @@ def nearest_hit(solids: Sequence[Solid], origins: Tensor, directions: Tensor) ->
 
 
 def render_solids(camera: Camera, solids: Sequence[Solid], light: Tensor) -> tuple[Tensor, Tensor]:
-    """Render solids, 3x3 rays a pixel: the image (3, H, W) in [0, 1] and the depth (H, W) at pixel centres, float32.
+    """Render solids, 3x3 rays a pixel: the image (3, H, W) in [0, 1] and the depth (H, W) at pixel centers, float32.
 
-    Surfaces are matt, so their colour does not depend on the view. The light is a small square of nine points (9, 3);
+    Surfaces are matt, so their color does not depend on the view. The light is a small square of nine points (9, 3);
     each of a pixel's nine rays sees another of them, which makes the shadows soft. Depth is along the camera's z axis;
     image and depth are 0 where nothing is hit.
     """

@@ -44,7 +44,7 @@ class View(Viewpoint):
     Args:
         name: the file name or another unique label.
         camera: its camera; ``camera.height`` and ``camera.width`` equal the image's.
-        image: colours in [0, 1], shape (3, H, W), float32, already composited on the scene's background.
+        image: colors in [0, 1], shape (3, H, W), float32, already composited on the scene's background.
         alpha: coverage in [0, 1], shape (H, W), where the source has one, else None.
         depth: true depth along the camera's z axis, shape (H, W), where it is known, else None; 0 where nothing is hit.
         mask: what an evaluation looks at, in [0, 1], shape (H, W), where the source has one: DTU's object. The
@@ -62,7 +62,7 @@ class View(Viewpoint):
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points to initialise Gaussians from: world coordinates and RGB in [0, 1], both (M, 3), float32.
+    """Points to initialize Gaussians from: world coordinates and RGB in [0, 1], both (M, 3), float32.
 
     ``source`` says for the log where they come from; ``seen_by`` names all the images that the points were triangulated
     from, where that is known.
@@ -83,7 +83,7 @@ class Scene:
         train: views to fit.
         test: held-out views, never used in training.
         points: initial points, or None to let the trainer draw random ones.
-        background: the colour (3,) behind everything, in [0, 1].
+        background: the color (3,) behind everything, in [0, 1].
         source: where the photographs come from.
         notes: what a user should know of how it was loaded, a sentence each.
         start: a model to start from instead; ``points`` are then its centers.

@@ -1,4 +1,4 @@
-"""Procedural solid textures: a colour for every point in space."""
+"""Procedural solid textures: a color for every point in space."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Noise:
 
 
 def color_ramp(values: Tensor, colors: Sequence[tuple[float, float, float]]) -> Tensor:
-    """Map values in [0, 1], shape (R,), to colours (R, 3) on a piecewise linear path through ``colors``.
+    """Map values in [0, 1], shape (R,), to colors (R, 3) on a piecewise linear path through ``colors``.
 
     Example:
         >>> color_ramp(torch.tensor([0.0, 0.5]), [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)]).tolist()
@@ -61,6 +61,6 @@ def color_ramp(values: Tensor, colors: Sequence[tuple[float, float, float]]) -> 
 
 
 def checker(u: Tensor, v: Tensor, joint: float) -> tuple[Tensor, Tensor]:
-    """Return which colour of a unit checkerboard (u, v) falls on, 0 or 1, and whether on a joint between tiles."""
+    """Return which color of a unit checkerboard (u, v) falls on, 0 or 1, and whether on a joint between tiles."""
     edge = torch.minimum((u - u.round()).abs(), (v - v.round()).abs())
     return (u.floor() + v.floor()).long() % 2, edge < joint / 2

@@ -29,7 +29,7 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
     are OpenCV and world to camera. nerfstudio's ``applied_transform`` is taken back, so that the world is that of the
     COLMAP files it came from. The focal length is ``fl_x`` and ``fl_y``, pixels, for a picture of ``w`` x ``h``, else
     it follows from the horizontal field of view ``camera_angle_x``, radians. The principal point ``cx``, ``cy`` is the
-    centre of the picture unless given; ``k1 k2 p1 p2 k3`` are OpenCV's distortion. A frame may have its own of each.
+    center of the picture unless given; ``k1 k2 p1 p2 k3`` are OpenCV's distortion. A frame may have its own of each.
     ``file_path`` is relative to the JSON file; without an extension it means a PNG file. Pictures of the same names are
     taken from another folder beside the file if one is given. The frames' names are the file paths without a leading
     ``./`` and without extension.

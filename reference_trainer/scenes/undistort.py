@@ -20,7 +20,7 @@ def distort(points: Tensor, camera: Camera, distortion: Sequence[float]) -> Tens
     """Return where the lens puts pixels (..., N, 2), float64, of a pinhole camera without distortion.
 
     Convention: OpenCV's rational model; the coefficients are k1 k2 p1 p2 k3 k4 k5 k6 or a beginning of that list, which
-    is also the order of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV. Pixel centres are half-integer.
+    is also the order of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV. Pixel centers are half-integer.
 
     Example:
         >>> camera = Camera(torch.eye(4), 100.0, 100.0, 50.0, 40.0, 100, 80)
@@ -62,7 +62,7 @@ def undistort(pixels: Tensor, camera: Camera, distortion: Sequence[float]) -> tu
     source = _distort_zoomed(torch.stack([x, y], -1).flatten(0, 1), camera, distortion, zoom)
     grid = 2 * source / torch.tensor([camera.width, camera.height], dtype=torch.float64) - 1
     grid = grid.to(pixels.dtype).reshape(1, camera.height, camera.width, 2)
-    # Without align_corners, -1 and 1 are the outer edges of the picture: the same half-pixel centres as the camera's.
+    # Without align_corners, -1 and 1 are the outer edges of the picture: the same half-pixel centers as the camera's.
     resampled = torch.nn.functional.grid_sample(
         pixels[None], grid, mode="bicubic", padding_mode="border", align_corners=False
     )
@@ -82,7 +82,7 @@ def _zoom(camera: Camera, distortion: Sequence[float]) -> float:
     border += [torch.stack([torch.full_like(y, edge), y], 1) for edge in (0.5, camera.width - 0.5)]
     center = torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
     steps = torch.linspace(0, 1, 33, dtype=torch.float64)[:, None, None]
-    rays = center + steps * (torch.cat(border) - center)  # from the centre to every point of the border
+    rays = center + steps * (torch.cat(border) - center)  # from the center to every point of the border
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
 
     def seen(zoom: float) -> bool:

@@ -1,4 +1,4 @@
-"""The attribution study: which Gaussians of a run hold its co-adaptation, in numbers, pictures and a coloured PLY."""
+"""The attribution study: which Gaussians of a run hold its co-adaptation, in numbers, pictures and a colored PLY."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from reference_trainer.scenes.scene import View, Viewpoint
 
 __all__ = ["study_attribution"]
 
-# Ends of the colour scale in units of the mean. Shares grow with the size of a Gaussian, so that a picture of them
+# Ends of the color scale in units of the mean. Shares grow with the size of a Gaussian, so that a picture of them
 # shows the large ones; per blend weight they show what the CA map shows, Gaussian by Gaussian.
 _SHARE_SCALE = (1.0, 100.0)
 
@@ -35,13 +35,13 @@ _README = """\
 {table}
 - `shares.npz`: `shares`, `total_effects` and `blend_weights`, one float64 per Gaussian in the order of the model
   (`numpy.load`).
-- `attribution.ply`: the same Gaussians for any viewer, coloured by their share: black {share[0]:.3g} (the mean share)
+- `attribution.ply`: the same Gaussians for any viewer, colored by their share: black {share[0]:.3g} (the mean share)
   or less, pale yellow {share[1]:.3g} (100 times the mean) or more.
-- `attribution_per_weight.ply`: coloured by their share per blend weight: black {share_per_weight[0]:.3g} (a tenth of
+- `attribution_per_weight.ply`: colored by their share per blend weight: black {share_per_weight[0]:.3g} (a tenth of
   the mean) or less, pale yellow {share_per_weight[1]:.3g} (10 times the mean) or more. The mean is the score over the
   sum of the weights. Here a Gaussian is bright that co-adapts much for what it contributes, small or large.
-- `views/`: render; CA map (black 0, pale yellow {ca_range:g} or more, grey: not covered by the score); the render with
-  the colours of either PLY.
+- `views/`: render; CA map (black 0, pale yellow {ca_range:g} or more, gray: not covered by the score); the render with
+  the colors of either PLY.
 
 Both scales are logarithmic, from black through purple, red and orange to pale yellow, and relative to the mean of this
 model: they show where its co-adaptation lives. How much there is, the score tells.
@@ -57,7 +57,7 @@ def study_attribution(
     device: str = "cpu",
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
-    """Attribute the exact score of a run; write the shares, a coloured PLY, pictures and a table, and print that.
+    """Attribute the exact score of a run; write the shares, a colored PLY, pictures and a table, and print that.
 
     Args:
         run: folder of the run; its last checkpoint is measured.
@@ -116,7 +116,7 @@ def study_attribution(
     table = _table(data)
     write_text(out / "README.md", _README.format(table=table, ca_range=CA_PICTURE_RANGE, **scales))
     say(table)
-    say(f"Shares, PLYs and pictures are in {out}; README.md there says what the colours mean")
+    say(f"Shares, PLYs and pictures are in {out}; README.md there says what the colors mean")
     return data
 
 
@@ -137,7 +137,7 @@ def _correlations(
 
 @torch.no_grad()
 def _picture(model: TrainedModel, colored: Iterable[Gaussians], view: View, result: CAResult) -> Tensor:
-    """Lay the render, the CA map and the render in other colours side by side."""
+    """Lay the render, the CA map and the render in other colors side by side."""
     opacities = model.test_opacities
     models = [model, *(dataclasses.replace(model, gaussians=gaussians) for gaussians in colored)]
     plain, *others = [each.rendering(opacities, view).image for each in models]

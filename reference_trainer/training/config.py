@@ -50,7 +50,7 @@ class TrainConfig:
     "my_module:MyRenderer"."""
 
     sh_degree: int = 3
-    """Degree of the spherical harmonics of the colours, 0 to 3."""
+    """Degree of the spherical harmonics of the colors, 0 to 3."""
     sh_every: int = 500
     """A band of spherical harmonics is added every so many steps; 0: all are there from the first step on."""
 
@@ -65,12 +65,12 @@ class TrainConfig:
     opacity_rate: float = 0.05
     """Learning rate of the opacity logits."""
     color_rate: float = 2.5e-3
-    """Learning rate of the constant colour; the other bands get a twentieth."""
+    """Learning rate of the constant color; the other bands get a twentieth."""
 
     initial_points: Literal["all", "seen"] = "all"
     """Points to start from: all, or those whose Gaussian has a pixel in a training view."""
     initial_scale: float = 1.0
-    """Size of the initial Gaussians, as a fraction of the distance to their neighbours."""
+    """Size of the initial Gaussians, as a fraction of the distance to their neighbors."""
     initial_opacity: float = 0.1
     """Opacity of the initial Gaussians."""
     densify_from: int = 500

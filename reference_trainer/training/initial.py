@@ -18,7 +18,7 @@ __all__ = ["drawn_by_any", "initial_gaussians"]
 
 
 def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
-    """Make one round Gaussian per point, as wide as the distance to its neighbours times ``config.initial_scale``.
+    """Make one round Gaussian per point, as wide as the distance to its neighbors times ``config.initial_scale``.
 
     Where the scene has a model to start from, its Gaussians are taken as they are, with as many bands of spherical
     harmonics as are asked for: further ones are left out, missing ones 0.

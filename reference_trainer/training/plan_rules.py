@@ -68,9 +68,9 @@ def alpha_masks(scene: Scene, config: TrainConfig) -> PlanItem:
 
 
 def background(scene: Scene, config: TrainConfig) -> PlanItem:
-    """The background is added behind the Gaussians, whatever its colour: it costs next to nothing."""
-    colour = ", ".join(f"{value:g}" for value in scene.background.tolist())
-    return PlanItem("background", "used", f"({colour}) behind everything; adding it takes less than 1% of a step")
+    """The background is added behind the Gaussians, whatever its color: it costs next to nothing."""
+    color = ", ".join(f"{value:g}" for value in scene.background.tolist())
+    return PlanItem("background", "used", f"({color}) behind everything; adding it takes less than 1% of a step")
 
 
 def depth_output(scene: Scene, config: TrainConfig) -> PlanItem:
@@ -165,8 +165,8 @@ def saturated(scene: Scene, config: TrainConfig) -> PlanItem:
 
 def ssim_windows(scene: Scene, config: TrainConfig) -> PlanItem:
     """Parts of the picture where photograph and background are the same."""
-    colour = scene.background[:, None, None]
-    busy = [(view.image != colour).any(0) for view in scene.train]
+    color = scene.background[:, None, None]
+    busy = [(view.image != color).any(0) for view in scene.train]
     share = sum(float(part.any(1).float().mean() * part.any(0).float().mean()) for part in busy) / len(busy)
     if not any(isinstance(term, Photometric) and term.lambda_dssim > 0 for term in config.make_losses()):
         return PlanItem("SSIM windows without change", "left out", "by construction: the loss has no SSIM")
@@ -188,9 +188,9 @@ def initial_size(scene: Scene, config: TrainConfig) -> PlanItem:
     if scene.start is not None:
         return PlanItem(name, "used", f"by construction: {count} Gaussians have sizes of their own")
     if points.source != "random":
-        size = f"as wide as {config.initial_scale:g} x the distance to their neighbours"
+        size = f"as wide as {config.initial_scale:g} x the distance to their neighbors"
         return PlanItem(name, "used", f"{count} measured points, {size}")
-    reason = f"{count} random points as wide as the distance to their neighbours would pile up; half as wide is as good"
+    reason = f"{count} random points as wide as the distance to their neighbors would pile up; half as wide is as good"
     return PlanItem(name, "reduced", reason, {"initial_scale": 0.5})
 
 

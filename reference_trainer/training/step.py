@@ -33,7 +33,7 @@ class Step:
         views: all training views.
         gaussians: the model.
         regularizer: what acts in this step; an empty chain if nothing does.
-        background: colour behind the model, shape (3,).
+        background: color behind the model, shape (3,).
         sh_degree: highest band of spherical harmonics of this step.
         seed: of the training.
         renderer: what draws.
@@ -45,7 +45,7 @@ class Step:
         params: the parameters of the view's camera, activated, as they are without a regularizer.
         drawn: the same as the regularizer returned it; in an analytic step what the expectation was rendered with.
         image: the render, or in an analytic step its expectation, not clamped, shape (3, H, W).
-        variance: of the colours in an analytic step, shape (3, H, W); None in others.
+        variance: of the colors in an analytic step, shape (3, H, W); None in others.
         rendering: with alpha, depth if a term needs it, and what was drawn; None in an analytic step.
         observed: what density control is to see: splats and camera of every render that counts.
     """
@@ -134,7 +134,7 @@ class Step:
     def moments(
         self, camera: Camera, multiplier: Multiplier, params: Params | None = None, *, observed: bool = False
     ) -> MomentImages:
-        """Render the exact mean and variance of a camera's colours under random factors on the alphas.
+        """Render the exact mean and variance of a camera's colors under random factors on the alphas.
 
         Args:
             camera: on the model's device.

@@ -28,7 +28,7 @@ class Look:
     """How a model is looked at.
 
     Args:
-        mode: the render of the test, the exact CA map, depth, or the Gaussians in the colours of their `Heat`.
+        mode: the render of the test, the exact CA map, depth, or the Gaussians in the colors of their `Heat`.
         drop_rate: of the CA map and of the mask, in [0, 1).
         noise: standard deviation of the opacity noise, at least 0: the CA map is that of dropout and noise, all other
             pictures are of one draw of it.
@@ -83,7 +83,7 @@ class Subject:
             score = CAScore(exact=model.moments, regularizer=_draws(look))
             result = score(model.gaussians.opacities, view)
             said = f"exact CA {result.value * 1e3:.2f}e-3" if result.value == result.value else result.reason.value
-            return ca_picture(result), f"{said}; variance 0 (black) to {CA_PICTURE_RANGE:g}, grey: not covered"
+            return ca_picture(result), f"{said}; variance 0 (black) to {CA_PICTURE_RANGE:g}, gray: not covered"
         out = model.test_rendering(view, depth=look.mode == "depth")
         if out.depth is None:
             return out.image.clamp(0, 1), self._said_of_heat(look)
@@ -95,7 +95,7 @@ class Subject:
         return colors.T.view_as(out.image), f"depth {1 / high:.3g} (bright) to {1 / low:.3g}"
 
     def _said_of_heat(self, look: Look) -> str:
-        """Say what the colours mean, and how much co-adaptation is hidden."""
+        """Say what the colors mean, and how much co-adaptation is hidden."""
         said = []
         if look.mode == "heat":
             said.append(
@@ -109,7 +109,7 @@ class Subject:
         return "; ".join(said)
 
     def _chosen(self, look: Look) -> TrainedModel:
-        """Return the model with the Gaussians, colours and opacities of a look."""
+        """Return the model with the Gaussians, colors and opacities of a look."""
         gaussians, regularizer = self.model.gaussians, self.model.regularizer
         if look.mode != "co-adaptation" and (look.mask or look.noise):  # in place of the test-time opacities
             drawn = _draws(look).regularize(gaussians.params(), torch.Generator(gaussians.means.device).manual_seed(0))

@@ -114,7 +114,7 @@ def gradient_noise(
 
     Args:
         gaussians: the model.
-        background: colour behind it, shape (3,).
+        background: color behind it, shape (3,).
         config: dropout rate, without noise; seed of the masks; weight of D-SSIM.
         views: to train on, with different names.
         sh_degree: highest band of spherical harmonics to use.

@@ -25,7 +25,7 @@ VARIANTS = {
     "exact_half": "the same at drop rate 1/2 for every model",
     "limit_conditioned": "the variance of exact_half over the region of protocol_half",
     "weighted_half": "the variance of exact_half over all pixels, weighted by their expected alpha",
-    "neutral_half": "exact_half composited over the expected colour instead of the background",
+    "neutral_half": "exact_half composited over the expected color instead of the background",
 }
 """The scores that are compared, in the order of the tables."""
 

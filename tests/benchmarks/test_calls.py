@@ -47,5 +47,5 @@ def test_the_gradients_are_those_of_the_mean_squared_error():
     for sign in (1, -1):
         parameters = {**workload.parameters, "colors": workload.colors + sign * step}
         changes.append((BASELINE(parameters, workload.camera) - workload.target).square().mean())
-    # The loss is quadratic in the colours: the central difference is exact.
+    # The loss is quadratic in the colors: the central difference is exact.
     assert torch.allclose((changes[0] - changes[1]) / 2, gradient[3].sum(), rtol=1e-9)

@@ -29,11 +29,11 @@ def silent(text: str) -> None:
     """Say nothing."""
 
 
-def model_of_layers(greys: list[float], size: float) -> TrainedModel:
-    """Grey Gaussians behind one another, over black."""
-    n = len(greys)
+def model_of_layers(grays: list[float], size: float) -> TrainedModel:
+    """Gray Gaussians behind one another, over black."""
+    n = len(grays)
     positions = torch.tensor([[0.0, 0.0, 1.0 + i] for i in range(n)])
-    colors = torch.tensor(greys)[:, None].expand(n, 3)
+    colors = torch.tensor(grays)[:, None].expand(n, 3)
     gaussians = Gaussians.from_points(positions, colors, torch.full((n,), size), sh_degree=0, opacity=OPACITY)
     return TrainedModel(gaussians, torch.zeros(3))
 
@@ -43,13 +43,13 @@ def black_view(pixels: int) -> View:
     return View("view", camera, torch.zeros(3, pixels, pixels))
 
 
-def composites(greys: list[float], behind: float = 0.0) -> list[float]:
+def composites(grays: list[float], behind: float = 0.0) -> list[float]:
     """The pixel under each of the equally likely masks, the one that drops everything last."""
     out = []
-    for mask in itertools.product([1, 0], repeat=len(greys)):
+    for mask in itertools.product([1, 0], repeat=len(grays)):
         color, light = 0.0, 1.0
-        for keep, grey in zip(mask, greys, strict=True):
-            color, light = color + keep * light * OPACITY * grey, light * (1 - keep * OPACITY)
+        for keep, gray in zip(mask, grays, strict=True):
+            color, light = color + keep * light * OPACITY * gray, light * (1 - keep * OPACITY)
         out.append(color + light * behind)
     return out
 
@@ -58,18 +58,18 @@ def composites(greys: list[float], behind: float = 0.0) -> list[float]:
 def walls() -> dict[str, tuple[list[float], list[dict[str, float]]]]:
     """Two models of three layers that fill the view: equal ones, whose holes show black, and unequal darker ones."""
     view = black_view(2)
-    greys = {"equal": [1.0, 1.0, 1.0], "unequal": [0.3, 0.7, 0.4]}
+    grays = {"equal": [1.0, 1.0, 1.0], "unequal": [0.3, 0.7, 0.4]}
     return {
         name: (layers, [score_view(model_of_layers(layers, 100.0), view, index=i) for i in range(24)])
-        for name, layers in greys.items()
+        for name, layers in grays.items()
     }
 
 
 @pytest.mark.parametrize("name", ["equal", "unequal"])
 def test_five_renders_without_a_hole_know_the_variance_given_no_hole(walls, name):
     """All five masks keep something in half of the views; they are then independent draws from such masks."""
-    greys, rows = walls[name]
-    limit, without_hole = statistics.pvariance(composites(greys)), statistics.pvariance(composites(greys)[:-1])
+    grays, rows = walls[name]
+    limit, without_hole = statistics.pvariance(composites(grays)), statistics.pvariance(composites(grays)[:-1])
     for quantity in ("protocol_half", "repeat"):
         values = [row[quantity] for row in rows if math.isfinite(row[quantity])]
         assert 3 < len(values) < 22  # expected (7/8)^5 of 24 = 12, spread 2.4: 3e-4
@@ -80,7 +80,7 @@ def test_five_renders_without_a_hole_know_the_variance_given_no_hole(walls, name
     values = [row["unconditioned"] for row in rows]
     assert statistics.mean(values) == pytest.approx(0.8 * limit, abs=4 * statistics.stdev(values) / math.sqrt(24))
     mean_alpha = 1 - (1 - OPACITY / 2) ** 3
-    over_own_color = statistics.pvariance(composites(greys, statistics.mean(composites(greys)) / mean_alpha))
+    over_own_color = statistics.pvariance(composites(grays, statistics.mean(composites(grays)) / mean_alpha))
     for row in rows:
         assert row["exact_half"] == pytest.approx(limit, rel=1e-4)
         assert row["weighted_half"] == pytest.approx(limit, rel=1e-4)
@@ -140,7 +140,7 @@ def test_regions_and_variances_are_crossed_as_the_names_say(tiny_scene):
 
 
 def test_the_weights_are_the_expected_alpha():
-    """One small Gaussian: variance alpha^2/4 times the squared colour, weight alpha/2; nowhere 0.8 on average."""
+    """One small Gaussian: variance alpha^2/4 times the squared color, weight alpha/2; nowhere 0.8 on average."""
     model, view = model_of_layers([0.5], 0.1), black_view(16)
     alpha = model.render(model.gaussians.opacities, view)[1].double()
     row = score_view(model, view, index=0)

@@ -19,7 +19,7 @@ PARAMETERS = ("means", "quaternions", "scales", "opacities", "colors")
 
 _SEED = 1234
 _MIN_ALPHA = 1 / 255
-_DISTANCE = 2.0  # from the camera to the centre of the cube
+_DISTANCE = 2.0  # from the camera to the center of the cube
 _YAW, _PITCH = 10.0, -7.0  # of the camera, degrees
 _FOCAL = 2.0  # in image widths
 _SPREAD = 3.0  # scales lie between the base scale divided and multiplied by this
@@ -31,7 +31,7 @@ class Workload:
 
     Args:
         means: world coordinates, shape (N, 3).
-        quaternions: wxyz, normalised, shape (N, 4).
+        quaternions: wxyz, normalized, shape (N, 4).
         scales: standard deviations, shape (N, 3).
         opacities: activated, shape (N,).
         colors: RGB in [0, 1], shape (N, 3).
@@ -62,10 +62,10 @@ class WorkloadSpec:
     """The recipe of a workload: random Gaussians in the unit cube, seen from outside, before black.
 
     Means are uniform in the cube around the origin, orientations isotropic, scales log-uniform over a factor of 9 and
-    independent per axis, opacities uniform in [0.1, 0.9], colours and target uniform in [0, 1].
+    independent per axis, opacities uniform in [0.1, 0.9], colors and target uniform in [0, 1].
 
-    Convention: OpenCV camera, turned by 10 degrees in yaw and -7 in pitch, 2 in front of the centre, focal length of
-    two image widths. Drawn in float64 by numpy's PCG64 in the order means, quaternions, scales, opacities, colours,
+    Convention: OpenCV camera, turned by 10 degrees in yaw and -7 in pitch, 2 in front of the center, focal length of
+    two image widths. Drawn in float64 by numpy's PCG64 in the order means, quaternions, scales, opacities, colors,
     target (H, W, 3), then rounded to float32.
 
     Args:

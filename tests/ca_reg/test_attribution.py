@@ -44,7 +44,7 @@ class Scene:
         return CAScore(exact=self.moments, drop_rate=rate, neutral=neutral, threshold=THRESHOLD)
 
     def draws(self, supports):
-        """Colours over black (pixels, 3, ...) and alpha (pixels, ...) of every outcome, one axis per Gaussian in depth.
+        """Colors over black (pixels, 3, ...) and alpha (pixels, ...) of every outcome, one axis per Gaussian in depth.
 
         ``supports`` are (values, probabilities) per Gaussian in depth order.
         """

@@ -81,6 +81,29 @@ def test_a_chain_drops_what_a_member_drops_and_replays():
     assert torch.equal(chain(opacity, drawn=chain.last), out)
 
 
+def test_a_member_in_eval_gives_its_test_time_value_in_a_replay_as_well():
+    chain = Chain(GaussianDropout(0.5), OpacityNoise(0.5))
+    chain.members[0].eval()
+    opacity = torch.full((400,), 0.6)
+    out = chain(opacity)
+    assert chain.keep is None
+    assert torch.equal(out, 0.5 * opacity * (1 + chain.last.value[1].value).clamp(0, 1 / 0.3))
+    assert torch.equal(chain(opacity, drawn=chain.last), out)
+
+
+def test_a_draw_is_that_of_all_members_in_either_mode_and_leaves_no_trace():
+    x, drawn = Params(torch.full((400,), 0.6)), []
+    for chain in (
+        Chain(GaussianDropout(0.5), OpacityNoise(0.5)),
+        Chain(GaussianDropout(0.5), OpacityNoise(0.5)).eval(),
+    ):
+        draw = chain.draw(x, torch.Generator().manual_seed(2))
+        assert chain.last is None
+        drawn.append(chain.replay(x, draw).opacities)
+    assert torch.equal(*drawn)
+    assert bool((drawn[0] == 0).any())
+
+
 def test_members_may_change_other_parameters_and_say_what_they_need():
     chain = Chain(GaussianDropout(0.5), ScaleUp())
     assert chain.needs == ("scales",)

@@ -38,10 +38,10 @@ def test_survivors_of_compensated_dropout_may_exceed_one():
 def test_masks_keep_the_stated_fraction_independently(p):
     n = 200_000
     keep = draw_keep_mask(n, p, generator=torch.Generator().manual_seed(1)).double()
-    # Means of n Bernoulli and of n/2 products of neighbours; 5 standard deviations each: false alarm 6e-7 a comparison.
+    # Means of n Bernoulli and of n/2 products of neighbors; 5 standard deviations each: false alarm 6e-7 a comparison.
     assert abs(keep.mean().item() - (1 - p)) < 5 * (p * (1 - p) / n) ** 0.5
-    centred = keep - (1 - p)
-    assert abs((centred[::2] * centred[1::2]).mean().item()) < 5 * p * (1 - p) / (n / 2) ** 0.5
+    centered = keep - (1 - p)
+    assert abs((centered[::2] * centered[1::2]).mean().item()) < 5 * p * (1 - p) / (n / 2) ** 0.5
 
 
 def test_masks_do_not_depend_on_the_dtype_of_the_opacities():

@@ -83,7 +83,7 @@ def test_the_rate_follows_the_step():
     torch.testing.assert_close(dropout.eval()(OPACITY), OPACITY * 0.9)
 
 
-def test_logits_are_recognised_at_the_first_call():
+def test_logits_are_recognized_at_the_first_call():
     for module in (GaussianDropout(0.2), OpacityNoise(0.2), GaussianDropout(0.2).eval()):
         with pytest.raises(ValueError, match="sigmoid"):
             module(torch.randn(50))

@@ -20,7 +20,7 @@ EXACT = {"rtol": 1e-12, "atol": 1e-14}
 
 
 def lists(pixels, n, *, channels=3, seed=0, dtype=torch.float64, low=0.0, high=0.99):
-    """Random alphas (pixels, n), colours (pixels, n, channels) and backgrounds (pixels, channels)."""
+    """Random alphas (pixels, n), colors (pixels, n, channels) and backgrounds (pixels, channels)."""
     g = torch.Generator().manual_seed(seed)
     alphas = low + (high - low) * torch.rand(pixels, n, generator=g, dtype=dtype)
     return alphas, torch.rand(pixels, n, channels, generator=g, dtype=dtype), torch.rand(
@@ -161,13 +161,13 @@ def test_the_neutral_background_is_the_mean_itself_and_equals_the_enumeration():
     torch.testing.assert_close(result.mean, neutral, **EXACT)
     torch.testing.assert_close(result.variance, expected[1], **EXACT)
     # Compositing mean renders over one another converges to it: the fixed point, reached without the formula.
-    colour = torch.zeros_like(neutral)
+    color = torch.zeros_like(neutral)
     for _ in range(200):
-        colour = pixel_moments(alphas, colors, dropout, background=colour).mean
-    torch.testing.assert_close(colour, neutral, **EXACT)
+        color = pixel_moments(alphas, colors, dropout, background=color).mean
+    torch.testing.assert_close(color, neutral, **EXACT)
 
 
-def test_over_the_neutral_background_only_disagreement_of_colours_counts():
+def test_over_the_neutral_background_only_disagreement_of_colors_counts():
     alphas, colors, background = lists(8, 10, high=0.1)
     alphas[0] = 0.0
     dropout = Multiplier.dropout(0.5)
@@ -177,7 +177,7 @@ def test_over_the_neutral_background_only_disagreement_of_colours_counts():
     assert (neutral[0] == 0).all()
     assert pixel_moments(alphas, same, dropout, background=neutral).variance.max() < 1e-30
     assert pixel_moments(alphas, same, dropout).variance[1:].min() > 1e-6
-    # A shift of all colours changes nothing.
+    # A shift of all colors changes nothing.
     shifted = neutral_background(alphas, colors + 3, dropout)
     torch.testing.assert_close(
         pixel_moments(alphas, colors + 3, dropout, background=shifted).variance,
@@ -252,7 +252,7 @@ def test_shapes_without_a_pixel_axis_or_with_several_agree():
     torch.testing.assert_close(one.variance, flat.variance[2], **EXACT)
 
 
-def test_channels_are_independent_and_colours_scale_and_shift():
+def test_channels_are_independent_and_colors_scale_and_shift():
     alphas, colors, background = lists(8, 7)
     dropout, order = Multiplier.dropout(0.3), [2, 0, 1]
     plain = pixel_moments(alphas, colors, dropout, background=background)
@@ -264,7 +264,7 @@ def test_channels_are_independent_and_colours_scale_and_shift():
     torch.testing.assert_close(affine.variance, 9 * plain.variance, **EXACT)
 
 
-def test_equal_colours_over_themselves_have_exactly_no_variance_in_float32():
+def test_equal_colors_over_themselves_have_exactly_no_variance_in_float32():
     alphas, _, background = lists(50, 20, dtype=torch.float32)
     colors = background[:, None].expand(50, 20, 3)
     mean, variance = pixel_moments(alphas, colors, Multiplier.dropout(0.5), background=background)
@@ -396,7 +396,7 @@ def test_wrong_arguments_are_refused(change, error, message):
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 @pytest.mark.parametrize("function", [pixel_moments, contributions, neutral_background, first_order_variance])
-def test_colours_that_are_not_finite_are_refused_in_the_padding_too(function, bad):
+def test_colors_that_are_not_finite_are_refused_in_the_padding_too(function, bad):
     alphas, colors, _ = lists(3, 5)
     alphas[1, 4], colors[1, 4, 2] = 0.0, bad
     with pytest.raises(ValueError, match="colors must be finite"):
@@ -409,7 +409,7 @@ def test_a_background_that_is_not_finite_is_refused():
         pixel_moments(alphas, colors, Multiplier.dropout(0.3), background=torch.tensor([0.0, math.nan, 0.0]).double())
 
 
-def test_finite_colours_whose_sum_overflows_are_no_mistake():
+def test_finite_colors_whose_sum_overflows_are_no_mistake():
     alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[3e38], [3e38]])
     assert pixel_moments(alphas, colors, Multiplier.dropout(0.5)).mean.item() == pytest.approx(0.4375 * 3e38)
 

@@ -68,6 +68,15 @@ def test_psnr_gets_the_opacities_of_the_test_and_is_averaged_over_views(tmp_path
     assert record["psnr/test"] == 30.0
 
 
+@pytest.mark.parametrize("step", [10.0, -10, True])
+def test_a_step_that_is_none_is_refused_before_it_is_logged(tmp_path, step):
+    with make(tmp_path) as monitor:
+        with pytest.raises((TypeError, ValueError), match="step must be"):
+            monitor(step, OPACITY)
+        assert monitor(np.int64(10), OPACITY)["step"] == 10
+    assert [line["step"] for line in lines(tmp_path)] == [10]
+
+
 def test_a_line_is_on_disk_when_the_call_returns(tmp_path):
     with make(tmp_path) as monitor:
         monitor(10, OPACITY)

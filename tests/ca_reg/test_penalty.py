@@ -18,7 +18,7 @@ BACKGROUND = torch.tensor([0.9, 0.1, 0.4], dtype=torch.float64)
 
 
 class Cloud:
-    """Gaussians in a fixed order over a picture: falloffs (H, W, n) at most 1, and colours (n, 3)."""
+    """Gaussians in a fixed order over a picture: falloffs (H, W, n) at most 1, and colors (n, 3)."""
 
     def __init__(self, n, seed=0, dtype=torch.float64):
         g = torch.Generator().manual_seed(seed)

@@ -34,7 +34,7 @@ OPACITIES = st.integers(0, 30).flatmap(tensors)
 
 @st.composite
 def pixels(draw, most=5):
-    """Alphas (P, n) and colours (P, n, 3) of a few pixels, and their background."""
+    """Alphas (P, n) and colors (P, n, 3) of a few pixels, and their background."""
     p, n = draw(st.integers(1, 3)), draw(st.integers(1, most))
     return draw(tensors((p, n))), draw(tensors((p, n, 3))), draw(tensors(3))
 
@@ -85,6 +85,24 @@ def test_a_column_gets_what_a_vector_gets(opacity, p, sigma, seed):
         assert matrix.shape == column.shape
         assert matrix.dtype == vector.dtype == torch.float64
         torch.testing.assert_close(matrix[:, 0], vector, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 1)])
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_each_gaussian_has_its_own_rate_in_every_shape_and_type(shape, dtype):
+    rates, opacity = torch.tensor([0.0, 0.25, 0.5]), torch.full(shape, 0.5, dtype=dtype)
+    kept = torch.tensor([True, False, True])
+    scaled, raised = F.scale_opacity(opacity, rates), F.apply_dropout(opacity, kept, p=rates, compensate=True)
+    assert (scaled.shape, scaled.dtype, raised.shape, raised.dtype) == (shape, dtype, shape, dtype)
+    assert scaled.flatten().tolist() == [0.5, 0.375, 0.25]
+    assert raised.flatten().tolist() == [0.5, 0.0, 1.0]
+    for call in (
+        lambda p: F.scale_opacity(opacity, p),
+        lambda p: F.apply_dropout(opacity, kept, p=p, compensate=True),
+        lambda p: F.draw_keep_mask(3, p),
+    ):
+        with pytest.raises(ValueError, match=r"p must have shape \(3,\)"):
+            call(rates[:1])
 
 
 @REPEATABLE
@@ -188,7 +206,7 @@ def test_moments_stay_in_their_bounds(pixel, p, sigma):
 
 @REPEATABLE
 @given(pixels(8), RATES, tensors(3))
-def test_a_common_colour_behind_moves_the_mean_alone(pixel, p, shift):
+def test_a_common_color_behind_moves_the_mean_alone(pixel, p, shift):
     alphas, colors, background = pixel
     here = F.pixel_moments(alphas, colors, Multiplier.dropout(p), background=background)
     there = F.pixel_moments(alphas, colors + shift, Multiplier.dropout(p), background=background + shift)
@@ -217,7 +235,7 @@ def test_the_neutral_background_is_neutral(pixel, p):
     background = F.neutral_background(alphas, colors, Multiplier.dropout(p))
     mean, variance = F.pixel_moments(alphas, colors, Multiplier.dropout(p), background=background)
     torch.testing.assert_close(mean, background, rtol=1e-9, atol=1e-9)
-    same = colors[..., :1, :].expand_as(colors)  # splats of one colour agree, whatever is left out
+    same = colors[..., :1, :].expand_as(colors)  # splats of one color agree, whatever is left out
     background = F.neutral_background(alphas, same, Multiplier.dropout(p))
     _, variance = F.pixel_moments(alphas, same, Multiplier.dropout(p), background=background)
     assert float(variance.max()) < 1e-24
@@ -249,16 +267,16 @@ def test_clamped_noise_has_the_bounds_of_what_it_multiplies(opacity, sigma, clip
     assert bool((opacity.square() * noise.variance <= mean * (1 - mean) + 1e-12).all())  # Bhatia-Davis again
 
 
-# Colour variance
+# Color variance
 
 
 @REPEATABLE
 @given(pixels(8))
-def test_colour_variance_is_the_weighted_variance(pixel):
+def test_color_variance_is_the_weighted_variance(pixel):
     weights, colors, _ = pixel
     order = torch.randperm(weights.shape[-1], generator=seeded(0))
     cv = F.color_variance(weights, colors)
-    assert bool(((cv.variance >= 0) & (cv.variance <= 0.25 + 1e-12)).all())  # Popoviciu, colours in [0, 1]
+    assert bool(((cv.variance >= 0) & (cv.variance <= 0.25 + 1e-12)).all())  # Popoviciu, colors in [0, 1]
     torch.testing.assert_close(F.color_variance(weights[:, order], colors[:, order]).variance, cv.variance)
     torch.testing.assert_close(F.color_variance(weights * 0.125, colors).variance, cv.variance)
     for i in range(len(weights)):

@@ -16,7 +16,7 @@ from ca_reg.types import Rendering
 
 
 class Splats:
-    """n splats in depth order over H x W pixels, with random footprints and colours."""
+    """n splats in depth order over H x W pixels, with random footprints and colors."""
 
     def __init__(self, n, height=4, width=5, seed=0):
         generator = torch.Generator().manual_seed(seed)
@@ -286,7 +286,7 @@ def test_an_empty_visible_region_is_a_reason():
     assert result.as_dict()["reason"] == "EMPTY"
 
 
-def test_colours_that_are_not_finite_are_a_reason_only_where_they_are_seen():
+def test_colors_that_are_not_finite_are_a_reason_only_where_they_are_seen():
     def render_fn(opacity, view):
         image, alpha = torch.rand(3, 4, 4), torch.ones(4, 4)
         image[:, 0, 0] = torch.nan

@@ -194,7 +194,7 @@ def test_nan_in_a_single_render_is_not_finite(arguments):
 
 @each_method
 def test_nan_where_nothing_is_covered_does_not_count(arguments):
-    """Renderers that divide colours by alpha return 0 / 0 there."""
+    """Renderers that divide colors by alpha return 0 / 0 there."""
 
     def fn(opacity, view):
         image, alpha = render(opacity, view)
@@ -203,7 +203,7 @@ def test_nan_where_nothing_is_covered_does_not_count(arguments):
 
     assert CAScore(fn, threshold=0.2, **arguments)(OPACITY, None).reason is Reason.OK
     nothing = CAScore(lambda o, v: (torch.full((3, 4, 4), math.nan), torch.zeros(4, 4)), **arguments)
-    assert nothing(OPACITY, None).reason is Reason.NOT_FINITE  # not one colour is finite
+    assert nothing(OPACITY, None).reason is Reason.NOT_FINITE  # not one color is finite
 
 
 @pytest.mark.parametrize("name", ["mean", "variance", "alpha_mean"])

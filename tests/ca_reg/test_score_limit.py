@@ -39,7 +39,7 @@ class Model:
 
     @cached_property
     def all_renders(self):
-        """Number of Gaussians kept, colours over black and alpha of every mask."""
+        """Number of Gaussians kept, colors over black and alpha of every mask."""
         masks = torch.tensor(list(itertools.product([0.0, 1.0], repeat=len(self.opacity))), dtype=torch.float64)
         renders = [self.render(self.opacity * mask, None, torch.zeros(3, dtype=torch.float64)) for mask in masks]
         return masks.sum(1), torch.stack([x[0] for x in renders]), torch.stack([x[1] for x in renders])
@@ -160,7 +160,7 @@ def test_exact_needs_no_gradient_and_keeps_the_shape_of_the_opacities():
     assert shapes == [(8, 1)]
 
 
-def test_exact_without_visible_pixels_or_with_broken_colours_is_a_reason():
+def test_exact_without_visible_pixels_or_with_broken_colors_is_a_reason():
     model = FEW[0]
     empty = CAScore(exact=model.moments, threshold=1.0)(model.opacity, None)
     assert empty.reason is Reason.EMPTY

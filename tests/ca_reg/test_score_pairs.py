@@ -38,7 +38,7 @@ IMAGES, ALPHAS = image_and_alpha(OPACITY * MASKS, BLACK)  # of all masks, over b
 
 
 def all_masks(rate, neutral=False, behind=None):
-    """Mean and variance of the colours and mean alpha over all masks, weighted by their probability."""
+    """Mean and variance of the colors and mean alpha over all masks, weighted by their probability."""
     weights = np.prod(np.where(MASKS > 0, 1 - rate, rate), axis=1)
     alpha = np.einsum("k,khw->hw", weights, ALPHAS)
     if behind is None:

@@ -4,8 +4,21 @@ import itertools
 
 import pytest
 import torch
+from torch import nn
 
-from ca_reg import CAScore, Draw, GaussianDropout, IndependentDropout, ListMoments, Params, PixelLists, Regularizer
+from ca_reg import (
+    CAScore,
+    Chain,
+    Draw,
+    GaussianDropout,
+    IndependentDropout,
+    LinearRamp,
+    ListMoments,
+    Params,
+    PixelLists,
+    Regularizer,
+)
+from ca_reg.regularizers.scale_noise import ScaleNoise
 
 OPACITY = torch.tensor([0.7, 0.5, 0.9], dtype=torch.float64)
 MEANS = torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 3]], dtype=torch.float64)
@@ -70,6 +83,33 @@ def test_sampled_scores_draw_what_the_regularizer_draws():
     assert result.value == pytest.approx(exact, rel=0.015)
     independent = CAScore(exact=ListMoments(lists), drop_rate=0.5, threshold=0.1)(OPACITY, None).value
     assert abs(result.value - independent) > 0.05 * independent  # the neighbors' company shows
+
+
+def test_a_score_of_opacities_is_taken_at_the_step_of_the_regularizer():
+    dropout = GaussianDropout(LinearRamp(0.0, 0.5, 0, 100))
+    dropout.set_step(50)
+    expected = CAScore(exact=ListMoments(lists), drop_rate=0.25, threshold=0.1)(OPACITY, None).value
+    assert CAScore(exact=ListMoments(lists), regularizer=dropout, threshold=0.1)(OPACITY, None).value == expected
+
+
+def test_a_score_does_not_ask_for_the_mode_of_the_regularizer():
+    values = {
+        CAScore(render, regularizer=rule, threshold=0.1)(OPACITY, None).value
+        for rule in (GaussianDropout(0.5), Chain(GaussianDropout(0.5)), Chain(GaussianDropout(0.5)).eval())
+    }
+    assert len(values) == 1
+    assert values.pop() > 0
+
+
+def test_what_a_score_cannot_render_is_refused():
+    with pytest.raises(TypeError, match=r"must be a ca_reg.Regularizer, got Dropout: wrap it in ca_reg.Chain"):
+        CAScore(render, regularizer=nn.Dropout(0.5))
+    score = CAScore(render, regularizer=Chain(GaussianDropout(0.5), ScaleNoise(0.5)), threshold=0.1)
+    with pytest.raises(ValueError, match="Chain changes more than opacities"):
+        score(Params(OPACITY, scales=torch.ones(3, 3)), None)
+    for rates in ({"p": torch.tensor([0.1, 0.2, 0.3])}, {"drop_rate": torch.tensor([0.1, 0.2, 0.3])}):
+        with pytest.raises(TypeError, match=f"{next(iter(rates))} must be a real number, got Tensor"):
+            CAScore(render, **rates)
 
 
 def test_an_adaptive_score_takes_the_region_of_the_expected_image():

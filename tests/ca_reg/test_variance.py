@@ -1,4 +1,4 @@
-"""The colour variance, against numpy's weighted moments in float64."""
+"""The color variance, against numpy's weighted moments in float64."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_padding_and_order_do_not_matter():
     torch.testing.assert_close(color_variance(weights[:, order], colors[:, order]).value, value)
 
 
-def test_equal_colours_have_no_variance_even_in_float32():
+def test_equal_colors_have_no_variance_even_in_float32():
     # E[c^2] - E[c]^2 gives up to 1e-7 here, of either sign.
     result = color_variance(torch.rand(100, 20), torch.full((100, 20, 3), 0.9))
     assert result.variance.min() >= 0

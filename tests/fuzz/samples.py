@@ -119,7 +119,7 @@ def write_split(folder: Path) -> None:
 
 
 def write_points(folder: Path, form: str = "binary_little_endian") -> None:
-    """A coloured point cloud."""
+    """A colored point cloud."""
     names = [*(f"property float {axis}" for axis in "xyz"), *(f"property uchar {c}" for c in ("red", "green", "blue"))]
     header = ["ply", f"format {form} 1.0", "comment made by hand", f"element vertex {POINTS}", *names, "end_header", ""]
     rows = [(0.5 * i, -1.5, 2.0, i, 100, 255) for i in range(POINTS)]

@@ -18,7 +18,7 @@ from torch import nn
 from ca_reg import GaussianDropout, OpacityNoise
 from ca_reg.functional import apply_dropout
 from ca_reg.integrations._tally import Skip
-from ca_reg.integrations.gsplat import install, regularized, unregularized
+from ca_reg.integrations.gsplat import Installation, install, regularized, unregularized
 from ca_reg.schedules import StartStop
 
 N, WIDTH, HEIGHT = 60, 24, 16
@@ -193,10 +193,10 @@ def test_training_is_told_by_mode_and_by_gradient(params, cameras):
     frozen = splats | {"opacities": splats["opacities"].detach()}
 
     def evaluates(splats):
-        before = wrapped.evaluated
+        before = wrapped.tally.scaled
         torch.testing.assert_close(wrapped(**splats, **cameras)[0], scaled, rtol=0, atol=0)
         assert dropout.keep is None
-        return wrapped.evaluated == before + 1
+        return wrapped.tally.scaled == before + 1
 
     with torch.no_grad():
         assert evaluates(splats)
@@ -207,7 +207,7 @@ def test_training_is_told_by_mode_and_by_gradient(params, cameras):
     dropout.train()
     wrapped(**splats, **cameras)
     assert dropout.keep is not None
-    assert (wrapped.trained, wrapped.evaluated) == (1, 3)
+    assert (wrapped.trained, wrapped.tally.scaled) == (1, 3)
 
 
 def test_the_modes_of_the_parts_survive_an_evaluation(params, cameras):
@@ -335,6 +335,13 @@ def test_a_training_past_the_installation_is_an_error(fake_gsplat, params, camer
     ):
         train()
     assert made == 2
+
+
+def test_a_block_installs_what_is_not(fake_gsplat):
+    original = fake_gsplat.rasterization
+    with Installation(GaussianDropout(0.5)) as installation:
+        assert fake_gsplat.rasterization is installation.rasterization
+    assert fake_gsplat.rasterization is original
 
 
 def test_a_schedule_that_never_begins_is_an_error(fake_gsplat, params, cameras):

@@ -10,7 +10,7 @@ import pytest
 import torch
 from oracles import brute_force, random_scene
 from stand_ins import gsplat as gsplat_stand_in
-from stand_ins.gsplat import centred, intrinsics
+from stand_ins.gsplat import centered, intrinsics
 
 from ca_reg import CAScore, GaussianDropout, ListMoments
 from ca_reg.functional import Multiplier
@@ -50,13 +50,13 @@ def test_render_is_what_a_score_takes_and_is_not_regularized(package):
         ours = render(*scene[:4], scene.camera, colors=scene.colors, background=BACKGROUND)
     torch.testing.assert_close(image, ours.image)
     torch.testing.assert_close(alpha, ours.alpha.clamp(max=0.99))
-    assert package.rasterization.trained == package.rasterization.evaluated == 0
+    assert package.rasterization.trained == package.rasterization.tally.scaled == 0
     result = CAScore(model.render, threshold=0.3)(scene.opacities, view)
     assert result.value > 0
 
 
 def test_exact_moments_are_those_of_all_masks(package):
-    scene = centred(random_scene(7, WIDTH, HEIGHT, seed=9, size=0.25))
+    scene = centered(random_scene(7, WIDTH, HEIGHT, seed=9, size=0.25))
     scene = scene._replace(opacities=scene.opacities.clamp(max=0.7))  # no render reaches the early stop
     model, view = model_of(scene)
     p = 0.3
@@ -98,7 +98,7 @@ def test_lists_go_on_behind_an_opaque_surface(package):
 
 
 def test_harmonics_and_gradients(package):
-    scene = centred(random_scene(30, WIDTH, HEIGHT, seed=2, size=0.15))
+    scene = centered(random_scene(30, WIDTH, HEIGHT, seed=2, size=0.15))
     g = torch.Generator().manual_seed(0)
     sh = torch.randn(30, 9, 3, generator=g, dtype=torch.float64) / 4
     opacities = scene.opacities.clone().requires_grad_()
@@ -135,7 +135,7 @@ def test_gsplats_kernels_list_what_they_draw(antialiased):
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     pytest.importorskip("gsplat", exc_type=ImportError)
-    scene = centred(random_scene(200, 64, 48, seed=4)).to(torch.float32, "cuda")
+    scene = centered(random_scene(200, 64, 48, seed=4)).to(torch.float32, "cuda")
     sh = torch.randn(200, 9, 3, generator=torch.Generator().manual_seed(0)).cuda() / 4
     model, view = model_of(scene, colors=sh, sh_degree=2, antialiased=antialiased)
     with torch.no_grad():

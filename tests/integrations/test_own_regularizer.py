@@ -194,7 +194,7 @@ def test_what_no_render_has_is_refused_before_the_training(rasterizer):
 
 @pytest.fixture
 def splats():
-    """Gaussians and two views, as gsplat takes them; the colours are spherical harmonics of degree 1."""
+    """Gaussians and two views, as gsplat takes them; the colors are spherical harmonics of degree 1."""
     scene = random_scene(40, 24, 16, seed=3).to(torch.float32)
     poses = torch.stack([scene.camera.world_to_camera.float()] * 2)
     poses[1, 2, 3] += 3.0

@@ -315,6 +315,11 @@ def test_an_installed_command_is_a_script_as_well(tmp_path, monkeypatch):
         (["--dropout", "1.5", "SCRIPT"], r"p must be in \[0, 1\)"),
         (["--noise", "-1", "SCRIPT"], "sigma must be finite and at least 0"),
         (["--dropout", "0.2", "--ramp", "0", "SCRIPT"], "end_step must come after start_step"),
+        (
+            ["--regularizer", "dropout(0.2)", "--ramp", "9", "SCRIPT"],
+            "--start and --ramp are about --dropout and --noise",
+        ),
+        (["--dropout", "0.2", "--seed", "-1", "SCRIPT"], "seed must be at least 0"),
         (["--outputs", "2", "SCRIPT"], "which --cpu asks for"),
         (["--report", "nowhere/x.json", "SCRIPT"], "there is no folder"),
         (["--drop", "0.2", "SCRIPT"], "unrecognized arguments|no script"),

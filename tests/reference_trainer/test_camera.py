@@ -48,10 +48,10 @@ def test_a_point_lands_where_the_hand_puts_it():
 def test_scaling_keeps_the_field_of_view_and_the_principal_ray(factor):
     old = camera()
     new = old.resized(max(1, round(64 * factor)), max(1, round(48 * factor)))
-    for size, focal, centre in (("width", "fx", "cx"), ("height", "fy", "cy")):
+    for size, focal, center in (("width", "fx", "cx"), ("height", "fy", "cy")):
         for edge in (0, 1):  # the rays through both edges of the picture stay
-            slope = (edge * getattr(old, size) - getattr(old, centre)) / getattr(old, focal)
-            assert (edge * getattr(new, size) - getattr(new, centre)) / getattr(new, focal) == pytest.approx(slope)
+            slope = (edge * getattr(old, size) - getattr(old, center)) / getattr(old, focal)
+            assert (edge * getattr(new, size) - getattr(new, center)) / getattr(new, focal) == pytest.approx(slope)
     assert new.world_to_camera is old.world_to_camera
 
 

@@ -31,7 +31,7 @@ SMALL = ["--downscale", "8", "--iterations", "3", "--monitor-every", "2"]
 
 
 def plain(text: str) -> str:
-    """Strip colours and boxes, and join the lines."""
+    """Strip colors and boxes, and join the lines."""
     return " ".join(re.sub(r"\x1b\[[0-9;]*m|[│╭╮╰╯─]", " ", text).split())
 
 

@@ -98,7 +98,7 @@ def _points(change: Callable[[torch.Tensor], torch.Tensor]) -> Push:
 
 
 def _photographs(value: float) -> Push:
-    """Make all photographs one grey."""
+    """Make all photographs one gray."""
 
     def changed(scene: Scene, config: TrainConfig) -> tuple[Scene, TrainConfig]:
         views = tuple(dataclasses.replace(view, image=torch.full_like(view.image, value)) for view in scene.train)
@@ -116,12 +116,12 @@ CASES: dict[str, Push] = {
     "rate of the means x100": _faster(100, ("means_rate", "means_rate_final")),
     "rate of the scales x100": _faster(100, ("scales_rate",)),
     "rate of the opacities x100": _faster(100, ("opacity_rate",)),
-    "rate of the colours x100": _faster(100, ("color_rate",)),
+    "rate of the colors x100": _faster(100, ("color_rate",)),
     "one view": _one_view,
     "every point twice": _points(lambda x: torch.cat([x[::2], x[::2], x])[: len(x)]),
     "all points at one place": _points(lambda x: x.median(0).values.expand_as(x).clone()),
     "black photographs": _photographs(0.0),
-    "grey photographs": _photographs(0.5),
+    "gray photographs": _photographs(0.5),
     "white photographs": _photographs(1.0),
     "reset to 0.01, noise 0.8": _with(opacity_reset=0.01, noise=0.8),
     "reset to 0.01, noise 3": _with(opacity_reset=0.01, noise=3.0),

@@ -56,7 +56,7 @@ def test_with_noise_it_comes_back_because_every_step_draws_anew(scene):
     reached, trainer = lowered(scene, BELOW, steps, noise=0.8)
     visible = seen(scene)
     assert visible.sum() > 100
-    # A footprint shrinks to a point near the cut: it may miss all pixel centres.
+    # A footprint shrinks to a point near the cut: it may miss all pixel centers.
     assert reached[visible].float().mean() > 0.5
     assert trainer.gaussians.opacities[reached].max() > 2 * MIN_ALPHA
 

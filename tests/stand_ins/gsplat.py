@@ -105,7 +105,7 @@ def intrinsics(camera):
     return camera.world_to_camera.new_tensor(rows)
 
 
-def centred(scene):
+def centered(scene):
     """A scene in which nothing of gsplat differs from the renderer.
 
     The principal point is in the middle, else the projection of what lies beyond the picture's edge differs, and the

@@ -66,16 +66,16 @@ def make_rasterizer(form: str = "depth-alpha") -> type[nn.Module]:
                 means3D, rotations, scales, opacities, camera,
                 sh=shs, colors=colors_precomp, background=settings.bg, depth=True,
             )  # fmt: skip
-            centres = out.splats.projection.means
-            half = centres.new_tensor([0.5 * width, 0.5 * height])
-            if centres.requires_grad and means2D.requires_grad:
+            centers = out.splats.projection.means
+            half = centers.new_tensor([0.5 * width, 0.5 * height])
+            if centers.requires_grad and means2D.requires_grad:
                 indices = out.splats.indices  # a hook that held the rendering would keep its graph alive for ever
 
                 def deliver(gradient):
                     means2D.grad = torch.zeros_like(means2D)
                     means2D.grad[indices, :2] = gradient * half
 
-                centres.register_hook(deliver)
+                centers.register_hook(deliver)
             radii = radii_of_all(means3D, rotations, scales, camera)
             plane = out.depth[None]
             members = {

@@ -25,7 +25,7 @@ class TorchEngine:
     def project(
         self, inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
     ) -> tuple[Projection, Tensor]:
-        """Project and colour Gaussians."""
+        """Project and color Gaussians."""
         if indices.shape[0] < inputs["means"].shape[0]:
             inputs = {name: x.index_select(0, indices) for name, x in inputs.items()}
         projection = project(inputs["means"], inputs["quaternions"], inputs["scales"], camera)

@@ -18,7 +18,7 @@ def project(
 ) -> Projection:
     """Project 3D Gaussians with a local affine approximation of the perspective (EWA splatting).
 
-    Convention: OpenCV camera, half-pixel centres, wxyz quaternions. Every Gaussian must lie in front of the camera.
+    Convention: OpenCV camera, half-pixel centers, wxyz quaternions. Every Gaussian must lie in front of the camera.
 
     The arguments are those of `reference_trainer.render.render`; differentiable in each.
 

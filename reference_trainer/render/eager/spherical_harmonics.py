@@ -1,4 +1,4 @@
-"""View-dependent colour: real spherical harmonics up to degree 3."""
+"""View-dependent color: real spherical harmonics up to degree 3."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def evaluate_sh(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """Evaluate colours from spherical-harmonic coefficients.
+    """Evaluate colors from spherical-harmonic coefficients.
 
     Convention: 0.5 is added and the result is clamped below at 0, as in the INRIA code; it is not clamped above.
 
-    The coefficients are (N, K, 3), the directions unit vectors from the camera centre to the Gaussians, (N, 3), the
-    colours (N, 3).
+    The coefficients are (N, K, 3), the directions unit vectors from the camera center to the Gaussians, (N, 3), the
+    colors (N, 3).
 
     Raises:
         ValueError: if there are fewer than (degree + 1)^2 coefficients.

@@ -45,7 +45,7 @@ class Block(NamedTuple):
         """
         x, y, l11, l21, l22, log_opacity = geometry.unbind(0)
         dx, dy = x - self.centers[0], y - self.centers[1]
-        # log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2, expanded around the tile's centre. Squaring w1 and w2,
+        # log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2, expanded around the tile's center. Squaring w1 and w2,
         # which are small wherever alpha is not, avoids the cancellation of a dx^2 + 2 b dx dy + c dy^2.
         w1, w2 = l11 * dx + l21 * dy, l22 * dy
         polynomial = [
@@ -58,7 +58,7 @@ class Block(NamedTuple):
 
 
 def pixel_offsets(like: Tensor) -> Tensor:
-    """Return x and y of a tile's pixels from its centre, in the dtype and on the device of a tensor, (2, 64, 1)."""
+    """Return x and y of a tile's pixels from its center, in the dtype and on the device of a tensor, (2, 64, 1)."""
     axis = torch.arange(TILE, dtype=like.dtype, device=like.device) - (TILE - 1) / 2
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     return torch.stack([x, y]).view(2, PIXELS, 1)

@@ -30,13 +30,13 @@ _BITS = 12  # of a digit of the radix sort
 
 @inlined
 def _first_pixel(x: Any, size: Any) -> Any:
-    """Return the first pixel whose centre is at x or beyond it; in [0, size]."""
+    """Return the first pixel whose center is at x or beyond it; in [0, size]."""
     return max(_ZERO, min(size, np.ceil(x - _HALF)))
 
 
 @inlined
 def _last_pixel(x: Any, size: Any) -> Any:
-    """Return the last pixel whose centre is at x or before it; in [-1, size - 1]."""
+    """Return the last pixel whose center is at x or before it; in [-1, size - 1]."""
     return max(-_ONE, min(size - _ONE, np.floor(x - _HALF)))
 
 

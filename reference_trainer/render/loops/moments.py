@@ -194,7 +194,7 @@ def _gradients(
 
 
 class _Moments(torch.autograd.Function):
-    """Mean and variance of the colours, and the expected accumulated alpha, (3, 3 and 1, whole tiles)."""
+    """Mean and variance of the colors, and the expected accumulated alpha, (3, 3 and 1, whole tiles)."""
 
     @staticmethod
     def forward(ctx: Any, splats: Splats, multiplier: Tensor, behind: Tensor, *_differentiable: Tensor) -> Any:

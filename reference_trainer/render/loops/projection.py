@@ -1,4 +1,4 @@
-"""From 3D Gaussians to coloured 2D ellipses, one Gaussian after the other; the formulas are those of `project`."""
+"""From 3D Gaussians to colored 2D ellipses, one Gaussian after the other; the formulas are those of `project`."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def _forward(
     view: Array, lens: Array, position: Array, centers: Array, factors: Array, covariances: Array, depths: Array,
     colors: Array,
 ) -> None:  # fmt: skip
-    """Project and colour."""
+    """Project and color."""
     values = np.empty(16, f4)
     for k in range(first, last):
         i = indices[k]
@@ -202,7 +202,7 @@ def _backward(
         to_quaternions[i, 1] = scale * (to_qx - along * qx)
         to_quaternions[i, 2] = scale * (to_qy - along * qy)
         to_quaternions[i, 3] = scale * (to_qz - along * qz)
-        # row = f / z (axis - clipped slope forward); centre = f slope + c
+        # row = f / z (axis - clipped slope forward); center = f slope + c
         forward = view[2, 0], view[2, 1], view[2, 2]
         to_slope_x, to_slope_y = lens[0] * to_centers[k, 0], lens[1] * to_centers[k, 1]
         if abs(slope_x) <= lens[4]:
@@ -265,8 +265,8 @@ class _Project(torch.autograd.Function):
 def project(
     inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
 ) -> tuple[Projection, Tensor]:
-    """Project and colour Gaussians, see `Engine.project`."""
-    # Colours are coefficients (N, 1, 3) of degree -1.
+    """Project and color Gaussians, see `Engine.project`."""
+    # Colors are coefficients (N, 1, 3) of degree -1.
     sh, band = (inputs["colors"][:, None], -1) if degree is None else (inputs["sh"], degree)
     *projection, colors = _Project.apply(  # type: ignore[no-untyped-call]
         inputs["means"], inputs["quaternions"], inputs["scales"], sh, indices, camera, band

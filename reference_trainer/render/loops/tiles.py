@@ -29,7 +29,7 @@ CHUNK = 16
 """Entries of a list that are read at once."""
 
 X = np.tile(np.arange(TILE, dtype=f4) - f4((TILE - 1) / 2), TILE)
-"""x of every pixel of a tile from its centre, row by row."""
+"""x of every pixel of a tile from its center, row by row."""
 Y = np.repeat(np.arange(TILE, dtype=f4) - f4((TILE - 1) / 2), TILE)
 """y likewise."""
 
@@ -83,7 +83,7 @@ def over_tiles(kernel: Any, lists: TileLists, *arguments: Tensor) -> None:
 def sum_rows(rows: Tensor, table: Tensor, lists: TileLists) -> list[Tensor]:
     """Add up the rows of every splat's entries, (P, 9 or more), always in the same order.
 
-    Returns the gradients of means, factors, opacities and colours, and the sums of the columns that are left.
+    Returns the gradients of means, factors, opacities and colors, and the sums of the columns that are left.
     """
     assert lists.offsets is not None
     sums = [table.new_empty(len(table), *shape) for shape in ((2,), (3,), (), (3,), (rows.shape[1] - 9,))]
@@ -142,7 +142,7 @@ def read_entries(
 ) -> Any:
     """Collect what pixels need of ``range(first, last, step)`` of a tile's list, leaving out who cannot be seen.
 
-    Rows of ``entries`` receive footprint, colour, and what else is in the table. Returns how many there are; one more
+    Rows of ``entries`` receive footprint, color, and what else is in the table. Returns how many there are; one more
     that is nowhere seen follows, so that they can be taken in pairs.
     """
     count = 0
@@ -169,7 +169,7 @@ def footprint_of(entry: Any) -> Any:
 
 @inlined
 def _from_center(table: Any, i: Any, tile: Any, columns: Any) -> Any:
-    """Return the factor of a splat, its mean seen from the centre of a tile, and the product of both."""
+    """Return the factor of a splat, its mean seen from the center of a tile, and the product of both."""
     l11, l21, l22 = table[i, 2], table[i, 3], table[i, 4]
     dx = table[i, 0] - f4(tile % columns * TILE + TILE // 2)
     dy = table[i, 1] - f4(tile // columns * TILE + TILE // 2)
@@ -178,7 +178,7 @@ def _from_center(table: Any, i: Any, tile: Any, columns: Any) -> Any:
 
 @inlined
 def footprint(table: Any, i: Any, tile: Any, columns: Any) -> Any:
-    """Expand log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2 in 1, x, y, x^2, x y, y^2 around a tile's centre."""
+    """Expand log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2 in 1, x, y, x^2, x y, y^2 around a tile's center."""
     # Squaring w1 and w2, which are small wherever alpha is not, avoids the cancellation of a dx^2 + 2 b dx dy + c dy^2.
     l11, l21, l22, _, _, w1, w2 = _from_center(table, i, tile, columns)
     return (

@@ -26,12 +26,12 @@ def render_simply(
     A tile of 16 x 16 pixels considers every Gaussian whose bounding box at alpha = 1/255 meets it, so nothing that the
     definition draws is left out: in float64 this is brute force.
 
-    Convention: OpenCV camera, half-pixel centres, wxyz quaternions; the constants of the INRIA rasterizer; the gradient
+    Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA rasterizer; the gradient
     passes through the clamp at 0.99.
 
     Args:
         means: world coordinates, shape (N, 3).
-        quaternions: need not be normalised, shape (N, 4).
+        quaternions: need not be normalized, shape (N, 4).
         scales: standard deviations, shape (N, 3).
         opacities: activated, shape (N,).
         colors: RGB, shape (N, 3).
@@ -51,13 +51,13 @@ def render_simply(
     depths = (means @ view[:3, :3].T + view[:3, 3])[:, 2].detach()
     order = torch.argsort(depths, stable=True)
     order = order[depths[order] > _NEAR]
-    centres, covariances = _project(means[order], quaternions[order], scales[order], view, camera)
+    centers, covariances = _project(means[order], quaternions[order], scales[order], view, camera)
     opacities, colors = opacities[order], colors[order]
     inverses = torch.linalg.inv(covariances)
     with torch.no_grad():
         radii = torch.sqrt(2 * torch.log(opacities / _MIN_ALPHA).clamp(min=0))
         reach = radii[:, None] * covariances.diagonal(dim1=1, dim2=2).sqrt()
-        low, high = centres - reach, centres + reach
+        low, high = centers - reach, centers + reach
     strips = []
     for top in range(0, camera.height, _TILE):
         strip = []
@@ -69,7 +69,7 @@ def render_simply(
                 torch.arange(top, bottom).to(means) + 0.5, torch.arange(left, right).to(means) + 0.5, indexing="ij"
             )
             pixels = torch.stack([x, y], dim=-1).view(-1, 2)
-            sums = _blend(pixels, centres[near], inverses[near], opacities[near], colors[near])
+            sums = _blend(pixels, centers[near], inverses[near], opacities[near], colors[near])
             strip.append(sums.T.view(-1, bottom - top, right - left))
         strips.append(torch.cat(strip, dim=2))
     return torch.cat(strips, dim=1)
@@ -92,13 +92,13 @@ def _project(means: Tensor, quaternions: Tensor, scales: Tensor, view: Tensor, c
         ], dim=1,
     ).view(-1, 3, 3)  # fmt: skip
     half = jacobian.view(-1, 2, 3) @ rotation @ (orientation * scales[:, None, :])
-    centres = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=1)
-    return centres, half @ half.transpose(1, 2) + _DILATION * torch.eye(2).to(means)
+    centers = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=1)
+    return centers, half @ half.transpose(1, 2) + _DILATION * torch.eye(2).to(means)
 
 
-def _blend(pixels: Tensor, centres: Tensor, inverses: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
-    """Composite Gaussians, nearest first, at pixels (P, 2); return the colours (P, 3)."""
-    dx, dy = (pixels[:, None] - centres).unbind(2)
+def _blend(pixels: Tensor, centers: Tensor, inverses: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
+    """Composite Gaussians, nearest first, at pixels (P, 2); return the colors (P, 3)."""
+    dx, dy = (pixels[:, None] - centers).unbind(2)
     power = inverses[:, 0, 0] * dx * dx + 2 * inverses[:, 0, 1] * dx * dy + inverses[:, 1, 1] * dy * dy
     raw = opacities * torch.exp(-0.5 * power)
     alpha = raw + (raw.clamp(max=_MAX_ALPHA) - raw).detach()

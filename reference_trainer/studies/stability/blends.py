@@ -1,4 +1,4 @@
-"""Cases of opacity, depth order, masks, noise, colours and precision of the inputs."""
+"""Cases of opacity, depth order, masks, noise, colors and precision of the inputs."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from reference_trainer.studies.stability.scenes import PARAMETERS, base_scene, s
 
 __all__ = ["blend_cases"]
 
-_OPACITY, _BLEND, _RANDOM, _COLOR, _DTYPE = "opacity", "blending", "dropout and noise", "colours", "precision"
+_OPACITY, _BLEND, _RANDOM, _COLOR, _DTYPE = "opacity", "blending", "dropout and noise", "colors", "precision"
 _OPACITIES = {"0": 0.0, "1e-8": 1e-8, "1/255 + 1e-6": 1 / 255 + 1e-6, "1 - 1e-7": 1 - 1e-7, "1": 1.0}
 _LOGITS = (1.0, 10.0, 20.0, 50.0, 100.0)
 _STACKS = (0.01, 0.5, 0.95)
 _RATES = {"0": 0.0, "1e-6": 1e-6, "0.999": 0.999, "1 - 1e-7": 1 - 1e-7}
 _SIGMAS = (1e-6, 1e-3, 0.05, 0.8, 1.0, 10.0)
-_HDR = {"white to HDR background": 0.0, "white to HDR colours and background": 1.0}
+_HDR = {"white to HDR background": 0.0, "white to HDR colors and background": 1.0}
 _SQUARES = "variances are squares, which overflow float32: the score says NOT_FINITE"
 
 
 def blend_cases() -> list[Case]:
-    """Return the cases: magnitudes are numbers of Gaussians or of renders, standard deviations or colours."""
+    """Return the cases: magnitudes are numbers of Gaussians or of renders, standard deviations or colors."""
     return [
         *(single(_OPACITY, f"opacities {name}", partial(_opacities, x)) for name, x in _OPACITIES.items()),
         Case(
@@ -104,7 +104,7 @@ def _one_plane() -> Probe:
 
 
 def _copies(count: float) -> Probe:
-    """Draw one Gaussian many times, in many colours: rounding must not change the order of equal depths."""
+    """Draw one Gaussian many times, in many colors: rounding must not change the order of equal depths."""
     n = int(count)
     scene = base_scene(n)
     same = {name: getattr(scene, name)[:1].expand(n, -1) for name in ("means", "quaternions", "scales")}
@@ -178,7 +178,7 @@ def _renders(count: float) -> Probe:
 
 
 def _colored(share: float, background: float) -> Probe:
-    """Vary the background, and with a share of 1 the colours with it."""
+    """Vary the background, and with a share of 1 the colors with it."""
     scene = base_scene()
     behind = torch.full_like(scene.background, background)
     return of_scene(scene.with_(background=behind, colors=scene.colors * (background if share else 1.0)))

@@ -52,7 +52,7 @@ def geometry_cases() -> list[Case]:
         Case(_PLACE, "depth and size multiplied by", _far, decades(0, 12)),
         Case(
             _PLACE, "world offset, scene sizes", _offset, decades(0, 8), until=1e3,
-            note="float32 has 7 digits: recentre the scene; refused from a quarter of a pixel on",
+            note="float32 has 7 digits: recenter the scene; refused from a quarter of a pixel on",
         ),
         Case(_CAMERA, "focal length, scene shrinks with the field of view", _telephoto, _FOCALS),
         Case(_CAMERA, "focal length, camera backs away", _backs_away, _FOCALS),

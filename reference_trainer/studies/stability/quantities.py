@@ -85,7 +85,7 @@ def reference_quantities(scene: StressScene) -> Quantities:
 
 
 def independent_images(scene: StressScene) -> Quantities:
-    """Compute `IMAGES` in float64 with the frozen simple renderer; white as a fourth colour gives the alpha."""
+    """Compute `IMAGES` in float64 with the frozen simple renderer; white as a fourth color gives the alpha."""
     scene = scene.to(torch.float64)
     parameters = _leaves(scene)
     means, quaternions, scales, opacities, colors = parameters.values()

@@ -15,7 +15,7 @@ PARAMETERS = ("means", "quaternions", "scales", "opacities", "colors")
 """The tensors of the Gaussians, by the names that the renderer gives them."""
 
 _SEED = 20
-_DISTANCE = 3.0  # from the camera to the centre of the scene, whose half width is 1
+_DISTANCE = 3.0  # from the camera to the center of the scene, whose half width is 1
 
 
 @dataclass(frozen=True)

@@ -25,12 +25,12 @@ from reference_trainer.studies.study import Record, Records, Study, run_study
 
 __all__ = ["all_cases", "judge_with", "stability_study", "study_stability"]
 
-_FLOOR = 1e-9  # of the colours of the figure
+_FLOOR = 1e-9  # of the colors of the figure
 
 
 @cache
 def all_cases() -> tuple[Case, ...]:
-    """Return all cases: shape, place and camera; opacities, masks, colours and precision."""
+    """Return all cases: shape, place and camera; opacities, masks, colors and precision."""
     return (*geometry_cases(), *blend_cases())
 
 
@@ -180,7 +180,7 @@ def _heat(figure: Any, engine: str, cases: Sequence[Record]) -> None:
     for i in range(1, len(cases)):
         if cases[i]["family"] != cases[i - 1]["family"]:
             axes.axhline(i - 0.5, color="white", linewidth=2)
-    axes.set_title(f"{engine}: largest error where all is right (grey: not part of the case)", fontsize=9)
+    axes.set_title(f"{engine}: largest error where all is right (gray: not part of the case)", fontsize=9)
     bar = figure.colorbar(picture, ax=axes, shrink=0.4, aspect=30)
     bar.set_label("log10 of the relative error", fontsize=7)
 

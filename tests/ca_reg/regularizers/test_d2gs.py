@@ -6,6 +6,7 @@ import torch
 from clouds import KINDS, cloud, mean_distance, params, rank
 
 from ca_reg.regularizers.d2gs import D2GSDropout
+from ca_reg.regularizers.depth import DepthDropout
 
 STEPS = (1, 500, 4_000, 25_000)
 
@@ -106,6 +107,12 @@ def test_the_mean_rate_where_depth_and_density_are_unrelated():
     rates = D2GSDropout(rate=0.3).rates(params(cloud("spread", 400)))
     assert abs(rates.mean() / 0.3 - mean) < 0.015  # 5 standard deviations of 400 random densities; the seed is fixed
     assert abs(mean - 0.36) < 0.005
+
+
+@pytest.mark.parametrize("kind", [D2GSDropout, DepthDropout])
+def test_a_rate_out_of_range_is_refused_at_once(kind):
+    with pytest.raises(ValueError, match=r"rate must be in \[0, 1\), got 30"):
+        kind(30.0)
 
 
 def test_test_time_is_the_model_itself():

@@ -4,6 +4,7 @@ import pytest
 import torch
 from clouds import KINDS, cloud, mean_distance, params, rank
 
+from ca_reg import Chain, OpacityNoise
 from ca_reg.regularizers.density import DensityDropout
 
 
@@ -36,6 +37,15 @@ def test_the_test_time_value_does_not_depend_on_the_steps_before():
     rule.draw(first)
     assert torch.equal(rule.rates(second), rule.rates(first))  # in training they are those of step 10
     assert torch.equal(rule.expected(second).opacities, fresh)
+    chain = Chain(rule, OpacityNoise(0.8, scale=True))
+    noisy = OpacityNoise(0.8, scale=True).expected(second).opacities
+    torch.testing.assert_close(chain.expected(second).opacities, noisy * fresh / second.opacities)
+    assert torch.equal(rule.rates(second), rule.rates(first))  # and the next draw is what it would have been
+
+
+def test_a_test_time_value_without_what_it_needs_is_an_error_with_a_name():
+    with pytest.raises(ValueError, match="DensityDropout needs means"):
+        Chain(DensityDropout()).eval()(torch.ones(3))
 
 
 @pytest.mark.parametrize("bad", [{"low": -0.1}, {"high": 1.0}, {"k": 0}, {"every": 0}])

@@ -133,7 +133,7 @@ def test_what_scripts_ask_a_device_has_an_answer():
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side), torch.cuda.nvtx.range("a render"):
-            torch.cuda.nvtx.range_push("colours")
+            torch.cuda.nvtx.range_push("colors")
             torch.cuda.nvtx.range_pop()
             assert torch.ones(2, device="cuda").sum() == 2
         side.synchronize()

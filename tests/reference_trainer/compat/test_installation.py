@@ -24,7 +24,7 @@ def render(view, model, background):
     settings = GaussianRasterizationSettings(
         image_height=view["height"], image_width=view["width"], tanfovx=view["tanfovx"], tanfovy=view["tanfovy"],
         bg=background, scale_modifier=1.0, viewmatrix=view["view"], projmatrix=view["full"], sh_degree=0,
-        campos=view["centre"], prefiltered=False, debug=False)
+        campos=view["center"], prefiltered=False, debug=False)
     rasterizer = GaussianRasterizer(raster_settings=settings)
     image, radii = rasterizer(
         means3D=model["xyz"], means2D=screen, shs=None, colors_precomp=torch.sigmoid(model["color"]),
@@ -81,7 +81,7 @@ def _given(settings_of):
     scene = random_scene(60, 24, 18, seed=2).to(torch.float32)
     settings = settings_of(scene.camera)
     view = {"height": 18, "width": 24, "tanfovx": settings.tanfovx, "tanfovy": settings.tanfovy}
-    view |= {"view": settings.viewmatrix, "full": settings.projmatrix, "centre": settings.campos}
+    view |= {"view": settings.viewmatrix, "full": settings.projmatrix, "center": settings.campos}
     return {"POINTS": scene.means, "TARGET": torch.full((3, 18, 24), 0.6), "VIEW": view}
 
 

@@ -26,10 +26,10 @@ def _definition(mean, quaternion, scale, camera) -> int:
     small, large = torch.linalg.eigvalsh(chain @ covariance @ chain.T + 0.3 * torch.eye(2).double()).tolist()
     middle, spread = 0.5 * (large + small), 0.5 * (large - small)
     radius = math.ceil(3 * math.sqrt(middle + math.sqrt(max(0.1, spread**2))))
-    centre = (camera.fx * x / z + camera.cx - 0.5, camera.fy * y / z + camera.cy - 0.5)
+    center = (camera.fx * x / z + camera.cx - 0.5, camera.fy * y / z + camera.cy - 0.5)
     meets = all(
         any(16 * tile + 1 <= c + radius and 16 * tile + 16 > c - radius for tile in range(math.ceil(size / 16)))
-        for c, size in zip(centre, (camera.width, camera.height), strict=True)
+        for c, size in zip(center, (camera.width, camera.height), strict=True)
     )
     return radius if meets else 0
 

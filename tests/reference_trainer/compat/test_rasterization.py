@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 from oracles import random_scene
-from stand_ins.gsplat import centred, intrinsics
+from stand_ins.gsplat import centered, intrinsics
 
 from reference_trainer.compat.rasterization import make_rasterization
 
@@ -20,7 +20,7 @@ rasterization = make_rasterization(rendering.rasterization, per_axis=True)
 
 def given(seed=3, n=N, dtype=torch.float64, **changes):
     """Arguments of a call: two views of one scene, one Gaussian in six behind them."""
-    scene = centred(random_scene(n, WIDTH, HEIGHT, seed=seed, size=0.15)).to(dtype)
+    scene = centered(random_scene(n, WIDTH, HEIGHT, seed=seed, size=0.15)).to(dtype)
     poses = torch.stack([scene.camera.world_to_camera] * 2)
     poses[1, :2, 3] += torch.tensor([0.4, -0.2], dtype=dtype)
     lens = intrinsics(scene.camera).expand(2, 3, 3)
@@ -60,7 +60,7 @@ def slow(a):
 
 
 def expected(a, sums, alpha):
-    """What gsplat returns for a mode, of sums of colours and depths."""
+    """What gsplat returns for a mode, of sums of colors and depths."""
     mode = a.get("render_mode", "RGB")
     depth = sums[..., 3:] / (alpha.clamp_min(1e-10) if "ED" in mode else 1)
     behind = a.get("backgrounds")

@@ -73,7 +73,7 @@ def test_gradients_equal_brute_force_also_those_on_the_screen(settings_of, moved
     sums, alpha = moved_brute_force(slow, torch.cat([slow.colors, z], dim=1), shifts)
     (torch.cat([sums, alpha[None]]) * weights).sum().backward()
 
-    # The picture spans [-1, 1] in normalised device coordinates: a unit is half the width or height in pixels.
+    # The picture spans [-1, 1] in normalized device coordinates: a unit is half the width or height in pixels.
     expected = torch.nn.functional.pad(shifts.grad * torch.tensor([13.0, 9.0]), (0, 1))
     torch.testing.assert_close(screen.grad, expected, rtol=1e-8, atol=1e-9)
     assert screen.grad[:, :2].abs().max() > 0.1

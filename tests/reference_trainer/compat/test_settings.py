@@ -16,15 +16,15 @@ def test_the_camera_takes_points_where_the_matrices_take_them(settings_of):
     points = scene.means[5:]
     clip = torch.cat([points, torch.ones(len(points), 1).double()], dim=1) @ settings.projmatrix
     size = torch.tensor([40.0, 24.0]).double()
-    integer_centres = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) * 0.5
+    integer_centers = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) * 0.5
     local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     ours = torch.stack([camera.fx * local[:, 0], camera.fy * local[:, 1]], dim=1) / local[:, 2:]
     ours = ours + torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
-    torch.testing.assert_close(ours - 0.5, integer_centres, rtol=0, atol=1e-9)
+    torch.testing.assert_close(ours - 0.5, integer_centers, rtol=0, atol=1e-9)
     torch.testing.assert_close(camera.position, settings.campos)
 
 
-def test_in_single_precision_the_centre_stays_the_centre(settings_of):
+def test_in_single_precision_the_center_stays_the_center(settings_of):
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([40.0, -30.0, 70.0])
     camera = random_scene(1, 500, 300, seed=1).camera

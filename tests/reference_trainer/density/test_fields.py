@@ -116,7 +116,7 @@ def test_self_ensembling_perturbs_the_second_field_where_the_first_changes(tiny_
             assert all(
                 torch.equal(x, y) for (_, x), (_, y) in zip(before[1].named(), second.gaussians.named(), strict=True)
             )
-            with torch.no_grad():  # Gaussians of the first change colour
+            with torch.no_grad():  # Gaussians of the first change color
                 first.gaussians.sh_dc.add_(0.5 * torch.randn(first.gaussians.sh_dc.shape, generator=g))
     uncertain = literal_uncertain(torch.stack(pictures).double().numpy(), 0.02, 0.01)
     chosen = torch.from_numpy(literal_chosen(before[1], strategy.cameras, uncertain))

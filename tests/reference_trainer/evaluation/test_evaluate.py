@@ -153,7 +153,7 @@ def test_the_exact_score_is_the_limit_of_many_samples(tiny_scene, gaussians):
     assert abs(adaptive.value - result.value) < 5 * adaptive.std_error < 0.5 * result.value
 
 
-def test_exact_scores_at_another_drop_rate_and_over_the_expected_colour(tiny_scene, gaussians):
+def test_exact_scores_at_another_drop_rate_and_over_the_expected_color(tiny_scene, gaussians):
     view, model = tiny_scene.train[0], TrainedModel(gaussians, tiny_scene.background)
     other = dataclasses.replace(model, background=1 - tiny_scene.background)
     assert model.exact_ca_score(drop_rate=0.3).settings.drop_rate == 0.3
@@ -175,10 +175,10 @@ def test_moments_use_only_the_bands_and_the_background_of_the_model(tiny_scene, 
 
 
 def test_only_the_bands_of_the_model_are_used(tiny_scene, gaussians):
-    grey = dataclasses.replace(gaussians, sh_rest=gaussians.sh_rest[:, :0])
+    gray = dataclasses.replace(gaussians, sh_rest=gaussians.sh_rest[:, :0])
     cut = evaluate(TrainedModel(gaussians, tiny_scene.background, sh_degree=0), of_scene(tiny_scene))
     assert scores(cut, "psnr") == scores(
-        evaluate(TrainedModel(grey, tiny_scene.background), of_scene(tiny_scene)), "psnr"
+        evaluate(TrainedModel(gray, tiny_scene.background), of_scene(tiny_scene)), "psnr"
     )
     assert scores(cut, "psnr") != scores(
         evaluate(TrainedModel(gaussians, tiny_scene.background), of_scene(tiny_scene)), "psnr"
@@ -306,8 +306,8 @@ def test_photographs_are_not_needed_for_co_adaptation(tiny_scene, gaussians):
         assert repr(one) == repr(same)  # where nan is nan
 
 
-def test_the_neutral_score_is_that_of_a_background_of_expected_colour(tiny_scene, gaussians):
-    """Sampled: 400 masks, every render over the mean colour of its pixel; std error of the score below 2 %."""
+def test_the_neutral_score_is_that_of_a_background_of_expected_color(tiny_scene, gaussians):
+    """Sampled: 400 masks, every render over the mean color of its pixel; std error of the score below 2 %."""
     model = TrainedModel(gaussians, tiny_scene.background, "dropout(0.2)")
     generator = torch.Generator().manual_seed(0)
     opacities, view = gaussians.opacities, tiny_scene.train[0]

@@ -69,13 +69,13 @@ def distance(features: list[tuple[Tensor, Tensor]], state: dict[str, Tensor]) ->
     return total
 
 
-def normalised(image: Tensor) -> Tensor:
+def normalized(image: Tensor) -> Tensor:
     shift, scale = torch.tensor([-0.030, -0.088, -0.188]).double(), torch.tensor([0.458, 0.448, 0.450]).double()
     return ((image.double() - shift[:, None, None]) / scale[:, None, None])[None]
 
 
 def alex_features(state: dict[str, Tensor], image: Tensor) -> list[Tensor]:
-    x = [convolve(state, "features.0", normalised(image), 2, 4).relu()]
+    x = [convolve(state, "features.0", normalized(image), 2, 4).relu()]
     x.append(convolve(state, "features.3", functional.max_pool2d(x[-1], 3, 2), 2).relu())
     x.append(convolve(state, "features.6", functional.max_pool2d(x[-1], 3, 2), 1).relu())
     x.append(convolve(state, "features.8", x[-1], 1).relu())
@@ -83,7 +83,7 @@ def alex_features(state: dict[str, Tensor], image: Tensor) -> list[Tensor]:
 
 
 def st_features(state: dict[str, Tensor], image: Tensor) -> list[Tensor]:
-    x = [blurred_half(convolve(state, ST_NAMES[0], normalised(2 * image.double() - 1), 2)).relu()]
+    x = [blurred_half(convolve(state, ST_NAMES[0], normalized(2 * image.double() - 1), 2)).relu()]
     x.append(convolve(state, ST_NAMES[1], blurred_half(functional.max_pool2d(x[-1], 3, 1)), 2).relu())
     x.append(convolve(state, ST_NAMES[2], blurred_half(functional.max_pool2d(x[-1], 3, 1)), 1).relu())
     x.append(convolve(state, ST_NAMES[3], x[-1], 1).relu())
@@ -91,7 +91,7 @@ def st_features(state: dict[str, Tensor], image: Tensor) -> list[Tensor]:
 
 
 def vgg_features(state: dict[str, Tensor], image: Tensor) -> list[Tensor]:
-    x, features = normalised(image), []
+    x, features = normalized(image), []
     for block in ([0, 2], [5, 7], [10, 12, 14], [17, 19, 21], [24, 26, 28]):
         x = functional.max_pool2d(x, 2) if features else x
         for index in block:

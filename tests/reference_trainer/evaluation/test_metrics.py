@@ -18,7 +18,7 @@ def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 def direct_ssim(x: np.ndarray, y: np.ndarray) -> float:
-    """Return the definition: for each pixel the weighted moments of its zero-padded window, centred, by a loop."""
+    """Return the definition: for each pixel the weighted moments of its zero-padded window, centered, by a loop."""
     line = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     window = np.outer(line, line) / line.sum() ** 2
     x, y = (np.pad(z, ((0, 0), (5, 5), (5, 5))) for z in (x, y))

@@ -59,15 +59,15 @@ def test_png_takes_gradients_and_clamps(tmp_path):
         assert np.array(picture).min() == 255
 
 
-def test_heat_map_has_the_colours_of_inferno():
-    colours = heat_map(torch.tensor([[0.0, 1.0, 2.0], [-1.0, 5.0, 0.5]]), vmax=2.0)
+def test_heat_map_has_the_colors_of_inferno():
+    colors = heat_map(torch.tensor([[0.0, 1.0, 2.0], [-1.0, 5.0, 0.5]]), vmax=2.0)
     expected = [matplotlib.colormaps["inferno"](x)[:3] for x in (0.0, 128, 1.0, 0.0, 1.0, 64)]
-    torch.testing.assert_close(colours.reshape(3, 6).T, torch.tensor(expected, dtype=torch.float32), atol=1e-6, rtol=0)
+    torch.testing.assert_close(colors.reshape(3, 6).T, torch.tensor(expected, dtype=torch.float32), atol=1e-6, rtol=0)
 
 
-def test_heat_map_is_monotone_in_brightness_and_leaves_grey_for_the_undefined():
-    colours = heat_map(torch.linspace(0, 1, 100)[None], vmax=1.0)
-    brightness = (torch.tensor([0.2126, 0.7152, 0.0722])[:, None, None] * colours).sum(0)[0]
+def test_heat_map_is_monotone_in_brightness_and_leaves_gray_for_the_undefined():
+    colors = heat_map(torch.linspace(0, 1, 100)[None], vmax=1.0)
+    brightness = (torch.tensor([0.2126, 0.7152, 0.0722])[:, None, None] * colors).sum(0)[0]
     assert (brightness.diff() >= 0).all()
     undefined = heat_map(torch.tensor([[float("nan"), float("inf")]]), vmax=1.0)
     assert torch.equal(undefined, torch.full((3, 1, 2), 0.5))

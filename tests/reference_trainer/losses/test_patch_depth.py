@@ -1,4 +1,4 @@
-"""DNGaussian's patch-normalised depth against loops over the patches in numpy."""
+"""DNGaussian's patch-normalized depth against loops over the patches in numpy."""
 
 import dataclasses
 

@@ -60,7 +60,7 @@ def test_float32_agrees_with_float64(size, spread):
         similarity = ssim_map(image, target, variance)
         results.append([similarity.detach(), *torch.autograd.grad((similarity * weights).sum(), (image, variance))])
     for short, long in zip(*results, strict=True):
-        # Rounding: the squares of colours near 1, against the constant 9e-4 that they are compared with.
+        # Rounding: the squares of colors near 1, against the constant 9e-4 that they are compared with.
         assert (short - long).norm() <= 1e-4 * long.norm()
 
 
@@ -145,7 +145,7 @@ def test_a_variance_adds_to_the_contrast_within_the_window():
     variance = 0.1 * pair(9, 14, seed=5)[0]
     offsets = torch.arange(-5, 6, dtype=torch.float64)
     line = torch.exp(-offsets.square() / (2 * 1.5**2))
-    window = (line[:, None] * line[None] / line.sum() ** 2)[1:10, 1:10]  # around the centre, all of a 9 x 9 image
+    window = (line[:, None] * line[None] / line.sum() ** 2)[1:10, 1:10]  # around the center, all of a 9 x 9 image
     x, y, v = image[:, :, :9], target[:, :, :9], variance[:, :, :9]
     mx, my = (window * x).sum((1, 2)), (window * y).sum((1, 2))
     vx, vy = (window * x**2).sum((1, 2)) - mx**2, (window * y**2).sum((1, 2)) - my**2

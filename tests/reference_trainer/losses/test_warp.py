@@ -14,7 +14,7 @@ from reference_trainer.model.rendering import render_gaussians
 
 
 def literal_warp(image, disparity):
-    """Every row looked up by numpy.interp; zero where a neighbour of the place is outside."""
+    """Every row looked up by numpy.interp; zero where a neighbor of the place is outside."""
     height, width = disparity.shape
     columns = np.arange(width)
     warped, inside = np.zeros_like(image), np.zeros((height, width))

@@ -18,7 +18,7 @@ def some(n: int = 6, degree: int = 1) -> Gaussians:
     )
 
 
-def test_points_become_round_gaussians_of_their_colour():
+def test_points_become_round_gaussians_of_their_color():
     positions, colors, distances = torch.rand(5, 3), torch.rand(5, 3), torch.rand(5) + 0.1
     made = Gaussians.from_points(positions, colors, distances, sh_degree=2, opacity=0.3)
     assert torch.equal(made.means, positions)

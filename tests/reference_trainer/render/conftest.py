@@ -1,4 +1,4 @@
-"""Every behaviour of the renderer, for every engine."""
+"""Every behavior of the renderer, for every engine."""
 
 from collections.abc import Iterator
 from contextlib import nullcontext

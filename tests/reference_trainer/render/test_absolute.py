@@ -1,4 +1,4 @@
-"""Sums of absolute gradients, of colours, depth and accumulated alpha, against the gradients of one pixel at a time."""
+"""Sums of absolute gradients, of colors, depth and accumulated alpha, against the gradients of one pixel at a time."""
 
 import torch
 from oracles import random_scene

@@ -1,4 +1,4 @@
-"""Colour variance of a rendering against its definition."""
+"""Color variance of a rendering against its definition."""
 
 import torch
 from oracles import brute_force, random_scene

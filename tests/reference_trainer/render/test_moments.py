@@ -64,7 +64,7 @@ def test_moments_equal_the_closed_form_per_pixel(name, per_pixel, case):
     assert (ours.variance >= 0).all()
 
 
-@pytest.mark.parametrize("behind", [BACKGROUND, backdrop(13, 19)], ids=["one colour", "per pixel"])
+@pytest.mark.parametrize("behind", [BACKGROUND, backdrop(13, 19)], ids=["one color", "per pixel"])
 def test_gradients_equal_autograd_through_the_closed_form(behind, case):
     scene = random_scene(40, 19, 13, seed=7)
     weights = torch.randn(7, 13, 19, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -85,7 +85,7 @@ def test_gradients_equal_autograd_through_the_closed_form(behind, case):
         case.same_gradient(mine, other)
 
 
-def test_gradients_in_a_colour_or_a_variance_alone(case):
+def test_gradients_in_a_color_or_a_variance_alone(case):
     """Upstream gradients that are absent, or are zero but for one image."""
     scene = random_scene(30, 19, 13, seed=8, size=0.2)
     for pick in ("mean", "variance", "alpha_mean"):
@@ -150,7 +150,7 @@ def test_float32_variances_stay_close_to_float64(case):
     assert abs(single.variance.double().mean() / exact.variance.mean() - 1) < 1e-4
 
 
-@pytest.mark.parametrize("background", [BACKGROUND, backdrop(7, 9)], ids=["one colour", "per pixel"])
+@pytest.mark.parametrize("background", [BACKGROUND, backdrop(7, 9)], ids=["one color", "per pixel"])
 def test_nothing_in_view(background, case):
     scene = random_scene(3, 9, 7, seed=1).to(case.dtype)
     splats = splat(scene.means - 10 * scene.camera.forward, *scene[1:4], scene.camera, colors=scene.colors)

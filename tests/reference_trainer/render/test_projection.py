@@ -22,8 +22,8 @@ def in_front(n, seed):
     return scene.means[keep], scene.quaternions[keep], scene.scales[keep], camera
 
 
-def test_centres_follow_the_pinhole_equation_with_half_pixel_centres():
-    # A point on the ray through the centre of the pixel in row 7, column 3.
+def test_centers_follow_the_pinhole_equation_with_half_pixel_centers():
+    # A point on the ray through the center of the pixel in row 7, column 3.
     camera = Camera(torch.eye(4, dtype=torch.float64), 21.0, 19.0, 5.25, 4.5, 10, 9)
     direction = torch.tensor([(3.5 - 5.25) / 21, (7.5 - 4.5) / 19, 1.0], dtype=torch.float64)
     out = project(4.2 * direction[None], torch.tensor([[1.0, 0, 0, 0]]).double(), torch.ones(1, 3).double(), camera)

@@ -86,7 +86,7 @@ def agree(random, scene):
     error = (image - exact).abs() / exact.abs().clamp(min=1.0)
     assert (error[:, mask] <= PIXEL).all()
     _, doubt = decided(splats)
-    assert (error <= PIXEL + 3.5 * doubt).all()  # colours of up to 1, depths of up to 3.5
+    assert (error <= PIXEL + 3.5 * doubt).all()  # colors of up to 1, depths of up to 3.5
     scale = max((float(x.norm()) for x in gradients if x is not None), default=0.0)
     for one, other in zip(mine, gradients, strict=True):
         assert (one is None) == (other is None)

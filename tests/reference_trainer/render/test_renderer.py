@@ -202,7 +202,7 @@ def test_nothing_in_view_is_the_background(n, case):
     assert all((x.grad is None or not x.grad.any()) for x in tensors)
 
 
-def test_a_gaussian_at_the_cut_is_drawn_at_its_centre_or_not_at_all(case):
+def test_a_gaussian_at_the_cut_is_drawn_at_its_center_or_not_at_all(case):
     """An alpha of exactly 1/255 may fall to either side, and to no third one."""
     camera = Camera(torch.eye(4), 10.0, 10.0, 4.5, 4.5, 9, 9)
     for factor, seen in ((1.0, None), (1.001, True), (0.999, False)):

@@ -48,7 +48,7 @@ def test_shares_add_up_to_the_weighted_variance(case):
     torch.testing.assert_close(shares.sum(), total, rtol=rounding, atol=0)
 
 
-def test_a_splat_whose_colour_is_that_behind_it_has_no_share(case):
+def test_a_splat_whose_color_is_that_behind_it_has_no_share(case):
     scene = random_scene(1, 16, 12, seed=3).to(case.dtype)
     splats = splat(*scene[:4], scene.camera, colors=scene.colors)
     shares = variance_shares(splats, Multiplier.dropout(0.5), torch.ones(12, 16), background=scene.colors[0])

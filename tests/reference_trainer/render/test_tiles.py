@@ -13,7 +13,7 @@ ROUNDING = {torch.float64: 1e-9, torch.float32: 1e-3}  # of an alpha, relative
 
 
 def alphas(splats, width, height):
-    """The largest alpha of every splat at the pixel centres of every tile, in float64, (M, tiles)."""
+    """The largest alpha of every splat at the pixel centers of every tile, in float64, (M, tiles)."""
     means, factors, opacities = (x.double() for x in (*splats.projection[:2], splats.opacities))
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     dx, dy = x - means[:, 0, None, None], y - means[:, 1, None, None]
@@ -44,7 +44,7 @@ def test_lists_hold_every_gaussian_that_counts_and_few_others(n, width, height, 
     splats = splat(*scene[:4], scene.camera, colors=scene.colors)
     table, largest = listed(splats), alphas(splats, width, height)
     assert not ((largest >= MIN_ALPHA * (1 + ROUNDING[case.dtype])) & ~table).any()
-    # The ellipse test is exact for the rectangle spanned by the pixel centres, not for the centres: at most a few more.
+    # The ellipse test is exact for the rectangle spanned by the pixel centers, not for the centers: at most a few more.
     assert table.sum() <= 1.5 * (largest >= MIN_ALPHA).sum() + 5
     assert torch.equal(splats.lists.touched, table.any(1))
 

@@ -9,7 +9,7 @@ import sys
 import pytest
 import torch
 from oracles import random_scene
-from stand_ins.gsplat import centred, rasterization
+from stand_ins.gsplat import centered, rasterization
 
 from reference_trainer.compat.rasterization import make_rasterization
 from reference_trainer.density.statistics import DensityStatistics
@@ -24,7 +24,7 @@ by_stand_in = functools.partial(render_by, rasterization)
 
 
 def scene_of(device="cpu"):
-    return centred(random_scene(N, WIDTH, HEIGHT, seed=8).to(torch.float32, device))
+    return centered(random_scene(N, WIDTH, HEIGHT, seed=8).to(torch.float32, device))
 
 
 def rendered(renderer, scene, **options):

@@ -226,7 +226,7 @@ needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium, suc
 
 @pytest.fixture(scope="module")
 def turned(tmp_path_factory, short):
-    """Two runs with ellipsoids of all shapes, in colours that depend on the direction, and the page about both."""
+    """Two runs with ellipsoids of all shapes, in colors that depend on the direction, and the page about both."""
     folder = tmp_path_factory.mktemp("turned")
     options, runs = SceneOptions("synthetic", downscale=2), [folder / "baseline", folder / "dropout"]
     spreads = {"sh_rest": 0.2, "log_scales": 0.7, "quaternions": 1.0, "opacity_logits": 2.0}

@@ -21,7 +21,7 @@ FEW = OrbitOptions(cameras=2, size=40)
 
 
 def ball(n=300, radius=1.0, degree=0, opacity=0.9):
-    """Coloured Gaussians on a sphere."""
+    """Colored Gaussians on a sphere."""
     generator = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1) * radius
     colors = torch.rand(n, 3, generator=generator)
@@ -240,8 +240,8 @@ def test_a_model_that_fits_no_photograph(tmp_path, options):
         save_ply(gaussians, tmp_path / f"{name}.ply")
         heard[name] = []
         score_ply(tmp_path / f"{name}.ply", options, tmp_path / name, samples=2, say=heard[name].append)
-    assert "a picture of one colour" in heard["wrong"][-1]
-    assert not any("one colour" in text for text in heard["right"])
+    assert "a picture of one color" in heard["wrong"][-1]
+    assert not any("one color" in text for text in heard["right"])
 
 
 def test_a_ply_in_another_frame_is_refused_before_anything_is_written(tmp_path, options):

@@ -98,7 +98,7 @@ def test_few_photographs_all_train_from_whatever_points_there_are(photographs, c
         ("none", (), (0.5, 0.5, 0.5)),
     ],
 )
-def test_instantsplat_and_the_colours_of_point_clouds(photographs, colmap_text, kind, values, colors):
+def test_instantsplat_and_the_colors_of_point_clouds(photographs, colmap_text, kind, values, colors):
     folder = photographs / "sparse_3" / "0"
     colmap_text(folder)
     (folder / "points3D.txt").unlink()

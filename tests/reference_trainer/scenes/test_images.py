@@ -31,13 +31,13 @@ def test_reads_the_stored_bytes(tmp_path):
     assert image_size(tmp_path / "a.png") == (7, 5)
 
 
-def test_grey_and_palette_files_become_rgb(tmp_path):
-    grey = np.array([[0, 128], [200, 255]], dtype=np.uint8)
-    Image.fromarray(grey).save(tmp_path / "grey.png")
-    Image.fromarray(grey).convert("P").save(tmp_path / "palette.png", transparency=0)
-    image, alpha = read_image(tmp_path / "grey.png")
+def test_gray_and_palette_files_become_rgb(tmp_path):
+    gray = np.array([[0, 128], [200, 255]], dtype=np.uint8)
+    Image.fromarray(gray).save(tmp_path / "gray.png")
+    Image.fromarray(gray).convert("P").save(tmp_path / "palette.png", transparency=0)
+    image, alpha = read_image(tmp_path / "gray.png")
     assert alpha is None
-    assert all(np.array_equal(channel.numpy(), grey / np.float32(255)) for channel in image)
+    assert all(np.array_equal(channel.numpy(), gray / np.float32(255)) for channel in image)
     assert read_image(tmp_path / "palette.png")[1].tolist() == [[0, 1], [1, 1]]
 
 

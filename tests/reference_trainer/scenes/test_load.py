@@ -245,7 +245,7 @@ def test_splits_find_their_own_points(data_root, scene, split, train, points):
 
 @pytest.mark.data
 def test_points_have_the_colors_of_the_pictures(data_root):
-    """Independent of any file but the photographs: projected points fall on pixels of their own colour."""
+    """Independent of any file but the photographs: projected points fall on pixels of their own color."""
     scene = load_scene(data_root / "fern", images="images_16")
     view = scene.train[1]
     camera, points = view.camera, scene.points

@@ -25,14 +25,14 @@ def pixels(camera, points):
 
 @pytest.mark.parametrize(("width", "height"), [(120, 90), (60, 100)])
 @pytest.mark.parametrize("field_of_view", [0.4, math.radians(45), 2.0])
-def test_the_sphere_touches_the_shorter_side_and_the_centre_is_in_the_middle(width, height, field_of_view):
+def test_the_sphere_touches_the_shorter_side_and_the_center_is_in_the_middle(width, height, field_of_view):
     points = shell()
     cameras = orbit_views(
         points, torch.full((4000, 1), 0.3), count=7, width=width, height=height, field_of_view=field_of_view
     )
     for camera in cameras:
         seen = pixels(camera, points) - torch.tensor([width / 2, height / 2])
-        # The quantile leaves 2 % of the points outside, and 4,000 of them place the centre to about 1 %.
+        # The quantile leaves 2 % of the points outside, and 4,000 of them place the center to about 1 %.
         assert seen.norm(dim=1).quantile(0.98).item() == pytest.approx(min(width, height) / 2, rel=0.06)
         assert pixels(camera, CENTER[None])[0].tolist() == pytest.approx([width / 2, height / 2], abs=2)
 
@@ -97,7 +97,7 @@ def test_up_is_up_in_every_world(world, up):
 
 
 @pytest.mark.parametrize(("count", "angles"), [(1, [0]), (2, [-30, 30]), (3, [-30, 0, 30]), (4, [-30, -10, 10, 30])])
-def test_an_arc_is_centred_on_the_first_camera_of_the_circle(count, angles):
+def test_an_arc_is_centered_on_the_first_camera_of_the_circle(count, angles):
     cameras = orbit_views(shell(), torch.ones(4000), count=count, width=9, height=9, arc=math.radians(60))
     found = [math.degrees(math.atan2(-camera.forward[0], camera.forward[2])) for camera in cameras]
     assert found == pytest.approx(angles, abs=1e-3)

@@ -91,7 +91,7 @@ def test_nearest_hit_is_the_nearest():
     assert index[0] == 1
 
 
-def test_depth_of_a_sphere_is_exact_at_pixel_centres():
+def test_depth_of_a_sphere_is_exact_at_pixel_centers():
     camera = Camera(torch.eye(4), fx=30.0, fy=30.0, cx=16.0, cy=12.0, width=32, height=24)
     image, depth = render_solids(camera, [Round((0.0, 0.0, 4.0), 1.0, white)], torch.zeros(9, 3))
     for row in range(24):

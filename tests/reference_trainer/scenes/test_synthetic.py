@@ -21,7 +21,7 @@ def lifted(view):
 
 
 def looked_up(view, world):
-    """Of world points (..., 3): depth in a view, and the view's depth and colour there; and whether they are inside."""
+    """Of world points (..., 3): depth in a view, and the view's depth and color there; and whether they are inside."""
     camera = view.camera
     x, y, z = (world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(-1)
     grid = torch.stack(
@@ -50,7 +50,7 @@ def test_views_agree_on_depth_and_color_where_both_see(scene, other):
     assert in_front.float().mean() < 0.03
     assert seen.float().mean() > 0.5
     error = (one.image - color).abs().mean(0)[seen]
-    # Fine texture is sampled differently; unrelated colours differ by about 0.2 on average.
+    # Fine texture is sampled differently; unrelated colors differ by about 0.2 on average.
     assert error.mean() < 0.05
     unrelated = (one.image - two.image.flip(2)).abs().mean()
     assert unrelated > 3 * error.mean()

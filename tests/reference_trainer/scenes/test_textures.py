@@ -17,7 +17,7 @@ def test_noise_is_the_lattice_value_on_the_lattice(noise):
     assert torch.equal(noise(points), torch.stack([lattice[0, 0, 0], lattice[3, 5, 7], lattice[31, 1, 2]]))
 
 
-def test_noise_between_lattice_points_is_the_trilinear_mean_at_the_centre(noise):
+def test_noise_between_lattice_points_is_the_trilinear_mean_at_the_center(noise):
     lattice = noise.lattice
     torch.testing.assert_close(noise(torch.tensor([[4.5, 9.5, 2.5]]))[0], lattice[4:6, 9:11, 2:4].mean())
 

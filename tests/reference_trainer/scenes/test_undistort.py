@@ -74,7 +74,7 @@ def test_a_lens_that_folds_is_refused():
 def test_corner_displacement_closed_forms():
     f, k = 200.0, 0.02
     camera = Camera(torch.eye(4), f, f, 80.0, 60.0, 160, 120)
-    # The corner is 100 px from the centre; a radial term moves it by k r^3 f with r = 100 / f.
+    # The corner is 100 px from the center; a radial term moves it by k r^3 f with r = 100 / f.
     assert corner_displacement(camera, (k,)) == pytest.approx(k * (100 / f) ** 3 * f, rel=1e-12)
     x, y = 80 / f, 60 / f
     expected = f * math.hypot(2 * 0.01 * x * y, 0.01 * (x * x + y * y + 2 * y * y))

@@ -42,7 +42,7 @@ def study(run):
 
 
 def luminance(gaussians: Gaussians) -> torch.Tensor:
-    """Of the constant colours."""
+    """Of the constant colors."""
     return (gaussians.sh_dc[:, 0] * SH_C0 + 0.5).double() @ torch.tensor([0.2126, 0.7152, 0.0722]).double()
 
 
@@ -70,7 +70,7 @@ def test_the_shares_in_the_file_add_up_to_the_score_that_is_printed(run, study):
     assert json.loads((out / "attribution.json").read_text())["score"] == data["score"]
 
 
-def test_the_plys_hold_the_same_gaussians_coloured_by_rank(run, study):
+def test_the_plys_hold_the_same_gaussians_colored_by_rank(run, study):
     data, out, _ = study
     model = of_run(run)[0]
     with np.load(out / "shares.npz") as file:
@@ -115,7 +115,7 @@ def test_views_of_the_same_name_in_two_folders_keep_their_pictures(run, tmp_path
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["a_r.png", "b_r.png"]
 
 
-def test_colours_rise_with_the_value_on_a_logarithmic_scale():
+def test_colors_rise_with_the_value_on_a_logarithmic_scale():
     n = 500
     values = torch.cat(
         [torch.tensor([0.0]), torch.logspace(-4, 4, n - 2, dtype=torch.float64), torch.tensor([math.inf])]
@@ -136,7 +136,7 @@ def test_colours_rise_with_the_value_on_a_logarithmic_scale():
 
 
 def test_blend_weights_are_those_of_brute_force():
-    """Colours that are the rows of the identity make one image of each Gaussian's weight."""
+    """Colors that are the rows of the identity make one image of each Gaussian's weight."""
     n, scale = 30, 0.8
     scene = random_scene(n, 24, 18, seed=5)
     pose = scene.camera.world_to_camera.clone()

@@ -57,7 +57,7 @@ def test_mean_variance_and_their_gradients_are_those_of_all_masks(p, compensate)
 
 
 def one_white(opacity: float) -> tuple[Gaussians, Camera]:
-    """A white Gaussian that is centred on a pixel, so that its falloff there is 1; in the corner it is 0.73."""
+    """A white Gaussian that is centered on a pixel, so that its falloff there is 1; in the corner it is 0.73."""
     white = Gaussians.from_points(
         torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1, 3), torch.tensor([1.2]), sh_degree=0, opacity=opacity
     )

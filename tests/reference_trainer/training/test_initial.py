@@ -25,7 +25,7 @@ def with_points(scene: Scene, extra: torch.Tensor) -> Scene:
     return dataclasses.replace(scene, points=cloud)
 
 
-def test_sizes_are_the_distance_to_the_neighbours_times_the_scale(tiny_scene):
+def test_sizes_are_the_distance_to_the_neighbors_times_the_scale(tiny_scene):
     whole = initial_gaussians(tiny_scene, TrainConfig())
     half = initial_gaussians(tiny_scene, TrainConfig(initial_scale=0.5))
     torch.testing.assert_close(half.scales, whole.scales / 2)

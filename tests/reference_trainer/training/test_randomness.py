@@ -17,8 +17,8 @@ def test_large_seeds_are_not_cut():
     assert len({torch.rand(4, generator=stream(seed, 0, "a")).sum().item() for seed in seeds}) == 3
 
 
-def test_neighbouring_streams_are_independent():
-    """Masks of neighbouring steps overlap as chance has it.
+def test_neighboring_streams_are_independent():
+    """Masks of neighboring steps overlap as chance has it.
 
     The share of 200 x 500 pairs that agree has mean 1/2 and standard deviation 0.0016; 5 of them: false alarm 6e-7.
     """

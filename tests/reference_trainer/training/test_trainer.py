@@ -310,7 +310,7 @@ def test_resets_reach_the_model(tiny_scene):
 
 
 def test_initial_gaussians():
-    """Two points, one camera: the scale is their distance, the colour theirs; the extent of one camera is 1."""
+    """Two points, one camera: the scale is their distance, the color theirs; the extent of one camera is 1."""
     view = View("a", Camera(torch.eye(4), 20.0, 20.0, 8.0, 8.0, 16, 16), torch.zeros(3, 16, 16))
     positions, colors = torch.tensor([[0.0, 0, 4], [0.0, 0.3, 4]]), torch.tensor([[1.0, 0, 0], [0, 0.5, 1]])
     scene = Scene("two", (view,), (), PointCloud(positions, colors, "hand"), torch.zeros(3))

@@ -46,7 +46,7 @@ def test_the_co_adaptation_is_that_of_the_chosen_rate(model, mask):
     image, _ = Subject(model, []).draw(Look("co-adaptation", drop_rate=0.3, mask=mask), CAMERA)
     moments, _ = render_moments_of(model.gaussians, Multiplier.dropout(0.3), CAMERA, model.background)
     variance = moments.variance.mean(0).masked_fill(moments.alpha_mean <= 0.8, math.nan)
-    torch.testing.assert_close(image, heat_map(variance, CA_PICTURE_RANGE), rtol=0, atol=0.02)  # a step of the colours
+    torch.testing.assert_close(image, heat_map(variance, CA_PICTURE_RANGE), rtol=0, atol=0.02)  # a step of the colors
 
 
 def test_the_co_adaptation_takes_the_noise_in(model):
@@ -104,7 +104,7 @@ def test_heat_is_brighter_where_more_co_adapts(model):
     inside = (values > subject.heat.mean / 10) & (values < subject.heat.mean * 10)
     brightness = gaussians.sh_dc[inside, 0].sum(1)[values[inside].argsort()]
     assert inside.sum() > 50
-    assert bool((brightness.diff() >= -1e-6).all())  # along the colour map, up to steps of its table
+    assert bool((brightness.diff() >= -1e-6).all())  # along the color map, up to steps of its table
     torch.testing.assert_close(image, Subject(replace(model, gaussians=gaussians), []).draw(Look(), CAMERA)[0])
 
 
@@ -128,6 +128,6 @@ def test_depth_is_that_of_walls():
     near, far = (float(word) for word in note.removeprefix("depth ").replace(" (bright) to", "").split())
     assert (near, far) == pytest.approx((2, 6), rel=0.02)
     assert image[:, 5, 5].sum() > image[:, 5, 35].sum() + 1
-    torch.testing.assert_close(image[:, 25:], torch.full((3, 5, 40), 0.5))  # grey
+    torch.testing.assert_close(image[:, 25:], torch.full((3, 5, 40), 0.5))  # gray
     nothing = replace(thin, opacity_logits=thin.opacity_logits - 99)
     assert Subject(TrainedModel(nothing, torch.ones(3)), []).draw(Look("depth"), CAMERA)[1].startswith("nothing")
