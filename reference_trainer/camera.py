@@ -94,7 +94,8 @@ class Camera:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """Return the camera with its view matrix on another device or in another dtype."""
-        return replace(self, world_to_camera=self.world_to_camera.to(device=device, dtype=dtype))
+        pose = self.world_to_camera.to(device=device, dtype=dtype)
+        return self if pose is self.world_to_camera else replace(self, world_to_camera=pose)
 
 
 def pixels_of(positions: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:

@@ -12,10 +12,13 @@ from types import ModuleType
 from typing import Any, NoReturn
 from unittest.mock import patch
 
-from reference_trainer.compat.rasterization import make_rasterization
-from reference_trainer.model.relocation import compute_relocation, quat_scale_to_covar_preci
+from torch import Tensor
 
-__all__ = ["gsplat_functions"]
+from reference_trainer.compat.rasterization import make_rasterization
+from reference_trainer.model.relocation import compute_relocation
+from reference_trainer.rotations import rotation_matrices
+
+__all__ = ["gsplat_functions", "quat_scale_to_covar_preci"]
 
 
 @contextmanager
@@ -103,3 +106,24 @@ def _run_once(fn: Callable[..., Any], args: Any, verbose: bool = False) -> bool:
 def _per_axis(version: str) -> bool:
     """Whether radii are by axis: since gsplat 1.5."""
     return tuple(int(part) for part in version.split(".")[:2]) >= (1, 5)
+
+
+def quat_scale_to_covar_preci(
+    quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
+) -> tuple[Tensor | None, Tensor | None]:
+    """Return covariances and their inverses, None for what was not asked for: (N, 3, 3), or if ``triu`` (N, 6).
+
+    The six are xx, xy, xz, yy, yz, zz. Quaternions (N, 4) are wxyz, scales (N, 3) standard deviations.
+
+    Example:
+        >>> import torch
+        >>> quat_scale_to_covar_preci(torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[1.0, 2, 3]]), triu=True)[0]
+        tensor([[1., 0., 0., 4., 0., 9.]])
+    """
+    axes = rotation_matrices(quats)
+
+    def product(lengths: Tensor) -> Tensor:
+        matrix = (axes * lengths[:, None]) @ (axes * lengths[:, None]).mT
+        return matrix.flatten(1)[:, [0, 1, 2, 4, 5, 8]] if triu else matrix
+
+    return product(scales) if compute_covar else None, product(1 / scales) if compute_preci else None

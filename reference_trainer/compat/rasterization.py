@@ -13,10 +13,10 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.compat.antialiasing import filtered
-from reference_trainer.compat.radii import longer_radii
 from reference_trainer.render import Splats, draw, splat
 from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradients
 from reference_trainer.render.constants import DILATION, MIN_ALPHA, NEAR_PLANE
+from reference_trainer.render.radii import longer_radii
 
 __all__ = ["make_rasterization"]
 

@@ -13,7 +13,6 @@ from reference_trainer.compat.antialiasing import filtered
 from reference_trainer.compat.contributions import contributions
 from reference_trainer.compat.extensions import make_module
 from reference_trainer.compat.outputs import Picture, Unknown, kinds_of
-from reference_trainer.compat.radii import in_front, visible_radii
 from reference_trainer.compat.settings import GaussianRasterizationSettings, camera_of, warn_of_ignored
 from reference_trainer.compat.surfels import surface_planes
 from reference_trainer.compat.unpacking import names_of_results
@@ -21,6 +20,7 @@ from reference_trainer.model.relocation import compute_relocation
 from reference_trainer.render import draw, splat
 from reference_trainer.render.absolute import splat_weights, with_absolute_gradients
 from reference_trainer.render.constants import DILATION
+from reference_trainer.render.radii import in_front, visible_radii
 
 __all__ = ["GaussianRasterizer", "rasterizer_module"]
 

@@ -84,6 +84,10 @@ class AdaptiveDensity(DensityStrategy):
         """Return the random numbers of the splits of a step."""
         return stream(self.config.seed, step, "split", self.device)
 
+    def observes(self, step: int) -> bool:
+        """Until the end of densification."""
+        return step < self.config.densify_end
+
     def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:
         """Count the gradients of what was drawn."""
         means = splats.projection.means

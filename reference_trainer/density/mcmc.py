@@ -12,7 +12,8 @@ from reference_trainer.density.operations import refuse_not_finite
 from reference_trainer.density.strategy import DensityStrategy
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
-from reference_trainer.model.relocation import compute_relocation, quat_scale_to_covar_preci
+from reference_trainer.model.relocation import compute_relocation
+from reference_trainer.rotations import rotation_matrices
 from reference_trainer.training.randomness import stream
 
 __all__ = ["MCMCDensity"]
@@ -67,13 +68,12 @@ class MCMCDensity(DensityStrategy):
                 optimizer.append(drawn_copies(optimizer, optimizer.gaussians.opacities, target - n, generator))
         if step and self.noise:
             gaussians = optimizer.gaussians
-            covariances, _ = quat_scale_to_covar_preci(gaussians.quaternions, gaussians.scales, compute_preci=False)
-            assert covariances is not None
+            axes = rotation_matrices(gaussians.quaternions) * gaussians.scales[:, None]
             generator = stream(self.config.seed, step, "exploration", self.device)
             xi = torch.empty_like(gaussians.means).normal_(generator=generator)
             xi *= torch.sigmoid(100 * (0.005 - gaussians.opacities))[:, None]
             xi *= self.noise * self.config.means_rate_at(step - 1) * self.extent
-            gaussians.means.add_((covariances @ xi[:, :, None]).squeeze(-1))
+            gaussians.means.add_((axes @ (axes.mT @ xi[:, :, None])).squeeze(-1))
 
 
 def relocate(optimizer: GaussianOptimizer, dead: Tensor, generator: torch.Generator) -> None:

@@ -10,11 +10,11 @@ from torch.nn.functional import avg_pool2d
 
 from ca_reg.neighbors import nearest_distance
 from ca_reg.regularizers.segs import SEGSNoise
-from reference_trainer.compat.radii import SMALLEST_SPREAD, longer_radii
 from reference_trainer.density.co_pruning import CoPruning
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import arguments, render_gaussians
 from reference_trainer.render import splat
+from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
 from reference_trainer.scenes.pseudo import pseudo_cameras
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig

@@ -84,6 +84,10 @@ class DensityStrategy(abc.ABC):
     def together(self, fields: Sequence[Field], step: int) -> None:  # noqa: B027 (most look at one field alone)
         """Change what depends on other fields, after each has had its `before_step`; the first one's is called."""
 
+    def observes(self, step: int) -> bool:
+        """Whether `observe` is to be called at a step, and the renderer to do what the strategy needs."""
+        return True
+
     def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:  # noqa: B027
         """Look at a render whose gradients have been computed.
 

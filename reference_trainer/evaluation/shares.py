@@ -12,7 +12,7 @@ from ca_reg import CAResult, Reason, attribute, total_effects
 from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
-from reference_trainer.render import render
+from reference_trainer.render.absolute import splat_weights
 from reference_trainer.scenes.scene import Viewpoint
 
 __all__ = [
@@ -75,7 +75,6 @@ class Heat:
         return self.values.argsort().argsort() / len(self.shares)
 
 
-@torch.enable_grad()
 def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:
     """Return the weight with which every Gaussian enters the test-time renders, summed over all pixels and views.
 
@@ -88,12 +87,11 @@ def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:
     Returns:
         Sums of alpha times transmittance, shape (N,), float64.
     """
-    gaussians, opacities = model.gaussians, model.test_opacities
+    opacities = model.test_opacities
     total = torch.zeros_like(opacities, dtype=torch.float64)
     for view in views:
-        colors = torch.zeros_like(gaussians.means).requires_grad_()
-        out = render(gaussians.means, gaussians.quaternions, gaussians.scales, opacities, view.camera, colors=colors)
-        total += torch.autograd.grad(out.image[0].sum(), colors)[0][:, 0]
+        splats = model.splats(opacities, view)
+        total[splats.indices] += splat_weights(splats)
     return total
 
 

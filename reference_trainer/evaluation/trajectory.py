@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.pseudo import camera_between
 from reference_trainer.scenes.scene import Scene, Viewpoint
@@ -53,8 +54,7 @@ def measured_views(scene: Scene, say: Callable[[str], None]) -> dict[str, Sequen
     cameras = [view.camera for view in scene.train]
     if len(cameras) < 2:
         return {"train": scene.train}
-    places = torch.stack([camera.position for camera in cameras])
-    nearest = torch.cdist(places, places).fill_diagonal_(torch.inf).argmin(1).tolist()
+    nearest = nearest_neighbors(torch.stack([camera.position for camera in cameras]), 1)[1][:, 0].tolist()
     pairs = sorted({(min(pair), max(pair)) for pair in enumerate(nearest)})
     new = {
         "between": [camera_between(cameras[i], cameras[j], 0.5) for i, j in pairs],

@@ -7,7 +7,7 @@ from torch.nn.functional import max_pool2d, pad
 
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import WeightedTerm
-from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.step import Step
 
 __all__ = ["Alpha", "dark_background"]
@@ -32,6 +32,7 @@ class Alpha(WeightedTerm):
         if dark is not None and not 0 < dark <= 1:
             raise ValueError(f"dark must be in (0, 1], got {dark}.")
         self.dark = dark
+        self._backgrounds: dict[str, Tensor] = {}
 
     def begin(self, scene: Scene) -> None:
         """Refuse photographs of which nothing tells the background."""
@@ -44,13 +45,17 @@ class Alpha(WeightedTerm):
     def value(self, step: Step) -> Tensor:
         """Return the mean over all pixels."""
         assert step.rendering is not None
-        view = step.view
+        name = step.view.name
+        if name not in self._backgrounds:
+            self._backgrounds[name] = self._background(step.view)
+        return (step.rendering.alpha * self._backgrounds[name]).mean()
+
+    def _background(self, view: View) -> Tensor:
+        """Return 1 where a photograph shows the background, (H, W)."""
         if self.dark is not None:
-            background = dark_background(view.image, self.dark)
-        else:
-            assert view.alpha is not None
-            background = 1 - view.alpha
-        return (step.rendering.alpha * background).mean()
+            return dark_background(view.image, self.dark)
+        assert view.alpha is not None
+        return 1 - view.alpha
 
 
 def dark_background(image: Tensor, threshold: float) -> Tensor:

@@ -43,7 +43,7 @@ class CoAdaptation(WeightedTerm):
         [200, 204, 208]
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset({"moments"})
+    needs = frozenset({"moments"})
     analytic: ClassVar[bool] = True
 
     def __init__(self, weight: float | Schedule = 1.0, p: float = 0.5, where: str = "training", every: int = 1) -> None:

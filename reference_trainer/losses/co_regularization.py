@@ -33,7 +33,7 @@ class CoRegularization(WeightedTerm):
         ValueError: if one is out of range, or the scene has no `pseudo_cameras`.
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset({"fields"})
+    needs = frozenset({"fields"})
     analytic: ClassVar[bool] = True
 
     def __init__(self, weight: float | Schedule = 1.0, lambda_dssim: float = 0.2) -> None:

@@ -54,6 +54,7 @@ class Consistency(WeightedTerm):
         self.dropout = GaussianDropout(p)
         _check_lambda(lambda_dssim)
         self.p, self.lambda_dssim, self.exact = p, lambda_dssim, exact
+        self.needs = frozenset({"moments"} if exact else ())
 
     def acts(self, number: int) -> bool:
         """Return whether there is a rate, and a weight at this step."""

@@ -34,5 +34,6 @@ class Flat(WeightedTerm):
 
     def value(self, step: Step) -> Tensor:
         """Return the mean excess."""
-        scales = step.gaussians.scales
+        scales = step.params.scales
+        assert scales is not None
         return (scales.amax(1) / scales.amin(1) - self.limit).clamp_min(0).mean()

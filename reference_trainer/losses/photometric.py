@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import expected_absolute_error
-from reference_trainer.losses.term import LossTerm
+from ca_reg.schedules import Schedule
+from reference_trainer.losses.term import WeightedTerm
 from reference_trainer.render.engine import engine_for
 from reference_trainer.training.step import Step
 
@@ -23,30 +24,30 @@ _C1 = 0.01**2
 _C2 = 0.03**2
 
 
-class Photometric(LossTerm):
+class Photometric(WeightedTerm):
     """The loss of 3D Gaussian Splatting against the photograph, `photometric_loss`; in an analytic step its mean.
 
     Args:
         lambda_dssim: weight of the structural term, in [0, 1].
-        weight: of the whole.
+        weight: of the whole, at least 0, or a schedule.
 
     Raises:
-        ValueError: if ``lambda_dssim`` is out of range.
+        ValueError: if one is out of range.
     """
 
     analytic: ClassVar[bool] = True
 
-    def __init__(self, lambda_dssim: float = 0.2, *, weight: float = 1.0) -> None:
+    def __init__(self, lambda_dssim: float = 0.2, *, weight: float | Schedule = 1.0) -> None:
+        super().__init__(weight)
         _check_lambda(lambda_dssim)
         self.lambda_dssim = lambda_dssim
-        self.weight = weight
 
-    def __call__(self, step: Step) -> Tensor:
+    def value(self, step: Step) -> Tensor:
         """Compare the render of the step with its photograph."""
         target = step.view.image
         if step.variance is None:
-            return self.weight * photometric_loss(step.image, target, self.lambda_dssim)
-        return self.weight * expected_photometric_loss(step.image, step.variance, target, self.lambda_dssim)
+            return photometric_loss(step.image, target, self.lambda_dssim)
+        return expected_photometric_loss(step.image, step.variance, target, self.lambda_dssim)
 
 
 def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -> Tensor:
@@ -74,8 +75,8 @@ def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -
         torch.Size([3, 16, 16])
     """
     _check_lambda(lambda_dssim)
-    similarity, error = ssim_map(image, target).mean(), torch.nn.functional.l1_loss(image, target)
-    return error * (1 - lambda_dssim) + (1 - similarity) * lambda_dssim
+    _check_pair(image, target)
+    return _with_ssim(torch.nn.functional.l1_loss(image, target), image, target, None, lambda_dssim)
 
 
 def expected_photometric_loss(mean: Tensor, variance: Tensor, target: Tensor, lambda_dssim: float = 0.2) -> Tensor:
@@ -105,9 +106,8 @@ def expected_photometric_loss(mean: Tensor, variance: Tensor, target: Tensor, la
         True
     """
     _check_lambda(lambda_dssim)
-    similarity = ssim_map(mean, target, variance).mean()
-    error = expected_absolute_error(mean, variance, target).mean()
-    return error * (1 - lambda_dssim) + (1 - similarity) * lambda_dssim
+    _check_pair(mean, target)
+    return _with_ssim(expected_absolute_error(mean, variance, target).mean(), mean, target, variance, lambda_dssim)
 
 
 def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None = None) -> Tensor:
@@ -133,6 +133,20 @@ def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None = None) -> T
         >>> bool(torch.allclose(ssim_map(image, image), torch.ones_like(image)))
         True
     """
+    _check_pair(image, target)
+    similarity: Tensor = _SSIMMap.apply(image, target, variance)  # type: ignore[no-untyped-call]
+    return similarity
+
+
+def _with_ssim(error: Tensor, image: Tensor, target: Tensor, variance: Tensor | None, lambda_dssim: float) -> Tensor:
+    """Mix an error with the structural term, which costs nothing where it does not count."""
+    if lambda_dssim == 0:
+        return error
+    return error * (1 - lambda_dssim) + (1 - ssim_map(image, target, variance).mean()) * lambda_dssim
+
+
+def _check_pair(image: Tensor, target: Tensor) -> None:
+    """Raise unless a picture can be compared with a photograph."""
     if image.ndim != 3 or image.shape != target.shape:
         raise ValueError(
             f"image and target must share one shape (C, H, W), got {tuple(image.shape)} and {tuple(target.shape)}."
@@ -144,8 +158,6 @@ def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None = None) -> T
         )
     if target.requires_grad:
         raise ValueError("target is a constant here, but it requires a gradient: pass target.detach().")
-    similarity: Tensor = _SSIMMap.apply(image, target, variance)  # type: ignore[no-untyped-call]
-    return similarity
 
 
 def _check_lambda(lambda_dssim: float) -> None:
@@ -160,10 +172,13 @@ class _SSIMMap(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, variance: Tensor | None) -> Tensor:
         # Only the sum of the two variances enters, so four maps are blurred and not five.
-        squares = torch.addcmul(image * image, target, target)
+        maps = image.new_empty(4, *image.shape)
+        maps[0], maps[1] = image, target
+        torch.mul(image, target, out=maps[2])
+        torch.mul(image, image, out=maps[3]).addcmul_(target, target)
         if variance is not None:
-            squares.add_(variance)
-        similarity, slopes = _similarity(_blur(torch.stack([image, target, image * target, squares])))
+            maps[3] += variance
+        similarity, slopes = _similarity(_blur(maps))
         ctx.save_for_backward(image, target, slopes)
         return similarity
 

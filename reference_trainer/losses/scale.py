@@ -34,4 +34,6 @@ class Scale(WeightedTerm):
 
     def value(self, step: Step) -> Tensor:
         """Return the mean squared excess."""
-        return (step.gaussians.scales.amax(1) - self.limit).clamp_min(0).square().mean()
+        scales = step.params.scales
+        assert scales is not None
+        return (scales.amax(1) - self.limit).clamp_min(0).square().mean()

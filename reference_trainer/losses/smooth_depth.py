@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from kornia.losses import inverse_depth_smoothness_loss
 from torch import Tensor
 
@@ -27,7 +25,7 @@ class SmoothDepth(WeightedTerm):
         ValueError: if it is negative.
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset({"depth"})
+    needs = frozenset({"depth"})
 
     def __init__(self, weight: float | Schedule = 0.001) -> None:
         super().__init__(weight)

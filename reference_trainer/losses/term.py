@@ -23,7 +23,7 @@ class LossTerm(abc.ABC):
         analytic: whether the term knows what to do with an expected image and its variance, without a draw.
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset()
+    needs: frozenset[str] = frozenset()
     analytic: ClassVar[bool] = False
 
     def begin(self, scene: Scene) -> None:  # noqa: B027
@@ -75,7 +75,7 @@ class WeightedTerm(LossTerm):
 
     def __call__(self, step: Step) -> Tensor:
         """Return the weighted value."""
-        return self._weight(step.number) * self.value(step) if self.acts(step.number) else step.image.new_zeros(())
+        return self._weight(step.number) * self.value(step)
 
     @abc.abstractmethod
     def value(self, step: Step) -> Tensor:
@@ -85,7 +85,7 @@ class WeightedTerm(LossTerm):
 class PriorTerm(WeightedTerm):
     """A term that compares the rendered depth with `View.depth_prior`."""
 
-    needs: ClassVar[frozenset[str]] = frozenset({"depth"})
+    needs = frozenset({"depth"})
 
     def begin(self, scene: Scene) -> None:
         """Raise a ValueError, which names them, if photographs have no prior."""

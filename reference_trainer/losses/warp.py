@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
 
 import torch
 from kornia.filters import spatial_gradient
@@ -32,7 +31,7 @@ class Warp(WeightedTerm):
         ValueError: if one is out of range.
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset({"depth"})
+    needs = frozenset({"depth"})
 
     def __init__(self, weight: float | Schedule = 1.0, shift: float = 0.4, smooth: float = 0.05) -> None:
         super().__init__(weight)

@@ -1,13 +1,11 @@
-"""What 3DGS-MCMC computes: several Gaussians in the place of one, and covariances."""
+"""What 3DGS-MCMC computes: several Gaussians in the place of one."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from reference_trainer.rotations import rotation_matrices
-
-__all__ = ["compute_relocation", "quat_scale_to_covar_preci"]
+__all__ = ["compute_relocation"]
 
 
 @torch.no_grad()
@@ -33,23 +31,3 @@ def compute_relocation(
     terms = binoms.double().cumsum(0) * (-1) ** k / (k + 1).sqrt()
     shrink = opacities.double() / (terms[n - 1] * opacity[:, None] ** (k + 1)).sum(1)
     return opacity.to(opacities), scales * shrink[:, None].to(scales)
-
-
-def quat_scale_to_covar_preci(
-    quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
-) -> tuple[Tensor | None, Tensor | None]:
-    """Return covariances and their inverses, None for what was not asked for: (N, 3, 3), or if ``triu`` (N, 6).
-
-    The six are xx, xy, xz, yy, yz, zz. Quaternions (N, 4) are wxyz, scales (N, 3) standard deviations.
-
-    Example:
-        >>> quat_scale_to_covar_preci(torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[1.0, 2, 3]]), triu=True)[0]
-        tensor([[1., 0., 0., 4., 0., 9.]])
-    """
-    axes = rotation_matrices(quats)
-
-    def product(lengths: Tensor) -> Tensor:
-        matrix = (axes * lengths[:, None]) @ (axes * lengths[:, None]).mT
-        return matrix.flatten(1)[:, [0, 1, 2, 4, 5, 8]] if triu else matrix
-
-    return product(scales) if compute_covar else None, product(1 / scales) if compute_preci else None

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from reference_trainer.render.renderer import draw
 from reference_trainer.render.splats import Rendering, Splats
@@ -31,6 +32,7 @@ class _AbsoluteGradients(torch.autograd.Function):
         return drawn.view_as(drawn)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         # The light that is left shows the background: without it, its gradient is one more of alpha.
         (drawn,), (gradient,) = ctx.saved_tensors, gradients

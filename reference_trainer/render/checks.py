@@ -36,10 +36,11 @@ def check_projection(
         ValueError: if the rounding of the coordinates moves Gaussians by more than `MAX_ROUNDING`.
     """
     results = (projection.means, projection.covariances, colors)
-    if not bool(sum((x.sum() for x in results), total).isfinite()):  # one wait for a GPU
-        _refuse(results, inputs, camera)
     # At what share of its mean depth the scene lies from the origin of the world.
-    share = float(camera.position.abs().amax() / projection.depths.mean())
+    distance = camera.position.abs().amax() / projection.depths.mean()
+    total, share = torch.stack([sum((x.sum() for x in results), total), distance]).tolist()  # one wait for a GPU
+    if not math.isfinite(total):
+        _refuse(results, inputs, camera)
     rounding = 0.5 * torch.finfo(colors.dtype).eps * share * max(camera.fx, camera.fy)
     if rounding > MAX_ROUNDING:
         raise ValueError(
@@ -50,12 +51,22 @@ def check_projection(
 
 
 def either(sh: Tensor | None, sh_degree: int | None, colors: Tensor | None) -> tuple[Tensor, int | None]:
-    """Return coefficients and their highest band, or colors and None; raise unless one of the two is given."""
-    if sh is None and colors is not None:
-        return colors, None
-    if sh is None or colors is not None:
+    """Return coefficients and their highest band, or colors and None; raise unless one of the two is as it must be."""
+    if (sh is None) == (colors is None):
         raise ValueError("give either sh (N, K, 3) or colors (N, 3), not both and not neither.")
-    return sh, math.isqrt(sh.shape[1]) - 1 if sh_degree is None else sh_degree
+    if sh is None:
+        assert colors is not None
+        if colors.ndim != 2 or colors.shape[1] != 3:
+            raise ValueError(f"colors must have shape (N, 3), got {tuple(colors.shape)}.")
+        return colors, None
+    if sh.ndim != 3 or sh.shape[2] != 3:
+        raise ValueError(f"sh must have shape (N, K, 3), got {tuple(sh.shape)}.")
+    degree = math.isqrt(sh.shape[1]) - 1 if sh_degree is None else sh_degree
+    if degree not in (0, 1, 2, 3) or sh.shape[1] < (degree + 1) ** 2:
+        raise ValueError(
+            f"degree {degree}, of at most 3, needs {(degree + 1) ** 2} coefficients, got sh of {tuple(sh.shape)}."
+        )
+    return sh, degree
 
 
 def checked_background(background: Tensor | None, splats: Splats, *shapes: tuple[int, ...]) -> Tensor:

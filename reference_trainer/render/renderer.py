@@ -32,7 +32,7 @@ def splat(
 
     Raises:
         TypeError: if a tensor is not floating point.
-        ValueError: if not exactly one of ``sh`` and ``colors`` is given, the opacities have another shape, or the world
+        ValueError: if not exactly one of ``sh`` and ``colors`` is given, a tensor has another shape, or the world
             coordinates are too large for their precision, see `MAX_ROUNDING`.
         NotFiniteError: if an input that decides about the view is nan or infinite. What is behind the camera, or
             dropped, may be so but for its place and opacity.
@@ -41,8 +41,11 @@ def splat(
     n = means.shape[0]
     if opacities.shape not in ((n,), (n, 1)):
         raise ValueError(f"opacities must have shape ({n},) or ({n}, 1), got {tuple(opacities.shape)}.")
-    named = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities.reshape(n)}
-    named |= {"colors": values} if degree is None else {"sh": values[:, : (degree + 1) ** 2]}
+    named = {"means": means, "quaternions": quaternions, "scales": scales, "colors" if degree is None else "sh": values}
+    for (name, x), shape in zip(named.items(), ((n, 3), (n, 4), (n, 3), (n, *values.shape[1:])), strict=True):
+        if x.shape != shape:  # the loops would read beyond the ends
+            raise ValueError(f"{name} must have shape {shape}, got {tuple(x.shape)}.")
+    named["opacities"] = opacities.reshape(n)
     inputs = {name: _working(name, x, means.dtype) for name, x in named.items()}
     # Mixed precision would move means by pixels: its products have 8 bits.
     with torch.autocast(means.device.type, enabled=False):
@@ -92,7 +95,7 @@ def render(
         opacities: activated, in [0, 1], shape (N,) or (N, 1).
         camera: the view.
         sh: spherical-harmonic coefficients, shape (N, K, 3), or
-        sh_degree: highest band to evaluate; all of ``sh`` by default.
+        sh_degree: highest band to evaluate, at most 3; all of ``sh`` by default.
         colors: colors, shape (N, 3).
         background: color behind everything, shape (3,); black by default.
         depth: whether to accumulate depth as well.

@@ -31,7 +31,7 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     content = io.BytesIO()  # torch.save to a file hides the error of a full disk behind one of its own
     torch.save({"format": _FORMAT, **moved(state, "cpu")}, content)
     with replacing(path) as place:
-        place.write_bytes(content.getvalue())
+        place.write_bytes(content.getbuffer())
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:

@@ -57,7 +57,7 @@ class TrainConfig:
     means_rate: float = 1.6e-4
     """Initial learning rate of the means, in units of the scene's extent."""
     means_rate_final: float = 1.6e-6
-    """Its value at the last step; in between it falls exponentially."""
+    """Its value after the last step, to which it falls exponentially."""
     scales_rate: float = 5e-3
     """Learning rate of the logarithms of the scales."""
     quaternions_rate: float = 1e-3
@@ -201,8 +201,10 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("iterations", "fields"), lambda x: x >= 1, "at least 1", ""),
     (("dropout",), lambda x: 0 <= x < 1, "in [0, 1)", ": 0 turns it off"),
     (("noise",), lambda x: x >= 0, "at least 0", ": 0 turns it off"),
-    (("seed", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from"),
-     lambda x: x >= 0, "at least 0", ""),
+    (("seed", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from",
+      "densify_gradient", "dense_fraction", "prune_opacity", "scales_rate", "quaternions_rate", "opacity_rate",
+      "color_rate"), lambda x: x >= 0, "at least 0", ""),
+    (("max_gaussians", "densify_until", "opacity_reset_from"), lambda x: x is None or x >= 0, "None or at least 0", ""),
     (("sh_degree",), lambda x: x in (0, 1, 2, 3), "0, 1, 2 or 3", ""),
     (("initial_points",), lambda x: x in ("all", "seen"), "all or seen", ""),
     (("prune_size",), lambda x: x is None or x > 0, "positive, or None to keep what is large", ""),

@@ -10,7 +10,8 @@ from torch.nn.functional import pad
 
 from ca_reg.neighbors import mean_neighbor_distance
 from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.model.rendering import arguments
+from reference_trainer.render import splat
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.config import TrainConfig
 
@@ -65,6 +66,6 @@ def drawn_by_any(gaussians: Gaussians, views: tuple[View, ...]) -> Tensor:
     """Return which Gaussians have a pixel in some view, shape (N,), bool. The others never receive a gradient."""
     drawn = torch.zeros(len(gaussians), dtype=torch.bool)
     for view in views:
-        splats = render_gaussians(gaussians, view.camera, torch.zeros(3), sh_degree=0).splats
+        splats = splat(**arguments(gaussians), camera=view.camera, sh_degree=0)
         drawn[splats.indices[splats.lists.touched]] = True
     return drawn

@@ -54,7 +54,8 @@ def hold_interrupts() -> Iterator[Callable[[], None]]:
         if waiting:
             raise TrainingInterrupted(waiting[0])
 
-    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
+    # None: set by a library in C, which Python could not put back.
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) not in (signal.SIG_IGN, None)]
     before = {number: signal.signal(number, remember) for number in numbers}
     try:
         yield stop

@@ -111,7 +111,7 @@ def _read_field(
     expected = counts.state_dict()
     _refuse_other_entries(state["statistics"], expected, f"{where}, statistics")
     for name, x in state["statistics"].items():
-        _check(x, tuple(expected[name].shape), f"{where}, {name}", least=0)
+        _check(x, tuple(expected[name].shape), f"{where}, {name}")
     # They are counted up in place, which a file can forbid: by a gradient, or by memory that is shared.
     statistics = {name: x.detach().clone() for name, x in state["statistics"].items()}
     found = state["regularizer"]

@@ -159,22 +159,21 @@ class Trainer:
             loss = sum((term(step) for step in steps for term in terms), start=steps[0].image.new_zeros(()))
         except NotFiniteError as error:
             raise TrainingStoppedError(f"step {self.step + 1} cannot be rendered: {error}") from error
-        value = loss.item()
+        mse = torch.nn.functional.mse_loss(steps[0].image.detach().clamp(0, 1), steps[0].view.image)
+        value, squared_error = torch.stack([loss.detach(), mse]).tolist()  # one wait for a GPU
         if not math.isfinite(value):
             raise TrainingStoppedError(f"the loss became {value} at step {self.step + 1}: lower the learning rates.")
         if loss.requires_grad:
             loss.backward()  # type: ignore[no-untyped-call]
             for field, step in zip(self.fields, steps, strict=True):
-                for splats, camera in step.observed:
+                for splats, camera in step.observed if field.density.observes(self.step) else ():
                     if splats.projection.means.grad is not None:  # none if nothing was drawn, or no term saw it
                         field.density.observe(splats, camera)
                 field.optimizer.set_means_rate(self.config.means_rate_at(self.step) * self.scene.extent)
                 field.optimizer.step()
         self.step += 1
-        with torch.no_grad():
-            mse = torch.nn.functional.mse_loss(steps[0].image.clamp(0, 1), steps[0].view.image).item()
         steps.clear()  # each step knows all of them: in a cycle their graphs would wait for the garbage collector
-        return value, mse
+        return value, squared_error
 
     def save(self, path: Path) -> None:
         """Write a checkpoint from which `load` continues to the identical result.
@@ -247,10 +246,11 @@ class Trainer:
         if self.config.random_background:
             generator = stream(self.config.seed, self.step, "background", self.device)
             background = torch.rand(3, generator=generator, device=self.device)
+        view = self.views[view_order(self.config.seed, self.step, len(self.views))]
         for field in self.fields:
             step = Step(
                 self.step,
-                self.views[view_order(self.config.seed, self.step, len(self.views))],
+                view,
                 self.views,
                 field.gaussians,
                 field.regularizer if begun else Chain(),
@@ -258,7 +258,7 @@ class Trainer:
                 sh_degree=self.config.sh_degree_at(self.step + 1),
                 seed=self.config.seed,
                 renderer=self.renderer,
-                absgrad="absgrad" in self.density.needs,
+                absgrad="absgrad" in self.density.needs and self.density.observes(self.step),
                 label=field.label,
                 fields=steps,
             )

@@ -16,6 +16,7 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
+from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.camera import Camera, pixels_of
 from reference_trainer.evaluation.pictures import as_pillow
 from reference_trainer.evaluation.trained_model import TrainedModel
@@ -198,9 +199,10 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         gui, scene = self._server.gui, self._server.scene
         cameras = {f"{split} {view.name}": view.camera for split, of in views.items() for view in of}
         distance = _distance(gaussians, next(iter(cameras.values())))
-        places = torch.stack([camera.position for camera in cameras.values()])
-        apart = torch.cdist(places, places).fill_diagonal_(torch.inf).amin(1).median().item()
-        size = min(0.04 * distance, 0.25 * apart)  # of a frustum
+        size = 0.04 * distance  # of a frustum
+        if len(cameras) > 1:
+            places = torch.stack([camera.position for camera in cameras.values()])
+            size = min(size, 0.25 * nearest_neighbors(places, 1)[0].sqrt().median().item())
         poses = {name: _pose(camera, distance) for name, camera in cameras.items()}
         scene.set_up_direction(sum(pose["up_direction"] for pose in poses.values()))
         start, at = self._server.initial_camera, poses[next(iter(poses))]

@@ -9,10 +9,10 @@ from oracles import random_scene
 from torch import Tensor, nn
 
 from reference_trainer.camera import Camera
-from reference_trainer.compat.radii import SMALLEST_SPREAD, longer_radii
 from reference_trainer.render import render as reference_render
 from reference_trainer.render.constants import NEAR_PLANE
 from reference_trainer.render.eager.projection import project
+from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
 
 PIPE = SimpleNamespace(debug=False)
 

@@ -26,6 +26,8 @@ class TorchEngine:
         self, inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
     ) -> tuple[Projection, Tensor]:
         """Project and color Gaussians."""
+        if degree is not None:
+            inputs = inputs | {"sh": inputs["sh"][:, : (degree + 1) ** 2]}
         if indices.shape[0] < inputs["means"].shape[0]:
             inputs = {name: x.index_select(0, indices) for name, x in inputs.items()}
         projection = project(inputs["means"], inputs["quaternions"], inputs["scales"], camera)

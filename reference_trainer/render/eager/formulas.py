@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from reference_trainer.render.constants import MAX_ALPHA, MIN_TRANSMITTANCE
 from reference_trainer.render.eager.walk import Block
@@ -53,6 +54,7 @@ class _BlendWeights(torch.autograd.Function):
         return weights
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         passed, transmittance, weights = ctx.saved_tensors
         # A splat adds its own light, and dims by 1 / (1 - alpha) all behind it; the clamp lets gradients pass.

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from reference_trainer.render.constants import BLOCK_PAIRS_CPU, BLOCK_PAIRS_CUDA, MIN_ALPHA, TILE
 from reference_trainer.render.splats import Splats, TileLists
@@ -120,6 +121,7 @@ class _Walk(torch.autograd.Function):
         return untile(result, lists)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, Tensor, None, None]:
         rows, behind = ctx.saved_tensors
         lists: TileLists = ctx.lists

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.render.constants import MIN_ALPHA, MIN_TRANSMITTANCE
@@ -221,6 +222,7 @@ class _Composite(torch.autograd.Function):
         return ctx.lists.cut(light), ctx.lists.cut(image)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, to_light: Tensor, to_image: Tensor) -> tuple[Tensor | None, ...]:
         table, light, image = ctx.saved_tensors
         upstream = ctx.lists.padded(to_light), ctx.lists.padded(to_image)

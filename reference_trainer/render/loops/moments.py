@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from reference_trainer.compiled.compiling import inlined, kernel
 from reference_trainer.render.loops import tiles
@@ -173,7 +174,9 @@ def _make_backward(complete: bool) -> Any:
                         share += of_spread * spread
                     s[_SLOPE + p] = raw * (_TWO * varies * to_spread * alpha + to_expected * factor)
                 tiles.footprint_gradient(table, i, tile, columns, s[_SLOPE:], row)
-                row[6], row[7], row[8], row[9], row[10], row[11] = to_r, to_g, to_b, to_factor, to_varies, share
+                row[6], row[7], row[8] = to_r, to_g, to_b
+                if complete:
+                    row[9], row[10], row[11] = to_factor, to_varies, share
             tiles.store(s, _TO_MEAN, to_behind, tile, columns)
 
     return _backward
@@ -185,8 +188,9 @@ _backward, _complete_backward = _make_backward(False), _make_backward(True)
 def _gradients(
     lists: TileLists, table: Tensor, behind: Tensor, upstream: Sequence[Tensor], complete: bool
 ) -> list[Tensor]:
-    """Return the gradients of splats, of their multipliers with the shares, (M, 3), and of what is behind."""
-    rows, to_behind = table.new_empty(lists.gaussians.shape[0], 12), torch.empty_like(behind)
+    """Return the gradients of splats, of their multipliers with the shares, (M, 3) or (M, 0), and of what is behind."""
+    rows = table.new_empty(lists.gaussians.shape[0], 12 if complete else 9)
+    to_behind = torch.empty_like(behind)
     assert lists.slots is not None
     kernel = _complete_backward if complete else _backward
     tiles.over_tiles(kernel, lists, lists.slots, table, behind, *upstream, rows, to_behind)
@@ -206,12 +210,13 @@ class _Moments(torch.autograd.Function):
         return images
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         table, behind = ctx.saved_tensors
         complete = gradients[2] is not None or ctx.needs_input_grad[1]
         upstream = [torch.zeros_like(behind) if x is None else x for x in gradients]
         *of_splats, more, to_behind = _gradients(ctx.lists, table, behind, upstream, complete)
-        return None, more[:, :2], to_behind, *of_splats
+        return None, more[:, :2] if complete else None, to_behind, *of_splats
 
 
 def moments(splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:

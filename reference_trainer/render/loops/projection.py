@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from reference_trainer.camera import Camera
 from reference_trainer.compiled.compiling import inlined, kernel
@@ -242,24 +243,25 @@ class _Project(torch.autograd.Function):
         count = indices.shape[0]
         limits = (0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
         lens = [camera.fx, camera.fy, camera.cx, camera.cy, *(FRUSTUM_MARGIN * limit for limit in limits)]
-        arrays = (x.detach().contiguous().numpy() for x in (indices, means, quaternions, scales, sh))
+        inputs = [x.detach().contiguous() for x in (indices, means, quaternions, scales, sh)]
         view = (x.contiguous().numpy() for x in (camera.world_to_camera, camera.position))
-        ctx.arguments = (*arrays, degree, next(view), np.array(lens, f4), next(view))
+        ctx.view = degree, next(view), np.array(lens, f4), next(view)
         outputs = tuple(means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,)))
-        in_threads(_forward, count, *ctx.arguments, *(x.numpy() for x in outputs), least=4096)
-        ctx.save_for_backward(outputs[-1])
+        in_threads(_forward, count, *(x.numpy() for x in inputs), *ctx.view, *(x.numpy() for x in outputs), least=4096)
+        ctx.save_for_backward(*inputs, outputs[-1])
         ctx.mark_non_differentiable(outputs[2])
         return outputs
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
-        (colors,) = ctx.saved_tensors
+        *given, colors = ctx.saved_tensors
         to_centers, to_factors, _, to_depths, to_colors = gradients
         upstream = tuple(x.contiguous().numpy() for x in (colors, to_centers, to_factors, to_depths, to_colors))
-        inputs = [torch.zeros(x.shape) for x in ctx.arguments[1:5]]
-        outputs = tuple(x.numpy() for x in inputs)
-        in_threads(_backward, colors.shape[0], *ctx.arguments, *upstream, *outputs, least=4096)
-        return (*inputs, None, None, None)
+        found = [torch.zeros_like(x) for x in given[1:]]
+        arrays = *(x.numpy() for x in given), *ctx.view, *upstream, *(x.numpy() for x in found)
+        in_threads(_backward, colors.shape[0], *arrays, least=4096)
+        return (*found, None, None, None)
 
 
 def project(

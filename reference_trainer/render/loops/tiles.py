@@ -71,7 +71,7 @@ def _fill_table(
 
 def whole_tiles(lists: TileLists, *channels: int) -> Tensor:
     """Return an empty image of whole tiles, (*channels, 8 rows, 8 columns): kernels need not look at borders."""
-    return torch.empty(*channels, TILE * lists.rows, TILE * lists.columns)
+    return torch.empty(*channels, TILE * lists.rows, TILE * lists.columns, dtype=torch.float32, device="cpu")
 
 
 def over_tiles(kernel: Any, lists: TileLists, *arguments: Tensor) -> None:

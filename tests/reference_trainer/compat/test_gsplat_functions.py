@@ -8,6 +8,7 @@ from oracles import random_scene
 from stand_ins.gsplat import intrinsics
 
 from reference_trainer.compat import stand_in
+from reference_trainer.compat.gsplat_functions import quat_scale_to_covar_preci
 
 gsplat = pytest.importorskip("gsplat")
 N, WIDTH, HEIGHT = 80, 24, 18
@@ -90,3 +91,20 @@ def test_without_gsplat_its_name_is_in_the_message(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(ImportError, match="pip install gsplat"), stand_in():
         pass
+
+
+@pytest.mark.parametrize("triu", [True, False])
+def test_covariances_are_gsplats(triu):
+    own = pytest.importorskip("gsplat.cuda._torch_impl")
+    generator = torch.Generator().manual_seed(1)
+    quats, scales = (
+        torch.randn(7, 4, generator=generator).double(),
+        torch.rand(7, 3, generator=generator).double() + 0.1,
+    )
+    for ours, theirs in zip(
+        quat_scale_to_covar_preci(quats, scales, triu=triu),
+        own._quat_scale_to_covar_preci(quats, scales, triu=triu),
+        strict=True,
+    ):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
+    assert quat_scale_to_covar_preci(quats, scales, compute_preci=False)[1] is None

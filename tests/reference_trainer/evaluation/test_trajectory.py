@@ -107,6 +107,17 @@ def test_without_test_views_a_model_is_measured_between_and_around_the_training_
     assert [view.name for view in found["around"]] == ["000", "001", "002"]
 
 
+def test_the_nearest_camera_is_found_far_from_the_origin():
+    """Where a distance by way of products has lost it, as torch.cdist takes it of more than 25 places."""
+    angles = torch.arange(30).double() * 12
+    places = torch.stack([1000 + angles.deg2rad().cos(), angles.deg2rad().sin(), torch.zeros(30)], 1)
+    cameras = [camera(torch.eye(3).double(), place) for place in places]
+    between = measured_views(scene_of(cameras), lambda text: None)["between"]
+    steps = [(view.camera.position - places.to(view.camera.position)).norm(dim=1).min().item() for view in between]
+    assert len(steps) >= 15
+    assert max(steps) < 0.11  # half of a step of 2 sin(6 degrees), but for single precision
+
+
 def test_one_training_view_has_nothing_around_it():
     scene = scene_of(random_cameras(1))
     assert measured_views(scene, lambda text: None) == {"train": scene.train}

@@ -121,13 +121,16 @@ def test_the_full_render_is_the_plain_one_whatever_regularizes_the_step(exact):
     assert len(regularized.observed) == 1, "density control sees the render of the step alone"
 
 
-def test_nothing_is_rendered_or_drawn_without_weight_or_rate(monkeypatch):
-    gaussians, view = four()
-    step = step_of(gaussians, view)
-    monkeypatch.setattr(step, "render", None)
-    monkeypatch.setattr(step, "generator", None)
+def test_it_does_not_act_without_weight_or_rate():
     for term in (Consistency(0.0), Consistency(0.4, 0.0), Consistency(0.0, exact=True)):
-        assert term(step).item() == 0
+        assert not term.acts(0)
+
+
+def test_the_exact_form_needs_moments_of_the_renderer():
+    for exact in (False, True):
+        assert Consistency(exact=exact).needs == ({"moments"} if exact else set())
+    with pytest.raises(ValueError, match="the loss needs moments, which the renderer gsplat lacks"):
+        TrainConfig(loss="photometric + consistency(0.3, exact=True)", renderer="gsplat").check()
 
 
 def test_arguments():

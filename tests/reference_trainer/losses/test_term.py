@@ -38,9 +38,11 @@ def test_a_negative_weight_is_refused_at_its_step(take_step):
         term(take_step(number=10))
 
 
-def test_every_registered_term_takes_a_weight_but_photometric():
-    made = {name: LOSSES.make(name)[0] for name in LOSSES}
-    assert {name for name, term in made.items() if not isinstance(term, WeightedTerm)} == {"photometric"}
+def test_every_registered_term_takes_a_weight():
+    for name in LOSSES:
+        assert isinstance(LOSSES.make(name)[0], WeightedTerm)
+        with pytest.raises(ValueError, match="weight must not be negative"):
+            LOSSES.make(f"{name}(weight=-1.0)")
 
 
 def test_terms_look_at_the_photographs_before_the_first_step(tiny_scene):

@@ -245,6 +245,58 @@ def test_errors_name_the_problem():
         render(*scene[:3], scene.opacities[:2], scene.camera, colors=scene.colors)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"sh": torch.zeros(4, 1, 3), "sh_degree": 3},
+            r"degree 3, of at most 3, needs 16 coefficients, got sh of \(4, 1, 3\)",
+        ),
+        ({"sh": torch.zeros(4, 25, 3)}, "degree 4, of at most 3"),
+        ({"sh": torch.zeros(4, 4, 3), "sh_degree": -1}, "degree -1, of at most 3"),
+        ({"sh": torch.zeros(5, 4, 3)}, r"sh must have shape \(4, 4, 3\)"),
+        ({"sh": torch.zeros(4, 3)}, r"sh must have shape \(N, K, 3\)"),
+        ({"colors": torch.zeros(4, 1)}, r"colors must have shape \(N, 3\)"),
+        ({"colors": torch.zeros(5, 3)}, r"colors must have shape \(4, 3\), got \(5, 3\)"),
+        ({"scales": torch.ones(4, 1)}, r"scales must have shape \(4, 3\)"),
+        ({"quaternions": torch.ones(4, 3)}, r"quaternions must have shape \(4, 4\)"),
+        ({"means": torch.ones(4, 2)}, r"means must have shape \(4, 3\)"),
+    ],
+)
+def test_other_shapes_are_refused_before_a_loop_reads_beyond_them(change, message):
+    scene = random_scene(4, 8, 8, seed=0).to(torch.float32)
+    inputs = dict(zip(("means", "quaternions", "scales", "opacities"), scene[:4], strict=True))
+    inputs |= change if "sh" in change or "colors" in change else {"colors": scene.colors} | change
+    with pytest.raises(ValueError, match=message):
+        render(**inputs, camera=scene.camera)
+
+
+def test_a_second_derivative_is_refused(case):
+    scene = random_scene(4, 8, 8, seed=0).to(case.dtype)
+    opacities = scene.opacities.clone().requires_grad_()
+    image = render(*scene[:3], opacities, scene.camera, colors=scene.colors).image
+    (slope,) = torch.autograd.grad(image.square().sum(), opacities, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        slope.sum().backward()
+
+
+def test_an_input_that_was_changed_before_the_backward_pass_does_not_falsify_it(case):
+    scene = random_scene(4, 8, 8, seed=0).to(case.dtype)
+    slopes = []
+    for change in (0, 1):
+        means = scene.means.clone().requires_grad_()
+        image = render(means, *scene[1:4], scene.camera, colors=scene.colors).image
+        with torch.no_grad():
+            means.add_(change)
+        if case.engine == "loops":  # which keeps what it was given, the other engine copies of it
+            with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+                image.sum().backward()
+            return
+        image.sum().backward()
+        slopes.append(means.grad)
+    assert torch.equal(*slopes)
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_short_inputs_are_rendered_in_float32_and_their_gradients_come_back_short(dtype, engine):
     scene = random_scene(60, 30, 20, seed=4).to(dtype)

@@ -51,6 +51,15 @@ def test_what_the_process_ignores_stays_ignored():
         signal.signal(signal.SIGINT, before)
 
 
+def test_a_handler_that_is_not_of_python_is_left_alone(monkeypatch):
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    with hold_interrupts():
+        pass
+    monkeypatch.undo()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 @both
 def test_the_last_step_is_no_shelter(tiny_scene, number):
     """What arrives while the last step is taken still interrupts, after it."""

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from ca_reg.schedules import as_schedule
-from reference_trainer.compat.radii import SMALLEST_SPREAD, longer_radii
 from reference_trainer.density import absgrad, adaptive
 from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
 from reference_trainer.scenes.depth import true_priors
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training import step as step_module

@@ -6,7 +6,7 @@ import pytest
 import torch
 from oracles import random_scene
 
-from reference_trainer.compat.radii import in_front, visible_radii
+from reference_trainer.render.radii import in_front, visible_radii
 
 
 def _definition(mean, quaternion, scale, camera) -> int:
