@@ -9,10 +9,20 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, TypeVar
 
-__all__ = ["Registry"]
+__all__ = ["Registry", "imported"]
 
 T = TypeVar("T")
 _Factory = TypeVar("_Factory", bound=Callable[..., Any])
+
+
+def imported(module: str, name: str) -> Any:
+    """Return what a module has under a name; modules are looked for in the working directory as well.
+
+    Raises ImportError or AttributeError if there is none.
+    """
+    if "" not in sys.path:
+        sys.path.append("")  # installed commands do not look into the working directory, as python -m does
+    return getattr(importlib.import_module(module), name)
 
 
 class Registry(Generic[T]):
@@ -69,10 +79,8 @@ class Registry(Generic[T]):
                 raise ValueError(f"there is no {self.kind} {name!r}; choose one of {known}, or write module:Class.")
             return self._factories[name]
         module_name, _, class_name = name.rpartition(".")
-        if "" not in sys.path:
-            sys.path.append("")  # installed commands do not look into the working directory, as python -m does
         try:
-            found = getattr(importlib.import_module(module_name), class_name)
+            found = imported(module_name, class_name)
         except (ImportError, AttributeError) as error:
             raise ValueError(f"the {self.kind} {module_name}:{class_name} cannot be had: {error}.") from error
         if not (isinstance(found, type) and issubclass(found, self.base)):

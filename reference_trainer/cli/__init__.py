@@ -11,7 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import tyro
+try:
+    import tyro
+except ImportError as error:
+    raise SystemExit("ca-reg: the command needs the trainer's packages: pip install 'ca_reg[trainer]'.") from error
 
 from reference_trainer.cli.drawing import Warmup
 from reference_trainer.cli.names import Names, Recipes, Version
@@ -39,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         command()
     except BrokenPipeError:  # the reader of the output, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except (ValueError, OSError, ImportError, RuntimeError) as error:
         print(f"ca-reg: {error}", file=sys.stderr)
         sys.exit(2)
@@ -61,7 +65,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "plan": Plan(config=config, recipe=recipe, given=given),
         "train": Train(config=config, recipe=recipe, given=given),
         "compare": Compare(out=Path("runs/compare"), config=config, recipe=recipe),
-        "evaluate": Evaluate(),
+        "evaluate": Evaluate(run=tyro.MISSING),
         "report": Report(runs=tyro.MISSING),
         "view": View(run=tyro.MISSING),
         "render": Render(run=Path("runs/train")),

@@ -9,8 +9,8 @@ from typing import Annotated
 import tyro
 
 from reference_trainer.cli.drawing import Device, Draw, Drawing
-from reference_trainer.cli.runs import Orbit, PlyScene
-from reference_trainer.scenes.options import OrbitOptions
+from reference_trainer.cli.places import Orbit, PlyScene, place_of
+from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 
 __all__ = ["Bake", "Clean"]
 
@@ -64,11 +64,13 @@ class Clean:
     def __call__(self) -> None:
         from reference_trainer.runs.clean import clean_ply
 
-        orbit = self.scene.path == "orbit"
-        self.drawing.begin(self.device, trains=not orbit)
+        place = place_of(self.ply, self.scene, self.orbit)
+        if place is None:
+            raise ValueError(f"{self.ply} is no PLY: give the point_cloud.ply of a run.")
+        self.drawing.begin(self.device, trains=isinstance(place, SceneOptions))
         clean_ply(
             self.ply,
-            self.orbit if orbit else self.scene,
+            place,
             self.out or self.ply.with_name(f"{self.ply.stem}_clean.ply"),
             fraction=self.fraction,
             refine=self.refine,

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import tyro
 
 from reference_trainer.cli.drawing import Device, Draw, Drawing
-from reference_trainer.cli.runs import PORT, Orbit, PlyScene
+from reference_trainer.cli.places import Orbit, PlyScene, place_of
+from reference_trainer.cli.runs import PORT
 from reference_trainer.scenes.options import OrbitOptions
 
 __all__ = ["Report", "View"]
@@ -63,15 +64,15 @@ class View:
         from reference_trainer.runs.score_ply import place
         from reference_trainer.viewer.window import Viewer
 
+        where = place_of(self.run, self.scene, self.orbit)
         shared: dict[str, Any] = {"regularizer": self.regularizer, "device": self.device}
         with Viewer(self.port) as viewer:
             self.drawing.begin(self.device, trains=True)  # nobody waits for a compiler later
-            if self.run.suffix.lower() == ".ply" and not self.run.is_dir():
-                where = self.orbit if self.scene.path == "orbit" else self.scene
-                placed = place(self.run, where, background=self.scene.background, **shared)
-                viewer.show(placed.model, placed.views)
-            else:
+            if where is None:
                 model, scene, _ = of_run(self.run, **shared)
                 viewer.show(model, measured_views(scene, print))
+            else:
+                placed = place(self.run, where, background=self.scene.background, **shared)
+                viewer.show(placed.model, placed.views)
             print(f"{viewer}; Ctrl-C ends it.", flush=True)
             viewer.serve()

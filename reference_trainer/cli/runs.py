@@ -13,12 +13,13 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from reference_trainer.cli.drawing import Device, Draw, Drawing, DrawingOfSweep, DrawOfSweep
+from reference_trainer.cli.places import Orbit, PlyScene, place_of
 from reference_trainer.runs.engines.choice import EngineName
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES
 
-__all__ = ["PORT", "Compare", "Demo", "Evaluate", "Orbit", "Plan", "PlyScene", "Render", "Train", "given_fields"]
+__all__ = ["PORT", "Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
 
 PORT = 8080
 """Of the viewer."""
@@ -30,7 +31,6 @@ Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
 Folder = Annotated[
     str | None, tyro.conf.Positional, tyro.conf.arg(help='Scene folder, or "synthetic"; the same as --path.')
 ]
-Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="")]
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
 Recipe = Annotated[
     str | None,
@@ -200,15 +200,6 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class PlyScene(SceneOptions):
-    """The scene of a PLY, if it has one."""
-
-    path: Annotated[str, tyro.conf.arg(aliases=("--scene",))] = "orbit"
-    """For a PLY: scene folder, "synthetic" for the built-in scene, or "orbit" for cameras around the model."""
-    init: Annotated[str | None, tyro.conf.Suppress] = None  # the PLY is the model
-
-
-@dataclass(frozen=True)
 class Evaluate:
     """Measure a run, or any 3DGS PLY: PSNR, SSIM, LPIPS, CA, CV.
 
@@ -216,10 +207,8 @@ class Evaluate:
     (protocol, exact, and exact without the background) and CV.
     """
 
-    run: Annotated[Path | None, tyro.conf.Positional] = None
-    """Folder of a run of `ca-reg train`, or a PLY as for --ply."""
-    ply: Path | None = None
-    """A standard 3DGS PLY instead of a run, with its scene or without."""
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run of `ca-reg train`, or a standard 3DGS PLY."""
     scene: Annotated[PlyScene, tyro.conf.arg(name="")] = field(default_factory=PlyScene)
     orbit: Orbit = field(default_factory=OrbitOptions)
     regularizer: str | None = None
@@ -241,28 +230,19 @@ class Evaluate:
         from reference_trainer.runs.measure import measure, of_run
         from reference_trainer.runs.score_ply import score_ply
 
-        if self.run is not None and self.ply is not None:
-            raise ValueError(f"give the folder of a run or --ply FILE, not both: got {self.run} and {self.ply}.")
-        run, ply = self.run, self.ply
-        if run is not None and run.suffix.lower() == ".ply" and not run.is_dir():
-            run, ply = None, run
-        if run is None and ply is None:
-            raise ValueError("nothing to evaluate: give the folder of a run, or --ply FILE (and --path SCENE).")
-        orbit = ply is not None and self.scene.path == "orbit"
-        if orbit and (self.lpips is not None or replace(self.scene, background="auto") != PlyScene()):
-            raise ValueError(
-                "without photographs there is neither --lpips nor any option of a scene but --background: give --path."
-            )
+        place = place_of(self.run, self.scene, self.orbit)
+        if isinstance(place, OrbitOptions) and self.lpips is not None:
+            raise ValueError("without photographs there is no --lpips: give --path.")
         self.drawing.begin(self.device)
         shared: dict[str, Any] = {
             "samples": self.samples, "seed": self.seed, "perceptual": load_lpips(self.lpips, device=self.device)
         }  # fmt: skip
-        if run is not None:
-            model, scene, default = of_run(run, self.device, regularizer=self.regularizer)
+        if place is None:
+            model, scene, default = of_run(self.run, self.device, regularizer=self.regularizer)
             measure(model, measured_views(scene, print), self.out or default, about={"scene": scene.name}, **shared)
-        elif ply is not None:
+        else:
             shared |= {"regularizer": self.regularizer, "device": self.device, "background": self.scene.background}
-            score_ply(ply, self.orbit if orbit else self.scene, self.out, **shared)
+            score_ply(self.run, place, self.out, **shared)
 
 
 @dataclass(frozen=True)
@@ -305,8 +285,10 @@ class Compare:
 
     out: Path
     """Folder of the comparison; each run has a folder <strategy>/seed_<k> in it, below <scene> if there are several."""
-    path: tuple[str, ...] = ("synthetic",)
-    """Scene folders, or "synthetic"; the other options hold for all of them."""
+    folders: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Scene folders, or "synthetic"; the same as --path."""
+    path: tuple[str, ...] = ()
+    """Scene folders, by default "synthetic"; the other options hold for all of them."""
     scene: Annotated[EveryScene, tyro.conf.arg(name="")] = field(default_factory=EveryScene)
     config: Config = field(default_factory=TrainConfig)
     recipe: Recipe = None
@@ -346,6 +328,11 @@ class Compare:
         chosen = strategies(
             self.strategies, self.config, dropout=self.config.dropout or 0.2, noise=self.config.noise or 0.8
         )
+        if self.folders and self.path:
+            raise ValueError(
+                f"give the scenes as arguments or as --path, not both: got {self.folders} and {self.path}."
+            )
+        paths = self.folders or self.path or ("synthetic",)
         running = Running(
             choose_engine(self.engine, jobs=self.jobs, address=self.address, device=self.device),
             retries=self.retries,
@@ -357,7 +344,7 @@ class Compare:
         )
         if self.config.renderer == "torch":
             self.drawing.begin(self.device, trains=True)
-        comparisons = compare(scene_folders(self.path, self.scene, self.out), chosen, range(self.seeds), running)
+        comparisons = compare(scene_folders(paths, self.scene, self.out), chosen, range(self.seeds), running)
         report(comparisons, say=print)
         if any(comparison.failures for comparison in comparisons.values()):
             sys.exit(1)

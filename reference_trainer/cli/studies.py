@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -89,8 +90,8 @@ class Paper:
     """1 to 17, or comparisons by the names with which --list ends; by default all."""
     scenes: tuple[str, ...] = ()
     """Of the declared scenes, on which not every claim is tested; by default all."""
-    data: Path = Path("../shared/data")
-    """Where the folders of the declared scenes are."""
+    data: Path = field(default_factory=lambda: Path(os.environ.get("CA_REG_DATA", "data")))
+    """Where the folders of the declared scenes are, each with the name of its scene; by default $CA_REG_DATA."""
     scene: Annotated[OwnScene, tyro.conf.arg(name="")] = field(default_factory=OwnScene)
     recipe: str = "3dgs"
     """Of all trainings but those that are about another."""
@@ -124,7 +125,7 @@ class Paper:
         from reference_trainer.studies.paper.scenes import chosen_scenes
 
         rows = self.rows or self.out
-        own = SceneOptions(**{each.name: getattr(self.scene, each.name) for each in fields(SceneOptions)})
+        own = SceneOptions(**asdict(self.scene))
         scenes = chosen_scenes(self.scenes, self.data, own)
         claims = chosen(self.claims, [*scenes] if own.path else None)
         grid = Grid(claims, scenes, self.recipe, self.iterations, self.seeds, self.out, rows)

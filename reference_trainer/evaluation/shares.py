@@ -56,8 +56,7 @@ class Heat:
         shares, results = mean_shares(model, views, drop_rate=drop_rate)
         if not shares.any():
             raise ValueError(f"the score at drop rate {drop_rate} is 0: there is nothing to attribute.")
-        drawn = replace(model, regularizer="") if model.depends_on_camera else model
-        return cls(shares, blend_weights(drawn, views), results)
+        return cls(shares, blend_weights(model.without_camera, views), results)
 
     @property
     def values(self) -> Tensor:

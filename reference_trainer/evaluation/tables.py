@@ -18,7 +18,7 @@ _TITLES = {
     "ca_std_error": "CA std error x1e-3",
     "ca_half": "CA at 1/2",
     "ca_exact": "exact CA x1e-3",
-    "ca_exact_half": "exact CA at 1/2",
+    "ca_exact_half": "exact CA at 1/2 x1e-3",
     "ca_neutral": "neutral CA x1e-3",
     "visible": "visible",
     "covered": "covered",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -70,6 +70,11 @@ class TrainedModel:
     def depends_on_camera(self) -> bool:
         """Whether the opacities at test time are others for every camera: no file of Gaussians can hold them."""
         return any(member.renders_mean and "view_matrix" in member.needs for member in self.chain)
+
+    @property
+    def without_camera(self) -> TrainedModel:
+        """The model itself, or the plain one where the opacities at test time are others for every camera."""
+        return replace(self, regularizer="") if self.depends_on_camera else self
 
     @property
     def test_opacities(self) -> Tensor:

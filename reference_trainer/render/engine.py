@@ -6,8 +6,11 @@ import functools
 import importlib.util
 import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from typing import Protocol
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -16,7 +19,9 @@ from reference_trainer.camera import Camera
 from reference_trainer.render.eager.engine import TorchEngine
 from reference_trainer.render.splats import MomentImages, Projection, Splats, TileLists
 
-__all__ = ["ENGINES", "Engine", "chosen_engine", "describe_engine", "engine_for", "use_engine"]
+__all__ = [
+    "ENGINES", "Engine", "chosen_engine", "describe_engine", "drawn_by", "engine_for", "engines_on", "use_engine"
+]  # fmt: skip
 
 ENGINES = ("auto", "torch", "loops")
 _VARIABLE = "CA_REG_ENGINE"
@@ -116,6 +121,25 @@ def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engi
     if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
         return _TORCH
     return _loop_engine() or _TORCH
+
+
+def engines_on(device: torch.device) -> tuple[str, ...]:
+    """Return the engines that draw float32 on a device: "loops" only on a CPU, and where numba works."""
+    return ("loops", "torch") if device.type == "cpu" and _loop_engine() is not None else ("torch",)
+
+
+@contextmanager
+def drawn_by(engine: str) -> Iterator[None]:
+    """Let an engine draw, and afterwards the one that was chosen before; errors are those of `use_engine`.
+
+    Example:
+        >>> with drawn_by("torch"):
+        ...     describe_engine("cpu")
+        'torch'
+    """
+    with patch.dict(os.environ):
+        use_engine(engine)
+        yield
 
 
 def describe_engine(device: torch.device | str) -> str:

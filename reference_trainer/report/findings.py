@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -110,9 +110,7 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
     """
     model, scene, _ = of_run(run, device)
     notes: list[str] = []
-    drawn = model
     if model.depends_on_camera:
-        drawn = replace(model, regularizer="")
         notes.append(f"{label}: its test-time opacities depend on the camera; the model is drawn with the plain ones.")
     found = sorted(measured_views(scene, lambda text: None).items(), key=lambda item: item[0] == "train")
     chosen = {split: [of[i].to(device) for i in evenly_spaced(len(of), min(views, len(of)))] for split, of in found}
@@ -124,7 +122,7 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
         notes.append(f"{label}: no co-adaptation: {error}")
     results = [None] * len(flat) if heat is None else heat.results
     pictures = [_pictures(model, view, result) for view, result in zip(flat, results, strict=True)]
-    return Findings(label, model, drawn.test_opacities, scene, chosen, pictures, heat, notes)
+    return Findings(label, model, model.without_camera.test_opacities, scene, chosen, pictures, heat, notes)
 
 
 def _pictures(model: TrainedModel, view: Viewpoint, result: CAResult | None) -> dict[str, str]:

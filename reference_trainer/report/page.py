@@ -25,6 +25,7 @@ from reference_trainer.report.findings import Findings, find
 from reference_trainer.report.packing import data_uri, jpeg
 from reference_trainer.runs.figures import dynamics_figure
 from reference_trainer.runs.folder import CONFIG, RESULTS, read_results, read_run_settings
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.config import TrainConfig
 
@@ -142,11 +143,14 @@ def _trained(found: Sequence[Findings]) -> list[str]:
 
 def _settings(runs: dict[str, Path]) -> str:
     """Return the settings that differ between the runs, or from the defaults, as a table."""
-    configs = {label: dataclasses.asdict(read_run_settings(run / CONFIG)[1]) for label, run in runs.items()}
+    configs = {
+        label: {name: x for of in read_run_settings(run / CONFIG) for name, x in dataclasses.asdict(of).items()}
+        for label, run in runs.items()
+    }
     rows: list[dict[str, object]] = []
-    for name, usual in dataclasses.asdict(TrainConfig()).items():
+    for name, usual in (dataclasses.asdict(SceneOptions()) | dataclasses.asdict(TrainConfig())).items():
         values = {label: config[name] for label, config in configs.items()}
-        if set(values.values()) != {usual}:
+        if name != "path" and set(values.values()) != {usual}:
             rows.append({"setting": name, **{label: str(value) for label, value in values.items()}})
     return markdown_table(rows, ["setting", *configs]) if rows else ""
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from reference_trainer.evaluation.evaluate import Evaluation, evaluate
@@ -16,7 +15,8 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.score_ply import place, scaled
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
-from reference_trainer.scenes.scene import PointCloud, Scene
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.threads import threads_for
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
@@ -90,14 +90,12 @@ def refined(model: TrainedModel, scene: Scene, steps: int, device: str = "cpu") 
     """
     usual, start = TrainConfig(), model.gaussians
     config = replace(
-        usual, iterations=steps, regularizer=model.regularizer, sh_degree=start.sh_degree, sh_every=1,
+        usual, iterations=steps, regularizer=model.regularizer, sh_degree=start.sh_degree,
         means_rate=usual.means_rate_final, densify_every=0, opacity_reset_every=0,
     )  # fmt: skip
-    points = PointCloud(start.means.cpu(), torch.zeros_like(start.means).cpu(), "a model")
-    trainer = Trainer(replace(scene, points=points), config, device)
-    tensors = dict(start.named())
-    trainer.optimizer.load_state_dict({"gaussians": tensors, "moments": {name: {} for name in tensors}})
-    trainer.train()
+    trainer = Trainer(replace(scene, start=start), config, device)
+    with threads_for(scene.pixels):
+        trainer.train()
     return replace(model, gaussians=trainer.gaussians.map(Tensor.detach))
 
 

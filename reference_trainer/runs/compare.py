@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from reference_trainer.losses import LossTerm
 from reference_trainer.runs.compare_report import Comparison, save
 from reference_trainer.runs.engines.engine import Failure
-from reference_trainer.runs.folder import RESULTS
+from reference_trainer.runs.folder import RESULTS, folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
@@ -41,7 +40,7 @@ def strategies(
         noise: standard deviation of those of `NAMED`.
 
     Raises:
-        ValueError: if an expression cannot be understood.
+        ValueError: if an expression cannot be understood, or ``config`` has regularizers beyond the two rates.
 
     Example:
         >>> made = strategies(["analytic-dropout", "dropout(0.1) + noise(0.4)"], TrainConfig())
@@ -50,6 +49,10 @@ def strategies(
         >>> made["dropout_0.1_noise_0.4"].regularizer
         'dropout(0.1) + noise(0.4)'
     """
+    if config.regularizer or config.analytic:
+        raise ValueError(
+            "--strategies says what is compared: name regularizers there, and analytic-dropout or analytic-noise."
+        )
     rates = {"dropout": dropout, "noise": noise}
     plain = dataclasses.replace(config, dropout=0.0, noise=0.0, regularizer="", analytic=False)
     made = {}
@@ -58,7 +61,7 @@ def strategies(
             p, sigma = (rates[rate] if rate in NAMED[name] else 0.0 for rate in ("dropout", "noise"))
             made[name] = dataclasses.replace(plain, dropout=p, noise=sigma, analytic=name.startswith("analytic"))
         else:
-            made[re.sub(r"[^\w.=-]+", "_", name).strip("_")] = dataclasses.replace(plain, regularizer=name)
+            made[folder_name(name)] = dataclasses.replace(plain, regularizer=name)
     for settings in made.values():
         settings.check()
     return made

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from reference_trainer.training.plan import Plan
 
 __all__ = [
     "BAKED_PLY", "CHECKPOINT", "CONFIG", "PLAN", "PLY", "RESULTS", "VIEWS",
-    "begun_with", "claim", "read_results", "read_run_settings",
+    "begun_with", "claim", "folder_name", "read_results", "read_run_settings",
 ]  # fmt: skip
 
 CONFIG = "config.json"
@@ -24,6 +25,16 @@ PLY = "point_cloud.ply"
 BAKED_PLY = "point_cloud_for_viewers.ply"
 VIEWS = "views"  # here and in the folder of an evaluation
 RESULTS = "results.json"
+
+
+def folder_name(text: str) -> str:
+    """Return a name of a folder for an expression, such as that of a regularizer.
+
+    Example:
+        >>> folder_name("dropout(0.1) + noise(0.4)"), folder_name("")
+        ('dropout_0.1_noise_0.4', 'plain')
+    """
+    return re.sub(r"[^\w.=-]+", "_", text).strip("_") or "plain"
 
 
 def claim(options: SceneOptions, config: TrainConfig) -> dict[str, Any]:

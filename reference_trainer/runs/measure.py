@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,7 +18,8 @@ from reference_trainer.evaluation.tables import evaluation_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import remove_leftovers, write_text
-from reference_trainer.runs.folder import VIEWS
+from reference_trainer.runs.folder import VIEWS, folder_name
+from reference_trainer.runs.lock import run_lock
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene, Viewpoint
 from reference_trainer.threads import threads_for
@@ -46,9 +46,8 @@ def of_run(run: Path, device: str = "cpu", *, regularizer: str | None = None) ->
     model = model_of(trainer)
     if regularizer is None:
         return model, trainer.scene, run / "evaluation"
-    name = re.sub(r"\W+", "_", f"evaluation_{regularizer}").strip("_")
     parse(regularizer)
-    return replace(model, regularizer=regularizer), trainer.scene, run / name
+    return replace(model, regularizer=regularizer), trainer.scene, run / f"evaluation_{folder_name(regularizer)}"
 
 
 def measure(
@@ -76,9 +75,9 @@ def measure(
         perceptual: a perceptual metric.
         say: receives the table and the progress.
     """
-    remove_leftovers(out / VIEWS)
-    keep = out / PARTIAL
-    with threads_for(max(view.camera.width * view.camera.height for group in views.values() for view in group)):
+    keep, largest = out / PARTIAL, max(view.camera.width * view.camera.height for of in views.values() for view in of)
+    with run_lock(out), threads_for(largest):
+        remove_leftovers(out / VIEWS)
         result = evaluate(
             model, views, samples=samples, seed=seed, perceptual=perceptual, pictures=out / VIEWS, keep=keep, say=say
         )

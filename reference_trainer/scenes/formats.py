@@ -5,13 +5,11 @@ Formats outside of this package come by `register_format`, or by name: ``--forma
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 
+from ca_reg.registry import imported
 from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.images import is_image
 from reference_trainer.scenes.options import SceneOptions
@@ -112,10 +110,8 @@ def find_format(root: Path, name: str) -> tuple[str, Reader]:
 def _imported(name: str) -> Reader:
     """Return a reader from a module of the user, which may lie in the working directory."""
     module, _, attribute = name.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
     try:
-        reader: Reader = getattr(import_module(module), attribute)
+        reader: Reader = imported(module, attribute)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"format {name!r} must name a function (root, options) -> Capture: {error}.") from error
     return reader

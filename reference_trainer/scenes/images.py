@@ -130,8 +130,8 @@ def list_images(folder: str | Path) -> list[Path]:
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file is a picture by its name."""
-    return path.suffix.lower() in IMAGE_SUFFIXES
+    """Whether a file is a picture by its name; not so ``._a.jpg``, which macOS leaves on other file systems."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:

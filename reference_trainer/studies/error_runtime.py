@@ -19,11 +19,11 @@ from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.maps import first_order_map
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.render.engine import drawn_by, engines_on
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.score_ply import of_plain_ply
 from reference_trainer.scenes.orbit import orbit_views
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies.both_engines import drawn_by, engines_on
 from reference_trainer.studies.clocks import in_turns, now
 from reference_trainer.studies.study import Record, Records, Study, checkpoints
 

@@ -79,6 +79,8 @@ def study_attribution(
     model, scene, _ = of_run(run, device)
     out = run / "attribution" if out is None else out
     views = [view.to(device) for view in (scene.train if split == "train" else scene.test)]
+    if not views:
+        raise ValueError(f"the scene of {run} has no {split} view: give --split train.")
     heat = Heat.of(model, views, drop_rate=drop_rate)
     shares, weights, results = heat.shares, heat.weights, heat.results
     effects = mean_effects(model, views, drop_rate=drop_rate)
@@ -109,7 +111,9 @@ def study_attribution(
         "attribution_per_weight": colored_by(model.gaussians, heat.values, *scales["share_per_weight"]),
     }
     for name, gaussians in colored.items():  # with the scaling baked in, as in a run's PLY for viewers
-        save_for_viewers(dataclasses.replace(model, gaussians=gaussians), out / f"{name}.ply", pad_to_degree=3)
+        save_for_viewers(
+            dataclasses.replace(model.without_camera, gaussians=gaussians), out / f"{name}.ply", pad_to_degree=3
+        )
     for name, view, result in zip(file_names(list(data["views"])), views, results, strict=True):
         save_png(out / "views" / f"{name}.png", _picture(model, colored.values(), view, result))
     write_json(out / "attribution.json", data)
@@ -138,9 +142,8 @@ def _correlations(
 @torch.no_grad()
 def _picture(model: TrainedModel, colored: Iterable[Gaussians], view: View, result: CAResult) -> Tensor:
     """Lay the render, the CA map and the render in other colors side by side."""
-    opacities = model.test_opacities
     models = [model, *(dataclasses.replace(model, gaussians=gaussians) for gaussians in colored)]
-    plain, *others = [each.rendering(opacities, view).image for each in models]
+    plain, *others = [each.test_rendering(view).image for each in models]
     texts = [f"{low:g} to {high:g} x mean" for low, high in (_SHARE_SCALE, PER_WEIGHT_SCALE)]
     labels = ["render", f"exact CA {result.value * 1e3:.2f}e-3", f"share, {texts[0]}", f"share per weight, {texts[1]}"]
     return side_by_side([plain, ca_picture(result), *others], labels)

@@ -10,8 +10,8 @@ from torch import Tensor
 from benchmarks.workloads import Workload
 from reference_trainer.camera import Camera
 from reference_trainer.render import render
+from reference_trainer.render.engine import drawn_by, engines_on
 from reference_trainer.renderers.gsplat import load_gsplat_render
-from reference_trainer.studies.both_engines import drawn_by, engines_on
 from reference_trainer.studies.stability.baseline import render_simply
 
 __all__ = ["BASELINE", "PASSES", "Draw", "draw_of", "gradients", "image", "others_on"]

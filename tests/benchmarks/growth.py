@@ -25,7 +25,7 @@ from benchmarks.workloads import WorkloadSpec
 from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
-from reference_trainer.studies.both_engines import engines_on
+from reference_trainer.render.engine import engines_on
 from reference_trainer.studies.clocks import in_turns, processor_clock
 
 __all__ = ["extrapolated", "growth", "measure_growth"]

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from benchmarks.workloads import Workload
 from reference_trainer.render import splat
-from reference_trainer.render.engine import engine_for
-from reference_trainer.studies.both_engines import drawn_by
+from reference_trainer.render.engine import drawn_by, engine_for
 from reference_trainer.studies.clocks import Clock
 
 __all__ = ["STAGES", "Staged", "staged"]

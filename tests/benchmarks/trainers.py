@@ -105,9 +105,7 @@ for recipe, (fork, theirs, ours) in _RECIPES.items():  # a recipe beside the rep
     )
 
 EXPORT = "ca_reg.integrations.run --cpu ns-export gaussian-splat --load-config {config} --output-dir {out}/export"
-EVALUATE = (
-    "reference_trainer.cli evaluate --ply {ply} --scene {scene} --images {images} --out {out}/evaluation {scaled}"
-)
+EVALUATE = "reference_trainer.cli evaluate {ply} --scene {scene} --images {images} --out {out}/evaluation {scaled}"
 OPTIONS = {"plain": "", "dropout": "--dropout 0.2", "noise": "--noise 0.8"}
 
 

@@ -13,8 +13,8 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.render.engine import drawn_by
 from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.studies.both_engines import drawn_by
 from reference_trainer.studies.clocks import Clock, in_turns
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer

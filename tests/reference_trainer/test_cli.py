@@ -72,7 +72,7 @@ def trained(tmp_path_factory):
                 "--device",
             ],
         ),
-        (["evaluate"], ["--ply", "--path", "--scene", "--regularizer", "--samples", "--lpips"]),
+        (["evaluate"], ["--path", "--scene", "--regularizer", "--samples", "--lpips"]),
         (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
         (["bake"], ["PATH", "--regularizer", "--out"]),
         (["view"], ["PATH", "--scene", "--arc", "--regularizer", "--port", "--device"]),
@@ -130,7 +130,7 @@ def test_help_and_mistakes_need_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-@pytest.mark.parametrize("command", ["evaluate", "render", "train", "compare", "study attribution x"])
+@pytest.mark.parametrize("command", ["evaluate x", "render", "train", "compare", "study attribution x"])
 def test_a_card_that_is_not_there(command, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
@@ -229,7 +229,7 @@ def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
     assert evaluation["ca_settings"]["samples"] == 3
     assert evaluation["mean"]["test"]["psnr"] == results["mean"]["test"]["psnr"]
 
-    main(["evaluate", "--ply", str(trained / "point_cloud.ply"), "--scene", "synthetic", "--downscale", "8",
+    main(["evaluate", str(trained / "point_cloud.ply"), "--scene", "synthetic", "--downscale", "8",
           "--out", str(tmp_path / "p")])  # fmt: skip
     of_ply = json.loads((tmp_path / "p" / "evaluation.json").read_text())
     assert of_ply["views"] == results["views"]
@@ -245,7 +245,7 @@ def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path
     main(["train", "--out", str(tmp_path / "run"), "--noise", "0.8", *SMALL])
     main(["evaluate", str(tmp_path / "run"), "--regularizer", "noise(0.8, scale=True)", "--samples", "2"])
     results = json.loads((tmp_path / "run" / "results.json").read_text())
-    found = json.loads((tmp_path / "run" / "evaluation_noise_0_8_scale_True" / "evaluation.json").read_text())
+    found = json.loads((tmp_path / "run" / "evaluation_noise_0.8_scale=True" / "evaluation.json").read_text())
     assert found["mean"]["test"]["psnr"] != results["mean"]["test"]["psnr"]
 
 
@@ -256,7 +256,6 @@ def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch):
     main(
         [
             "evaluate",
-            "--ply",
             "a.ply",
             flag,
             "garden",
@@ -268,7 +267,7 @@ def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch):
             "noise",
         ]
     )
-    main(["evaluate", "--ply", "a.ply", "--cameras", "3", "--size", "64", "--world", "z-up", "--arc", "90",
+    main(["evaluate", "a.ply", "--cameras", "3", "--size", "64", "--world", "z-up", "--arc", "90",
           "--background", "white", "--samples", "7", "--seed", "1", "--out", "o"])  # fmt: skip
     ((ply, scene, out), named), ((other, orbit, folder), others) = asked
     assert (str(ply), scene.path, scene.images, scene.views, out) == ("a.ply", "garden", "images_8", 12, None)
@@ -284,12 +283,12 @@ def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):
     main(["bake", str(trained / "point_cloud.ply"), "--out", str(tmp_path / "baked.ply")])
     said = plain(capsys.readouterr().out)
     assert "baked.ply: opacities are those of the test after dropout(0.2), and marked so" in said
-    main(["evaluate", "--ply", str(tmp_path / "baked.ply"), *small])
+    main(["evaluate", str(tmp_path / "baked.ply"), *small])
     out = capsys.readouterr().out
     assert "0.8 baked in, taken out for CA; trained with: dropout(0.2)" in out
     assert "| mean orbit |" in out
     ply = str(trained / "point_cloud.ply")
-    main(["evaluate", "--ply", ply, "--out", str(tmp_path / "p"), *small])
+    main(["evaluate", ply, "--out", str(tmp_path / "p"), *small])
     one, other = (
         json.loads((tmp_path / folder / "evaluation.json").read_text()) for folder in ("baked_evaluation", "p")
     )
@@ -431,14 +430,21 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["compare", "--path", "a/fern", "b/fern"], "scenes whose folders have different names"),
         (["compare", "--retries", "-1"], "retries of at least 0"),
         (["compare", "--engine", "processes", "--address", "auto"], "--address auto is that of a Ray cluster"),
-        (["evaluate"], "nothing to evaluate: give the folder of a run, or --ply FILE"),
         (["evaluate", "nowhere"], "nowhere holds no run (no config.json): give the --out folder"),
         (["render", "nowhere"], "nowhere holds no run"),
-        (["evaluate", "--ply", "nowhere.ply"], "nowhere.ply"),
-        (["evaluate", "run", "--ply", "a.ply"], "not both: got run and a.ply"),
-        (["evaluate", "--ply", "a.ply", "--downscale", "8"], "without photographs there is neither"),
-        (["evaluate", "--ply", "a.ply", "--lpips", "installed"], "give --path"),
-        (["evaluate", "--ply", "a.ply", "--background", "red"], "background must be one of black, white, got 'red'"),
+        (["evaluate", "nowhere.ply"], "nowhere.ply"),
+        (["evaluate", "a.ply", "--downscale", "8"], "without photographs no option of a scene but --background"),
+        (
+            ["evaluate", "a.ply", "--scene", "synthetic", "--cameras", "3"],
+            "the options of an orbit do not apply",
+        ),
+        (["evaluate", "a.ply", "--lpips", "installed"], "give --path"),
+        (["evaluate", "run", "--scene", "synthetic"], "run is no PLY, and a run is looked at on its own scene"),
+        (["view", "run", "--background", "white"], "run is no PLY, and a run is looked at on its own scene"),
+        (["clean", "a.ply", "--views", "3"], "without photographs no option of a scene but --background"),
+        (["compare", "--regularizer", "d2gs"], "--strategies says what is compared"),
+        (["compare", "--analytic", "--dropout", "0.2"], "--strategies says what is compared"),
+        (["evaluate", "a.ply", "--background", "red"], "background must be one of black, white, got 'red'"),
         (["bake", "nowhere.ply"], "nowhere.ply"),
         (["train", "--regularizer", "dropot(0.2)"], "there is no regularizer 'dropot'; choose one of"),
         (["train", "--loss", "photometric(2.0)"], "lambda_dssim must lie in [0, 1], got 2.0"),
@@ -483,10 +489,10 @@ def test_an_interruption(monkeypatch, capsys, tmp_path):
 
 
 def test_the_real_arguments_are_the_default(monkeypatch, capsys):
-    monkeypatch.setattr(cli.sys, "argv", ["ca-reg", "evaluate"])
+    monkeypatch.setattr(cli.sys, "argv", ["ca-reg", "evaluate", "nowhere"])
     with pytest.raises(SystemExit):
         main()
-    assert "nothing to evaluate" in capsys.readouterr().err
+    assert "nowhere holds no run" in capsys.readouterr().err
 
 
 @pytest.mark.slow

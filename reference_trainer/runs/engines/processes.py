@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
 import threading
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
+from typing import Any
 
 from reference_trainer.runs.engines.engine import Answer, Death, Task, attempt
 from reference_trainer.threads import thread_count
@@ -36,7 +38,7 @@ class Processes:
             raise ValueError(f"expected at least 1 job, got {jobs}.")
         self.jobs = jobs
         self._threads = thread_count(jobs=jobs)
-        self._running: dict[Connection, tuple[int, SpawnProcess]] = {}
+        self._running: dict[Any, tuple[int, SpawnProcess]] = {}  # by the end of a pipe, whose class the system decides
 
     def start(self, number: int, task: Task) -> None:
         """Begin a task; see `Engine`."""
@@ -49,8 +51,8 @@ class Processes:
     def wait(self) -> list[tuple[int, Answer]]:
         """Wait for at least one task; see `Engine`."""
         ended: list[tuple[int, Answer]] = []
-        for here in wait(list(self._running)):
-            assert isinstance(here, Connection)
+        answering: list[Any] = wait([*self._running])
+        for here in answering:
             number, process = self._running.pop(here)
             try:
                 answer: Answer | None = here.recv()
@@ -97,7 +99,10 @@ def _end_with_parent(there: Connection, answered: threading.Event) -> None:
         there.recv()
     except (EOFError, OSError):
         if not answered.is_set():
-            os.kill(os.getpid(), signal.SIGINT)  # unlike interrupt_main, it also ends a wait in the system
+            if os.name == "posix":
+                os.kill(os.getpid(), signal.SIGINT)  # unlike interrupt_main, it also ends a wait in the system
+            else:
+                _thread.interrupt_main()
 
 
 def _reason(code: int | None) -> str:

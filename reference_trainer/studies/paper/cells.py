@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -20,6 +19,7 @@ from reference_trainer.evaluation.metrics import depth_errors, psnr
 from reference_trainer.evaluation.results import mean_std
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.runs.engines.engine import Failure, Task, attempt
+from reference_trainer.runs.folder import folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.options import SceneOptions
@@ -111,6 +111,11 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
     rows = rows_of(grid)
     left = [cell for cell in declared(grid) if not is_done(cell, rows)]
     for name in dict.fromkeys(cell.scene for cell in left):
+        folder = grid.scenes[name].options.path
+        if folder != "synthetic" and not Path(folder).is_dir():
+            raise FileNotFoundError(
+                f"there is no folder {folder}: say with --data, or $CA_REG_DATA, where the scenes are."
+            )
         if not grid.scenes[name].options.load().test:
             raise ValueError(f"{name} has no test views, which the claims are about: hold some out with --split llff.")
     cells = {_folder(grid, cell): cell for cell in left}
@@ -249,9 +254,7 @@ def depths(model: TrainedModel, view: View, truth: TrainedModel | None) -> dict[
 def _folder(grid: Grid, cell: Cell) -> Path:
     """Return where a training lives."""
     hidden = {"iterations": cell.setting["iterations"]}
-    return (
-        grid.out / cell.scene / re.sub(r"[^\w.=-]+", "_", label(cell.setting, hidden)).strip("_") / f"seed_{cell.seed}"
-    )
+    return grid.out / cell.scene / folder_name(label(cell.setting, hidden)) / f"seed_{cell.seed}"
 
 
 def _run(grid: Grid, cell: Cell) -> Run:
@@ -274,8 +277,11 @@ def _rounded(data: Any) -> Any:
 
 
 def _commit() -> str | None:
-    """Return the commit of this checkout, None if it is none."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
+    """Return the commit of this checkout, with "-dirty" if files differ from it; None if it is none."""
+    root = Path(__file__).parents[3]
+    if not (root / ".git").exists():  # an installed package may lie within the repository of something else
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):

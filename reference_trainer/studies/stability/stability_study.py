@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from reference_trainer.evaluation.results import machine, markdown_table
-from reference_trainer.studies.both_engines import drawn_by, engines_on
+from reference_trainer.render.engine import drawn_by, engines_on
 from reference_trainer.studies.stability.blends import blend_cases
 from reference_trainer.studies.stability.case import Case, Probe
 from reference_trainer.studies.stability.geometry import geometry_cases

@@ -27,7 +27,7 @@ def test_the_flag_of_the_evaluation_and_that_of_the_training_are_the_same(run, s
     one, other = (load_ply(folder / PLY).gaussians for folder in (plain, out))
     assert all(torch.equal(x, y) for (_, x), (_, y) in zip(one.named(), other.named(), strict=True))
     model, scene, default = of_run(plain, regularizer="dropout(0.2) + noise(0.3, scale=True)")
-    assert default == plain / "evaluation_dropout_0_2_noise_0_3_scale_True"
+    assert default == plain / "evaluation_dropout_0.2_noise_0.3_scale=True"
     measure(model, both(scene), tmp_path, about={}, say=lambda text: None)
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]

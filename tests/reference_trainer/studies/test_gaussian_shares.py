@@ -201,3 +201,18 @@ def test_other_views_and_mistakes(run, tmp_path):
         study_attribution(run, drop_rate=0.0)
     with pytest.raises(FileNotFoundError, match="holds no run"):
         study_attribution(tmp_path / "nowhere")
+
+
+def test_a_run_whose_opacities_depend_on_the_camera(run, tmp_path, options, short):
+    """Its PLYs hold the plain ones."""
+    trainer = Trainer(
+        options.load(),
+        dataclasses.replace(short, regularizer="depth(0.4, scale=True)", dropout=0.0, noise=0.0, initial_opacity=0.9),
+    )
+    trainer.train(until=4)
+    trainer.save(tmp_path / CHECKPOINT)
+    config = {"scene": dataclasses.asdict(options), "config": dataclasses.asdict(trainer.config)}
+    write_json(tmp_path / CONFIG, config)
+    study_attribution(tmp_path, say=lambda text: None)
+    stored = load_ply(tmp_path / "attribution" / "attribution.ply")
+    torch.testing.assert_close(stored.gaussians.opacities, trainer.gaussians.opacities.detach())

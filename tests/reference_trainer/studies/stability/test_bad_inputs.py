@@ -10,8 +10,8 @@ from ca_reg import CAScore, GaussianDropout, OpacityNoise
 from ca_reg import functional as F
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import render
+from reference_trainer.render.engine import drawn_by
 from reference_trainer.render.moments import render_moments
-from reference_trainer.studies.both_engines import drawn_by
 from reference_trainer.studies.stability.quantities import scene_quantities, splats_of
 from reference_trainer.studies.stability.scenes import PARAMETERS, base_scene
 

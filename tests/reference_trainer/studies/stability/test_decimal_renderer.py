@@ -5,7 +5,7 @@ import torch
 from decimal_renderer import exact_images
 from oracles import brute_force
 
-from reference_trainer.studies.both_engines import drawn_by, engines_on
+from reference_trainer.render.engine import drawn_by, engines_on
 from reference_trainer.studies.stability.judge import GRADIENT_TOLERANCE, VALUE_TOLERANCE, relative_error
 from reference_trainer.studies.stability.quantities import (
     IMAGES,

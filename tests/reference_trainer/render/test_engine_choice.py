@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from reference_trainer.render import describe_engine
-from reference_trainer.studies.both_engines import drawn_by, engines_on
+from reference_trainer.render.engine import drawn_by, engines_on
 
 
 @pytest.mark.parametrize("chosen", [None, "auto", "torch"])
