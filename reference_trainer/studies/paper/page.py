@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from reference_trainer.studies.paper.rows import Row, Rows, label, resolved, val
 from reference_trainer.studies.paper.scenes import SCENES
 from reference_trainer.studies.paper.verdict import Verdict, interval, overall, verdict
 
-__all__ = ["Kept", "claims_table", "details", "differences", "judged", "page"]
+__all__ = ["Kept", "claims_table", "details", "differences", "gains", "judged", "page"]
 
 _TITLES = {
     "test psnr": ("PSNR", 1.0), "test ssim": ("SSIM", 1.0), "test lpips": ("LPIPS", 1.0), "test ca": ("CA", 1e-3),
@@ -96,12 +97,42 @@ def details(name: str, kept: Kept) -> str:
     return "\n".join(parts)
 
 
+def gains(name: str, kept: Kept) -> str:
+    """Return what every setting of a claim changes against the plain training with the same views and recipe; else "".
+
+    In decibels of PSNR with two standard errors, and in percent of the exact score, on every scene where two seeds or
+    more are kept; in the order of the mean over the scenes, and those that lack one last.
+    """
+    claim, rows, scenes = CLAIMS[name], list[tuple[int, float, dict[str, object]]](), dict[str, None]()
+    for setting in claim.settings:
+        plain = {key: x for key, x in setting.items() if key in ("recipe", "views")}
+        cells: dict[str, object] = {}
+        means = []
+        for scene in kept.scenes if setting != plain else ():
+            of = differences(Check("test psnr", setting, plain), scene, kept)
+            score = differences(Check("test ca_exact_half", setting, plain, relative=True), scene, kept)
+            if len(of) > 1 and (scene in claim.scenes or scene not in SCENES):
+                mean, spread = interval(of)
+                less = f", {100 * statistics.fmean(score):+.0f} %" if score else ""
+                cells[scene] = f"{mean:+.2f} ± {spread:.2f} dB{less}"
+                means.append(mean)
+        if means:
+            scenes |= dict.fromkeys(cells)
+            average = statistics.fmean(means)
+            rows.append(
+                (len(means), average, {"setting": f"`{_name(setting, kept)}`", "mean": f"{average:+.2f} dB"} | cells)
+            )
+    ordered = [cells for *_, cells in sorted(rows, key=lambda row: row[:2], reverse=True)]
+    return markdown_table(ordered, ["setting", "mean", *sorted(scenes)]) if rows else ""
+
+
 def page(text: str, kept: Kept) -> str:
     """Return the text of a page with everything between its marks made again.
 
     The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``; WHAT is ``claims`` for the verdicts,
-    ``details`` of a claim by its name, all of them without, or ``rows`` for all rows of the file NAME beside the
-    folder, which says in ``usual`` what of a setting needs no name; iterations are by default those of ``kept``.
+    ``details`` or ``gains`` of a claim by its name, ``details`` of all without, or ``rows`` for all rows of the file
+    NAME beside the folder, which says in ``usual`` what of a setting needs no name; iterations are by default those of
+    ``kept``.
     """
 
     def made(match: re.Match[str]) -> str:
@@ -112,7 +143,7 @@ def page(text: str, kept: Kept) -> str:
         elif what == "rows":
             body = _rows(Rows(kept.folder.parent / f"{name}.json"))
         elif name:
-            body = details(name, of) or "Not yet measured.\n"
+            body = (gains if what == "gains" else details)(name, of) or "Not yet measured.\n"
         else:
             found = {key: details(key, of) for key in CLAIMS}
             headed = [f"## {_heading(key)}\n\n{text}" for key, text in found.items() if text]

@@ -29,7 +29,7 @@ from reference_trainer.studies.paper import figure as figure_module
 from reference_trainer.studies.paper.cells import Grid, declared, depths, estimate, is_done, renders, rows_of, run_cells
 from reference_trainer.studies.paper.claims import CLAIMS, Check, Claim, chosen
 from reference_trainer.studies.paper.figure import gains_figure
-from reference_trainer.studies.paper.page import Kept, claims_table, details, judged, page
+from reference_trainer.studies.paper.page import Kept, claims_table, details, gains, judged, page
 from reference_trainer.studies.paper.rows import Rows, config_of, resolved, value
 from reference_trainer.studies.paper.scenes import SCENES, chosen_scenes
 from reference_trainer.studies.paper.verdict import overall, verdict
@@ -214,6 +214,20 @@ def test_claims_are_judged_scene_by_scene(kept):
     assert lines["1"].endswith("| undecided | holds: a (3); fails: b (2); undecided: c (1) |")
     assert lines["2"].endswith("| not yet measured | - |")
     assert "systems" not in lines
+
+
+def test_gains_are_in_the_order_of_their_mean_and_those_that_lack_a_scene_are_last(kept):
+    for seed, of in kept.scenes["a"].of(resolved({}, "3dgs", 3_000)).items():
+        kept.scenes["a"].add(row(of["test"]["psnr"] + 7.0, seed, regularizer="dropout(0.3)"))
+        for name, gain in (("a", 1.5), ("b", 0.5)):
+            kept.scenes[name].add(row(20.0 + gain, seed, ca=4e-3, regularizer="dropout(0.1)"))
+    lines = gains("7", Kept(kept.folder)).splitlines()
+    assert lines[0] == "| setting | mean | a | b |"  # of c there is one seed
+    assert [line.split(" | ")[0] for line in lines[2:]] == ["| `dropout(0.1)`", "| `dropout(0.2)`", "| `dropout(0.3)`"]
+    # 1.0, 0.9, 1.1 and -1.0, -1.1: their means, and two standard errors
+    assert lines[3] == "| `dropout(0.2)` | -0.02 dB | +1.00 ± 0.12 dB | -1.05 ± 0.10 dB |"
+    assert lines[4].endswith("| +7.00 dB | +7.00 ± 0.00 dB | n/a |")
+    assert gains("11", Kept(kept.folder)) == ""
 
 
 def test_details_show_what_is_measured_and_every_check(kept):
