@@ -68,7 +68,7 @@ def remove_leftovers(folder: str | Path, *, below: bool = True) -> int:
 
 def _sync(path: Path) -> None:
     """Wait until a file or the entries of a folder are on the disk."""
-    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)  # Windows syncs what may be written alone
+    handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)  # Windows syncs only what may be written
     try:
         os.fsync(handle)
     finally:
