@@ -91,7 +91,7 @@ class Regularizer(Scheduled):
         return None
 
     def test_multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
-        """Return what the mean at test time is of: :meth:`multiplied`, unless training looks at former steps."""
+        """Return :meth:`multiplied` as of the test: the same, unless training goes by what it saw at a former step."""
         return self.multiplied(x)
 
     def regularize(self, x: Params, generator: torch.Generator | None = None) -> Params:
