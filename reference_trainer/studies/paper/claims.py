@@ -114,9 +114,9 @@ _ANCHORS, _TIERS = map(_with, ("drop_anchors(ramp(0.0, 0.02, 0, 10_000))", "d2gs
 _TRIPLED = _with(loss="photometric + views(3)")
 _BINOCULAR = _with(recipe="binocular")
 _ABSOLUTE, _LASTING = {**_BINOCULAR, "density": "absgrad"}, {**_BINOCULAR, "opacity_decay": 1.0}
-_SYSTEMS, _FURTHER = (
+_SYSTEMS, _FURTHER, _ENSEMBLED = (
     tuple({"recipe": name, **each} for name in names for each in _THREE)
-    for names in (("3dgs", "dngaussian", "fsgs", "corgs", "binocular"), ("mvgs", "absgs", "segs"))
+    for names in (("3dgs", "dngaussian", "fsgs", "corgs", "binocular"), ("mvgs", "absgs"), ("segs",))
 )
 _SCHEMES = (
     *_THREE, _with("drop_gaussian(0.2, 10_000)"), _DENSITY, _GEOMETRY, _with("soft(0.2)"), _CONCRETE, _ANCHORS,
@@ -192,6 +192,7 @@ CLAIMS = {
     "systems": Claim("five systems, each plain, with dropout and with noise", "the main table", _SYSTEMS,
                      scenes=("synthetic", "fern", "herz-jesu")),
     "further": Claim("further systems, likewise", "", _FURTHER, scenes=("synthetic", "fern")),
+    "ensembled": Claim("SE-GS, likewise", "", _ENSEMBLED, scenes=("synthetic", "fern")),
     "schemes": Claim("the field's schemes side by side", "", _SCHEMES),
     "views": Claim("dropout of 0.2 helps with 2 to 17 views", "", (*_VIEWS, *_DROPPED),
                    tuple(_higher(_PSNR, *pair) for pair in zip(_DROPPED, _VIEWS, strict=True)), scenes=_WITH_MORE),
