@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import cycle, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,12 +58,13 @@ def read_dynamics(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[np.floa
 
 
 def plot_dynamics(
-    runs: str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]], *, ax: Axes | None = None
+    runs: str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]], *, axes: Sequence[Axes] | None = None
 ) -> tuple[Axes, Axes]:
-    """Draw co-adaptation (left axis, solid) and PSNR (right axis, dotted) against the step.
+    """Draw co-adaptation and PSNR against the step, each on axes of its own.
 
-    One color per run and group of views; nan leaves a gap. The runs are one log or log directory, or several by label;
-    they are drawn on ``ax``, by default in a new figure. Returns the axes of co-adaptation and those of PSNR.
+    One color per run; of its groups of views the last one (test) is solid, others are dotted and dashed; nan leaves a
+    gap. The runs are one log or log directory, or several by label; they are drawn on two ``axes``, by default side by
+    side in a new figure. Returns the axes of co-adaptation and those of PSNR.
 
     Raises:
         ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
@@ -73,21 +75,18 @@ def plot_dynamics(
     if not labelled:
         raise ValueError("runs must hold at least one log, got an empty mapping.")
     columns = {label: read_dynamics(path) for label, path in labelled.items()}
-    ca_axes = new_axes() if ax is None else ax
-    psnr_axes = ca_axes.twinx()
-    color = 0
-    for label, column in columns.items():
-        for group in (key.removeprefix("ca/") for key in column if key.startswith("ca/")):
-            name = f"{label} {group}".strip()
-            style: dict[str, Any] = {"color": f"C{color}", "marker": ".", "markersize": 4}
-            ca_axes.plot(column["step"], column[f"ca/{group}"], label=name, **style)
+    ca_axes, psnr_axes = new_axes(2) if axes is None else axes
+    for number, (label, column) in enumerate(columns.items()):
+        groups = [key.removeprefix("ca/") for key in column if key.startswith("ca/")]
+        lines = [*islice(cycle(("-", ":", "--", "-.")), len(groups))][::-1]
+        for group, line in zip(groups, lines, strict=True):
+            style: dict[str, Any] = {"color": f"C{number}", "linestyle": line, "marker": ".", "markersize": 4}
+            ca_axes.plot(column["step"], column[f"ca/{group}"], label=f"{label} {group}".strip(), **style)
             if f"psnr/{group}" in column:
-                psnr_axes.plot(column["step"], column[f"psnr/{group}"], linestyle=":", **style)
-            color += 1
-    ca_axes.set_xlabel("iteration")
-    ca_axes.set_ylabel("co-adaptation score CA (solid)")
-    psnr_axes.set_ylabel("PSNR in dB (dotted)")
+                psnr_axes.plot(column["step"], column[f"psnr/{group}"], **style)
+    for drawn, quantity in ((ca_axes, "co-adaptation score CA"), (psnr_axes, "PSNR in dB")):
+        drawn.set_xlabel("iteration")
+        drawn.set_ylabel(quantity)
     ca_axes.set_ylim(bottom=0.0)
-    # Above the axes: inside, the curves of the other axis would run through it.
-    ca_axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    psnr_axes.legend(handles=[*ca_axes.lines], loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return ca_axes, psnr_axes

@@ -238,10 +238,10 @@ class ViewTally:
         )
 
 
-def new_axes() -> Any:
-    """Return the axes of a new figure, or say how to get matplotlib."""
+def new_axes(count: int = 1) -> Any:
+    """Return the axes of a new figure, an array of several side by side, or say how to get matplotlib."""
     try:
         import matplotlib.pyplot as plt
     except ImportError as error:
         raise ImportError("plots need matplotlib; install it with: pip install 'ca_reg[plot]'") from error
-    return plt.subplots()[1]
+    return plt.subplots(1, count, figsize=(6.4 * count, 4.8), layout="constrained")[1]

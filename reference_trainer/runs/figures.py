@@ -41,8 +41,8 @@ def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
         path: the PNG or SVG to write.
     """
     with new_figure(path) as figure:
-        figure.set_size_inches(9, 5)
-        plot_dynamics(dict(runs), ax=figure.add_subplot())
+        figure.set_size_inches(10, 4.2)
+        plot_dynamics(dict(runs), axes=figure.subplots(1, 2))
 
 
 def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split: str = "test") -> None:

@@ -203,7 +203,7 @@ def test_dynamics_are_read_as_columns(tmp_path):
         read_dynamics(tmp_path)
 
 
-def test_the_figure_shows_both_axes_for_every_run_and_group(tmp_path):
+def test_the_figure_shows_both_scores_for_every_run_and_group(tmp_path):
     plt = pytest.importorskip("matplotlib.pyplot")
     run(make(tmp_path / "a", psnr=lambda o, v: 20 + v), 1, 31)
     run(make(tmp_path / "b"), 1, 31)
@@ -214,9 +214,11 @@ def test_the_figure_shows_both_axes_for_every_run_and_group(tmp_path):
         "dropout train",
         "dropout test",
     ]
+    assert [line.get_linestyle() for line in ca.lines] == [":", "-"] * 2
+    assert ca.lines[0].get_color() == ca.lines[1].get_color() != ca.lines[2].get_color()
     np.testing.assert_array_equal(ca.lines[1].get_ydata(), read_dynamics(tmp_path / "a")["ca/test"])
     assert [list(line.get_ydata()) for line in psnr.lines] == [[21.5] * 3, [23.0] * 3]
-    alone, _ = plot_dynamics(tmp_path / "a", ax=plt.subplots()[1])
+    alone, _ = plot_dynamics(tmp_path / "a", axes=plt.subplots(2)[1])
     assert [line.get_label() for line in alone.lines] == ["train", "test"]
     plt.close("all")
 
