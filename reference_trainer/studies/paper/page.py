@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
-from reference_trainer.studies.paper.claims import CLAIMS, QUALITY, Check, Claim
+from reference_trainer.studies.paper.claims import CLAIMS, TIMED, Check, Claim
 from reference_trainer.studies.paper.rows import Row, Rows, label, resolved, value
 from reference_trainer.studies.paper.scenes import SCENES
 from reference_trainer.studies.paper.verdict import Verdict, interval, overall, verdict
@@ -165,7 +165,7 @@ def _rows(rows: Rows) -> str:
     found: dict[str, list[Row]] = {}
     for row in rows.rows:
         found.setdefault(label(row["setting"], rows.content["usual"]), []).append(row)
-    return _table(found, QUALITY)
+    return _table(found, TIMED)
 
 
 def _table(rows: Mapping[str, Sequence[Row]], figures: Sequence[str]) -> str:
