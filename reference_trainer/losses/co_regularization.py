@@ -1,4 +1,4 @@
-"""CoR-GS's comparison of the fields of a training with each other, from where there is no photograph."""
+"""CoR-GS's comparison of a training's fields with each other, at views without a photograph."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class CoRegularization(WeightedTerm):
     ``fields=2``, and costs a render of every field.
 
     Args:
-        weight: at least 0, or a schedule. The source has 1 from step 500 on with LLFF, from 2,000 on with DTU:
+        weight: at least 0, or a schedule. The source uses 1 from step 500 on with LLFF, from 2,000 on with DTU:
             ``between(1.0, 500)``.
         lambda_dssim: weight of the structural term, in [0, 1].
 
@@ -42,11 +42,11 @@ class CoRegularization(WeightedTerm):
         self.lambda_dssim = lambda_dssim
 
     def begin(self, scene: Scene) -> None:
-        """Look where cameras may stand."""
+        """Prepare the pseudo cameras."""
         self.draw = pseudo_cameras(scene)
 
     def value(self, step: Step) -> Tensor:
-        """Compare all fields at the step of the first, which stands for all."""
+        """Compare all fields, once: at the step of the first."""
         zero = step.image.new_zeros(())
         if step is not step.fields[0]:
             return zero
