@@ -131,7 +131,7 @@ class TrainConfig:
         return self.iterations if self.densify_until is None else min(self.densify_until, self.iterations)
 
     def means_rate_at(self, step: int) -> float:
-        """Learning rate of the means at a step, the first being 0, in units of the scene's extent, exponential in it.
+        """Learning rate of the means at a step, the first being 0, in scene extents; it decays exponentially.
 
         Example:
             >>> round(TrainConfig().means_rate_at(1500), 7)  # half way
