@@ -1,4 +1,4 @@
-"""Sums over the pixels at which a splat is drawn, for every splat: the scores of Taming 3DGS."""
+"""Per-splat sums over the pixels at which the splat is drawn: the scores of Taming 3DGS."""
 
 from __future__ import annotations
 

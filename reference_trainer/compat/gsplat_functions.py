@@ -62,7 +62,7 @@ def gsplat_functions() -> Iterator[None]:
 
 
 def _put_module(name: str, module: ModuleType | None) -> None:
-    """Put a module into ``sys.modules``, where gsplat looks for its compiled code, or remove what is there for None."""
+    """Put a module into ``sys.modules``, where gsplat looks for its compiled code; None removes what is there."""
     if module is None:
         sys.modules.pop(name, None)
     else:

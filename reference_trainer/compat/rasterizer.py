@@ -84,8 +84,8 @@ class GaussianRasterizer(nn.Module):
         ignored, with a warning unless they are None, False or zeros.
 
         Returns:
-            The values that the caller's names for them tell, see `kinds_of`; by default first the image (3, H, W), not
-            clamped, and radii in pixels, shape (N,) int32, 0 for what is out of view. Depth and inverse depth are sums
+            The values that the caller unpacks, told by its names, see `kinds_of`; by default first the image (3, H, W),
+            not clamped, and radii in pixels, (N,) int32, 0 for what is out of view. Depth and inverse depth are sums
             of weight times (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's
             sum of weights over the pixels, shape (N,), pixels (N, 1) the number of those at which it is drawn, both
             without a gradient; so are the scores of Taming 3DGS, see `contributions`. Normals, mean depth and

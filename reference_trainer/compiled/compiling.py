@@ -43,7 +43,7 @@ _DIGEST = _digest()
 
 
 def describe_compilation(folder: str | None) -> str:
-    """Tell people what happens when a loop must be compiled, to be cached in a folder, or nowhere."""
+    """Describe for people what happens when a loop must be compiled, to be cached in a folder, or nowhere."""
     when = "once on this machine" if folder else "in every process, as no folder can be written (set NUMBA_CACHE_DIR)"
     return f"Compiling the renderer's loops, {when}: about 20 s of one core."
 

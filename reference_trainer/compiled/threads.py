@@ -41,7 +41,7 @@ if hasattr(os, "register_at_fork"):
 def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any, least: int = _LEAST) -> list[Any]:
     """Call ``kernel(first, last, *arguments)`` for ranges that make up ``range(count)``; return what the calls return.
 
-    Once this returns or raises, a kernel's error or KeyboardInterrupt, no thread writes any more.
+    Once this returns, or raises a kernel's error or KeyboardInterrupt, no thread writes any more.
 
     Args:
         kernel: compiled with `reference_trainer.compiled.compiling.kernel`.

@@ -20,7 +20,7 @@ __all__ = ["AbsGradDensity"]
 class AbsGradDensity(AdaptiveDensity):
     """Clones by the gradient of the projected center, splits by the sum of its absolute values over the pixels (AbsGS).
 
-    Different pixels pull a Gaussian that is too large to different sides, and the pulls cancel: AbsGS (Ye et al. 2024)
+    Pixels pull a Gaussian that is too large in different directions, and their gradients cancel: AbsGS (Ye et al. 2024)
     splits where ``mean over the steps of |(sum |g_x|, sum |g_y|)|`` is large, the sums over the pixels. All else is
     `AdaptiveDensity` with the settings of `TrainConfig`, but for two of them, which are arguments here.
     Defaults are the source's (TY424/AbsGS 87d7a5a, arguments/__init__.py); its pruning by pixel weight is off there.
@@ -31,8 +31,8 @@ class AbsGradDensity(AdaptiveDensity):
         clone_gradient: threshold of the signed gradient, in place of ``densify_gradient``.
         split_gradient: threshold of the absolute gradient.
         dense_fraction: larger Gaussians are split, smaller ones cloned, as with the setting of this name.
-        opacity_ceiling: what opacities are regularly lowered to, in (0, 1).
-        ceiling_every: steps between these, until densification ends; 0 never lowers.
+        opacity_ceiling: value that higher opacities are regularly lowered to, in (0, 1).
+        ceiling_every: number of steps between these, until densification ends; 0 never lowers.
 
     Raises:
         ValueError: if one is out of range.

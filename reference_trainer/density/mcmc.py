@@ -26,9 +26,9 @@ class MCMCDensity(DensityStrategy):
     """Relocates dead Gaussians, adds some, and moves all by noise (3DGS-MCMC, Kheradmand et al. 2024, Sec. 3).
 
     When the schedule densifies, every Gaussian with an opacity of at most ``prune_opacity`` becomes a copy of a live
-    one drawn by opacity. Then copies of any, drawn likewise, make their number grow by the factor ``growth``, up to
-    ``max_gaussians``. The n at one place get the opacity ``1 - (1 - o)^(1/n)`` and the scales of equation 9, so that
-    they look as the one did; the optimizer state of those drawn is cleared. After every step all centers move by
+    one drawn by opacity. Then further copies, drawn likewise, raise the number of Gaussians by the factor ``growth``,
+    up to ``max_gaussians``. The n at one place get the opacity ``1 - (1 - o)^(1/n)`` and the scales of equation 9, so
+    that they look as the one did; the optimizer state of those drawn is cleared. After every step all centers move by
     ``Sigma xi``, xi normal with standard deviation ``noise x (rate of the means) x sigmoid(100 (0.005 - o))``: only
     faint Gaussians move visibly.
 

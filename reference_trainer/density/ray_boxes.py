@@ -23,7 +23,7 @@ __all__ = ["RayBoxDensity", "ray_box", "worst_region"]
 class RayBoxDensity(AdaptiveDensity):
     """`AdaptiveDensity` with the cross-ray densification and the threshold of MVGS (Du et al. 2024).
 
-    At every densification a few training views are drawn at random. For each two of them, the rays through the corners
+    At every densification a few training views are drawn at random. For each pair of them, rays through the corners
     of their worst regions (`worst_region`) span a box (`ray_box`); all Gaussians inside are cloned too, whatever their
     size. If two of the cameras' positions, normalized to distance 1 from the world's origin, are more than 1 apart,
     ``densify_gradient`` is halved. The source (xiaobiaodu/MVGS ec9b30e, train.py and scene/gaussian_model.py) takes the

@@ -19,7 +19,7 @@ __all__ = ["CoAdaptation"]
 
 
 class CoAdaptation(WeightedTerm):
-    """``weight`` times the mean variance of the colors when each Gaussian is dropped with a rate of its own.
+    """``weight`` times the mean variance of the colors when each Gaussian is dropped independently, with rate ``p``.
 
     The variance needs no photograph, so it can be taken at virtual views as well. At the training view an analytic step
     has computed its variance already, which costs nothing more; else the moments are rendered, which takes about as
@@ -31,7 +31,7 @@ class CoAdaptation(WeightedTerm):
         where: ``"training"``, the view of the step, or a camera drawn anew at each step: between two training cameras
             on a ``"line"`` or on an ``"arc"`` (`cameras_between`), on an arc extended by half its length ``"beyond"``
             either, or in their ``"box"`` (`pseudo_cameras`).
-        every: the term acts once in so many steps, multiplied by their number, so that ``weight`` is its mean weight.
+        every: the term acts once in so many steps, multiplied by their number, so that ``weight`` is the mean per step.
 
     Raises:
         ValueError: if one is out of range, or the scene has no such cameras.

@@ -18,7 +18,7 @@ __all__ = ["CoRegularization"]
 
 
 class CoRegularization(WeightedTerm):
-    """``weight`` times the photometric loss of every field's render to every other's, at a pseudo view (CoR-GS, 2024).
+    """``weight`` times the photometric loss between the renders of all fields, at a pseudo view (CoR-GS, 2024).
 
     At each step one of the `pseudo_cameras` is rendered with the plain model of every field, and each compared with the
     others as if they were photographs, mean over the others. Density control does not see these renders. It needs

@@ -17,7 +17,7 @@ __all__ = ["Consistency"]
 
 
 class Consistency(WeightedTerm):
-    """``weight`` times the difference of the full render to a second one that drops Gaussians (DropoutGS, CVPR 2025).
+    """``weight`` times the difference between the full render and one that drops Gaussians (DropoutGS, CVPR 2025).
 
     Both renders are of the view of the step, and both learn. Sampled, as in the source: L1 + D-SSIM to a render with
     one draw of dropout at the constant rate p, its survivors not compensated. ``exact``: the expectation over all draws

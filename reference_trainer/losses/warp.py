@@ -55,7 +55,7 @@ class Warp(WeightedTerm):
 
 
 def warp_horizontally(image: Tensor, disparity: Tensor) -> tuple[Tensor, Tensor]:
-    """Sample a picture to the right of every pixel, by a disparity; return the result and where that stays inside.
+    """Sample a picture a disparity to the right of every pixel; return the result and where that stays inside.
 
     Args:
         image: shape (C, H, W).

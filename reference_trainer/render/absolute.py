@@ -34,7 +34,7 @@ class _AbsoluteGradients(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        # The remaining light shows the background: over black, the background's part is one more gradient of alpha.
+        # The remaining light, 1 - alpha, shows the background; once that is taken out, its gradient is part of alpha's.
         (drawn,), (gradient,) = ctx.saved_tensors, gradients
         black = torch.cat([drawn[:4] - (1 - drawn[4]) * ctx.background, drawn[4:]])
         of_alpha = gradient[4:] - (gradient[:4] * ctx.background).sum(0, keepdim=True)

@@ -52,7 +52,7 @@ class TrainConfig:
     sh_degree: int = 3
     """Degree of the spherical harmonics of the colors, 0 to 3."""
     sh_every: int = 500
-    """Steps after which another band of spherical harmonics is added; 0: all are there from the first step on."""
+    """Steps until another band of spherical harmonics is added; 0: all are there from the first step on."""
 
     means_rate: float = 1.6e-4
     """Initial learning rate of the means, in units of the scene's extent."""

@@ -29,7 +29,7 @@ def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
         config: says which points to take and how large and how opaque the Gaussians are.
 
     Raises:
-        ValueError: if the scene has no points, or no seen ones where only those are asked for.
+        ValueError: if the scene has no points, or only seen ones are to be taken and there are none.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene

@@ -116,7 +116,7 @@ def opacity_reset(scene: Scene, config: TrainConfig) -> PlanItem:
 
 
 def dropout(scene: Scene, config: TrainConfig) -> PlanItem:
-    """Dropout is never switched on unasked: comparisons need a training without it. But its known gains are told."""
+    """Dropout is never switched on unasked: comparisons need a training without it. Its known gains are told."""
     count, apart = len(scene.train), _degrees_apart(scene)
     known = min(DROPOUT_GAINS, key=lambda n: abs(math.log(n / count)))
     gains = " and ".join(f"{gain:+.1f} dB on {where}" for where, gain in DROPOUT_GAINS[known].items())
@@ -221,7 +221,7 @@ def _points(scene: Scene) -> PointCloud:
 
 
 def _degrees_apart(scene: Scene) -> float:
-    """The angle between a training view and the nearest other one, seen from the middle of the points; the median."""
+    """The median over the training views of the angle to the nearest other one, seen from the middle of the points."""
     middle = _points(scene).positions.median(0).values
     to = torch.nn.functional.normalize(torch.stack([view.camera.position for view in scene.train]) - middle, dim=1)
     return float((to @ to.T).fill_diagonal_(-1.0).amax(1).clamp(-1, 1).arccos().rad2deg().median())

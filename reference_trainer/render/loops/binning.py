@@ -77,7 +77,7 @@ def _measure(
 ) -> None:  # fmt: skip
     """Collect what `_find_spans` needs of every ellipse, its first row of tiles last, and count its rows of tiles.
 
-    The values of an ellipse are adjacent: taken nearest first, ellipses are scattered over memory, and misses dominate.
+    An ellipse's values are adjacent: taken nearest first, ellipses are scattered over memory; cache misses dominate.
     """
     size = f4(height)
     for i in range(first, last):
