@@ -1,4 +1,4 @@
-"""The pinhole camera: the one thing that scenes and the renderer share."""
+"""The pinhole camera, which scenes and the renderer share."""
 
 from __future__ import annotations
 
@@ -75,9 +75,9 @@ class Camera:
         return (local - pose[:3, 3]) @ pose[:3, :3]
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pixels (..., 2) and depths (...) of world points (..., 3); what `lift` undoes.
+        """Return pixels (..., 2) and depths (...) of world points (..., 3); the inverse of `lift`.
 
-        Behind the camera the depth is negative and the pixel has no meaning, at depth 0 it is not finite.
+        Behind the camera the depth is negative and the pixel meaningless; at depth 0 the pixel is not finite.
         """
         pose = self.world_to_camera.to(points)
         local = points @ pose[:3, :3].T + pose[:3, 3]
@@ -99,7 +99,7 @@ class Camera:
 
 
 def pixels_of(positions: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Return column and row of the pixel of every point, clamped to the picture, and whether the picture holds it."""
+    """Return the column and row of every point's pixel, clamped to the picture, and whether the point is in view."""
     pixels, depth = camera.project(positions)
     column, row = pixels.unbind(1)
     within = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)

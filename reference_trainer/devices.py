@@ -1,4 +1,4 @@
-"""Where to compute, as the command line names it."""
+"""Checking the device that the command line names."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ __all__ = ["check_device"]
 
 
 def check_device(name: str, *, here: bool = True) -> None:
-    """Refuse a device, such as ``"cuda:1"``, that PyTorch cannot compute on, unless it is another machine's.
+    """Refuse a device, such as ``"cuda:1"``, that PyTorch cannot compute on; unless ``here``, check its name alone.
 
     Raises:
-        ValueError: if it is no device, or there is none ``here``, if this machine must have it.
+        ValueError: if the name is not that of a device, or if ``here`` and this machine cannot compute on it.
 
     Example:
         >>> check_device("cpu")
@@ -27,7 +27,7 @@ def check_device(name: str, *, here: bool = True) -> None:
         raise ValueError(message) from error
     if not here:
         return
-    if device.type == "cuda":  # nothing is allocated: workers may be those that compute
+    if device.type == "cuda":  # allocate nothing: workers may be the ones that compute
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         if (device.index or 0) >= count:
             raise ValueError(f"--device {name}: PyTorch {torch.__version__} finds {count} CUDA devices; take cpu.")

@@ -1,4 +1,4 @@
-"""Writing files whole or not at all."""
+"""Writing files atomically."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ _PART = ".part"
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Give a place to write to; on success it becomes ``path`` in one move, on failure nothing has changed.
+    """Yield a temporary path to write to; on success it replaces ``path`` atomically, on failure nothing changes.
 
-    Missing folders are made; the place is in the same folder. The content is on disk before the move, and the move
-    before this returns: a power cut leaves the old file or the new, and what is written later does not survive without
-    what was written before.
+    The temporary file lies in the same folder, which is created if missing. The content is synced before the move, and
+    the move before this returns: a power cut leaves the old file or the new one, and no later write without this one.
 
     Raises:
-        OSError: if it cannot be written, such as on a full disk; it names ``path``.
+        OSError: if the file cannot be written, as on a full disk; the error names ``path``.
 
     Example:
         >>> import tempfile
@@ -50,15 +49,15 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text in UTF-8 as `replacing` does."""
+    """Write text as UTF-8, atomically as `replacing` does."""
     with replacing(path) as place:
         place.write_text(text, encoding="utf-8")
 
 
 def remove_leftovers(folder: str | Path, *, below: bool = True) -> int:
-    """Remove what killed processes had begun to write in a folder, and return how many files that were.
+    """Remove the temporary files that killed processes left in a folder, and return their number.
 
-    No other process may be writing there now. ``below`` also looks into all folders below it.
+    No other process may be writing there. ``below`` includes all subfolders.
     """
     leftovers = [path for path in Path(folder).glob(f"{'**/' * below}.*{_PART}") if path.is_file()]
     for path in leftovers:
@@ -67,7 +66,7 @@ def remove_leftovers(folder: str | Path, *, below: bool = True) -> int:
 
 
 def _sync(path: Path) -> None:
-    """Wait until a file or the entries of a folder are on the disk."""
+    """Flush a file, or the entries of a folder, to disk."""
     handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)  # Windows syncs only what may be written
     try:
         os.fsync(handle)

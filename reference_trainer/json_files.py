@@ -1,4 +1,4 @@
-"""Reading JSON files that somebody else may have written, and settings out of them."""
+"""Reading untrusted JSON files, and settings from them."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def read_json(path: str | Path) -> Any:
 
 
 def settings_from(kind: type[T], values: Any, where: str) -> T:
-    """Make a dataclass of plain fields from a JSON object; fields that it lacks get their defaults.
+    """Make a dataclass of plain fields from a JSON object; missing fields get their defaults.
 
-    The fields are numbers, strings, booleans or None, or a choice of strings; ``where`` is what errors call it.
+    Fields hold numbers, strings, booleans, None or literal strings. Errors call the object ``where``.
 
     Raises:
-        ValueError: if it is no object, has a field that there is not, a value of another type, or one that ``kind``
-            refuses.
+        ValueError: if ``values`` is not an object, or a field is unknown, of the wrong type, not finite, beyond 64 bits
+            or refused by ``kind``.
 
     Example:
         >>> from reference_trainer.training.config import TrainConfig
@@ -63,7 +63,7 @@ def settings_from(kind: type[T], values: Any, where: str) -> T:
 
 
 def _allows(hint: Any, value: Any) -> bool:
-    """Whether a value read from JSON is of the type of a field: a class, a union of them, or a choice of strings."""
+    """Whether a JSON value matches a field's type: a class, a union of classes, or a Literal of strings."""
     if get_origin(hint) is Literal:
         return type(value) is str and value in get_args(hint)
     if get_args(hint):

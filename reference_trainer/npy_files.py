@@ -1,4 +1,4 @@
-"""Arrays of floats in NumPy's files, which somebody else may have written."""
+"""Reading untrusted ``.npy`` and ``.npz`` files."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ __all__ = ["read_npy", "read_npz"]
 def read_npy(data: bytes, name: str | Path, *, strict: bool = True) -> NDArray[Any]:
     """Read an array from the content of an ``.npy`` file, which errors call ``name``; floats become float64.
 
-    Its announced size is compared with the data before anything is allocated for it. (Reading from a file would
-    allocate whatever length its header has.) Raises ValueError if it is damaged, holds Python objects, or, if it is to
-    be ``strict``, anything but finite floats.
+    The announced size is compared with the data before anything is allocated. (Reading from a file would allocate
+    whatever its header announces.) Raises ValueError if the data is damaged or holds anything but real numbers or text;
+    if ``strict``, anything but finite floats of 4 or 8 bytes.
     """
     file = io.BytesIO(data)
     try:
@@ -46,12 +46,12 @@ def read_npy(data: bytes, name: str | Path, *, strict: bool = True) -> NDArray[A
 
 
 def read_npz(path: Path, *, largest: int = 10_000, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an ``.npz`` file by name; each may have so many bytes.
+    """Read the arrays of an ``.npz`` file by name, each of at most ``largest`` bytes.
 
-    Of several, those with certain names may be asked for; these may hold numbers of any kind, or text.
+    With ``names``, only these arrays are read, and they may hold any real numbers or text.
 
     Raises:
-        ValueError: if it is none, is damaged, or an array is larger or not one of finite floats.
+        ValueError: if the file is not an ``.npz`` or is damaged, or an array is too large or not what `read_npy` takes.
         OSError: if the file cannot be read.
     """
     members: dict[str, bytes] = {}

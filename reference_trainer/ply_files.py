@@ -1,4 +1,4 @@
-"""The vertices of a PLY file, whatever they mean: points with colors, or Gaussians."""
+"""Reading the vertices of PLY files, be they colored points or Gaussians."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class PlyVertices:
 
     Args:
         rows: one record per vertex, with a field per property.
-        kinds: the properties, with the numpy type that the file declares, such as ``u1``; an ASCII file's rows hold
-            float64 all the same.
+        kinds: the numpy type that the file declares for each property, such as ``u1``; an ASCII file's rows hold
+            float64 regardless.
         comments: the comment lines of the header.
     """
 
@@ -42,7 +42,7 @@ class PlyVertices:
     comments: list[str]
 
     def columns(self, names: Sequence[str]) -> Tensor:
-        """Return some properties side by side, shape (N, len(names)), float32; infinite where that cannot hold them."""
+        """Return properties as columns, shape (N, len(names)), float32; values beyond its range become infinite."""
         table = np.empty((len(self.rows), len(names)), dtype=np.float32)
         with np.errstate(over="ignore"):
             for index, name in enumerate(names):
@@ -51,10 +51,10 @@ class PlyVertices:
 
 
 def read_ply(path: Path) -> PlyVertices:
-    """Read the vertices, the first element of the file: binary of either byte order or ASCII.
+    """Read the vertices, which must be the file's first element; binary of either byte order or ASCII.
 
     Raises:
-        ValueError: if the file is no such PLY, is compressed, or is shorter or longer than its header says.
+        ValueError: if the file is not such a PLY, is compressed, or is shorter or longer than its header says.
         OSError: if the file cannot be read.
     """
     with path.open("rb") as file:
@@ -64,7 +64,7 @@ def read_ply(path: Path) -> PlyVertices:
 
 @dataclass(frozen=True)
 class _Header:
-    """The format, the number of vertices, their properties with numpy types, comments, and if there is nothing else."""
+    """What a header declares; ``alone`` if the vertices are its only element."""
 
     layout: str
     count: int
@@ -115,7 +115,7 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
 
 
 def _read_rows(file: BinaryIO, path: Path, header: _Header) -> NDArray[np.void]:
-    """Read the vertices as a structured array; the file's size is compared first, so a false count costs nothing."""
+    """Read the vertices as a structured array; the file's size is checked first, so a false count costs nothing."""
     layout, count, properties = header.layout, header.count, header.properties
     available = os.fstat(file.fileno()).st_size - file.tell()
     binary = layout != "ascii"

@@ -13,7 +13,7 @@ _NO_DIRECTION = 1e-30  # a quaternion well below this is taken for 0
 def rotation_matrices(quaternions: Tensor) -> Tensor:
     """Turn quaternions (N, 4) into rotation matrices (N, 3, 3).
 
-    Convention: wxyz; they are normalized here, whatever their norm. That of 0 is the identity, with a gradient of 0.
+    Convention: wxyz, of any norm; they are normalized here. A zero quaternion gives the identity and a gradient of 0.
 
     Example:
         >>> rotation_matrices(torch.tensor([[2.0, 0.0, 0.0, 0.0]]))[0].tolist()
@@ -24,7 +24,7 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 
 def rotations(quaternions: Tensor) -> Tensor:
     """Turn quaternions (N, 4) into rotation matrices (3, 3, N): long last axes are several times faster on a CPU."""
-    # Divided by the largest component first: the squares of the norm would overflow from 1e19 on, or underflow.
+    # Divided by the largest component first: its square would overflow from 1e19 on, or underflow.
     largest = quaternions.detach().abs().amax(1).clamp_(min=_NO_DIRECTION)
     w, x, y, z = torch.nn.functional.normalize(quaternions.T / largest, dim=0).unbind(0)
     rows = [

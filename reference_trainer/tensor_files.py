@@ -1,4 +1,4 @@
-"""Reading files of ``torch.save`` without trusting them."""
+"""Reading untrusted ``torch.save`` files."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from torch import Tensor
 __all__ = ["load_tensors", "moved"]
 
 _STORAGES = ("Bool", "Byte", "Char", "Short", "Int", "Long", "Half", "BFloat16", "Float", "Double")
-# torch's own list for weights_only has bytearray and Tensor as well, which take any amount of memory from a few bytes.
+# torch's own list for weights_only also has bytearray and Tensor, which allocate any amount of memory from a few bytes.
 _ALLOWED = {
     "collections OrderedDict",
     "torch._utils _rebuild_parameter",
     "torch._utils _rebuild_tensor_v2",
     *(f"torch {kind}Storage" for kind in _STORAGES),
 }
-_LARGEST_PICKLE = 256_000  # bytes, with the names of all views but no tensors. Each may make 160 of memory
+_LARGEST_PICKLE = 256_000  # bytes, with the names of all views but no tensors; each may take 160 of memory
 _PICKLES_OF_OLD_FILES = 5  # magic number, version, platform, content, names of the storages
 
 
 def load_tensors(path: str | Path, device: torch.device | str = "cpu", *, what: str = "a file of tensors") -> Any:
     """Read tensors, numbers and strings in nested dicts and lists; no code in the file is executed.
 
-    Beyond what ``torch.load(weights_only=True)`` does, the checksums are compared, so that a damaged file is refused
-    and not read as other numbers, and nothing is read that would take much more memory than the file has bytes: what
-    describes the tensors is small, and no list or dict in it stands at two places. Files from before PyTorch 1.6 have
-    no checksums; they are read, too. ``what`` the file should be goes into the error.
+    Stricter than ``torch.load(weights_only=True)``: checksums are verified, so that a damaged file is refused instead
+    of read as other numbers, and nothing is read that would take much more memory than the file has bytes: the pickle
+    must be small, and no container in it may be referenced twice. Files from before PyTorch 1.6, which have no
+    checksums, are read too. Errors say ``what`` the file should have been.
 
     Raises:
-        ValueError: if the file is damaged, or holds anything else.
-        OSError: if it cannot be read.
+        ValueError: if the file is damaged or holds anything else.
+        OSError: if the file cannot be read.
 
     Example:
         >>> import tempfile
@@ -61,7 +61,7 @@ def load_tensors(path: str | Path, device: torch.device | str = "cpu", *, what: 
 
 
 def moved(state: Any, device: torch.device | str) -> Any:
-    """Return nested dicts and lists with their tensors on a device; those that are there already are not copied.
+    """Return nested dicts and lists with their tensors on a device; tensors already there are not copied.
 
     Example:
         >>> moved({"x": [torch.zeros(2)], "step": 3}, "meta")
@@ -75,9 +75,9 @@ def moved(state: Any, device: torch.device | str) -> Any:
 
 
 def _checked_archive(data: io.BytesIO) -> io.BytesIO:
-    """Return the archive anew, its checksums compared, so that torch finds in it what was checked here.
+    """Verify the checksums and rewrite the archive, so that torch reads exactly what was checked here.
 
-    A damaged attribute of a record makes torch take it for a folder, and return a tensor of memory that nobody wrote.
+    A damaged attribute would make torch take a record for a folder, and return a tensor of uninitialized memory.
     """
     clean = io.BytesIO()
     with zipfile.ZipFile(data) as archive, zipfile.ZipFile(clean, "w") as copy:
@@ -96,7 +96,7 @@ def _checked_archive(data: io.BytesIO) -> io.BytesIO:
 
 
 def _check_old_file(data: io.BytesIO) -> None:
-    """Refuse a file in the format before PyTorch 1.6 that names something else or asks for more than it has."""
+    """Refuse a file of the format before PyTorch 1.6 that names forbidden objects or announces more than it holds."""
     size = len(data.getbuffer())
     for part in range(_PICKLES_OF_OLD_FILES):
         _check_pickle(data, largest=size if part == 3 else None)
@@ -104,10 +104,9 @@ def _check_old_file(data: io.BytesIO) -> None:
 
 
 def _check_pickle(file: IO[bytes], largest: int | None = None) -> None:
-    """Refuse a pickle that names anything but tensors, is long, repeats a tuple, or has a size above the largest.
+    """Refuse a pickle that names anything but tensors, is long, reuses a tuple, or has an integer above ``largest``.
 
-    A tuple that holds another one twice, which holds a third one twice, and so on, has as many parts as it wants: as a
-    key of a dict it would take that long already.
+    Tuples that each hold the next one twice grow exponentially: hashing the outermost as a dict key would not end.
     """
     start, last, tuples = file.tell(), "", set[object]()
     for opcode, argument, position in pickletools.genops(file):
@@ -129,7 +128,7 @@ def _check_pickle(file: IO[bytes], largest: int | None = None) -> None:
 
 
 def _check_content(state: Any) -> None:
-    """Refuse what stands for more than it takes: tensors that repeat their storage, containers at two places."""
+    """Refuse content larger than its storage: tensors that repeat theirs, containers referenced twice."""
     pending, seen = [state], set[int]()
     while pending:
         x = pending.pop()

@@ -1,4 +1,4 @@
-"""How many threads to compute with."""
+"""Choosing the number of threads."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from contextlib import contextmanager
 __all__ = ["chosen_threads", "thread_count", "threads_for"]
 
 PIXELS_PER_THREAD = 65_536
-"""Below twice this a picture gets one thread. Its steps are many operations of microseconds, at the end of each of
-which the threads wait for each other: a second one gains little on an idle machine, and where another process has its
-processor they wait until the system takes that away (a step at 96x64 takes 14 times as long, docs/reliability.md)."""
+"""A picture of less than twice this gets one thread. Its steps are many operations of microseconds, each of which ends
+in a barrier: a second thread gains little on an idle machine, and where another process occupies its core, the first
+waits for the scheduler (a step at 96x64 takes 14 times as long, docs/reliability.md)."""
 
 
 def chosen_threads() -> int | None:
-    """Return the number that the user has set, as ``OMP_NUM_THREADS``; None if there is none."""
+    """Return the number of threads that the user has set in ``OMP_NUM_THREADS``, or None."""
     word = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # a list is for nested regions
     return int(word) if word.isdecimal() and int(word) > 0 else None
 
 
 def thread_count(pixels: int | None = None, *, jobs: int = 1) -> int:
-    """Return how many threads a computation on pictures of so many pixels gets, with so many processes side by side.
+    """Return how many threads to use for pictures of ``pixels`` pixels, with ``jobs`` processes side by side.
 
-    What the user has set wins. Else it is the share of the processors that this process may run on, and for small
-    pictures fewer. It does not depend on how busy the machine is: a training repeats bit for bit with the same number.
+    The user's choice wins. Else it is a job's share of the processors that this process may run on, and fewer for small
+    pictures. The machine's load does not matter: a training repeats bit for bit only with the same number.
 
     Example:
         >>> thread_count(96 * 64, jobs=2) == (chosen_threads() or 1)
@@ -41,7 +41,7 @@ def thread_count(pixels: int | None = None, *, jobs: int = 1) -> int:
 
 @contextmanager
 def threads_for(pixels: int) -> Iterator[None]:
-    """Compute on pictures of so many pixels with at most `thread_count` threads, and with as many as before afterwards.
+    """Limit PyTorch to `thread_count` threads for pictures of ``pixels`` pixels within a block.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Another blur than the renderer's, and opacities that make up for it: antialiasing after Mip-Splatting."""
+"""Antialiasing after Mip-Splatting: another blur than the renderer's, and opacities that compensate for it."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ def filtered(
     blur: float = DILATION,
     floor: float | None,
 ) -> Splats:
-    """Blur splats by ``blur`` in the place of `DILATION`, square pixels, and lower their opacities for it.
+    """Blur splats by ``blur`` instead of `DILATION`, in square pixels, and lower their opacities accordingly.
 
     The Gaussians are those that the M splats were made of: world coordinates (N, 3), wxyz (N, 4), standard deviations
-    (N, 3). Opacities are multiplied by the root of the share of its area that a splat had before it was blurred
-    (Mip-Splatting, equation 9), at least ``floor``, above 0: the root has a slope. None leaves them as they are.
+    (N, 3). Opacities are multiplied by the root of the ratio of the covariance's determinants before and after the blur
+    (Mip-Splatting, equation 9). The ratio is at least ``floor``, above 0, as the root's slope is infinite there; a
+    floor of None leaves opacities as they are.
 
     Raises:
-        ValueError: if ``blur`` is negative or above `DILATION`: the tiles were chosen for that.
+        ValueError: if ``blur`` is negative or above `DILATION`, for which the tile lists were made.
     """
     if not 0 <= blur <= DILATION:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What the pixels of a picture add up to for every splat that is drawn at them: the scores of Taming 3DGS."""
+"""Per-splat sums over the pixels at which the splat is drawn: the scores of Taming 3DGS."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["contributions"]
 def contributions(splats: Splats, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Sum over the pixels at which a splat is drawn: an image (H, W), ones, its blend weights, and its distances.
 
-    Each is (M,); the distances are those of the pixel from the splat's center, in pixels.
+    Each is (M,); distances are from the splat's center to the pixel, in pixels.
     """
     rows = pad_entries(geometry_rows(splats))
     sums = rows.new_zeros(4, rows.shape[1])

@@ -22,20 +22,18 @@ MEMORY = 2**34  # bytes, all of them free
 
 @contextmanager
 def cuda_on_cpu() -> Iterator[None]:
-    """Let torch functions take the CPU wherever they are told to take a CUDA device.
+    """Make torch functions use the CPU wherever they are told to use a CUDA device.
 
     With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
     ``.cuda()`` of tensors and modules, ``.pin_memory()``, ``torch.load(map_location="cuda")`` and
-    ``torch.Generator("cuda")`` mean the CPU, and
-    ``torch.cuda.Event``, ``Stream``, ``synchronize``, ``set_device``, ``current_device``, ``current_stream``,
-    ``reset_peak_memory_stats`` and ``nvtx`` are harmless, and ``mem_get_info``, ``get_device_properties`` and
-    ``get_device_name`` speak of a device with `MEMORY` bytes; everything is restored at the end.
-    ``torch.cuda.is_available()`` stays False.
+    ``torch.Generator("cuda")`` mean the CPU. In ``torch.cuda``, ``Event``, ``Stream``, ``stream``, ``synchronize``,
+    ``set_device``, ``current_device``, ``current_stream``, ``reset_peak_memory_stats`` and ``nvtx`` run without effect,
+    and ``mem_get_info``, ``get_device_properties`` and ``get_device_name`` report a device with `MEMORY` bytes.
+    Everything is restored at the end. ``torch.cuda.is_available()`` stays False.
 
-    A tensor that is moved to "cuda" is the same tensor, as on a real device if it were there already: what is written
-    into one of them in place is written into the other.
+    A tensor moved to "cuda" stays the same tensor, as if it were there already: in-place writes affect both.
 
-    It holds for this thread and for those that are started within the block, such as a viewer's.
+    This applies to the current thread and to threads started within the block, such as a viewer's.
 
     Example:
         >>> with cuda_on_cpu():
@@ -70,7 +68,7 @@ class _CudaMeansCpu(TorchFunctionMode):
 
 
 def _load_on_cpu(load: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `torch.load`, which is no function of tensors, for a machine without CUDA."""
+    """Wrap `torch.load`, which a mode of torch functions does not see, for a machine without CUDA."""
 
     @functools.wraps(load)
     def load_on_cpu(f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
@@ -80,7 +78,7 @@ def _load_on_cpu(load: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _start_on_cpu(start: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
-    """Return `threading.Thread.start` for threads without CUDA: a mode of torch functions ends at its thread."""
+    """Wrap `threading.Thread.start` for threads without CUDA: a mode of torch functions is local to its thread."""
 
     @functools.wraps(start)
     def start_on_cpu(thread: threading.Thread) -> None:
@@ -145,7 +143,7 @@ class _Event:
 
 
 class _Stream:
-    """The order in which a CPU works, which is the only one."""
+    """A stream of work; a CPU has only one."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         pass

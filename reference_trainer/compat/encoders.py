@@ -25,12 +25,12 @@ class GridEncoder(nn.Module):
 
     Args:
         input_dim: D.
-        num_levels: of resolution.
+        num_levels: number of resolutions.
         level_dim: features per level.
-        per_level_scale: ratio of resolutions; ``desired_resolution``, of the last level, takes its place.
-        base_resolution: of the first level.
-        log2_hashmap_size: logarithm of the most rows in a table.
-        desired_resolution: see above.
+        per_level_scale: ratio of successive resolutions, unless ``desired_resolution`` is given.
+        base_resolution: resolution of the first level.
+        log2_hashmap_size: binary logarithm of the largest number of rows in a table.
+        desired_resolution: resolution of the last level.
         gridtype: "hash" or "tiled".
         align_corners: whether the outermost corners lie on the bounds; else half a cell outside.
         interpolation: "linear" or "smoothstep".
@@ -120,7 +120,7 @@ class SHEncoder(nn.Module):
     Convention: the Condon-Shortley phase is kept, and the order within a band is m = -l .. l.
 
     Raises:
-        ValueError: if the degree or the dimension is another.
+        ValueError: if ``degree`` is out of range or ``input_dim`` is not 3.
 
     Example:
         >>> SHEncoder(degree=2)(torch.tensor([[0.0, 0.0, 1.0]])).round(decimals=3)

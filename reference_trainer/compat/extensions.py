@@ -1,4 +1,4 @@
-"""The small extensions that trainers import: ``simple_knn`` and ``fused_ssim``."""
+"""Stand-ins for the small extensions that trainers import: ``simple_knn`` and ``fused_ssim``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def make_module(name: str, **members: Any) -> ModuleType:
 def distCUDA2(points: Tensor) -> Tensor | tuple[Tensor, Tensor]:
     """Return mean squared distances to the three nearest neighbors, shape (N,).
 
-    To callers that take the result apart, as those of FSGS and CoR-GS do, their numbers come with it: (N, 3) int32.
+    Callers that unpack the result, as FSGS and CoR-GS do, also get the indices of the neighbors, (N, 3) int32.
     """
     squares, numbers = nearest_neighbors(points, 3)
     return squares.mean(1) if names_of_results() is None else (squares.mean(1), numbers.int())
@@ -38,7 +38,7 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
     """Return the mean SSIM of pictures (B, C, H, W), as `ssim_map` has it; differentiable in the first.
 
     ``padding`` is "same" for all pixels, zeros beyond the border, or "valid" for those whose window lies inside;
-    ``train`` is not read. Raises ValueError for another padding.
+    ``train`` is ignored. Raises ValueError for another padding.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Put functions that need no CUDA in the place of gsplat's."""
+"""Replacing gsplat's functions by ones that need no CUDA."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def gsplat_functions() -> Iterator[None]:
 
 
 def _put_module(name: str, module: ModuleType | None) -> None:
-    """Let a module be found by its name, or not; where gsplat holds its compiled code, or looks for it."""
+    """Put a module into ``sys.modules``, where gsplat looks for its compiled code; None removes what is there."""
     if module is None:
         sys.modules.pop(name, None)
     else:
@@ -70,7 +70,7 @@ def _put_module(name: str, module: ModuleType | None) -> None:
 
 
 def _no_kernels() -> ModuleType:
-    """Make a module for compiled code that is not there."""
+    """Make a module in place of the missing compiled code."""
 
     def refuse(name: str) -> NoReturn:
         raise AttributeError(name) if name.startswith("__") else _without_cuda(name)
@@ -81,7 +81,7 @@ def _no_kernels() -> ModuleType:
 
 
 def _refusing(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function with the same signature that says that it needs CUDA."""
+    """Return a function with the same signature that raises, as it needs CUDA."""
 
     @functools.wraps(function)
     def refuse(*args: Any, **kwargs: Any) -> NoReturn:
@@ -104,7 +104,7 @@ def _run_once(fn: Callable[..., Any], args: Any, verbose: bool = False) -> bool:
 
 
 def _per_axis(version: str) -> bool:
-    """Whether radii are by axis: since gsplat 1.5."""
+    """Whether radii are per axis: since gsplat 1.5."""
     return tuple(int(part) for part in version.split(".")[:2]) >= (1, 5)
 
 

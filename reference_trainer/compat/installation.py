@@ -1,4 +1,4 @@
-"""Put the stand-ins in the place of the CUDA extensions that a foreign repository imports, or of gsplat's functions."""
+"""Installing the stand-ins for the CUDA extensions that a foreign repository imports, or for gsplat's functions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _in_worker = ExitStack()
 
 
 class Rasterizers(NamedTuple):
-    """The rasterizers that a repository expects: of every module the names, and what they return, if it was said."""
+    """The rasterizers that a repository expects: names by module, and what they return, if specified."""
 
     modules: dict[str, set[str]]
     outputs: tuple[str, ...] | None
@@ -45,23 +45,22 @@ def stand_in(
     The extensions of the INRIA family are ``diff_gaussian_rasterization``, the other modules that the repository
     imports a ``...Rasterizer`` from, unless they are its own, ``simple_knn``, ``fused_ssim``, and the encoders
     ``gridencoder``, ``shencoder`` and ``freqencoder``. For gsplat its functions are replaced (`gsplat_functions`), and
-    ``fused_ssim``, which its trainer imports. "cuda" is mapped to the CPU; if there is a CUDA device, it stays what it
-    is. Modules that were imported within the block keep the stand-ins. Worker processes that start afresh, as those of
-    data loaders do on macOS, find the extensions as well: by a temporary folder at the end of the search path, which
-    such processes inherit.
+    ``fused_ssim``, which its trainer imports. "cuda" is mapped to the CPU unless there is a CUDA device. Modules that
+    were imported within the block keep the stand-ins. Worker processes that start afresh, such as those of data loaders
+    on macOS, find the extensions as well: in a temporary folder at the end of the search path, which they inherit.
 
     Args:
-        repository: its root, whose sources are read. None for gsplat.
+        repository: its root folder, whose sources are read; None for gsplat.
         outputs: what its rasterizer returns, in this order, if the names that it assigns them to do not tell:
             ``("image", "radii", "depth", "alpha")``, say; see `reference_trainer.compat.outputs.kinds_of`.
-        rasterizer: one more, as ``module:Class``.
+        rasterizer: one more rasterizer, as ``module:Class``.
 
     Yields:
         The names of the modules.
 
     Raises:
         RuntimeError: if the extensions, or stand-ins for them, are imported already.
-        ImportError: if gsplat is missing, for which this is to be done.
+        ImportError: if gsplat's functions are to be replaced and gsplat is missing.
 
     Example:
         >>> with stand_in("a/repository") as modules:
@@ -89,7 +88,7 @@ def stand_in(
 
 
 def install_in_worker(modules: dict[str, set[str]] | None, outputs: tuple[str, ...] | None) -> None:
-    """Install the stand-ins in a worker process, for as long as it lives: what `Rasterizers` has; None for gsplat."""
+    """Install the stand-ins in a worker process for its lifetime; arguments as in `Rasterizers`, None for gsplat."""
     _in_worker.enter_context(cuda_on_cpu())
     sys.modules.update(_modules(None if modules is None else Rasterizers(modules, outputs)))
 
@@ -125,10 +124,10 @@ def _modules(expected: Rasterizers | None) -> dict[str, ModuleType]:
 def _importable(modules: Iterable[str], expected: Rasterizers | None) -> Iterator[None]:
     """Let processes that inherit the search paths import the stand-ins, but not their parent's objects.
 
-    They also find an ``nvidia-smi``, if there is none, by which scripts choose a GPU (Scaffold-GS).
+    They also find a stand-in for a missing ``nvidia-smi``, with which scripts choose a GPU (Scaffold-GS).
     """
     with TemporaryDirectory(prefix="ca_reg_stand_in_") as folder:
-        # The import system hands out what stands in sys.modules once the file has run.
+        # The import system returns what is in sys.modules once the file has run.
         arguments = ", ".join(map(repr, expected or (None, None)))
         text = f"from {__name__} import install_in_worker\n\ninstall_in_worker({arguments})\n"
         for name in modules:

@@ -1,4 +1,4 @@
-"""What the rasterizers of the INRIA family return, told by its name."""
+"""What the rasterizers of the INRIA family return, told by the names that callers give to it."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ class Unknown:
 
 
 class Picture(Tensor):
-    """Planes (C, H, W) that refuse, by ValueError, to be asked for a channel which they do not have.
+    """Planes (C, H, W) that raise ValueError when asked for a channel that they lack.
 
-    A slice of a tensor that lies beyond it would be empty without a word. What is computed from planes is a tensor.
+    A slice beyond the end of a plain tensor would silently be empty. Results computed from planes are plain tensors.
     """
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
@@ -87,14 +87,14 @@ for _operator in ("getitem", "len", "iter", "bool", "gt", "lt", "add", "mul", "t
 
 
 def kinds_of(names: tuple[str, ...] | None, fields: set[str]) -> tuple[str | None, ...]:
-    """Return what the values are; None for an unknown one. Image and radii come first if no name says otherwise.
+    """Return the kind of each value, None if unknown. Image and radii come first if no name says otherwise.
 
-    What has several in its channels has their names with a + between them.
+    A value that has several kinds as its channels has their names joined by +.
 
     Args:
-        names: by which the caller calls the values; None if it does not take them apart.
-        fields: of the settings, as the caller gives them: with ``antialiasing`` (INRIA since October 2024) a third of
-            three values is an inverse depth, whatever its name, and with ``confidence`` (FSGS) there are four; with
+        names: what the caller calls the values; None if it does not unpack them.
+        fields: names of the settings that the caller gives: with ``antialiasing`` (INRIA since October 2024) the third
+            of three values is an inverse depth, whatever its name; with ``confidence`` (FSGS) there are four; with
             ``pixel_weights`` (Taming 3DGS) there are scores of the Gaussians, under their own names.
 
     Raises:

@@ -36,10 +36,10 @@ Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterization:
     """Make a function with the arguments and results of ``gsplat.rasterization``, for any device.
 
-    Drawn are the Gaussians that gsplat 1.5 draws, with its near plane, far plane and radii; all arguments that do not
-    say how fast are obeyed or refused. Differences: alpha is clamped at 0.99, as in gsplat 1.6 (0.999 before), and
-    gradients pass the clamp; the projection is linearised within a margin around the middle of the picture, not around
-    the principal point; with gsplat 1.4, too, Gaussians fainter than 1/255 have no radius.
+    It draws the Gaussians that gsplat 1.5 draws, with its near plane, far plane and radii; all arguments but those that
+    affect only speed are obeyed or refused. Differences: alpha is clamped at 0.99, as in gsplat 1.6 (0.999 before), and
+    gradients pass the clamp; the projection is linearized within a margin around the middle of the picture, not around
+    the principal point; Gaussians fainter than 1/255 have no radius, with gsplat 1.4 too.
 
     ``info`` holds ``means2d`` (pixels, part of the graph: `retain_grad` it; ``absgrad`` appears on it at the backward
     pass if it was asked for), ``radii``, ``depths``, ``opacities``, the numbers ``batch_ids``, ``camera_ids`` and
@@ -47,13 +47,13 @@ def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterizat
 
     Args:
         original: the function of the gsplat that is installed, whose signature is taken over; it is not called.
-        per_axis: whether radii are those of gsplat since 1.5, by axis, [C, N, 2], or packed [nnz, 2]; else those of
+        per_axis: whether radii are those of gsplat since 1.5, per axis, [C, N, 2], or packed [nnz, 2]; else those of
             1.4, [C, N] or [nnz].
 
     Returns:
-        The function. It raises ValueError, by name, for arguments that the renderer has not: cameras other than
-        pinholes, an ``eps2d`` above 0.3, covariances, batches of scenes, features that are no colors, ``distributed``,
-        the unscented transform, and gradients of the poses.
+        The function. It raises ValueError, which names them, for arguments that the renderer does not support: cameras
+        other than pinholes, an ``eps2d`` above 0.3, covariances, batches of scenes, features other than colors,
+        ``distributed``, the unscented transform, and gradients of the poses.
 
     Example:
         >>> def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane=0.01,
@@ -87,7 +87,7 @@ def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterizat
 class _View(NamedTuple):
     """What one camera sees: M of the N Gaussians; gsplat's radii (M, 2), 0 for what it does not draw.
 
-    ``listed`` are the numbers of those with a radius, among the M.
+    ``listed`` holds the indices of those with a radius, among the M.
     """
 
     splats: Splats
@@ -97,7 +97,7 @@ class _View(NamedTuple):
 
 def _rasterize(given: SimpleNamespace, per_axis: bool) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Draw all cameras."""
-    # The renderer's near plane is fixed. In other units of length it is any: the picture does not change.
+    # The renderer's near plane is fixed; a change of the unit of length moves it, and leaves the picture as it is.
     unit = NEAR_PLANE / max(given.near_plane, NEAREST)
     means, scales = given.means * unit, given.scales * unit
     views = [_look(given, number, means, scales, unit, per_axis) for number in range(len(given.viewmats))]
@@ -112,7 +112,7 @@ def _rasterize(given: SimpleNamespace, per_axis: bool) -> tuple[Tensor, Tensor, 
         return torch.stack([table.index_copy(0, view.splats.indices, x) for table, x, view in pairs])
 
     def rows(table: Tensor, number: int, others: Tensor) -> Tensor:
-        """Return what a table has for the M Gaussians of a camera; those that it does not list keep what they had."""
+        """Return what a table has for the M Gaussians of a camera, and ``others`` for those that it does not list."""
         if given.packed:
             return others.index_copy(0, views[number].listed, torch.split(table, counts)[number])
         return table[number].index_select(0, views[number].splats.indices)
@@ -192,7 +192,7 @@ def _extents(splats: Splats, per_axis: bool) -> Tensor:
 
 
 def _check(given: SimpleNamespace) -> None:
-    """Raise ValueError for what the renderer has not."""
+    """Raise ValueError for what the renderer does not support."""
     if given.means.ndim != 2:
         _refuse("means", f"must have shape (N, 3), a single scene, got {tuple(given.means.shape)}")
     if given.render_mode not in MODES:

@@ -27,8 +27,8 @@ __all__ = ["GaussianRasterizer", "rasterizer_module"]
 FIELDS = ("antialiasing", "confidence", "pixel_weights")  # of the settings, which tell what the outputs are
 SCORES = ("accum_weights", "accum_count", "accum_blend", "accum_dist", "depths")
 SURFACES = {"normal", "mean_depth", "distortion"}
-FLOOR = 2.5e-5  # INRIA's least share of the area, of antialiasing
-FLOOR_OF_MIP = 1e-6  # that of Mip-Splatting
+FLOOR = 2.5e-5  # least ratio of determinants in INRIA's antialiasing
+FLOOR_OF_MIP = 1e-6  # the same in Mip-Splatting
 
 
 class GaussianRasterizer(nn.Module):
@@ -80,16 +80,16 @@ class GaussianRasterizer(nn.Module):
 
         ``means2D`` (N, 3), or (N, 4) for AbsGS, receives the screen-space gradients. Colors are spherical-harmonic
         coefficients ``shs`` (N, K, 3), whose first band may stand apart in ``dc`` (N, 1, 3), or ``colors_precomp`` (N,
-        3). Scales (N, 2) are those of surfels (2DGS), which are drawn as flat Gaussians. Further arguments are left
-        out, with a warning unless they are None.
+        3). Scales (N, 2) are those of surfels (2DGS), which are drawn as flat Gaussians. Further arguments are
+        ignored, with a warning unless they are None, False or zeros.
 
         Returns:
-            What the caller calls the members, see `kinds_of`; first, by default, the image (3, H, W), not clamped, and
-            radii in pixels, shape (N,) int32, 0 for what is out of view. Depth and inverse depth are sums of weight
-            times (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's sum of
-            weights over the pixels, shape (N,), pixels (N, 1) the number of those at which it is drawn, both without a
-            gradient; so are the scores of Taming 3DGS, see `contributions`. Normals, mean depth and distortion are
-            those of `surface_planes`.
+            The values that the caller unpacks, told by its names, see `kinds_of`; by default first the image (3, H, W),
+            not clamped, and radii in pixels, (N,) int32, 0 for what is out of view. Depth and inverse depth are sums
+            of weight times (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's
+            sum of weights over the pixels, shape (N,), pixels (N, 1) the number of those at which it is drawn, both
+            without a gradient; so are the scores of Taming 3DGS, see `contributions`. Normals, mean depth and
+            distortion are those of `surface_planes`.
 
         Raises:
             ValueError: if ``means2D`` has another shape, a covariance is given, the outputs cannot be told, or a
@@ -131,11 +131,11 @@ class GaussianRasterizer(nn.Module):
         # Pixels per unit of normalized device coordinates, for every column.
         half = [0.5 * camera.width, 0.5 * camera.height, 0.5 * camera.width, 0.5 * camera.height]
         sink = means2D.index_select(0, splats.indices) * means2D.new_tensor(half[:columns])
-        # Zeros are added, whose gradient is that of the positions.
+        # Adds zeros, which receive the gradient of the projected positions.
         projection = splats.projection
         splats = splats._replace(projection=projection._replace(means=projection.means + (sink - sink.detach())[:, :2]))
         inverse, surfaces = "inverse_depth" in parts, not SURFACES.isdisjoint(parts)
-        depths = projection.depths.reciprocal() if inverse else projection.depths  # sorted already, these are summed
+        depths = projection.depths.reciprocal() if inverse else projection.depths  # only summed: sorting is done
         rendering = draw(
             splats._replace(projection=splats.projection._replace(depths=depths)),
             background=settings.bg,
@@ -157,7 +157,7 @@ class GaussianRasterizer(nn.Module):
             table = torch.stack([*contributions(splats, image), projection.depths.detach()])
             table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
             found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": found["radii"], "pixels": table[1, :, None]}
-        labels = (*(names or kinds), "radii")  # which a caller of one value alone does not name
+        labels = (*(names or kinds), "radii")  # for a caller that names only one value
         return tuple(_output(kind, label, found, drawn) for kind, label in zip(kinds, labels, strict=False))
 
     def _axes(
@@ -174,10 +174,10 @@ class GaussianRasterizer(nn.Module):
 
 
 def _output(kind: str | None, label: str | None, found: dict[str, Tensor], drawn: Tensor) -> Tensor | Unknown:
-    """Return a value as CUDA code would, planes (..., H, W) one behind the other; by its label if one was not found.
+    """Return a value as CUDA code would, its planes (..., H, W) stacked; an `Unknown` with its label if one is lacking.
 
-    Planes are a copy, which the caller may write over (DNGaussian). Their gradient counts only where something is
-    drawn: that of depth / alpha, say, is nan elsewhere (2DGS).
+    Planes are a copy, which the caller may overwrite (DNGaussian). Their gradient is taken only where something is
+    drawn: elsewhere that of depth / alpha, say, is nan (2DGS).
     """
     parts = str(kind).split("+")
     if not found.keys() >= set(parts):
@@ -200,8 +200,8 @@ def rasterizer_module(name: str, names: Iterable[str] = (), outputs: tuple[str, 
     """Make a module with the interface of a rasterizer package.
 
     Its classes are new for every call: a patch of their ``forward`` ends with the module. ``names`` are those of
-    further classes, of settings if they end with ``Settings``; ``outputs`` names what the result has, by default what
-    its caller calls it. Whatever else is imported from it is refused by name, as an ImportError.
+    further classes, of settings if they end with ``Settings``; ``outputs`` names the rendered values, by default as
+    their caller does. Importing anything else from it raises an ImportError with its name.
 
     Example:
         >>> module = rasterizer_module("diff_gaussian_rasterization")

@@ -42,9 +42,9 @@ class GaussianRasterizationSettings(_Fields):
     ``viewmatrix`` is world to camera, ``projmatrix`` world to clip space, both (4, 4); sizes are in pixels, ``tanfovx``
     and ``tanfovy`` tangents of half the fields of view. ``confidence`` (N, 1) is a factor on the gradients of every
     Gaussian (FSGS, CoR-GS), ``antialiasing`` that of INRIA since October 2024, ``pixel_weights`` (H, W) asks for the
-    scores of Taming 3DGS, and ``kernel_size`` is the blur of Mip-Splatting, square pixels. Not read are ``campos``,
-    which the view matrix has too, ``prefiltered`` and ``debug``. Further fields are left out, with a warning unless
-    they are None, or zeros.
+    scores of Taming 3DGS, and ``kernel_size`` is the blur of Mip-Splatting, square pixels. ``campos``, which the view
+    matrix tells as well, ``prefiltered`` and ``debug`` are ignored; so are further fields, with a warning unless they
+    are None, False or zeros.
     """
 
     __slots__ = ()
@@ -57,10 +57,7 @@ class GaussianRasterizationSettings(_Fields):
 
 
 def warn_of_ignored(kind: str, values: dict[str, Any]) -> None:
-    """Warn, once each, of values that the stand-in does not know; None, False and zeros are nothing to ignore.
-
-    Zeros that wait for a gradient are something.
-    """
+    """Warn, once per name, of values that the stand-in ignores; not of None, False or zeros without a gradient."""
     for name, value in sorted(values.items()):
         if (value.requires_grad or value.any()) if isinstance(value, Tensor) else value not in (None, False):
             _warn(kind, name)
@@ -80,7 +77,7 @@ def camera_of(settings: GaussianRasterizationSettings) -> Camera:
     The principal point is the projection matrix's: the picture's center in the INRIA code, elsewhere in some forks.
 
     Raises:
-        ValueError: if the projection matrix is no pinhole camera with the fields of view of the settings.
+        ValueError: if the projection matrix is not that of a pinhole camera with the settings' fields of view.
 
     Example:
         >>> lens = torch.tensor([[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 1, 1], [0, 0, -0.01, 0]])

@@ -21,7 +21,7 @@ def surface_planes(
 
     The normal of a Gaussian is its shortest axis, turned to the camera; a pixel's is the sum of weight times normal.
     The distortion is that of 2DGS, equation 13, of depths mapped by ``FAR / (FAR - NEAR) (1 - NEAR / z)``. Depths are
-    those of the centers, where 2DGS intersects the surfels, and the mean depth stands where 2DGS has the median.
+    those of the centers, whereas 2DGS intersects the surfels; the mean depth takes the place of 2DGS's median.
 
     Args:
         rendering: with depth.

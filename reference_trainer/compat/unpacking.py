@@ -1,4 +1,4 @@
-"""What a caller makes of the results of a function: the names that it assigns them to, read from its source."""
+"""The names to which a caller assigns the results of a function, read from its source."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def names_of_results() -> tuple[str, ...] | None:
     """Return the names to which the caller of a stand-in assigns the members of its result; None if it cannot be told.
 
     They are those of ``image, radii = rasterizer(...)``, or of ``image, radii = result`` if that is how the same
-    function takes apart its ``result = rasterizer(...)``. For ``rasterizer(...)[1]`` they are ("0", "1").
+    function unpacks its ``result = rasterizer(...)``. For ``rasterizer(...)[1]`` they are ("0", "1").
 
     Example:
         >>> def distances():
@@ -40,13 +40,13 @@ def names_of_results() -> tuple[str, ...] | None:
 
 
 def _is_between(module: str) -> bool:
-    """Whether a module is none of the caller's."""
+    """Whether a module lies between caller and stand-in."""
     return any(module == name or module.startswith(f"{name}.") for name in _BETWEEN)
 
 
 @functools.lru_cache(maxsize=64)
 def _uses(source: str) -> Mapping[_Place, tuple[str, ...]]:
-    """Return the names by the places of the calls whose results are taken apart."""
+    """Return the names by the place of each call whose result is unpacked."""
     found: dict[_Place, tuple[str, ...]] = {}
     try:
         tree = ast.parse(source)

@@ -1,1 +1,1 @@
-"""Loops over arrays that numba compiles, and the threads that run them."""
+"""Loops over arrays, compiled by numba, and the threads that run them."""

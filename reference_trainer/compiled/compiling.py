@@ -1,4 +1,4 @@
-"""How the loops are compiled: once per machine, kept on the disk where that can be written."""
+"""Compiling the loops: once per machine, cached on disk where possible."""
 
 from __future__ import annotations
 
@@ -21,19 +21,18 @@ __all__ = ["KERNELS", "describe_compilation", "inlined", "kernel", "prefetch", "
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# Sums may be reordered and products fused. Nothing may assume that there are no nan and infinity: what the checks of
-# the inputs see must be what is there.
+# Sums may be reordered and products fused, but nan and infinity must survive: the checks of the inputs rely on them.
 _FAST = {"nsz", "contract", "reassoc", "arcp", "afn"}
 
 KERNELS: list[Any] = []
-"""All that were made; those of modules that are not imported yet are missing."""
+"""All kernels of the modules that have been imported."""
 
 
 def _digest() -> str:
-    """Return a hash of all that is compiled into kernels of other files.
+    """Return a hash of all sources that are compiled into kernels of other files.
 
-    numba looks at the file of a kernel alone, and would go on using machine code into which an older version of
-    another file was inlined.
+    numba checks a kernel's own file alone, and would go on using machine code with an older version of another file
+    inlined.
     """
     package = Path(__file__).parents[1]
     sources = package / "render/constants.py", Path(__file__), *sorted((package / "render/loops").glob("*.py"))
@@ -44,13 +43,13 @@ _DIGEST = _digest()
 
 
 def describe_compilation(folder: str | None) -> str:
-    """Return what happens, for people, when something must be compiled that will be kept in a folder, or nowhere."""
+    """Describe for people what happens when a loop must be compiled, to be cached in a folder, or nowhere."""
     when = "once on this machine" if folder else "in every process, as no folder can be written (set NUMBA_CACHE_DIR)"
     return f"Compiling the renderer's loops, {when}: about 20 s of one core."
 
 
 class _Log:
-    """Says once in a process that it compiles."""
+    """Logs once per process that loops are compiled."""
 
     said = False
 
@@ -66,10 +65,10 @@ _report: Callable[[str, str | None], None] = _Log()
 
 @contextmanager
 def reported_to(report: Callable[[str, str | None], None]) -> Iterator[None]:
-    """Tell a function, instead of the log, of every kernel that is compiled because it is not on the disk.
+    """Report every kernel that is compiled, for lack of a cached one, to a function instead of the log.
 
     Args:
-        report: receives the kernel's name, and the folder where it will be kept, None if there is none.
+        report: receives the kernel's name, and the folder of the cache, None if there is none.
     """
     global _report
     before, _report = _report, report
@@ -84,7 +83,7 @@ def _name(function: Callable[..., Any]) -> str:
 
 
 class _Kept(FunctionCache):
-    """Machine code on the disk; what is wrong with the disk costs the time to compile, and not the run."""
+    """Machine code on disk; a fault of the disk costs the time to compile, not the run."""
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         return (*super()._index_key(sig, codegen), _DIGEST)
@@ -110,7 +109,7 @@ class _Kept(FunctionCache):
 
 
 class _NotKept(NullCache):
-    """No machine code on the disk."""
+    """No machine code on disk."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
@@ -120,10 +119,10 @@ class _NotKept(NullCache):
 
 
 def kernel(function: F) -> F:
-    """Compile a loop over NumPy arrays; it runs without the interpreter's lock, so that threads run side by side.
+    """Compile a loop over NumPy arrays; it runs without the GIL, so that threads run in parallel.
 
-    The machine code is kept beside the source, or in the user's cache if that cannot be written, or nowhere if none
-    can: then every process compiles anew. ``NUMBA_CACHE_DIR`` goes before both.
+    The machine code is cached beside the source, or in the user's cache folder if that cannot be written, or nowhere if
+    neither can: then every process compiles anew. ``NUMBA_CACHE_DIR`` takes precedence over both.
     """
     compiled: Any = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy")(function)
     try:
@@ -136,21 +135,21 @@ def kernel(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """Compile a part of kernels into each of them."""
+    """Compile a function that is inlined into the kernels that call it."""
     compiled: F = numba.njit(inline="always", fastmath=_FAST, error_model="numpy")(function)
     return compiled
 
 
 @intrinsic
 def prefetch(_context: Any, _array: Any) -> Any:
-    """Have the beginning of an array fetched that is needed soon, so that nobody waits for the memory then."""
+    """Prefetch the beginning of an array that is needed soon."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         start = builder.bitcast(make_array(signature.args[0])(context, builder, arguments[0]).data, cgutils.voidptr_t)
         whole = ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [start.type, whole, whole, whole])
         fetch = builder.module.declare_intrinsic("llvm.prefetch", [start.type], kind)
-        builder.call(fetch, [start, *(whole(x) for x in (0, 3, 1))])  # to be read, and kept in all caches; data
+        builder.call(fetch, [start, *(whole(x) for x in (0, 3, 1))])  # for reading, into all cache levels, data
         return context.get_dummy_value()
 
     return types.void(_array), generate

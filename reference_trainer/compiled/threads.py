@@ -1,9 +1,9 @@
-"""Loops side by side: ranges of one loop are handed to threads, as many as PyTorch uses.
+"""Running loops in parallel: ranges of a loop are handed to as many threads as PyTorch uses.
 
-Kernels run without the interpreter's lock, so plain threads are enough, and with them what compilers' own thread pools
-break holds: several threads may call at once, processes may fork at any time (the new one goes on with one thread), and
-``OMP_NUM_THREADS`` and `torch.set_num_threads` decide for both libraries. Every range writes to places of its own, and
-no sum crosses ranges: results do not depend on the number of threads.
+Kernels run without the GIL, so plain threads are enough. Unlike compilers' own thread pools they allow several threads
+to call at once and processes to fork at any time (the child goes on with one thread), and ``OMP_NUM_THREADS`` and
+`torch.set_num_threads` hold for them as for PyTorch. Every range writes to its own memory, and no sum crosses ranges:
+results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ import torch
 
 __all__ = ["in_threads"]
 
-_RANGES = 32  # for each thread: so many that none waits long for the others
+_RANGES = 32  # per thread, enough that none waits long for the others
 _LEAST = 64  # items worth a call
 
 _pools: dict[int, ThreadPoolExecutor] = {}
 
 
 def _begin_forked_process() -> None:
-    """Forget the threads of the parent, which do not exist here: ours, and PyTorch's own.
+    """Forget the parent's threads, which do not exist here: ours, and PyTorch's own.
 
-    PyTorch would wait for the latter for ever; a worker of its DataLoader begins likewise.
+    PyTorch would wait for the latter forever; its DataLoader workers begin likewise.
     """
     _pools.clear()
     torch.set_num_threads(1)
@@ -39,15 +39,15 @@ if hasattr(os, "register_at_fork"):
 
 
 def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any, least: int = _LEAST) -> list[Any]:
-    """Call ``kernel(first, last, *arguments)`` for ranges that make up ``range(count)``; return what they return.
+    """Call ``kernel(first, last, *arguments)`` for ranges that make up ``range(count)``; return what the calls return.
 
-    Nothing is written any more when this returns, or raises: be it what a kernel raised, or KeyboardInterrupt.
+    Once this returns, or raises a kernel's error or KeyboardInterrupt, no thread writes any more.
 
     Args:
         kernel: compiled with `reference_trainer.compiled.compiling.kernel`.
-        count: of items.
-        arguments: of the kernel after the first two.
-        least: items worth a range of their own.
+        count: number of items.
+        arguments: of the kernel, after the first two.
+        least: number of items that is worth a range.
     """
     threads = torch.get_num_threads()
     size = max(least, -(-count // (_RANGES * threads)))
@@ -68,7 +68,7 @@ def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any, least: i
 
 
 def _start(work: Callable[[], Any], count: int, futures: list[Future[Any]]) -> None:
-    """Have work done by other threads; by none while the interpreter shuts down."""
+    """Submit work to other threads; to none while the interpreter shuts down."""
     pool = _pools.get(count)
     if pool is None:
         pool = _pools.setdefault(count, ThreadPoolExecutor(count, thread_name_prefix="loops"))
@@ -80,9 +80,9 @@ def _start(work: Callable[[], Any], count: int, futures: list[Future[Any]]) -> N
 
 
 def _finish(ranges: Iterator[int], futures: list[Future[Any]]) -> list[Future[Any]]:
-    """Wait for all that have begun, whatever Ctrl-C says meanwhile; return them. The others never begin.
+    """Wait for all calls that have begun, despite Ctrl-C, and return them; the others never begin.
 
-    Nobody takes the ranges that are left after an error or Ctrl-C any more.
+    Ranges that are left after an error or Ctrl-C are discarded.
     """
     interruption = None
     while True:

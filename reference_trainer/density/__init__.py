@@ -1,4 +1,4 @@
-"""Density control: strategies, one file each, and their registry: what ``--density`` knows by name."""
+"""Density control: the strategies, one per file, and their registry: what ``--density`` knows by name."""
 
 from ca_reg.registry import Registry
 from reference_trainer.density.absgrad import AbsGradDensity
@@ -36,4 +36,4 @@ DENSITY: Registry[DensityStrategy] = Registry(
     co_pruning=CoPruning,
     self_ensembling=SelfEnsembling,
 )
-"""What can be asked for by name; ``DENSITY.register("name")`` adds a class."""
+"""The strategies by name; ``DENSITY.register("name")`` adds a class."""

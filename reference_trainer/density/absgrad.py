@@ -1,4 +1,4 @@
-"""AbsGS's density control: what to split is told by absolute gradients, which do not cancel between pixels."""
+"""AbsGS's density control: absolute gradients, which do not cancel between pixels, decide what to split."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ __all__ = ["AbsGradDensity"]
 class AbsGradDensity(AdaptiveDensity):
     """Clones by the gradient of the projected center, splits by the sum of its absolute values over the pixels (AbsGS).
 
-    A Gaussian that is too large is pulled to different sides by different pixels, and the pulls cancel: AbsGS (Ye et
-    al. 2024) splits where ``mean over the steps of |(sum |g_x|, sum |g_y|)|`` is large, the sums over the pixels. All
-    else is `AdaptiveDensity` with the settings of `TrainConfig`, but for two of them, which are arguments here.
+    Pixels pull a Gaussian that is too large in different directions, and their gradients cancel: AbsGS (Ye et al. 2024)
+    splits where ``mean over the steps of |(sum |g_x|, sum |g_y|)|`` is large, the sums over the pixels. All else is
+    `AdaptiveDensity` with the settings of `TrainConfig`, but for two of them, which are arguments here.
     Defaults are the source's (TY424/AbsGS 87d7a5a, arguments/__init__.py); its pruning by pixel weight is off there.
 
     Dropped Gaussians: neither sum counts a step that dropped them.
 
     Args:
         clone_gradient: threshold of the signed gradient, in place of ``densify_gradient``.
-        split_gradient: threshold of the absolute one.
-        dense_fraction: larger Gaussians are split, smaller ones cloned, as the setting of this name.
-        opacity_ceiling: opacities are lowered to it, in (0, 1), ...
-        ceiling_every: ... every so many steps until densification ends; 0 never.
+        split_gradient: threshold of the absolute gradient.
+        dense_fraction: larger Gaussians are split, smaller ones cloned, as with the setting of this name.
+        opacity_ceiling: value that higher opacities are regularly lowered to, in (0, 1).
+        ceiling_every: number of steps between these, until densification ends; 0 never lowers.
 
     Raises:
         ValueError: if one is out of range.
@@ -60,17 +60,17 @@ class AbsGradDensity(AdaptiveDensity):
         self.split_gradient, self.opacity_ceiling, self.ceiling_every = split_gradient, opacity_ceiling, ceiling_every
 
     def begin(self, config: TrainConfig, scene: Scene, device: torch.device, count: int) -> None:
-        """Put the own thresholds into the settings."""
+        """Replace two settings by this strategy's own."""
         super().begin(dataclasses.replace(config, **self.settings), scene, device, count)  # type: ignore[arg-type]
 
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
-        """Lower opacities as well."""
+        """Do as the base class, then lower opacities if it is time."""
         super().before_step(optimizer, step)
         if self.ceiling_every and 0 < step < self.config.densify_end and step % self.ceiling_every == 0:
             reset_opacity(optimizer, self.opacity_ceiling)
 
     def selected(self, optimizer: GaussianOptimizer) -> Tensor:
-        """Take the large by their absolute gradients."""
+        """Select large Gaussians by their absolute gradients."""
         seen = self.statistics
         assert seen.absolute_sum is not None
         torn = seen.absolute_sum / seen.steps.clamp(min=1) >= self.split_gradient

@@ -24,8 +24,8 @@ __all__ = ["AdaptiveDensity"]
 class AdaptiveDensity(DensityStrategy):
     """Clones and splits where the gradient of the projected centers is large, prunes what is faint, resets opacities.
 
-    All thresholds and steps are those of `TrainConfig`; ``opacity_decay`` below 1 makes it Binocular3DGS's. Dropped
-    Gaussians are not counted in that step; they are pruned, reset and decayed by their plain opacities as all others.
+    All thresholds and steps are those of `TrainConfig`; ``opacity_decay`` below 1 makes it Binocular3DGS's. Gaussians
+    dropped in a step are not counted in it; like all others they are pruned, reset and decayed by plain opacity.
     """
 
     resets: ClassVar[bool] = True
@@ -35,7 +35,7 @@ class AdaptiveDensity(DensityStrategy):
         self.statistics = DensityStatistics.zeros(count, self.device, absolute="absgrad" in self.needs)
 
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
-        """Densify, prune, reset and decay as the schedule says for the steps that are done."""
+        """Densify, prune, reset and decay as scheduled after ``step`` steps."""
         config = self.config
         if config.opacity_decay < 1 and step > config.densify_from:
             decay_opacity(optimizer, config.opacity_decay)
@@ -76,29 +76,29 @@ class AdaptiveDensity(DensityStrategy):
         return self.statistics.mean_gradient >= self.config.densify_gradient
 
     def select(self, optimizer: GaussianOptimizer, keep: Tensor) -> None:
-        """Keep some Gaussians, (N,) bool, with what was counted of them."""
+        """Keep some Gaussians, (N,) bool, with their statistics."""
         optimizer.select(keep)
         self.statistics = self.statistics[keep]
 
     def split_generator(self, step: int) -> torch.Generator:
-        """Return the random numbers of the splits of a step."""
+        """Return the random generator for the splits of a step."""
         return stream(self.config.seed, step, "split", self.device)
 
     def observes(self, step: int) -> bool:
-        """Until the end of densification."""
+        """Whether densification has not ended."""
         return step < self.config.densify_end
 
     def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:
-        """Count the gradients of what was drawn."""
+        """Count the gradients of the Gaussians that were drawn."""
         means = splats.projection.means
         assert means.grad is not None
         absolute = means.absgrad if "absgrad" in self.needs else None  # type: ignore[union-attr]
         self.statistics.update(splats.indices, splats.lists.touched, means.grad, camera.width, camera.height, absolute)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the counts."""
+        """Return the statistics."""
         return self.statistics.named()
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Go on counting."""
+        """Restore the statistics."""
         self.statistics = DensityStatistics(**state)

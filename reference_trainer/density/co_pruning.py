@@ -1,4 +1,4 @@
-"""CoR-GS's density control: what has no counterpart in the other field goes."""
+"""CoR-GS's density control: Gaussians without a counterpart in the other field are pruned."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__ = ["CoPruning"]
 class CoPruning(AdaptiveDensity):
     """`AdaptiveDensity` that also prunes where the fields disagree (CoR-GS, Zhang et al. 2024, Sec. 3.3).
 
-    Every ``every`` steps after ``densify_from``, to the end of the training, a Gaussian goes that has no other field's
-    Gaussian nearer than a distance; all fields are compared as they were before one is pruned. It needs ``fields=2``.
+    Every ``every`` steps after ``densify_from``, to the end of the training, Gaussians that lack a neighbor nearer than
+    ``distance`` in any other field are pruned; all fields are compared before any is pruned. It needs ``fields=2``.
     Defaults are the source's for LLFF (jiaw-z/CoR-GS 1db13a4, train.py, lines 284-301).
 
-    Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; neighbors are looked for among all.
+    Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; neighbors are sought among all.
 
     Args:
         distance: world units, positive: 5 in the worlds of LLFF, 10 in those of DTU.

@@ -18,18 +18,19 @@ from reference_trainer.training.randomness import stream
 
 __all__ = ["MCMCDensity"]
 
-_MOST = 50  # Gaussians that are told apart at one place
-_OPACITIES = 0.005, 1 - torch.finfo(torch.float32).eps  # the least and the most that a copy gets
+_MOST = 50  # Gaussians at one place; more are treated as this many
+_OPACITIES = 0.005, 1 - torch.finfo(torch.float32).eps  # least and greatest opacity of a copy
 
 
 class MCMCDensity(DensityStrategy):
     """Relocates dead Gaussians, adds some, and moves all by noise (3DGS-MCMC, Kheradmand et al. 2024, Sec. 3).
 
     When the schedule densifies, every Gaussian with an opacity of at most ``prune_opacity`` becomes a copy of a live
-    one drawn by opacity, and then ``growth`` times as many are drawn among all, up to ``max_gaussians``; the n at one
-    place get the opacity ``1 - (1 - o)^(1/n)`` and the scales of equation 9, so that they look as the one did, and
-    those drawn begin with a cleared optimizer. After every step all centers move by ``Sigma xi``, xi normal with the
-    standard deviation ``noise x (rate of the means) x sigmoid(100 (0.005 - o))``: only the faint feel it.
+    one drawn by opacity. Then further copies, drawn likewise, raise the number of Gaussians by the factor ``growth``,
+    up to ``max_gaussians``. The n at one place get the opacity ``1 - (1 - o)^(1/n)`` and the scales of equation 9, so
+    that they look as the one did; the optimizer state of those drawn is cleared. After every step all centers move by
+    ``Sigma xi``, xi normal with standard deviation ``noise x (rate of the means) x sigmoid(100 (0.005 - o))``: only
+    faint Gaussians move visibly.
 
     Of `TrainConfig` it reads seed, schedule (``densify_from``, ``_until``, ``_every``), ``prune_opacity``,
     ``max_gaussians`` and the rate of the means; there are no splits, resets or decay. Defaults are the source's
@@ -37,12 +38,12 @@ class MCMCDensity(DensityStrategy):
     ``initial_scale=0.1``, a limit for every scene, and a loss of 0.01 times the mean opacity and 0.01 times the mean
     scale, without which few Gaussians die.
 
-    Dropped Gaussians: treated as all others, by their plain opacities; no gradient is looked at. It has no state but
-    the step, on which its random numbers depend.
+    Dropped Gaussians: treated like all others, by their plain opacities; gradients are not used. It has no state: its
+    random numbers depend on seed and step.
 
     Args:
-        noise: at least 0.
-        growth: at least 1.
+        noise: strength of the exploration noise, at least 0.
+        growth: factor on the number of Gaussians, at least 1.
 
     Raises:
         ValueError: if one is out of range.
@@ -57,7 +58,7 @@ class MCMCDensity(DensityStrategy):
 
     @torch.no_grad()
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
-        """Relocate and grow as the schedule says for the steps that are done, and move the centers."""
+        """Relocate and grow as scheduled after ``step`` steps, and move the centers."""
         if self.is_due(step):
             refuse_not_finite(optimizer, step)
             generator = stream(self.config.seed, step, "relocation", self.device)
@@ -84,16 +85,16 @@ def relocate(optimizer: GaussianOptimizer, dead: Tensor, generator: torch.Genera
 
 
 def drawn_copies(optimizer: GaussianOptimizer, weights: Tensor, count: int, generator: torch.Generator) -> Gaussians:
-    """Return copies of Gaussians that are drawn in proportion to weights (N,), and shrink those as well."""
+    """Return copies of Gaussians drawn in proportion to weights (N,), and shrink the originals as well."""
     drawn = torch.multinomial(weights, count, replacement=True, generator=generator)
     copies = shared(optimizer.gaussians, drawn)
-    optimizer.relocate(drawn, copies)  # opacity and scales: all else is the same
+    optimizer.relocate(drawn, copies)  # only opacity and scales change
     optimizer.forget(drawn)
     return copies
 
 
 def shared(gaussians: Gaussians, drawn: Tensor) -> Gaussians:
-    """Return copies of the Gaussians that were drawn, each with the opacity and scales of its share of the place.
+    """Return copies of the drawn Gaussians, with the opacities and scales that make all at one place look as before.
 
     Args:
         gaussians: all N.

@@ -1,4 +1,4 @@
-"""What density control does to Gaussians: clone, split, prune, lower their opacities."""
+"""The operations of density control: clone, split and prune Gaussians, and lower their opacities."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 _SPLIT_INTO = 2
-_SPLIT_SHRINK = 0.8 * _SPLIT_INTO  # children of a split are this much smaller, as in the INRIA code
+_SPLIT_SHRINK = 0.8 * _SPLIT_INTO  # children of a split are smaller by this factor, as in the INRIA code
 
 
 def clone(optimizer: GaussianOptimizer, selected: Tensor) -> None:
@@ -33,11 +33,11 @@ def clone(optimizer: GaussianOptimizer, selected: Tensor) -> None:
 
 
 def split(optimizer: GaussianOptimizer, selected: Tensor, *, generator: torch.Generator | None = None) -> None:
-    """Replace Gaussians by two smaller ones drawn from each, which stand at the end.
+    """Replace each selected Gaussian by two smaller ones, at positions drawn from it, appended at the end.
 
     Args:
         optimizer: holds the Gaussians; changed.
-        selected: which of them, (N,) bool; it may be shorter and leave those out that have been added since.
+        selected: which of them, (N,) bool; may be shorter, leaving out those that have been added since.
         generator: for the positions of the children.
     """
     gaussians = optimizer.gaussians.map(torch.Tensor.detach)
@@ -71,14 +71,14 @@ def densify(
 
 
 def is_large(optimizer: GaussianOptimizer, size: float) -> Tensor:
-    """Return which Gaussians have a standard deviation above ``size``, world units; shape (N,) bool."""
+    """Return which Gaussians have a standard deviation above ``size``, in world units; shape (N,) bool."""
     return optimizer.gaussians.scales.detach().amax(dim=1) > size
 
 
 def refuse_not_finite(optimizer: GaussianOptimizer, step: int) -> None:
-    """Raise a TrainingStoppedError if a parameter is nan or infinite: the renderer would tell, but too late.
+    """Raise a TrainingStoppedError if a parameter is nan or infinite: the renderer would notice, but too late.
 
-    Pruning takes for faint what is not a number.
+    Pruning would remove Gaussians with a nan opacity as too faint.
     """
     if not all(bool(x.isfinite().all()) for _, x in optimizer.gaussians.named()):
         raise TrainingStoppedError(f"Gaussians became nan or infinite by step {step}: lower the learning rates.")
@@ -89,8 +89,8 @@ def prune(optimizer: GaussianOptimizer, *, min_opacity: float, max_scale: float 
 
     Args:
         optimizer: holds the Gaussians; changed.
-        min_opacity: fainter ones go; compared with the plain opacity, without any regularizer.
-        max_scale: Gaussians with a larger standard deviation go, world units; None keeps them.
+        min_opacity: fainter ones are removed; compared with the plain opacity, without any regularizer.
+        max_scale: Gaussians with a larger standard deviation, in world units, are removed; None keeps them.
     """
     keep = optimizer.gaussians.opacities.detach() >= min_opacity
     if max_scale is not None:

@@ -1,4 +1,4 @@
-"""FSGS's density control: new Gaussians between those that stand far from their neighbors."""
+"""FSGS's density control: new Gaussians between those that are far from their neighbors."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ class ProximityDensity(AdaptiveDensity):
 
     A Gaussian is sparse if the mean of the *squared* distances to its 3 nearest neighbors exceeds a multiple of the
     scene's extent, and its largest standard deviation exceeds the extent. At every densification sparse ones are split
-    as well; before step ``until`` each gets three more: halfway to each neighbor, with opacity and scales of the
-    neighbor, no rotation, and spherical harmonics zero, which is gray. Defaults, order and the comparison of a square
+    as well; before step ``until`` each adds three more: halfway to each neighbor, with the neighbor's opacity and
+    scales, no rotation, and zero spherical harmonics, which is gray. Defaults, order and the comparison of a square
     with a length, which depends on the unit of the scene, are the source's (VITA-Group/FSGS a536a64,
-    scene/gaussian_model.py, lines 405-490), but not its pairs: with several sparse Gaussians, its new ones stand
+    scene/gaussian_model.py, lines 405-490). Its pairs are not: with several sparse Gaussians, it places new ones
     between one and the neighbors of another.
 
-    Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; who is whose neighbor is asked of all.
+    Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; neighbors are sought among all.
 
     Args:
         until: step before which Gaussians are added between others.
-        distance: of the sparse that are unpooled, in units of the extent; positive.
-        split_distance: of the sparse that are split; positive.
+        distance: multiple of the extent beyond which sparse Gaussians are unpooled; positive.
+        split_distance: multiple of the extent beyond which they are split; positive.
 
     Raises:
         ValueError: if one is out of range.
@@ -48,7 +48,7 @@ class ProximityDensity(AdaptiveDensity):
         self.unpool_until, self.distance, self.split_distance = until, distance, split_distance
 
     def grow(self, optimizer: GaussianOptimizer, step: int) -> None:
-        """Clone, split and unpool, in this order: each sees what the ones before have added."""
+        """Clone, split and unpool, in this order: each sees what the previous ones have added."""
         steep, large = self.selected(optimizer), is_large(optimizer, self.large)
         clone(optimizer, steep & ~large)
         sparse = self._sparse(optimizer, self.split_distance)[0]
@@ -69,7 +69,7 @@ class ProximityDensity(AdaptiveDensity):
 
 
 def between(gaussians: Gaussians, selected: Tensor, neighbors: Tensor) -> Gaussians:
-    """Return new Gaussians halfway from the selected to each of their neighbors, whose size and opacity they have.
+    """Return new Gaussians halfway from the selected to each of their neighbors, with the neighbor's size and opacity.
 
     Args:
         gaussians: all N.

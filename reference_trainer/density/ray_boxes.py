@@ -23,16 +23,16 @@ __all__ = ["RayBoxDensity", "ray_box", "worst_region"]
 class RayBoxDensity(AdaptiveDensity):
     """`AdaptiveDensity` with the cross-ray densification and the threshold of MVGS (Du et al. 2024).
 
-    At every densification a few training views are drawn at random. The rays of the corners of each one's worst region
-    (`worst_region`) meet those of every other one's; all Gaussians inside such a box (`ray_box`) are cloned too,
-    whatever their size. If two of the cameras are more than 1 apart, each divided by its distance from the origin of
-    the world, ``densify_gradient`` counts half. The source (xiaobiaodu/MVGS ec9b30e, train.py and
-    scene/gaussian_model.py) takes the views of the step; here they are rendered for it, which leaves no state.
+    At every densification a few training views are drawn at random. For each pair of them, rays through the corners
+    of their worst regions (`worst_region`) span a box (`ray_box`); all Gaussians inside are cloned too, whatever their
+    size. If two of the cameras' positions, normalized to distance 1 from the world's origin, are more than 1 apart,
+    ``densify_gradient`` is halved. The source (xiaobiaodu/MVGS ec9b30e, train.py and scene/gaussian_model.py) takes the
+    views of the step; here they are rendered anew, which leaves no state.
 
     Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; regions are those of the plain model.
 
     Args:
-        views: at least 2; of fewer training views all.
+        views: number of views, at least 2; all, if there are fewer training views.
         height: of a region, pixels, positive.
         width: of a region, pixels, positive.
 
@@ -60,7 +60,7 @@ class RayBoxDensity(AdaptiveDensity):
         split(optimizer, steep & large, generator=self.split_generator(step))
 
     def _inside(self, optimizer: GaussianOptimizer, views: Sequence[View], step: int) -> Tensor:
-        """Return which Gaussians are in the box of two views, shape (N,) bool."""
+        """Return which Gaussians are in the box of any two views, shape (N,) bool."""
         gaussians = optimizer.gaussians.map(torch.Tensor.detach)
         background, degree = self.scene.background.to(self.device), self.config.sh_degree_at(step)
         regions = []
@@ -76,17 +76,17 @@ class RayBoxDensity(AdaptiveDensity):
 
 
 def worst_region(error: Tensor, height: int, width: int) -> Tensor:
-    """Return the corners of the region of a picture with the largest mean, the first of equals.
+    """Return the corners of the region of a picture with the largest mean; the first of equal ones.
 
     Args:
         error: shape (H, W).
-        height: of a region, pixels. Regions stand side by side from the upper left on, and end before the last row and
-            column; one that would be larger is as large as fits.
+        height: of a region, pixels. Regions tile the picture from the upper left, without its last row and column; one
+            that would be larger is cut to that size.
         width: of a region, pixels.
 
     Returns:
         Centers of the pixels at the corners, (x, y): upper left and right, lower left and right, shape (4, 2). The
-        right and lower ones are those behind the last pixel of the region.
+        right and lower ones lie one pixel outside the region.
 
     Example:
         >>> error = torch.zeros(9, 9)
@@ -112,8 +112,8 @@ def ray_box(one: Camera, corners: Tensor, other: Camera, others: Tensor) -> tupl
         others: pixels of its rays, in the same order, shape (M, 2).
 
     Returns:
-        Lower and upper corner of the box along the axes of the world, shape (3,) each. A point is the middle of the
-        shortest line between two rays, be it behind a camera.
+        Lower and upper corner of the axis-aligned box in the world, shape (3,) each. A point is the middle of the
+        shortest segment between two rays' lines, even if it lies behind a camera.
 
     Example:
         >>> from reference_trainer.camera import Camera

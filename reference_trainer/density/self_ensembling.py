@@ -29,26 +29,26 @@ _BOX = 5  # pixels, over which deviations are averaged
 class SelfEnsembling(CoPruning):
     """`CoPruning` that perturbs the second field where the first is uncertain (SE-GS, Zhao et al., ICCV 2025).
 
-    Every ``every`` steps the first field is rendered at the same `pseudo_cameras`. From ``start`` to ``stop`` the
-    standard deviation over this and the last two times, mean over the channels and over 5 x 5 pixels, tells where it is
-    uncertain: where that exceeds ``least`` and all but the ``share`` of a picture's largest. The other field's
-    Gaussians whose center lies within such a picture, nearer to an uncertain pixel than the root of their radius in
-    pixels, get the noise of `SEGSNoise`, for good, and the optimizer forgets the geometry of all. The root, for the
-    source compares a squared distance with a radius. It keeps two pictures of every view, also in checkpoints.
+    Every ``every`` steps the first field is rendered at the same `pseudo_cameras`. From ``start`` to ``stop`` it is
+    uncertain where the standard deviation over the last three of these times, averaged over the channels and 5 x 5
+    pixels, exceeds ``least`` and is among the ``share`` of a picture's largest. The other field's Gaussians whose
+    center lies within such a picture, nearer to an uncertain pixel than the root of their radius in pixels, get the
+    noise of `SEGSNoise`, for good, and the optimizer state of all Gaussians' geometry is cleared. (The root, because
+    the source compares a squared distance with a radius.) Two pictures of every view are kept, also in checkpoints.
 
     Defaults are the source's for LLFF (sailor-z/SE-GS 43668d7, train_llff.py); one thing differs: Gaussians too faint
-    to be drawn, below 1/255, are not perturbed. Dropped Gaussians: as `CoPruning`; the pictures are of the plain model.
+    to be drawn, below 1/255, are not perturbed. Dropped Gaussians: as in `CoPruning`; the plain model is rendered.
 
     Args:
-        distance: of `CoPruning`.
-        every: of both, steps.
+        distance: as in `CoPruning`.
+        every: steps between prunings and between renders.
         first: ratio of the noise at ``start``.
-        last: the ratio at ``stop``.
-        start: first step with noise; before twice ``every`` there are no three pictures.
-        stop: first step without it again.
-        views: how many cameras.
-        share: of the pixels of a picture, in (0, 1).
-        least: standard deviation, in colors of [0, 1].
+        last: ratio of the noise at ``stop``.
+        start: first step with noise; at least twice ``every``, for three pictures.
+        stop: first step without noise again.
+        views: number of cameras.
+        share: greatest share of a picture's pixels that is uncertain, in (0, 1).
+        least: smallest standard deviation of an uncertain pixel, in colors of [0, 1].
 
     Raises:
         ValueError: if one is out of range, or the scene has no `pseudo_cameras`.
@@ -84,7 +84,7 @@ class SelfEnsembling(CoPruning):
 
     @torch.no_grad()
     def together(self, fields: Sequence[Field], step: int) -> None:
-        """Prune all fields, look at the first and perturb the others."""
+        """Prune all fields, render the first and perturb the others."""
         super().together(fields, step)
         if step % self.every or not self.start - 2 * self.every <= step < self.stop:
             return
@@ -109,7 +109,7 @@ class SelfEnsembling(CoPruning):
         return deviation > limit.clamp(min=self.least)[:, None, None]
 
     def under(self, gaussians: Gaussians, uncertain: Tensor) -> Tensor:
-        """Return which Gaussians lie at uncertain pixels, (V, H, W), of a camera, shape (N,), bool."""
+        """Return which Gaussians lie at uncertain pixels (V, H, W) of any camera, shape (N,), bool."""
         found = torch.zeros(len(gaussians), dtype=torch.bool, device=uncertain.device)
         for camera, where in zip(self.cameras, uncertain, strict=True):
             splats = splat(**arguments(gaussians), camera=camera, sh_degree=0)
@@ -139,11 +139,11 @@ class SelfEnsembling(CoPruning):
         field.optimizer.forget(slice(None), *geometry)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the counts, and the pictures of the first field."""
+        """Return the statistics, and the pictures if this is the first field."""
         return super().state_dict() | ({} if self.field else {"pictures": self.pictures})
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Go on counting and comparing."""
+        """Restore the statistics and pictures."""
         super().load_state_dict({name: x for name, x in state.items() if name != "pictures"})
         if self.field == 0:
             self.pictures = state["pictures"]

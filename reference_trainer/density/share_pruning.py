@@ -1,4 +1,4 @@
-"""Density control that removes those who co-adapt most for what they contribute."""
+"""Density control that removes the Gaussians that co-adapt most for what they contribute."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["SharePruning"]
 class SharePruning(AdaptiveDensity):
     """`AdaptiveDensity` that also prunes by the share of the exact score per blend weight.
 
-    Every ``every`` steps between ``densify_from`` and ``densify_until`` the ``fraction`` of the Gaussians goes whose
-    `ca_reg.attribute` shares, summed over the training views, are highest in relation to their blend weights; those
-    without a share stay. No published method: the criterion of docs/studies.md that lowered the score most at equal
-    count, applied to a finished model there. It costs an exact score, its shares and a backward pass for every
-    training view each time.
+    Every ``every`` steps between ``densify_from`` and ``densify_until`` this removes the ``fraction`` of the Gaussians
+    whose `ca_reg.attribute` shares, summed over the training views, are highest relative to their blend weights; those
+    without a share stay. Not a published method: in docs/studies.md, where finished models were pruned, this criterion
+    lowered the score most at equal count. Each time costs an exact score, its shares and a backward pass per training
+    view.
 
     Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; shares and weights are those of the plain
-    opacities, no draw and no test-time scaling in them.
+    opacities, without draws or test-time scaling.
 
     Args:
         every: positive number of steps.
@@ -44,13 +44,13 @@ class SharePruning(AdaptiveDensity):
         self.every, self.fraction, self.drop_rate = every, fraction, drop_rate
 
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
-        """Prune by share as well, after all else; the others keep what was counted of them."""
+        """Prune by share as well, after all else; the other Gaussians keep their statistics."""
         super().before_step(optimizer, step)
         if self.config.densify_from < step < self.config.densify_end and step % self.every == 0:
             self.select(optimizer, all_but_highest(self.shares_per_weight(optimizer, step), self.fraction))
 
     def shares_per_weight(self, optimizer: GaussianOptimizer, step: int) -> Tensor:
-        """Return the quotients over the training views of the Gaussians as they are, shape (N,), float64."""
+        """Return each current Gaussian's share per blend weight over the training views, shape (N,), float64."""
         model = TrainedModel(
             optimizer.gaussians.map(torch.Tensor.detach),
             self.scene.background.to(self.device),

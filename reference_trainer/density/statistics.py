@@ -1,4 +1,4 @@
-"""What was seen of every Gaussian since the last densification."""
+"""Statistics of every Gaussian since the last densification."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ __all__ = ["DensityStatistics"]
 
 @dataclass
 class DensityStatistics:
-    """What was seen of every Gaussian since the last densification.
+    """Gradients of every Gaussian, and steps that drew it, since the last densification.
 
     A Gaussian that a step did not draw (outside the view, or dropped by a regularizer) is not counted in that step. If
     dropped Gaussians were counted with their zero gradient, the threshold would in effect rise by 1 / (1 - p).
 
     Args:
-        gradient_sum: summed norms of the loss gradient with respect to the projected center, in units of half the image
-            size per unit (the INRIA code's normalized device coordinates), shape (N,).
+        gradient_sum: summed norms of the loss gradient with respect to the projected center in normalized device
+            coordinates, as in the INRIA code: times half the image size, shape (N,).
         steps: the number of steps that drew it, shape (N,).
-        absolute_sum: as ``gradient_sum``, of absolute gradients; None where they are not looked at.
+        absolute_sum: as ``gradient_sum``, of absolute gradients; None where they are not used.
     """
 
     gradient_sum: Tensor
@@ -47,7 +47,7 @@ class DensityStatistics:
         Args:
             indices: the Gaussians that may have been drawn, each once, shape (M,).
             drawn: which of them were, shape (M,) bool.
-            gradient: of the loss with respect to their projected centers, per pixel, 0 of the others, shape (M, 2).
+            gradient: of the loss with respect to their projected centers, per pixel; 0 if not drawn, shape (M, 2).
             width: image width, pixels.
             height: image height, pixels.
             absolute: the sums over the pixels of the absolute gradients, shape (M, 2).
@@ -59,11 +59,11 @@ class DensityStatistics:
         self.steps.index_add_(0, indices, drawn.to(self.steps))
 
     def named(self) -> dict[str, Tensor]:
-        """Return what there is, by name."""
+        """Return the statistics that are kept, by name."""
         return {name: x for name, x in vars(self).items() if x is not None}
 
     def __getitem__(self, index: Tensor) -> DensityStatistics:
-        """Return those of some Gaussians."""
+        """Return the statistics of some Gaussians."""
         return DensityStatistics(**{name: x[index] for name, x in self.named().items()})
 
     @property

@@ -22,18 +22,18 @@ __all__ = ["DensityStrategy"]
 
 
 class DensityStrategy(abc.ABC):
-    """Adds and removes Gaussians between the steps; a strategy of one's own is a subclass.
+    """Adds and removes Gaussians between the steps; custom strategies are subclasses.
 
     It is made from its arguments alone and told of the training by `begin`. Every step the trainer calls `before_step`,
-    then `observe` for every render that trains, then moves the Gaussians. What it counts belongs into `state_dict`, for
-    a resumed training to be the same.
+    then `observe` for every render that trains, then updates the Gaussians. What it counts must be in `state_dict`, so
+    that a resumed training is the same.
 
-    Gaussians that a regularizer dropped are not among those drawn: `observe` must not count them as seen. If they were
-    counted with their gradient of zero, a threshold would in effect rise by 1 / (1 - p).
+    Gaussians that a regularizer dropped are not drawn: `observe` must not count them as seen. If they were counted with
+    their gradient of zero, a threshold would in effect rise by 1 / (1 - p).
 
     Attributes:
-        needs: of the renderer: ``"absgrad"`` for ``splats.projection.means.absgrad``, sums of absolute gradients; of
-            the training: ``"fields"``, at least two.
+        needs: what it requires: ``"absgrad"`` of the renderer, for ``splats.projection.means.absgrad``, the sums of
+            absolute gradients; ``"fields"`` of the training, at least two.
         resets: whether it obeys the ``opacity_reset`` settings.
         field: the number of the field that it controls, if a training has several.
     """
@@ -57,7 +57,7 @@ class DensityStrategy(abc.ABC):
             device: of the Gaussians.
             count: their number.
         """
-        self.config = replace(config, seed=config.seed + (self.field << 32))  # every field splits by its own numbers
+        self.config = replace(config, seed=config.seed + (self.field << 32))  # every field has its own random splits
         self.scene, self.extent, self.device = scene, scene.extent, device
         self.large = config.dense_fraction * self.extent  # what is larger is split, what is smaller cloned
         self.reset(count)
@@ -68,28 +68,28 @@ class DensityStrategy(abc.ABC):
         return bool(every) and self.config.densify_from < step < self.config.densify_end and step % every == 0
 
     def reset(self, count: int) -> None:  # noqa: B027 (not every strategy counts)
-        """Forget what was counted, for so many Gaussians."""
+        """Start counting anew, for ``count`` Gaussians."""
 
     @abc.abstractmethod
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Change the set of Gaussians before the step with this number, the first being 0.
 
-        Before a step and not after it, so that whoever looks at the model between steps finds it optimized: a clone
-        doubles the opacity of its place until the next steps have adapted to it.
+        Before a step and not after it, so that between steps the model is always optimized: a clone lays a second splat
+        over the first until further steps have adapted to it.
 
         Raises:
             TrainingStoppedError: if the Gaussians are not finite, or none is left.
         """
 
     def together(self, fields: Sequence[Field], step: int) -> None:  # noqa: B027 (most look at one field alone)
-        """Change what depends on other fields, after each has had its `before_step`; the first one's is called."""
+        """Change what depends on several fields, after `before_step` of each; called on the first field's strategy."""
 
     def observes(self, step: int) -> bool:
-        """Whether `observe` is to be called at a step, and the renderer to do what the strategy needs."""
+        """Whether `observe` is to be called at a step, with what the strategy needs of the renderer."""
         return True
 
     def observe(self, splats: Splats | GsplatSplats, camera: Camera) -> None:  # noqa: B027
-        """Look at a render whose gradients have been computed.
+        """Count a render whose gradients have been computed.
 
         Args:
             splats: what was drawn; ``splats.projection.means.grad`` is the gradient per pixel of the projected centers.
@@ -97,8 +97,8 @@ class DensityStrategy(abc.ABC):
         """
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what was counted, tensors by name, float32."""
+        """Return the counts as float32 tensors by name."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:  # noqa: B027
-        """Go on with what `state_dict` returned."""
+        """Restore what `state_dict` returned."""

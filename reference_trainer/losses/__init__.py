@@ -1,4 +1,4 @@
-"""The terms of the training loss, one file each, and their registry: what ``--loss`` knows by name."""
+"""The terms of the training loss, one per file, and their registry: what ``--loss`` knows by name."""
 
 from ca_reg.registry import Registry
 from ca_reg.schedules import SCHEDULES
@@ -37,4 +37,4 @@ LOSSES: Registry[LossTerm] = Registry(
     consistency=Consistency,
     co_regularization=CoRegularization,
 )
-"""What can be asked for by name; ``LOSSES.register("name")`` adds a class."""
+"""The terms by name; ``LOSSES.register("name")`` adds a class."""

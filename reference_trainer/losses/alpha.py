@@ -1,4 +1,4 @@
-"""What is drawn outside the object, where a photograph says what is object."""
+"""A penalty on what is drawn where the photograph shows background."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Alpha(WeightedTerm):
 
     Args:
         weight: at least 0, or a schedule.
-        dark: without it the background is one minus the photograph's alpha; with it, `dark_background` of the
-            photograph. DNGaussian and Binocular3DGS have 30/255 on DTU, 15/255 for scan 110.
+        dark: threshold of `dark_background`, which then takes the place of one minus the photograph's alpha.
+            DNGaussian and Binocular3DGS use 30/255 on DTU, 15/255 for scan 110.
 
     Raises:
         ValueError: if one is out of range, or photographs have no alpha and ``dark`` is not given.
@@ -35,7 +35,7 @@ class Alpha(WeightedTerm):
         self._backgrounds: dict[str, Tensor] = {}
 
     def begin(self, scene: Scene) -> None:
-        """Refuse photographs of which nothing tells the background."""
+        """Refuse photographs without alpha if ``dark`` is not given."""
         if self.dark is None and (lacking := [view.name for view in scene.train if view.alpha is None]):
             raise ValueError(
                 f"{lacking} have no alpha channel, which alpha compares with: write alpha(dark=0.118) if the "

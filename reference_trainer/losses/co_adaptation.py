@@ -19,19 +19,19 @@ __all__ = ["CoAdaptation"]
 
 
 class CoAdaptation(WeightedTerm):
-    """``weight`` times the mean variance of the colors when each Gaussian is dropped with a rate of its own.
+    """``weight`` times the mean variance of the colors when each Gaussian is dropped independently, with rate ``p``.
 
-    The variance needs no photograph, so it may be taken where there is none: at virtual views. In an analytic step that
-    of its expectation at the training view is taken, which costs nothing; else the moments are rendered, which takes
-    about as long as the render.
+    The variance needs no photograph, so it can be taken at virtual views as well. At the training view an analytic step
+    has computed its variance already, which costs nothing more; else the moments are rendered, which takes about as
+    long as the render.
 
     Args:
         weight: at least 0, or a schedule.
         p: drop rate in [0, 1); in an analytic step the regularizer's own draws count at the training view instead.
         where: ``"training"``, the view of the step, or a camera drawn anew at each step: between two training cameras
-            on a ``"line"`` or on an ``"arc"`` (`cameras_between`), on an arc that goes half of its length ``"beyond"``
+            on a ``"line"`` or on an ``"arc"`` (`cameras_between`), on an arc extended by half its length ``"beyond"``
             either, or in their ``"box"`` (`pseudo_cameras`).
-        every: the term counts at every so many steps, by that factor more, so that ``weight`` is that of all steps.
+        every: the term acts once in so many steps, multiplied by their number, so that ``weight`` is the mean per step.
 
     Raises:
         ValueError: if one is out of range, or the scene has no such cameras.
@@ -56,16 +56,16 @@ class CoAdaptation(WeightedTerm):
         self.where, self.every = where, every
 
     def begin(self, scene: Scene) -> None:
-        """Look where cameras may stand."""
+        """Prepare the virtual cameras."""
         if self.where != "training":
             self.draw = VIRTUAL_VIEWS[self.where](scene)
 
     def acts(self, number: int) -> bool:
-        """Return whether it is the turn of a step, and its weight is not 0."""
+        """Return whether the term is due at a step, with a weight that is not 0."""
         return number % self.every == 0 and super().acts(number)
 
     def value(self, step: Step) -> Tensor:
-        """Return the mean variance, by the steps that it stands for."""
+        """Return the mean variance, times the number of steps that it stands for."""
         camera, variance = step.view.camera, step.variance
         if self.where != "training":
             camera, variance = self.draw(step.generator("co_adaptation")), None

@@ -1,4 +1,4 @@
-"""CoR-GS's comparison of the fields of a training with each other, from where there is no photograph."""
+"""CoR-GS's comparison of a training's fields with each other, at views without a photograph."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ __all__ = ["CoRegularization"]
 
 
 class CoRegularization(WeightedTerm):
-    """``weight`` times the photometric loss of every field's render to every other's, at a pseudo view (CoR-GS, 2024).
+    """``weight`` times the photometric loss between the renders of all fields, at a pseudo view (CoR-GS, 2024).
 
     At each step one of the `pseudo_cameras` is rendered with the plain model of every field, and each compared with the
     others as if they were photographs, mean over the others. Density control does not see these renders. It needs
     ``fields=2``, and costs a render of every field.
 
     Args:
-        weight: at least 0, or a schedule. The source has 1 from step 500 on with LLFF, from 2,000 on with DTU:
+        weight: at least 0, or a schedule. The source uses 1 from step 500 on with LLFF, from 2,000 on with DTU:
             ``between(1.0, 500)``.
         lambda_dssim: weight of the structural term, in [0, 1].
 
@@ -42,11 +42,11 @@ class CoRegularization(WeightedTerm):
         self.lambda_dssim = lambda_dssim
 
     def begin(self, scene: Scene) -> None:
-        """Look where cameras may stand."""
+        """Prepare the pseudo cameras."""
         self.draw = pseudo_cameras(scene)
 
     def value(self, step: Step) -> Tensor:
-        """Compare all fields at the step of the first, which stands for all."""
+        """Compare all fields, once: at the step of the first."""
         zero = step.image.new_zeros(())
         if step is not step.fields[0]:
             return zero

@@ -17,16 +17,16 @@ __all__ = ["Consistency"]
 
 
 class Consistency(WeightedTerm):
-    """``weight`` times the difference of the full render to a second one that drops Gaussians (DropoutGS, CVPR 2025).
+    """``weight`` times the difference between the full render and one that drops Gaussians (DropoutGS, CVPR 2025).
 
     Both renders are of the view of the step, and both learn. Sampled, as in the source: L1 + D-SSIM to a render with
     one draw of dropout at the constant rate p, its survivors not compensated. ``exact``: the expectation over all draws
     of the squared error, ``(mean - full)^2 + variance``, mean over pixels and channels, without a draw. The full render
-    is that of the step where no regularizer has changed it, else one more. Density control sees that of the step alone.
+    is the step's own, or an additional one if a regularizer has changed that. Density control sees the step's own only.
 
     Args:
-        p: drop rate in [0, 1). The source has 0.4 on LLFF, 0.3 on DTU, 0.1 to 0.2 on Blender.
-        weight: at least 0, or a schedule. The source has 0.2 on LLFF, 0.5 on DTU.
+        p: drop rate in [0, 1). The source uses 0.4 on LLFF, 0.3 on DTU, 0.1 to 0.2 on Blender.
+        weight: at least 0, or a schedule. The source uses 0.2 on LLFF, 0.5 on DTU.
         lambda_dssim: weight of the structural term, in [0, 1]; of the sampled form only.
         exact: take the expected squared error instead of a draw.
 
@@ -57,7 +57,7 @@ class Consistency(WeightedTerm):
         self.needs = frozenset({"moments"} if exact else ())
 
     def acts(self, number: int) -> bool:
-        """Return whether there is a rate, and a weight at this step."""
+        """Return whether neither the rate nor the weight at this step is 0."""
         return self.p > 0 and super().acts(number)
 
     def value(self, step: Step) -> Tensor:
@@ -70,7 +70,7 @@ class Consistency(WeightedTerm):
             return expected_squared_error(moments.mean, moments.variance, full).mean()
         params = self.dropout.regularize(step.params, step.generator("consistency"))
         dropped = step.render(camera, params).image
-        # The loss is differentiable in its first argument only, and symmetric: once each way, and its value once.
+        # The loss is symmetric, but differentiable in its first argument only: its gradient each way, its value once.
         one = photometric_loss(full, dropped.detach(), self.lambda_dssim)
         other = photometric_loss(dropped, full.detach(), self.lambda_dssim)
         return one + other - other.detach()

@@ -1,4 +1,4 @@
-"""A penalty of elongated Gaussians."""
+"""A penalty on elongated Gaussians."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Flat(WeightedTerm):
     """``weight * mean(max(longest / shortest axis - limit, 0))`` over the Gaussians: against needles and flakes.
 
     Args:
-        weight: at least 0, or a schedule. DNGaussian has 0.002 on LLFF and 0.005 on DTU.
-        limit: ratio that is free, at least 1, which is DNGaussian's but for a constant.
+        weight: at least 0, or a schedule. DNGaussian uses 0.002 on LLFF and 0.005 on DTU.
+        limit: ratio up to which nothing is penalized, at least 1; 1 gives DNGaussian's term but for a constant.
 
     Raises:
         ValueError: if one is out of range.

@@ -1,4 +1,4 @@
-"""A penalty of opacities: of all, or of those that are neither clear nor opaque."""
+"""A penalty on opacities, or a reward of opaque Gaussians."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Opacity(WeightedTerm):
     """``weight`` times the mean opacity (3DGS-MCMC), or with ``split`` DNGaussian's reward of opaque Gaussians.
 
     Args:
-        weight: at least 0, or a schedule. 3DGS-MCMC has 0.01 for the mean, DNGaussian 0.001 for its reward.
+        weight: at least 0, or a schedule. 3DGS-MCMC uses 0.01 for the mean, DNGaussian 0.001 for its reward.
         split: in (0, 1): the value is ``1 - mean(o^2 | o > split) + mean((1 - o)^2 | o < split)``, as in DNGaussian's
             code with 0.2; an empty part counts 0.
 

@@ -20,8 +20,8 @@ _HARD_OPACITY = 0.95
 class PatchDepth(PriorTerm):
     """``weight * (near * local + far * global)`` of DNGaussian (CVPR 2024), each a `patch_error` of rendered depth.
 
-    Patches tile the view without overlap; their side is drawn at each step, for the two parts apart. The source takes
-    an optimizer step for each pass; here they are terms of one loss: ``patch_depth(which="hard") +
+    Patches tile the view without overlap; their side is drawn at each step, separately for the two parts. The source
+    takes an optimizer step for each pass; here they are terms of one loss: ``patch_depth(which="hard") +
     patch_depth(which="soft")``.
 
     Args:
@@ -31,7 +31,7 @@ class PatchDepth(PriorTerm):
         far: weight of the global part.
         smallest: side of the smallest patch, pixels, at least 2; 17 on DTU.
         largest: side of the largest, 53 on DTU.
-        tolerance: differences up to it are free; 0.01 on DTU.
+        tolerance: differences up to this cost nothing; 0.01 on DTU.
         which: ``"plain"`` for the render of the step; ``"hard"`` for one with all opacities 0.95, of which only the
             positions learn; ``"soft"`` for one of the plain model, of which only the opacities learn. The source begins
             the soft pass at step 1,000.
@@ -87,7 +87,7 @@ class PatchDepth(PriorTerm):
 
 
 def patch_error(depth: Tensor, prior: Tensor, side: int, tolerance: float, *, overall: bool = False) -> Tensor:
-    """Return the mean squared difference of two pictures whose patches are normalized, where it exceeds a tolerance.
+    """Return the mean squared difference of two pictures, their patches normalized, where it exceeds a tolerance.
 
     A patch is centered and divided by its standard deviation, or with ``overall`` by that of the whole picture, through
     which no gradient goes; in either case plus 0.01 times that of all patches.

@@ -18,10 +18,10 @@ class Pearson(PriorTerm):
 
     D is the prior, larger where farther; for an inverse depth, such as MiDaS's, it is the negative of the file, and the
     two readings are the source's ``-file`` and ``1 / (file + 200)``. The second counts only where the prior spans a
-    good part of the offset. Pixels without a prior are left out; a depth or prior without contrast correlates with 0.
+    good part of the offset. Pixels without a prior are left out; without contrast in depth or prior, r is 0.
 
     Args:
-        weight: at least 0, or a schedule. The source has 0.05, and 0.001 after step 9,500.
+        weight: at least 0, or a schedule. The source uses 0.05, and 0.001 after step 9,500.
         offset: larger than every D; None for the first reading alone.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The photometric loss of 3D Gaussian Splatting, L1 + D-SSIM, made for being called at every step."""
+"""The photometric loss of 3D Gaussian Splatting, L1 + D-SSIM, optimized for being called at every step."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _C2 = 0.03**2
 
 
 class Photometric(WeightedTerm):
-    """The loss of 3D Gaussian Splatting against the photograph, `photometric_loss`; in an analytic step its mean.
+    """The loss of 3D Gaussian Splatting against the photograph, `photometric_loss`; in expectation if analytic.
 
     Args:
         lambda_dssim: weight of the structural term, in [0, 1].
@@ -80,11 +80,11 @@ def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -
 
 
 def expected_photometric_loss(mean: Tensor, variance: Tensor, target: Tensor, lambda_dssim: float = 0.2) -> Tensor:
-    """Return what `photometric_loss` is on average over random images of this mean and variance, approximately.
+    """Return, approximately, the mean of `photometric_loss` over random images of this mean and variance.
 
     The absolute error is that of normal pixels (`ca_reg.functional.expected_absolute_error`). In SSIM every local
-    moment is replaced by its expectation, and the variance counts as contrast within the window, not of the window's
-    mean, as it does where splats are smaller than the window.
+    moment is replaced by its expectation; all variance counts as contrast within the window and none as variance of the
+    window's mean, which holds where splats are smaller than the window.
 
     Args:
         mean: expected rendering, shape (3, H, W).
@@ -93,8 +93,8 @@ def expected_photometric_loss(mean: Tensor, variance: Tensor, target: Tensor, la
         lambda_dssim: weight of the structural term, in [0, 1].
 
     Returns:
-        A scalar, differentiable (once) in mean and variance; without variance, `photometric_loss` but for the rounding
-        error that the photograph is given.
+        A scalar, differentiable (once) in mean and variance; for variance 0 it is `photometric_loss`, but for the
+        rounding error that the photograph is assumed to have.
 
     Raises:
         ValueError: as `photometric_loss`.
@@ -113,9 +113,9 @@ def expected_photometric_loss(mean: Tensor, variance: Tensor, target: Tensor, la
 def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None = None) -> Tensor:
     """Return the SSIM of every pixel and channel: 11 x 11 Gaussian window, sigma 1.5, zeros beyond the border.
 
-    The same quantity as `reference_trainer.evaluation.metrics.ssim` before its mean. It is written here because forward
-    and backward take a third of the time of ``kornia.metrics.ssim`` (one CPU thread, 252 x 189 and 504 x 378). In
-    float32 a value errs by up to about 1e-3 in flat bright areas: for reports, take the float64 metric.
+    The same quantity as `reference_trainer.evaluation.metrics.ssim` before its mean, reimplemented because forward and
+    backward take a third of the time of ``kornia.metrics.ssim`` (one CPU thread, 252 x 189 and 504 x 378). In float32 a
+    value errs by up to about 1e-3 in flat bright areas: for reports, take the float64 metric.
 
     Args:
         image: a rendering, shape (C, H, W), floating point.
@@ -139,7 +139,7 @@ def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None = None) -> T
 
 
 def _with_ssim(error: Tensor, image: Tensor, target: Tensor, variance: Tensor | None, lambda_dssim: float) -> Tensor:
-    """Mix an error with the structural term, which costs nothing where it does not count."""
+    """Mix an error with the structural term, which is not computed if its weight is 0."""
     if lambda_dssim == 0:
         return error
     return error * (1 - lambda_dssim) + (1 - ssim_map(image, target, variance).mean()) * lambda_dssim
@@ -167,7 +167,7 @@ def _check_lambda(lambda_dssim: float) -> None:
 
 
 class _SSIMMap(torch.autograd.Function):
-    """SSIM with the hand-derived gradient in the image."""
+    """SSIM with hand-derived gradients with respect to image and variance."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, variance: Tensor | None) -> Tensor:
@@ -193,7 +193,7 @@ class _SSIMMap(torch.autograd.Function):
 
 
 def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
-    """Return SSIM = a1 a2 / (b1 b2), and its derivatives in the blurred x, x^2 + y^2 and x y.
+    """Return SSIM = a1 a2 / (b1 b2), and its derivatives with respect to the blurred x, x^2 + y^2 and x y.
 
     Args:
         blurred: x, y, x y and x^2 + y^2, shape (4, C, H, W).

@@ -1,4 +1,4 @@
-"""A penalty of large Gaussians."""
+"""A penalty on large Gaussians."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Scale(WeightedTerm):
     """``weight * mean(max(longest axis - limit, 0)^2)`` over the Gaussians.
 
     Args:
-        weight: at least 0, or a schedule. DNGaussian has 0.001 on LLFF and 0.005 on DTU, per square of a world unit.
-        limit: standard deviation that is free, at least 0, world units; DNGaussian has none.
+        weight: at least 0, or a schedule. DNGaussian uses 0.001 on LLFF and 0.005 on DTU, per squared world unit.
+        limit: standard deviation up to which nothing is penalized, at least 0, world units; DNGaussian has none.
 
     Raises:
         ValueError: if one is out of range.

@@ -15,11 +15,11 @@ __all__ = ["SmoothDepth"]
 class SmoothDepth(WeightedTerm):
     """``weight`` times kornia's inverse_depth_smoothness_loss of ``alpha / depth`` over its mean (Monodepth2, 2019).
 
-    ``sum over x and y of mean |dD| exp(-mean |dI|)``: forward differences, I the photograph, D the inverse of the mean
-    depth of a pixel, 0 where nothing is drawn, over the mean of D, so that the unit of length does not matter.
+    ``sum over x and y of mean |dD| exp(-mean |dI|)``: forward differences, I the photograph, D the inverse mean depth
+    of a pixel, 0 where nothing is drawn, divided by its own mean so that the unit of length does not matter.
 
     Args:
-        weight: at least 0, or a schedule. Monodepth2 has 0.001.
+        weight: at least 0, or a schedule. Monodepth2 uses 0.001.
 
     Raises:
         ValueError: if it is negative.

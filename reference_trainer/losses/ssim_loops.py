@@ -1,4 +1,4 @@
-"""What SSIM takes most of its time for, as loops: the window, and the formula with its derivatives."""
+"""The costly parts of SSIM as compiled loops: the window, and the formula with its derivatives."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def blur(maps: Tensor, weights: list[float]) -> Tensor:
     """Blur images (..., H, W) with a symmetric separable window, zeros beyond the border.
 
     Args:
-        maps: float32, on the processor.
+        maps: float32, on the CPU.
         weights: of the window's center and of the pixels to one side of it.
     """
     images = maps.contiguous().view(-1, *maps.shape[-2:])
@@ -74,12 +74,12 @@ def _similarity(first: int, last: int, blurred: Array, c1: float, c2: float, res
 
 
 def similarity(blurred: Tensor, c1: float, c2: float) -> tuple[Tensor, Tensor]:
-    """Return SSIM, and its derivatives in the blurred x, x^2 + y^2 and x y.
+    """Return SSIM, and its derivatives with respect to the blurred x, x^2 + y^2 and x y.
 
     Args:
-        blurred: x, y, x y and x^2 + y^2, float32 on the processor, shape (4, C, H, W).
-        c1: the constant beside the means.
-        c2: the constant beside the variances.
+        blurred: x, y, x y and x^2 + y^2, float32 on the CPU, shape (4, C, H, W).
+        c1: the constant added to the means.
+        c2: the constant added to the variances.
 
     Returns:
         Similarities (C, H, W) and derivatives (3, C, H, W).

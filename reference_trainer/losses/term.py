@@ -1,4 +1,4 @@
-"""The base classes of every term of the training loss."""
+"""The base classes of the terms of the training loss."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ __all__ = ["LossTerm", "PriorTerm", "WeightedTerm"]
 
 
 class LossTerm(abc.ABC):
-    """A summand of the loss of a step, its weight included; a term of one's own is a subclass.
+    """A summand of a step's loss, its weight included; custom terms are subclasses.
 
     Attributes:
-        needs: of the renderer, beside image and alpha: ``"depth"``, which the render of the step then has, or
-            ``"moments"``; of the training: ``"fields"``, at least two.
-        analytic: whether the term knows what to do with an expected image and its variance, without a draw.
+        needs: what it requires besides image and alpha: ``"depth"`` of the renderer, which the step's render then has,
+            or ``"moments"``; ``"fields"`` of the training, at least two.
+        analytic: whether the term works with an expected image and its variance, without a draw.
     """
 
     needs: frozenset[str] = frozenset()
     analytic: ClassVar[bool] = False
 
     def begin(self, scene: Scene) -> None:  # noqa: B027
-        """Look at the training views and the initial points before the first step.
+        """Examine the training views and the initial points before the first step.
 
         Raises:
             ValueError: if they lack what the term compares with.
@@ -49,7 +49,7 @@ class WeightedTerm(LossTerm):
         weight: at least 0, or a schedule: ``between(1.0, 20_000)``, ``ramp(0.0, 0.5, 2_000, 2_500)``, ``decay(...)``.
 
     Raises:
-        ValueError: if it is negative or not a number, of a schedule at the step that has such a weight.
+        ValueError: if it is negative or nan; a schedule raises at the step that has such a weight.
 
     Example:
         >>> from reference_trainer.losses import LOSSES
@@ -88,7 +88,7 @@ class PriorTerm(WeightedTerm):
     needs = frozenset({"depth"})
 
     def begin(self, scene: Scene) -> None:
-        """Raise a ValueError, which names them, if photographs have no prior."""
+        """Raise a ValueError that names the photographs without a prior, if any."""
         if lacking := [view.name for view in scene.train if view.depth_prior is None]:
             raise ValueError(
                 f"{type(self).__name__} compares with a depth of every training photograph, which {lacking} lack: name "

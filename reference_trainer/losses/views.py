@@ -18,11 +18,11 @@ __all__ = ["Views"]
 class Views(WeightedTerm):
     """``weight`` times the sum of the photometric losses of n - 1 further training views (MVGS, 2024).
 
-    Each is drawn as the view of the step is, with a draw of the regularizers of its own, and counted by density control
-    (the source counts the last one alone). ``photometric + views(3)`` makes three views a step.
+    Each is drawn like the view of the step, with its own draw of the regularizers, and counted by density control (the
+    source counts the last one alone). ``photometric + views(3)`` makes three views a step.
 
     Args:
-        n: views in a step, the step's own included, at least 2; of fewer training views all.
+        n: views in a step, including the step's own, at least 2; all, if there are fewer training views.
         weight: at least 0, or a schedule.
         lambda_dssim: of `photometric_loss`.
 

@@ -1,4 +1,4 @@
-"""Binocular3DGS's consistency of the rendered depth with a render from a camera beside the photograph's."""
+"""Binocular3DGS's consistency of the rendered depth with a render from a camera shifted sideways."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Warp(WeightedTerm):
 
 
 def warp_horizontally(image: Tensor, disparity: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a picture whose pixels are looked up to the right by a disparity, and where that stays inside.
+    """Sample a picture a disparity to the right of every pixel; return the result and where that stays inside.
 
     Args:
         image: shape (C, H, W).

@@ -1,1 +1,1 @@
-"""The Gaussians: parameters, optimizer, density control, PLY files."""
+"""The Gaussians: parameters, optimizer, relocation, rendering, PLY files."""

@@ -15,7 +15,7 @@ from reference_trainer.camera import Camera
 __all__ = ["PARAMETERS", "SH_C0", "Gaussians"]
 
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
-"""What every Gaussian has, by the names of the fields."""
+"""The parameters of every Gaussian, by the names of the fields."""
 
 SH_C0 = 0.28209479177387814  # the constant band of the spherical harmonics: sqrt(1 / (4 pi))
 
@@ -68,7 +68,7 @@ class Gaussians:
     def from_points(
         cls, positions: Tensor, colors: Tensor, distances: Tensor, *, sh_degree: int, opacity: float = 0.1
     ) -> Gaussians:
-        """Make round Gaussians at points.
+        """Make isotropic Gaussians at points.
 
         Args:
             positions: world coordinates, shape (N, 3).
@@ -79,7 +79,7 @@ class Gaussians:
 
         Raises:
             ValueError: if a position or color is not finite, a distance not positive and finite, the opacity not in
-                (0, 1), or as the class does.
+                (0, 1), or the shapes disagree.
         """
         n = positions.shape[0]
         for name, x in (("positions", positions), ("colors", colors)):
@@ -127,20 +127,20 @@ class Gaussians:
         return torch.cat([self.sh_dc, self.sh_rest], dim=1)
 
     def params(self, camera: Camera | None = None, *, step: int = 0) -> Params:
-        """Return what a rasterizer receives, activated, for a camera, at a step: what every regularizer works on."""
+        """Return the activated parameters that a rasterizer receives and every regularizer works on."""
         view_matrix = None if camera is None else camera.world_to_camera
         return Params(
             self.opacities, self.means, self.scales, self.quaternions, self.sh, view_matrix, self.learned, step
         )
 
     def named(self) -> Iterator[tuple[str, Tensor]]:
-        """Iterate over the parameters with their names, those that regularizers learn last."""
+        """Iterate over parameters and their names; those that regularizers learn come last."""
         yield from ((name, getattr(self, name)) for name in PARAMETERS)
         yield from self.learned.items()
 
     @classmethod
     def from_named(cls, tensors: Mapping[str, Tensor]) -> Gaussians:
-        """Return the Gaussians of these parameters, as `named` yields them."""
+        """Make Gaussians of named parameters, as `named` yields them."""
         own = {name: tensors[name] for name in PARAMETERS}
         return cls(**own, learned={name: x for name, x in tensors.items() if name not in PARAMETERS})
 

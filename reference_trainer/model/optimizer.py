@@ -1,4 +1,4 @@
-"""Adam over a changing set of Gaussians: the one place where parameters and optimizer state are cut and joined."""
+"""Adam over a changing set of Gaussians: the one place that resizes parameters and optimizer state."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["GaussianOptimizer"]
 
 
 class GaussianOptimizer:
-    """Gaussians whose tensors are leaves, and the Adam that moves them.
+    """Gaussians whose tensors are leaves, and the Adam optimizer that updates them.
 
     Args:
         gaussians: initial values; they are copied.
@@ -36,7 +36,7 @@ class GaussianOptimizer:
         self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def step(self) -> None:
-        """Move all parameters along their gradients and clear these."""
+        """Update all parameters and clear their gradients."""
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
@@ -45,7 +45,7 @@ class GaussianOptimizer:
         self._group("means")["lr"] = rate
 
     def select(self, index: Tensor) -> None:
-        """Keep only the Gaussians of ``index`` (bool mask or positions), with their optimizer state."""
+        """Keep only the Gaussians at ``index`` (bool mask or positions), with their optimizer state."""
         self._rebuild(lambda name, x: x[index], lambda moment: moment[index])
 
     def append(self, new: Gaussians) -> None:
@@ -66,13 +66,13 @@ class GaussianOptimizer:
             self._forget(parameter, slice(None))
 
     def relocate(self, index: Tensor, new: Gaussians) -> None:
-        """Overwrite the Gaussians of ``index``, positions, with as many new ones; their optimizer state stays."""
+        """Overwrite the Gaussians at ``index`` (positions) with as many new ones; their optimizer state stays."""
         with torch.no_grad():
             for (_, x), (_, value) in zip(self.gaussians.named(), new.named(), strict=True):
                 x[index] = value
 
     def forget(self, index: Tensor | slice, *names: str) -> None:
-        """Clear the optimizer state of the Gaussians of ``index`` (bool mask or positions), of all or some names."""
+        """Clear the optimizer state of the Gaussians at ``index`` (bool mask or positions), for all or some names."""
         for name, x in self.gaussians.named():
             if not names or name in names:
                 self._forget(x, index)
@@ -100,7 +100,7 @@ class GaussianOptimizer:
         return next(group for group in self._adam.param_groups if group["name"] == name)
 
     def _replace(self, tensors: dict[str, Tensor]) -> None:
-        """Make these leaves the parameters; their optimizer state is to be set by the caller."""
+        """Make these leaves the parameters; the caller must set their optimizer state."""
         self._adam.state.clear()
         for name, x in tensors.items():
             self._group(name)["params"] = [x]

@@ -1,4 +1,4 @@
-"""Standard 3D Gaussian Splatting PLY files, in and out."""
+"""Reading and writing standard 3D Gaussian Splatting PLY files."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class PlyModel:
         gaussians: the Gaussians, float32 on the CPU, exactly as stored but for a ``filter_3D``, which is applied.
         opacity_scale: the factor that is already part of the stored opacities, 1.0 if none is: a model trained with
             dropout ``p`` and saved with ``bake_p=p`` has ``1 - p`` here and must not be scaled again.
-        for_rendering: whether the file was saved with ``opacities=``: those in it are to be rendered as they are, and
-            the plain ones cannot be had from it.
-        regularizer: what the model was trained with, an expression of `ca_reg.regularizers.parse`, empty if the file
-            does not say. It is text from a file: do not import what it names.
+        for_rendering: whether the file was saved with ``opacities=``: its opacities are to be rendered as they are, and
+            the plain ones cannot be recovered.
+        regularizer: what the model was trained with, as for `ca_reg.regularizers.parse`; empty if the file does not
+            say. It is untrusted text: do not import what it names.
         step: of the training, 0 if the file does not say.
     """
 
@@ -61,24 +61,24 @@ def save_ply(
 ) -> None:
     """Write Gaussians as a binary little-endian PLY of float32, the layout of the INRIA code, for any viewer.
 
-    The file appears at once or not at all: it is written beside its place and moved there.
+    The file is written atomically, see `replacing`.
 
     Convention: opacities are logits, scales natural logarithms, ``rot_0`` is the real part of the quaternion, and
     ``f_rest_*`` runs through all coefficients of red, then of green, then of blue.
 
     Args:
         gaussians: what to write.
-        path: the file; its folder must exist.
-        bake_p: dropout rate in [0, 1) of the training, to store the opacities scaled by ``1 - bake_p`` as rendering
+        path: the file; its folder is created if missing.
+        bake_p: dropout rate in [0, 1) of the training: opacities are stored scaled by ``1 - bake_p``, as rendering
             needs them, for viewers that know nothing of dropout. A header comment records the factor. None or 0
             stores the opacities as they are.
-        opacities: to store these instead, in [0, 1], shape (N,): what rendering needs where that is not one factor, as
-            after opacity noise. A header comment records that they are not the plain ones.
+        opacities: stored instead of the model's, in [0, 1], shape (N,), where rendering needs other ones than a common
+            factor gives, as after opacity noise. A header comment records that they are not the plain ones.
         pad_to_degree: store at least this degree of spherical harmonics, 0 to 3, with zeros for the missing
             coefficients; many viewers read degree 3 only.
-        regularizer: what the model was trained with, for a header comment; what regularizers learned per Gaussian is
-            stored in properties of its own.
-        step: of the training, likewise.
+        regularizer: what the model was trained with, for a header comment. What regularizers learned per Gaussian is
+            stored in separate properties.
+        step: of the training, for the same comment.
 
     Raises:
         ValueError: if ``bake_p``, ``opacities`` or ``pad_to_degree`` is out of range, or the first two are both given.
@@ -127,15 +127,15 @@ def save_ply(
 
 
 def load_ply(path: str | Path) -> PlyModel:
-    """Read Gaussians from a 3DGS PLY file: binary of either byte order or ASCII, properties in any order and type.
+    """Read Gaussians from a 3DGS PLY file: binary of either byte order or ASCII, properties of any order and type.
 
     Normals and unknown properties are ignored. Spherical harmonics may have any degree from 0 to 3. A ``filter_3D``
     is applied to scales and opacities, as the 3D smoothing filter of Mip-Splatting (arXiv:2311.16493) defines it: each
     Gaussian is convolved with a normalized isotropic one of that standard deviation. Compressed files are refused.
 
     Raises:
-        ValueError: if the file is no such PLY, is shorter than its header says, or holds values that are not finite;
-            the message says what is missing.
+        ValueError: if the file is not such a PLY, disagrees with its header in length, or holds values that are not
+            finite.
         OSError: if the file cannot be read.
     """
     path = Path(path)
@@ -177,7 +177,7 @@ def load_ply(path: str | Path) -> PlyModel:
 
 
 def _logits(opacities: Tensor, count: int) -> Tensor:
-    """Return the logits of so many opacities in [0, 1], in float64; infinite at the ends."""
+    """Return the logits of ``count`` opacities in [0, 1], in float64; infinite at the ends."""
     if opacities.shape != (count,) or not bool(((opacities >= 0) & (opacities <= 1)).all()):
         raise ValueError(
             f"opacities must have shape ({count},) and values in [0, 1], activated; got shape {tuple(opacities.shape)}"
@@ -210,7 +210,7 @@ def _opacity_scale(comments: list[str], path: Path) -> float:
 
 
 def _trained_with(comments: list[str], path: Path) -> tuple[str, int]:
-    """Return the recorded regularizers and the step."""
+    """Return the recorded regularizers and step, empty and 0 if there are none."""
     for comment in comments:
         if comment.startswith(_TRAINED_WITH):
             step, _, regularizer = comment.removeprefix(_TRAINED_WITH).strip().partition(" ")

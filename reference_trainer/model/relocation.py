@@ -1,4 +1,4 @@
-"""What 3DGS-MCMC computes: several Gaussians in the place of one."""
+"""The relocation formula of 3DGS-MCMC: several Gaussians in place of one."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ __all__ = ["compute_relocation"]
 def compute_relocation(
     opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Return opacities and scales of Gaussians that, n at one place, look as one does (3DGS-MCMC, equation 9).
+    """Return opacities and scales with which n Gaussians at one place look like one (3DGS-MCMC, equation 9).
 
-    Opacities (N,) and scales (N, 3) are those of the one; ``ratios`` (N,) are n, which is taken for at most the size
-    of the table of binomials: row n, column k holds n over k. The opacities are no lower than ``min_opacity``, and
-    that is what the scales are for (gsplat 1.6).
+    Opacities (N,) and scales (N, 3) are those of the one; ``ratios`` (N,) holds n, clamped to the size of ``binoms``,
+    whose row n and column k is n choose k. New opacities are at least ``min_opacity``, and the scales account for it
+    (gsplat 1.6).
 
     Example:
         >>> table = torch.tensor([[1.0, 0.0], [1.0, 1.0]])
@@ -27,7 +27,7 @@ def compute_relocation(
     n = ratios.long().clamp(1, len(binoms))
     opacity = (1 - (1 - opacities.double()) ** (1 / n.double())).clamp_min(min_opacity)
     k = torch.arange(len(binoms), dtype=torch.float64, device=binoms.device)
-    # Terms of alternating signs: in single precision they would cancel.
+    # The signs of the terms alternate: in single precision they would cancel.
     terms = binoms.double().cumsum(0) * (-1) ** k / (k + 1).sqrt()
     shrink = opacities.double() / (terms[n - 1] * opacity[:, None] ** (k + 1)).sum(1)
     return opacity.to(opacities), scales * shrink[:, None].to(scales)

@@ -1,4 +1,4 @@
-"""Render a model: its raw parameters activated and handed to the renderer."""
+"""Rendering a model: activates its raw parameters and hands them to the renderer."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def render_gaussians(
     absgrad: bool = False,
     renderer: Callable[..., Any] = render,
 ) -> Rendering:
-    """Render Gaussians, or what is to be rendered of them, such as what a regularizer returned, over a color (3,).
+    """Render Gaussians, or activated parameters such as a regularizer returns, over a background color (3,).
 
-    Opacities (N,), activated, take the place of the model's own; ``sh_degree`` is the highest band to use, by default
-    all; with ``depth`` it is accumulated as well; with ``absgrad``, of renderers that are capable of it,
-    ``splats.projection.means.absgrad`` is set at the backward pass. Another renderer, such as gsplat's, has the
-    arguments of `render`; what it returns is returned.
+    Opacities (N,), activated, replace the model's own; ``sh_degree`` is the highest band to use, by default all; with
+    ``depth``, depth is accumulated as well; with ``absgrad``, if the renderer is capable of it, the backward pass sets
+    ``splats.projection.means.absgrad``. Another renderer, such as gsplat's, takes the arguments of `render`; its result
+    is returned as it is.
 
     Example:
         >>> import torch
@@ -54,10 +54,10 @@ def render_moments_of(
     *,
     sh_degree: int | None = None,
 ) -> tuple[MomentImages, Splats]:
-    """Render the exact moments of a model under random factors on its alphas, given their moments.
+    """Render the exact mean and variance of a model's picture under random factors on its alphas.
 
-    The background has shape (3,), or (3, H, W). Returned with the moments is what was drawn; its projected centers keep
-    their gradient.
+    The background has shape (3,), or (3, H, W). The splats are returned as well; their projected centers keep their
+    gradient.
     """
     splats = splat(**arguments(model), camera=camera, sh_degree=sh_degree)
     if splats.projection.means.requires_grad:
@@ -66,7 +66,7 @@ def render_moments_of(
 
 
 def arguments(model: Gaussians | Params, opacities: Tensor | None = None) -> dict[str, Any]:
-    """Return the renderer's arguments about the Gaussians; ``opacities`` (N,) instead of the model's own."""
+    """Return the renderer's arguments that describe the Gaussians; ``opacities`` (N,) replace the model's own."""
     x = model.params() if isinstance(model, Gaussians) else model
     opacities = x.opacities if opacities is None else opacities
     return dict(means=x.means, quaternions=x.quaternions, scales=x.scales, opacities=opacities, sh=x.sh)

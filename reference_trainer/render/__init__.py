@@ -1,7 +1,7 @@
-"""The renderer. It takes tensors and a camera, and knows neither scenes nor the model.
+"""The renderer: tensors and a camera in, a picture out. It knows neither scenes nor the model.
 
-Two engines draw: compiled loops (`loops`) for float32 on a CPU, and PyTorch operations (`eager`) for everything else,
-which the loops are tested against. `use_engine` chooses.
+Two engines draw: compiled loops (`loops`) for float32 on a CPU, and PyTorch operations (`eager`) for everything else.
+The loops are tested against the latter. `use_engine` chooses.
 """
 
 from reference_trainer.render.checks import NotFiniteError

@@ -1,4 +1,4 @@
-"""What AbsGS sums over the pixels for every Gaussian: blend weights, and absolute gradients of its position."""
+"""The sums over pixels that AbsGS takes for every Gaussian: blend weights, and absolute gradients of its center."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def splat_weights(splats: Splats) -> Tensor:
 
 
 class _AbsoluteGradients(torch.autograd.Function):
-    """The picture unchanged; on the way back the sums of absolute gradients go to an input of their own."""
+    """The identity, whose backward pass also hands the sums of absolute gradients to a separate input."""
 
     @staticmethod
     def forward(ctx: Any, drawn: Tensor, sink: Tensor, splats: Splats, background: Tensor) -> Tensor:
@@ -34,7 +34,7 @@ class _AbsoluteGradients(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        # The light that is left shows the background: without it, its gradient is one more of alpha.
+        # The remaining light, 1 - alpha, shows the background; once that is taken out, its gradient is part of alpha's.
         (drawn,), (gradient,) = ctx.saved_tensors, gradients
         black = torch.cat([drawn[:4] - (1 - drawn[4]) * ctx.background, drawn[4:]])
         of_alpha = gradient[4:] - (gradient[:4] * ctx.background).sum(0, keepdim=True)
@@ -43,17 +43,17 @@ class _AbsoluteGradients(torch.autograd.Function):
 
 
 def absgrad_sink(means: Tensor) -> Tensor:
-    """Return zeros of the shape of ``means``, whose gradient becomes ``means.absgrad``, as gsplat calls it."""
+    """Return zeros shaped like ``means`` whose gradient becomes ``means.absgrad``, gsplat's name for it."""
     sink = torch.zeros_like(means).requires_grad_()
     sink.register_hook(lambda gradient: setattr(means, "absgrad", gradient))  # type: ignore[no-untyped-call]
     return sink
 
 
 def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tensor | None = None) -> Rendering:
-    """Return the rendering, whose backward pass also delivers `Engine.absolute_gradients`.
+    """Return the rendering with a backward pass that also computes `Engine.absolute_gradients`.
 
-    They become the gradient of ``sink`` (M, 2).
-    The values of the sink do not matter. The background (3,) of the image is black by default.
+    They become the gradient of ``sink`` (M, 2), whose values do not matter. The image's background (3,) is black by
+    default.
     """
     depth = torch.zeros_like(rendering.alpha) if rendering.depth is None else rendering.depth
     behind = rendering.image.new_zeros(3) if background is None else background.detach().to(rendering.image)

@@ -1,6 +1,6 @@
-"""What the renderer refuses to draw: numbers that are not finite, and places that the precision cannot hold.
+"""What the renderer refuses to draw: numbers that are not finite, and coordinates too large for their precision.
 
-A nan would not be seen otherwise: a Gaussian whose depth is nan is not in front of the camera, and is left out.
+A nan would go unnoticed otherwise: a Gaussian whose depth is nan does not lie in front of the camera, and is culled.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ __all__ = ["NotFiniteError", "check_projection", "checked_background", "either"]
 
 
 class NotFiniteError(ValueError):
-    """An input of the renderer is nan or infinite, or what it projects to is."""
+    """An input of the renderer, or its projection, is nan or infinite."""
 
 
 @torch.no_grad()
 def check_projection(
     total: Tensor, projection: Projection, colors: Tensor, inputs: Mapping[str, Tensor], camera: Camera
 ) -> None:
-    """Raise unless all numbers are finite and the world is not too far from its origin for their precision.
+    """Raise unless all numbers are finite and the camera is near enough to the world's origin for their precision.
 
-    ``total`` is the sum of what decides about who is drawn, depths and opacities. Only where that and all that is
-    projected add up to no finite number are the inputs, by name and of all Gaussians, looked at one by one.
+    ``total`` sums what decides which Gaussians are drawn: all depths and opacities. Only if it and the projected values
+    add up to nan or infinity are the inputs (of all Gaussians, by name) examined one by one.
 
     Raises:
-        NotFiniteError: if an input is nan or infinite, or so large that the projection is; names it.
+        NotFiniteError: if an input, which the message names, or a projection is nan or infinite.
         ValueError: if the rounding of the coordinates moves Gaussians by more than `MAX_ROUNDING`.
     """
     results = (projection.means, projection.covariances, colors)
-    # At what share of its mean depth the scene lies from the origin of the world.
+    # The camera's distance from the world's origin, in mean depths.
     distance = camera.position.abs().amax() / projection.depths.mean()
     total, share = torch.stack([sum((x.sum() for x in results), total), distance]).tolist()  # one wait for a GPU
     if not math.isfinite(total):
@@ -51,7 +51,7 @@ def check_projection(
 
 
 def either(sh: Tensor | None, sh_degree: int | None, colors: Tensor | None) -> tuple[Tensor, int | None]:
-    """Return coefficients and their highest band, or colors and None; raise unless one of the two is as it must be."""
+    """Return coefficients and their highest band, or colors and None; raise unless exactly one is given, and valid."""
     if (sh is None) == (colors is None):
         raise ValueError("give either sh (N, K, 3) or colors (N, 3), not both and not neither.")
     if sh is None:
@@ -70,7 +70,7 @@ def either(sh: Tensor | None, sh_degree: int | None, colors: Tensor | None) -> t
 
 
 def checked_background(background: Tensor | None, splats: Splats, *shapes: tuple[int, ...]) -> Tensor:
-    """Return the color behind everything, black if there is none, of one of some shapes; raise unless it is finite."""
+    """Return the background, black by default; raise unless it is finite and has one of the shapes."""
     if background is None:
         return splats.colors.new_zeros(3)
     if background.shape not in shapes:
@@ -83,7 +83,7 @@ def checked_background(background: Tensor | None, splats: Splats, *shapes: tuple
 
 
 def _refuse(results: tuple[Tensor, ...], inputs: Mapping[str, Tensor], camera: Camera) -> None:
-    """Raise and say what is not finite; return if nothing is but the sum, which has overflowed."""
+    """Raise and say what is not finite; return if only their sum has overflowed."""
     for name, x in inputs.items():
         bad = ~x.isfinite().reshape(x.shape[0], -1).all(1)
         if bool(bad.any()):

@@ -1,4 +1,4 @@
-"""What an engine is, which ones there are, and which one draws."""
+"""The interface of rendering engines, and the choice of the one that draws."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _TORCH = TorchEngine()
 class Engine(Protocol):
     """Turns Gaussians into pictures, and into the exact moments of pictures.
 
-    All tensors of a call share one dtype and one device, and are checked already (`reference_trainer.render.renderer`,
-    `reference_trainer.render.moments`); what comes out is differentiable. Whoever adds an engine lists it in
-    `engine_for`.
+    All tensors of a call share one dtype and one device, and have been checked (`reference_trainer.render.renderer`,
+    `reference_trainer.render.moments`); results are differentiable unless said otherwise. A new engine is to be added
+    to `engine_for`.
     """
 
     name: str
@@ -41,10 +41,10 @@ class Engine(Protocol):
     def project(
         self, inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
     ) -> tuple[Projection, Tensor]:
-        """Project M of N Gaussians, the ``indices`` (M,), and evaluate their colors, (M, 3).
+        """Project M of N Gaussians, those at ``indices`` (M,), and evaluate their colors, (M, 3).
 
-        The inputs are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh (N, K, 3), of
-        which the bands up to ``degree`` are used, or colors (N, 3) of no degree, by name.
+        The inputs, by name, are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh
+        (N, K, 3), used up to band ``degree``, or colors (N, 3), whose ``degree`` is None.
         """
 
     def bin(self, projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
@@ -55,26 +55,25 @@ class Engine(Protocol):
         """
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
-        """Return splats with opacities (M,) that are nowhere higher; those below `MIN_ALPHA` cost nothing."""
+        """Return the splats with other opacities (M,), nowhere higher; those below `MIN_ALPHA` cost nothing."""
 
     def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draw splats front to back over a background (3,): image (3, H, W), alpha (H, W), depth (H, W) if asked."""
 
     def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw splats with K other opacities, (K, M), as in `masked`: images (K, 3, H, W), alphas; no gradients."""
+        """Draw K pictures with opacities (K, M), as in `masked`: images (K, 3, H, W), alphas (K, H, W); no graph."""
 
     def absolute_gradients(self, splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
-        """Sum the absolute gradients that pixels give to the positions (AbsGS), (M, 2), without a graph.
+        """Sum the absolute values of each pixel's gradient of the projected centers (AbsGS), (M, 2), without a graph.
 
-        ``drawn`` are colors and depth over black and the accumulated alpha, (5, H, W), and ``gradient`` is that of a
-        loss with respect to them.
+        ``drawn`` (5, H, W) holds colors and depth over black and the accumulated alpha, and ``gradient`` that of a loss
+        with respect to it.
         """
 
     def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
         """Return mean and variance of every pixel under random factors on the alphas of the full model.
 
-        The multiplier is mean and variance of every splat's factor, (M, 2), and ``behind`` the colors behind
-        everything, (3, H, W).
+        ``multiplier`` (M, 2) holds mean and variance of every splat's factor, ``behind`` (3, H, W) the background.
         """
 
     def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
@@ -105,7 +104,7 @@ def use_engine(name: str) -> None:
 
 
 def chosen_engine() -> str:
-    """Return what `use_engine`, or the environment, has chosen; for workers on other machines.
+    """Return the engine that `use_engine` or the environment has chosen, to tell workers on other machines.
 
     Raises:
         ValueError: if the environment names an engine that does not exist.
@@ -117,7 +116,7 @@ def chosen_engine() -> str:
 
 
 def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engine:
-    """Return the loops for float32 on a CPU unless torch was chosen, which draws the rest; as `chosen_engine`."""
+    """Return the loops for float32 on a CPU, if chosen and available, else torch; errors are `chosen_engine`'s."""
     if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
         return _TORCH
     return _loop_engine() or _TORCH
@@ -130,7 +129,7 @@ def engines_on(device: torch.device) -> tuple[str, ...]:
 
 @contextmanager
 def drawn_by(engine: str) -> Iterator[None]:
-    """Let an engine draw, and afterwards the one that was chosen before; errors are those of `use_engine`.
+    """Draw with an engine within a block; errors are those of `use_engine`.
 
     Example:
         >>> with drawn_by("torch"):
@@ -143,7 +142,7 @@ def drawn_by(engine: str) -> Iterator[None]:
 
 
 def describe_engine(device: torch.device | str) -> str:
-    """Return which engine draws a model (float32) on a device, which need not be there, in words for people."""
+    """Describe for people which engine draws a model (float32) on a device, which need not be present."""
     if engine_for(torch.device(device)).name == "torch":
         return "torch"
     count = torch.get_num_threads()
@@ -152,12 +151,12 @@ def describe_engine(device: torch.device | str) -> str:
 
 @functools.cache
 def _loop_engine() -> Engine | None:
-    """Return the loops, or None without a numba that works."""
+    """Return the loops, or None if numba is missing or does not work."""
     if importlib.util.find_spec("numba") is None:
         return None
     try:
         from reference_trainer.render.loops.engine import LoopEngine
-    except ImportError as error:  # such as of a NumPy that is too new for it
+    except ImportError as error:  # such as a NumPy that is too new for it
         warnings.warn(f"numba is installed but cannot be imported ({error}): the engine torch draws.", stacklevel=2)
         return None
     return LoopEngine()

@@ -1,4 +1,4 @@
-"""Exact mean and variance of a rendering under a random factor on every splat's alpha, and whose variance it is."""
+"""Exact mean and variance of a rendering under random factors on the alphas, and every Gaussian's share of it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def variance_shares(
 
     A Gaussian's share at a pixel is its summand of the variance, `ca_reg.functional.contributions`, mean over RGB.
 
-    The weights have shape (H, W); 1 / count in the region of a score makes shares of the score. The other arguments are
+    The weights have shape (H, W); 1 / count in the region of a score gives shares of that score. Other arguments are
     those of `render_moments`. Returns one share for every projected Gaussian (``splats.indices``), (M,), float64.
 
     Raises:

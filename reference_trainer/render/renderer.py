@@ -32,10 +32,10 @@ def splat(
 
     Raises:
         TypeError: if a tensor is not floating point.
-        ValueError: if not exactly one of ``sh`` and ``colors`` is given, a tensor has another shape, or the world
+        ValueError: if not exactly one of ``sh`` and ``colors`` is given, a tensor has the wrong shape, or the world
             coordinates are too large for their precision, see `MAX_ROUNDING`.
-        NotFiniteError: if an input that decides about the view is nan or infinite. What is behind the camera, or
-            dropped, may be so but for its place and opacity.
+        NotFiniteError: if an input that affects the view is nan or infinite. Of Gaussians behind the camera, or
+            dropped, only position and opacity must be finite.
     """
     values, degree = either(sh, sh_degree, colors)
     n = means.shape[0]
@@ -64,7 +64,7 @@ def splat(
 
 
 def _working(name: str, x: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return an input in the precision of the work: float64 if the means are, else float32."""
+    """Return an input in working precision: float64 if the means are, else float32."""
     if not x.is_floating_point():
         raise TypeError(f"{name} must be a floating-point tensor, got {x.dtype}; convert it with .float().")
     return x.to(torch.float64 if dtype == torch.float64 else torch.float32)
@@ -94,9 +94,9 @@ def render(
         scales: standard deviations along the axes, positive, shape (N, 3).
         opacities: activated, in [0, 1], shape (N,) or (N, 1).
         camera: the view.
-        sh: spherical-harmonic coefficients, shape (N, K, 3), or
+        sh: spherical-harmonic coefficients, shape (N, K, 3); give either these or ``colors``.
         sh_degree: highest band to evaluate, at most 3; all of ``sh`` by default.
-        colors: colors, shape (N, 3).
+        colors: RGB, shape (N, 3).
         background: color behind everything, shape (3,); black by default.
         depth: whether to accumulate depth as well.
 
@@ -104,7 +104,7 @@ def render(
         Image, accumulated alpha, depth if asked for, and the splats.
 
     Raises:
-        TypeError, ValueError, NotFiniteError: as `splat`; the last also for the background.
+        TypeError, ValueError, NotFiniteError: as `splat`; the last two also for the background.
 
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
@@ -118,7 +118,7 @@ def render(
 
 
 def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = False) -> Rendering:
-    """Composite what `splat` made; other arguments and errors are those of `render`."""
+    """Composite the splats of `splat`; other arguments and errors are those of `render`."""
     if splats.projection.means.requires_grad:
         splats.projection.means.retain_grad()
     with torch.autocast(splats.opacities.device.type, enabled=False):
@@ -136,7 +136,7 @@ def draw_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None =
         splats: of a view.
         opacities: activated, of all N Gaussians, (K, N), nowhere higher than those of the splats; 0 leaves a Gaussian
             out, at no cost.
-        background: as of `render`.
+        background: as for `render`.
 
     Returns:
         Images (K, 3, H, W) and accumulated alphas (K, H, W), without gradients.

@@ -1,4 +1,4 @@
-"""What the engines hand on: projected Gaussians, the lists of the tiles, and a rendered view."""
+"""What the engines produce: projected Gaussians, tile lists, and rendered views."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ class TileLists:
         width: image width, pixels.
         height: image height, pixels.
         starts: where each tile's list starts, row by row over the image, and where the last ends, shape (tiles + 1,).
-        gaussians: their numbers, tile after tile, shape (P,).
+        gaussians: the numbers of the listed Gaussians, tile after tile, shape (P,).
         touched: whether a Gaussian is in any list, shape (M,) bool.
-        slots: of every entry a number of its own, those of a Gaussian in sequence, shape (P,); the loops need them.
-        offsets: the first of each Gaussian's numbers, and the count of all, shape (M + 1,); likewise.
+        slots: a unique number for every entry, consecutive for each Gaussian, shape (P,); the loops need them.
+        offsets: each Gaussian's first slot, and the number of all, shape (M + 1,); likewise.
     """
 
     width: int
@@ -74,7 +74,7 @@ class TileLists:
         return self.starts.diff()
 
     def padded(self, image: Tensor) -> Tensor:
-        """Return an image (..., H, W) with zeros up to the borders of the tiles."""
+        """Return an image (..., H, W) padded with zeros to whole tiles."""
         missing = (0, TILE * self.columns - self.width, 0, TILE * self.rows - self.height)
         return torch.nn.functional.pad(image, missing) if any(missing) else image
 
@@ -83,7 +83,7 @@ class TileLists:
         return image[..., : self.height, : self.width]
 
     def only(self, kept: Tensor) -> TileLists:
-        """Return the lists of the Gaussians that are kept, (M,) bool; without the numbers that the loops need."""
+        """Return the lists without Gaussians that are not kept, (M,) bool, and without slots and offsets."""
         stays = kept[self.gaussians]
         starts = torch.nn.functional.pad(stays.cumsum(0), (1, 0))[self.starts]
         gaussians, touched = self.gaussians[stays], self.touched & kept

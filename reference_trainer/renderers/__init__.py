@@ -1,4 +1,4 @@
-"""What draws the training views, and its registry: what ``--renderer`` knows by name."""
+"""The renderers of the training views, and their registry: what ``--renderer`` knows by name."""
 
 from ca_reg.registry import Registry
 from reference_trainer.renderers.renderer import GsplatRenderer, OwnRenderer, Renderer
@@ -6,7 +6,7 @@ from reference_trainer.renderers.renderer import GsplatRenderer, OwnRenderer, Re
 __all__ = ["RENDERERS", "GsplatRenderer", "OwnRenderer", "Renderer"]
 
 RENDERERS: Registry[Renderer] = Registry("renderer", Renderer)  # type: ignore[type-abstract]
-"""What can be asked for by name; ``RENDERERS.register("name")`` adds a class."""
+"""The renderers by name; ``RENDERERS.register("name")`` adds a class."""
 
 RENDERERS.register("torch")(OwnRenderer)
 RENDERERS.register("gsplat")(GsplatRenderer)

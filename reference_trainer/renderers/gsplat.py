@@ -1,9 +1,9 @@
-"""Rendering by gsplat's CUDA kernels, where there are some, in place of this package's own renderer.
+"""Rendering with gsplat's CUDA kernels in place of this package's own renderer.
 
-Same arguments, same kind of result, and the same constants where gsplat lets them be chosen: near plane and dilation.
-Three are its own: alpha is clamped at 0.999 before gsplat 1.6, no gradient passes a clamped alpha, and the projection
-is linearised up to a margin beyond the picture's borders, which differs where the principal point is off the middle.
-There are no moments: analytic training and exact scores use this package's renderer.
+Arguments and results are the same, and the constants where gsplat lets them be chosen: near plane and dilation. Three
+things differ: alpha is clamped at 0.999 before gsplat 1.6, no gradient passes a clamped alpha, and the projection is
+linearized up to a margin beyond the picture's borders, which matters where the principal point is off center. There
+are no moments: analytic training and exact scores use this package's renderer.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def render_by(
     in ``projection.means.absgrad``.
 
     Raises:
-        TypeError: if the Gaussians are not float32, the only kind that gsplat knows.
+        TypeError: if the Gaussians are not float32, the only dtype that gsplat takes.
         ValueError: if not exactly one of ``sh`` and ``colors`` is given.
     """
     values, degree = either(sh, sh_degree, colors)
@@ -104,7 +104,7 @@ def render_by(
         near_plane=NEAR_PLANE,
         eps2d=DILATION,
         sh_degree=degree,
-        packed=True,  # the projected means of M Gaussians, as the gradient is wanted, not those of a batch of views
+        packed=True,  # projected means, whose gradient is wanted, of M Gaussians instead of a batch of views
         backgrounds=None if background is None else background.to(means)[None],
         render_mode="RGB+D" if depth else "RGB",
         absgrad=absgrad,

@@ -1,4 +1,4 @@
-"""What draws the training views: the base class, this package's renderer, and gsplat's kernels."""
+"""The renderers of the training views: the base class, this package's renderer, and gsplat's kernels."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ __all__ = ["GsplatRenderer", "OwnRenderer", "Renderer"]
 
 
 class Renderer(abc.ABC):
-    """Draws Gaussians, with the arguments of `reference_trainer.render.render`; one's own is a subclass.
+    """Draws Gaussians, with the arguments of `reference_trainer.render.render`; custom renderers are subclasses.
 
     Attributes:
-        capabilities: beside image and alpha: ``"depth"``; ``"moments"`` if `reference_trainer.render.render_moments`
+        capabilities: besides image and alpha: ``"depth"``; ``"moments"`` if `reference_trainer.render.render_moments`
             draws the same picture, which analytic training and terms that render moments need; ``"absgrad"`` if it
-            takes ``absgrad=True``, and then leaves the sums of absolute gradients (M, 2) in
-            ``splats.projection.means.absgrad`` at the backward pass.
+            takes ``absgrad=True``, with which the backward pass leaves the sums of absolute gradients (M, 2) in
+            ``splats.projection.means.absgrad``.
     """
 
     capabilities: ClassVar[frozenset[str]] = frozenset()
@@ -31,16 +31,16 @@ class Renderer(abc.ABC):
 
         Raises:
             ImportError: if something is missing.
-            RuntimeError: if it does not draw there.
+            RuntimeError: if it cannot draw there.
         """
 
     @abc.abstractmethod
     def __call__(self, **arguments: Any) -> Any:
-        """Return a `Rendering`, or what has its fields as far as training reads them: `GsplatRendering` shows which."""
+        """Return a `Rendering`, or an object with those fields that training reads: see `GsplatRendering`."""
 
 
 class OwnRenderer(Renderer):
-    """The renderer of this package, by whichever engine is chosen."""
+    """This package's renderer, with the chosen engine."""
 
     capabilities = frozenset({"depth", "moments", "absgrad"})
 

@@ -1,1 +1,1 @@
-"""Training: settings, loss, loop, checkpoints."""
+"""Training: settings, plan, recipes, loop, checkpoints."""

@@ -1,4 +1,4 @@
-"""Checkpoints: written whole or not at all, read without executing anything."""
+"""Checkpoints: written atomically, read without executing anything."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _FORMAT = "ca_reg-checkpoint-1"
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write a state of tensors, numbers and strings; an interrupted write leaves the file that was there before.
 
-    The tensors are written as those of a CPU, so that any machine can read them.
+    Tensors are written from the CPU, so that any machine can read them.
 
     Args:
-        path: where to; its folder is made.
-        state: nested dicts of tensors, numbers, strings and None.
+        path: the file; its folder is created if missing.
+        state: nested dicts and lists of tensors, numbers, strings and None.
 
     Raises:
-        OSError: if it cannot be written, such as on a full disk; it names the file.
+        OSError: if the file cannot be written, as on a full disk; the error names it.
     """
     content = io.BytesIO()  # torch.save to a file hides the error of a full disk behind one of its own
     torch.save({"format": _FORMAT, **moved(state, "cpu")}, content)

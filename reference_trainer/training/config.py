@@ -1,4 +1,4 @@
-"""Everything that decides a training run."""
+"""The settings of a training run."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ class TrainConfig:
     fields: int = 1
     """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
     random_background: bool = False
-    """Train over a color drawn anew at each step, which makes what is transparent an error (CoR-GS, SE-GS)."""
+    """Train over a background color drawn anew at each step, which penalizes transparency (CoR-GS, SE-GS)."""
     renderer: str = "torch"
-    """What draws in training: "torch", this package's renderer, "gsplat", which needs it and a CUDA device, or
+    """Renderer of the training: "torch", this package's own, "gsplat", which needs gsplat and a CUDA device, or
     "my_module:MyRenderer"."""
 
     sh_degree: int = 3
     """Degree of the spherical harmonics of the colors, 0 to 3."""
     sh_every: int = 500
-    """A band of spherical harmonics is added every so many steps; 0: all are there from the first step on."""
+    """Steps until another band of spherical harmonics is added; 0: all are there from the first step on."""
 
     means_rate: float = 1.6e-4
     """Initial learning rate of the means, in units of the scene's extent."""
     means_rate_final: float = 1.6e-6
-    """Its value after the last step, to which it falls exponentially."""
+    """Learning rate of the means after the last step, to which it decays exponentially."""
     scales_rate: float = 5e-3
     """Learning rate of the logarithms of the scales."""
     quaternions_rate: float = 1e-3
@@ -90,16 +90,16 @@ class TrainConfig:
     prune_size_from: int = 3_000
     """Only densifications after this step remove large Gaussians."""
     max_gaussians: int | None = None
-    """Densification stops above this number; None: no limit."""
+    """No Gaussians are added once there are this many; None: no limit."""
 
     opacity_reset: float = 0.05
-    """What opacities are lowered to at a reset."""
+    """Higher opacities are lowered to this at a reset."""
     opacity_reset_from: int = 2_001
-    """First reset."""
+    """Step of the first reset."""
     opacity_reset_every: int = 3_000
     """Steps between resets; 0 never resets."""
     opacity_reset_over_white: bool = False
-    """Over a white background opacities are lowered at step ``densify_from`` as well."""
+    """Over a white background, opacities are reset at step ``densify_from`` as well."""
     opacity_decay: float = 1.0
     """Opacities are multiplied by this at every step after ``densify_from``; 1 does nothing."""
 
@@ -131,7 +131,7 @@ class TrainConfig:
         return self.iterations if self.densify_until is None else min(self.densify_until, self.iterations)
 
     def means_rate_at(self, step: int) -> float:
-        """Learning rate of the means at a step, the first being 0, in units of the scene's extent; it falls by powers.
+        """Learning rate of the means at a step, the first being 0, in scene extents; it decays exponentially.
 
         Example:
             >>> round(TrainConfig().means_rate_at(1500), 7)  # half way
@@ -144,7 +144,7 @@ class TrainConfig:
         """Highest band of spherical harmonics of the step with this number, the first being 1."""
         return min(self.sh_degree, number // self.sh_every) if self.sh_every else self.sh_degree
 
-    # What follows imports torch, which the command line does without until it has to.
+    # The following methods import torch, which the command line defers until it has to.
 
     def make_regularizer(self) -> Chain:
         """Make the regularizers; empty if there are none."""
@@ -173,7 +173,7 @@ class TrainConfig:
         return RENDERERS.make_one(self.renderer)
 
     def check(self) -> None:
-        """Raise a ValueError unless the expressions can be made, and what they make goes together."""
+        """Raise a ValueError unless all expressions are valid and what they name is compatible."""
         self.make_regularizer()
         density = self.make_density()
         renderer, terms = self.make_renderer(), self.make_losses()
@@ -212,4 +212,4 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("initial_opacity", "opacity_reset"), lambda x: 0 < x < 1, "in (0, 1)", ""),
     (("opacity_decay",), lambda x: 0 < x <= 1, "in (0, 1]", ": 1 turns it off"),
 )  # fmt: skip
-"""Fields, what their values must satisfy, and how to say so."""
+"""Fields, the condition on their values, and the words and hint for errors."""

@@ -1,4 +1,4 @@
-"""Computing so that the result depends on the seed and the machine alone."""
+"""Making results depend on the seed and the machine alone."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ __all__ = ["deterministic"]
 
 @contextmanager
 def deterministic(device: torch.device | str = "cpu") -> Iterator[None]:
-    """Compute in one thread, and on CUDA with the algorithms that repeat themselves; afterwards as before.
+    """Compute in one thread, and on CUDA with deterministic algorithms, within a block.
 
-    Without this a run on a CPU repeats bit for bit with the same number of threads. With another number single results
-    of an exponential differ in their last bit, because the ends of a thread's share are computed by other instructions,
-    and training amplifies that. On CUDA sums by atomic additions differ from run to run.
+    Without this a run on a CPU repeats bit for bit with the same number of threads. With another number, some
+    exponentials differ in their last bit, because the ends of a thread's share are computed by other instructions, and
+    training amplifies that. On CUDA, sums by atomic additions differ from run to run.
 
     Args:
-        device: where is computed. On CUDA this is to be entered before the first computation of the process, which is
-            when cuBLAS reads its settings.
+        device: where to compute. On CUDA, enter the block before the first computation of the process, which is when
+            cuBLAS reads its settings.
 
     Raises:
-        RuntimeError: from within, on CUDA, if an operation has no algorithm that repeats itself.
+        RuntimeError: from within, on CUDA, if an operation has no deterministic algorithm.
 
     Example:
         >>> with deterministic():
@@ -37,7 +37,7 @@ def deterministic(device: torch.device | str = "cpu") -> Iterator[None]:
     if torch.device(device).type != "cpu":
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         torch.use_deterministic_algorithms(True)
-        # All buffers are written before they are read.
+        # Not needed: all buffers are written before they are read.
         torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     try:
         yield

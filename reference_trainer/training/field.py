@@ -1,4 +1,4 @@
-"""One model in training: its Gaussians, and all that changes them."""
+"""One model in training: its Gaussians, and everything that changes them."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ __all__ = ["Field"]
 class Field:
     """Gaussians with an optimizer, density control and regularizers of their own; a training has one, or several.
 
-    All fields of a training start from the same points. They become different by their random numbers: every field has
-    its own for the splits of density control and for the draws of regularizers and loss terms.
+    All fields of a training start from the same points and diverge by their random numbers: every field has its own for
+    the splits of density control and for the draws of regularizers and loss terms.
 
     Args:
         scene: with the points to start from.
@@ -30,7 +30,7 @@ class Field:
         number: of the field; the first, 0, is the one that is measured and written.
 
     Attributes:
-        label: of the field's random numbers.
+        label: prefix of the labels of the field's random streams.
 
     Raises:
         ValueError: as `initial_gaussians`.
@@ -76,7 +76,7 @@ class Field:
         """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: if the regularizers do not know their part.
+            ValueError: if the regularizers refuse their part.
         """
         self.optimizer.load_state_dict(dict(state))
         self.density.reset(len(self.gaussians))

@@ -1,4 +1,4 @@
-"""Where training starts: which of the scene's points become Gaussians, and how large these are; or from a model."""
+"""The Gaussians that training starts from: made of the scene's points, or those of a model."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ __all__ = ["drawn_by_any", "initial_gaussians"]
 
 
 def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
-    """Make one round Gaussian per point, as wide as the distance to its neighbors times ``config.initial_scale``.
+    """Make one isotropic Gaussian per point, as wide as the distance to its neighbors times ``config.initial_scale``.
 
-    Where the scene has a model to start from, its Gaussians are taken as they are, with as many bands of spherical
-    harmonics as are asked for: further ones are left out, missing ones 0.
+    If the scene has a model to start from, its Gaussians are taken as they are, their spherical harmonics cut or padded
+    with zeros to ``config.sh_degree``.
 
     Args:
         scene: with its initial points or model.
         config: says which points to take and how large and how opaque the Gaussians are.
 
     Raises:
-        ValueError: if the scene has no points, or none that is asked for.
+        ValueError: if the scene has no points, or only seen ones are to be taken and there are none.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene

@@ -15,7 +15,7 @@ class TrainingInterrupted(KeyboardInterrupt):
     """A signal between two steps: the model is whole and can be saved.
 
     Attributes:
-        signal: which one, ``SIGINT`` (Ctrl-C) or ``SIGTERM`` (clusters, ``kill``). Who has saved raises SIGTERM again
+        signal: which one, ``SIGINT`` (Ctrl-C) or ``SIGTERM`` (clusters, ``kill``). After saving, raise SIGTERM again
             (`signal.raise_signal`), so that the process ends as the sender expects.
     """
 
@@ -29,9 +29,9 @@ def hold_interrupts() -> Iterator[Callable[[], None]]:
     """Hold back Ctrl-C (SIGINT) and SIGTERM and remember them; a second Ctrl-C interrupts at once.
 
     A model that is interrupted while its tensors are being changed is broken and must not be saved. Inside this block
-    the caller decides when to stop. A second SIGTERM changes nothing: who cannot wait sends SIGKILL. Outside the main
-    thread, where signals do not arrive, nothing is done; a signal that the process ignores (of a job in the
-    background) stays ignored.
+    the caller decides when to stop. A second SIGTERM changes nothing: senders that cannot wait use SIGKILL. Outside the
+    main thread, where signals do not arrive, this does nothing; a signal that the process ignores (as in a background
+    job) stays ignored.
 
     Yields:
         A function that raises `TrainingInterrupted` if a signal is waiting.

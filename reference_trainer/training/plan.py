@@ -1,4 +1,4 @@
-"""What training uses of a scene and what it leaves out, decided from what is seen in the scene before it begins."""
+"""The plan of a training: what it uses and what it leaves out, decided from the scene before it begins."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Plan:
     items: tuple[PlanItem, ...]
 
     def applied(self, config: TrainConfig, *, given: Collection[str] = ()) -> TrainConfig:
-        """Return the settings with the changes of all items, except of the fields that somebody has ``given``."""
+        """Return the settings with the changes of all items, except to fields that are ``given`` or not at default."""
         kept = _kept(config, given)
         changes = {name: value for item in self.items for name, value in item.changes.items() if name not in kept}
         return dataclasses.replace(config, **changes)
@@ -100,7 +100,7 @@ def _kept(config: TrainConfig, given: Collection[str]) -> set[str]:
 
 
 def _item(found: PlanItem, config: TrainConfig, kept: Collection[str]) -> PlanItem:
-    """Return what a rule has found as a decision: what the user asked for stays."""
+    """Turn what a rule has found into a decision: what the user asked for stays."""
     chosen = ", ".join(f"{name}={getattr(config, name)}" for name in found.changes if name in kept)
     reason = f"asked for ({chosen}); the plan alone: {found.reason}"
     return PlanItem(found.name, "used", reason) if chosen else found

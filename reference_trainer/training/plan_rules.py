@@ -1,4 +1,4 @@
-"""The rules of the plan, each about one thing that training could use; docs/performance.md has what each is worth."""
+"""The rules of the plan, each about one thing that training could use; docs/performance.md says what each is worth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["DROPOUT_GAINS", "RULES", "PlanItem"]
 
 @dataclass(frozen=True)
 class PlanItem:
-    """One thing that training could use; of a rule, what the plan alone would do.
+    """The decision on one thing that training could use; as a rule returns it, what the plan alone would do.
 
     Args:
         name: what it is about.
@@ -74,7 +74,7 @@ def background(scene: Scene, config: TrainConfig) -> PlanItem:
 
 
 def depth_output(scene: Scene, config: TrainConfig) -> PlanItem:
-    """No loss looks at depth."""
+    """Depth is drawn only if a term of the loss needs it."""
     asking = dict.fromkeys(type(term).__name__ for term in config.make_losses() if "depth" in term.needs)
     if asking:
         return PlanItem("depth output", "used", f"asked for: {', '.join(asking)} looks at it")
@@ -116,7 +116,7 @@ def opacity_reset(scene: Scene, config: TrainConfig) -> PlanItem:
 
 
 def dropout(scene: Scene, config: TrainConfig) -> PlanItem:
-    """Dropout is never begun unasked: of two trainings that are compared one is without. But what it did is known."""
+    """Dropout is never switched on unasked: comparisons need a training without it. Its known gains are told."""
     count, apart = len(scene.train), _degrees_apart(scene)
     known = min(DROPOUT_GAINS, key=lambda n: abs(math.log(n / count)))
     gains = " and ".join(f"{gain:+.1f} dB on {where}" for where, gain in DROPOUT_GAINS[known].items())
@@ -137,7 +137,7 @@ def dropped(scene: Scene, config: TrainConfig) -> PlanItem:
 
 
 def regularizer_inputs(scene: Scene, config: TrainConfig) -> PlanItem:
-    """What the regularizers look at beside the opacities."""
+    """What the regularizers need besides the opacities."""
     needed = ", ".join(config.make_regularizer().needs)
     if needed:
         return PlanItem("inputs of the regularizers", "used", f"asked for: they need {needed}")
@@ -157,7 +157,7 @@ def unseen(scene: Scene, config: TrainConfig) -> PlanItem:
 
 
 def saturated(scene: Scene, config: TrainConfig) -> PlanItem:
-    """Pixels at the end of the range of the photograph."""
+    """White pixels, where the photograph is saturated."""
     share = sum(float((view.image >= 1).all(0).float().mean()) for view in scene.train) / len(scene.train)
     reason = f"{share:.1%} of the pixels are white; without them nothing would tell how bright these places are"
     return PlanItem("saturated pixels", "used", reason)
@@ -182,7 +182,7 @@ def moments(scene: Scene, config: TrainConfig) -> PlanItem:
 
 
 def initial_size(scene: Scene, config: TrainConfig) -> PlanItem:
-    """The size of initial points. Distances between random points say nothing about a surface, and pile them up."""
+    """The size of initial points. Distances between random points say nothing about a surface: Gaussians pile up."""
     name, points = "size of initial points", _points(scene)
     count = len(points.positions)
     if scene.start is not None:
@@ -215,13 +215,13 @@ RULES: tuple[Callable[[Scene, TrainConfig], PlanItem], ...] = (
 
 
 def _points(scene: Scene) -> PointCloud:
-    """The initial points, which `make_plan` has made sure of."""
+    """The initial points, whose presence `make_plan` has checked."""
     assert scene.points is not None
     return scene.points
 
 
 def _degrees_apart(scene: Scene) -> float:
-    """The angle between a training view and the nearest other one, from the middle of the points; the median view's."""
+    """The median over the training views of the angle to the nearest other one, seen from the middle of the points."""
     middle = _points(scene).positions.median(0).values
     to = torch.nn.functional.normalize(torch.stack([view.camera.position for view in scene.train]) - middle, dim=1)
     return float((to @ to.T).fill_diagonal_(-1.0).amax(1).clamp(-1, 1).arccos().rad2deg().median())

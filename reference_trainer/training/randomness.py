@@ -9,7 +9,7 @@ __all__ = ["stream", "view_order"]
 
 
 def stream(seed: int, step: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
-    """Return the generator of one purpose at one step.
+    """Return the random generator for one purpose at one step.
 
     Args:
         seed: of the run, not negative.

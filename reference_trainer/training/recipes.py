@@ -132,7 +132,7 @@ RECIPES: dict[str, Recipe] = {
 
 
 def with_steps(expression: str, times: float) -> str:
-    """Return an expression whose steps, the whole numbers from 100 on, are so many times as late.
+    """Return an expression with its steps, the whole numbers from 100 on, multiplied and rounded.
 
     Example:
         >>> with_steps("d2gs(ramp(0.05, 0.3, 0, 10_000), neighbors=10)", 0.3)
@@ -151,8 +151,8 @@ def with_recipe(name: str, **changes: object) -> TrainConfig:
 
     With other ``iterations`` the steps at which something begins or ends are scaled in proportion: ``sh_every``,
     ``densify_from``, ``densify_until``, ``prune_size_from``, ``opacity_reset_from``, and in loss and density the whole
-    numbers from 100 on. Rates and the steps between two densifications or resets stay: after either the optimizer needs
-    its time. What is given in ``changes`` is taken as it is.
+    numbers from 100 on. Rates and the steps between two densifications or resets stay: the optimizer needs its time
+    after either. ``changes`` are taken as they are.
 
     Args:
         name: a key of `RECIPES`.

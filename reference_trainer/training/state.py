@@ -1,4 +1,4 @@
-"""What the checkpoint of a trainer holds, checked before anything is made of it."""
+"""Checking the content of a trainer's checkpoint before anything is made of it."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class TrainingState(NamedTuple):
     Args:
         config: all settings.
         step: number of steps taken.
-        seconds: time that they took.
-        processor_seconds: of all threads.
-        fields: what `Field.state_dict` returned of each.
+        seconds: wall-clock time that they took.
+        processor_seconds: CPU time that all threads spent on them.
+        fields: the `Field.state_dict` of each field.
     """
 
     config: TrainConfig
@@ -43,7 +43,7 @@ class TrainingState(NamedTuple):
 
 
 def read_state(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
-    """Check what `Trainer.save` wrote: nothing is missing, and everything fits together and the scene.
+    """Check that what `Trainer.save` wrote is complete and consistent, and belongs to the scene.
 
     Args:
         state: content of the checkpoint.
@@ -61,7 +61,7 @@ def read_state(state: dict[str, Any], scene: Scene, where: Path) -> TrainingStat
 
 
 def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
-    """Read a state; what is of a type that is not checked for is a TypeError, an AttributeError or a LookupError."""
+    """Read a state; wrong types that are not checked for raise TypeError, AttributeError or LookupError."""
     others = ["others"] if "others" in state else []
     _refuse_other_entries(state, (*_ENTRIES, *_OF_A_FIELD, *others), f"{where}")
     names = [view.name for view in scene.train]
@@ -112,7 +112,7 @@ def _read_field(
     _refuse_other_entries(state["statistics"], expected, f"{where}, statistics")
     for name, x in state["statistics"].items():
         _check(x, tuple(expected[name].shape), f"{where}, {name}")
-    # They are counted up in place, which a file can forbid: by a gradient, or by memory that is shared.
+    # They are updated in place, which a file can prevent: by requiring a gradient, or by sharing memory.
     statistics = {name: x.detach().clone() for name, x in state["statistics"].items()}
     found = state["regularizer"]
     if type(found) is not dict or not all(isinstance(x, Tensor) and bool(x.isfinite().all()) for x in found.values()):
@@ -133,7 +133,7 @@ def _config(text: Any, where: Path) -> TrainConfig:
 
 
 def _refuse_other_entries(values: Any, names: Collection[str], what: str) -> None:
-    """Refuse anything but a dict with these names, and no other."""
+    """Refuse anything but a dict with exactly these names."""
     if type(values) is not dict:
         raise ValueError(f"{what}: expected entries by name, got {type(values).__name__}; the checkpoint is damaged.")
     if missing := [name for name in names if name not in values]:
@@ -143,7 +143,7 @@ def _refuse_other_entries(values: Any, names: Collection[str], what: str) -> Non
 
 
 def _check_moments(moments: Any, shape: tuple[int, ...], step: int, what: str) -> None:
-    """Refuse what Adam cannot go on with: a negative square would be a nan after the next step."""
+    """Refuse what Adam cannot continue from: a negative second moment would give nan at the next step."""
     _refuse_other_entries(moments, _MOMENTS, what)
     for key, x in moments.items():
         _check(x, () if key == "step" else shape, f"{what}, {key}", least=None if key == "exp_avg" else 0)
@@ -153,7 +153,7 @@ def _check_moments(moments: Any, shape: tuple[int, ...], step: int, what: str) -
 
 
 def _check(x: Any, shape: tuple[int, ...], what: str, *, least: float | None = None) -> None:
-    """Refuse anything but finite float32 of a shape, and what is smaller than the least."""
+    """Refuse anything but a finite float32 tensor of a shape, without values below ``least``."""
     if not isinstance(x, Tensor) or x.dtype != torch.float32 or tuple(x.shape) != shape:
         got = f"{x.dtype}, {tuple(x.shape)}" if isinstance(x, Tensor) else type(x).__name__
         raise ValueError(f"{what}: expected float32 of shape {shape}, got {got}.")

@@ -1,4 +1,4 @@
-"""One training step while it is taken: what a loss term may look at and ask for."""
+"""One training step in progress: what a loss term may read and render."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ class Step:
         view: the training view, on the model's device.
         views: all training views.
         gaussians: the model.
-        regularizer: what acts in this step; an empty chain if nothing does.
+        regularizer: the regularizers that act in this step; an empty chain if none do.
         background: color behind the model, shape (3,).
         sh_degree: highest band of spherical harmonics of this step.
         seed: of the training.
         renderer: what draws.
         absgrad: whether density control is to see absolute gradients.
-        label: of the random numbers.
+        label: prefix of the labels of the random streams.
         fields: the steps of all fields at this view, the first one's first.
 
     Attributes:
-        params: the parameters of the view's camera, activated, as they are without a regularizer.
-        drawn: the same as the regularizer returned it; in an analytic step what the expectation was rendered with.
+        params: the activated parameters, with the view's camera, before any regularizer.
+        drawn: the same after the regularizer; in an analytic step, what the expectation was rendered with.
         image: the render, or in an analytic step its expectation, not clamped, shape (3, H, W).
         variance: of the colors in an analytic step, shape (3, H, W); None in others.
-        rendering: with alpha, depth if a term needs it, and what was drawn; None in an analytic step.
-        observed: what density control is to see: splats and camera of every render that counts.
+        rendering: the render with alpha, depth if a term needs it, and splats; None in an analytic step.
+        observed: splats and camera of every render that density control is to count.
     """
 
     number: int
@@ -74,7 +74,7 @@ class Step:
 
     @property
     def depth(self) -> Tensor:
-        """Depth of the render of a step with a term that needs it: sum of weight times depth, shape (H, W)."""
+        """Depth of the step's render, if a term needs it: sum of weight times depth, shape (H, W)."""
         depth = None if self.rendering is None else self.rendering.depth
         assert depth is not None, "no term of the loss needs it"
         return depth
@@ -140,7 +140,7 @@ class Step:
             camera: on the model's device.
             multiplier: moments of the factor.
             params: what to render, by default the plain model.
-            observed: as of `render`.
+            observed: as for `render`.
         """
         params = self.params if params is None else params
         moments, splats = render_moments_of(params, multiplier, camera, self.background, sh_degree=self.sh_degree)
@@ -149,5 +149,5 @@ class Step:
         return moments
 
     def generator(self, purpose: str) -> torch.Generator:
-        """Return random numbers that depend on the seed, the step and a label alone: a resumed training draws them."""
+        """Return a generator that depends on seed, step and label alone: a resumed training draws the same numbers."""
         return stream(self.seed, self.number, self.label + purpose, self.gaussians.means.device)

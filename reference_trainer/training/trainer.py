@@ -38,10 +38,10 @@ class Trainer:
     Attributes:
         step: the number of steps taken.
         seconds: wall-clock time that they took.
-        processor_seconds: what all threads of the processor spent on them: the fairer figure beside other work.
-        renderer: what draws the draws of the regularizers.
+        processor_seconds: CPU time that all threads spent on them: the fairer figure on a busy machine.
+        renderer: what draws all but moments.
         fields: the models; the first is the one that is measured and written.
-        optimizer: of the first.
+        optimizer: of the first field.
         density: likewise.
         regularizer: likewise.
 
@@ -96,7 +96,7 @@ class Trainer:
 
     @property
     def regularized(self) -> bool:
-        """Whether the last step used the regularizers; of a model that has not begun, whether the first one will."""
+        """Whether the last step used the regularizers; before training, whether the first step will."""
         return max(self.step - 1, 0) >= self.config.regularize_from
 
     def train(
@@ -172,7 +172,7 @@ class Trainer:
                 field.optimizer.set_means_rate(self.config.means_rate_at(self.step) * self.scene.extent)
                 field.optimizer.step()
         self.step += 1
-        steps.clear()  # each step knows all of them: in a cycle their graphs would wait for the garbage collector
+        steps.clear()  # each step refers to all: a cycle would keep their graphs until garbage collection
         return value, squared_error
 
     def save(self, path: Path) -> None:
@@ -241,7 +241,7 @@ class Trainer:
             )
 
     def _begin_steps(self) -> list[Step]:
-        """Choose the view of the step, and what regularizes it: one for every field."""
+        """Choose the view of the step and what regularizes it; return a `Step` for every field."""
         begun, steps, background = self.step >= self.config.regularize_from, list[Step](), self.background
         if self.config.random_background:
             generator = stream(self.config.seed, self.step, "background", self.device)

@@ -1,1 +1,1 @@
-"""The engine of tensor operations."""
+"""The engine of PyTorch operations."""

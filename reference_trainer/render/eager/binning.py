@@ -61,7 +61,7 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
 
 
 def _expand(first: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """List the integers first[i] .. first[i] + counts[i] - 1 of every i; return the i and the integer of each."""
+    """List the integers first[i] .. first[i] + counts[i] - 1 for every i; return the i and the integer of each."""
     source = torch.repeat_interleave(counts)
     offset = first - (counts.cumsum(0) - counts)
     return source, offset[source] + torch.arange(source.shape[0], device=first.device)

@@ -1,4 +1,4 @@
-"""The engine of tensor operations: any dtype, any device; what the loops are tested against."""
+"""The engine of PyTorch operations, for any dtype and device; the loops are tested against it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TorchEngine:
     bin = staticmethod(bin_gaussians)
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
-        """Take those that are too faint out of the lists."""
+        """Remove splats that are too faint from the lists."""
         return splats._replace(opacities=opacities, lists=splats.lists.only(opacities >= MIN_ALPHA))
 
     def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -52,7 +52,7 @@ class TorchEngine:
         return sums[:3], sums[-1], sums[3] if depth else None
 
     def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw one after the other."""
+        """Draw one picture after the other."""
         drawn = (self.composite(self.masked(splats, row), background, depth=False) for row in opacities)
         images, alphas, _ = zip(*drawn, strict=True)
         return torch.stack(images), torch.stack(alphas)
@@ -67,8 +67,7 @@ class TorchEngine:
             with torch.enable_grad():
                 picture = formulas.over(formulas.blend_weights(raw), entries[6:], rows.new_zeros(()))
             (to_raw,) = torch.autograd.grad(picture, raw, upstream[block.tiles])
-            # ln alpha falls by half the square of (l11 dx + l21 dy, l22 dy); its gradient in the position is that of
-            # alpha divided by alpha.
+            # ln alpha = ln o - |(l11 dx + l21 dy, l22 dy)|^2 / 2, and the gradient of alpha is alpha times that of it.
             x, y, l11, l21, l22 = entries[:5, :, None]
             dx, dy = pixels[0] + block.centers[0][..., None] - x, pixels[1] + block.centers[1][..., None] - y
             w1, w2 = l11 * dx + l21 * dy, l22 * dy
@@ -82,7 +81,7 @@ class TorchEngine:
         return self._moments(splats, multiplier, behind, one)
 
     def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
-        """Return the gradients of the variance in factors of its summands."""
+        """Differentiate the variance with respect to factors on its summands."""
         with torch.enable_grad():
             factors = torch.ones_like(splats.opacities)[None].requires_grad_()
             variance = self._moments(splats, multiplier, behind, factors).variance

@@ -1,7 +1,7 @@
-"""The formulas of compositing, tile by tile: what is drawn, its exact moments, and their first order.
+"""The compositing formulas: the picture, its exact moments, and their first order.
 
-Each takes a `Block`, the rows of its entries and what is behind its tiles, and is differentiated by PyTorch. There are
-T tiles of 64 pixels with L entries each, nearest first.
+Each takes a `Block`, the rows of its entries and what is behind its tiles, and is differentiable. A block has T tiles
+of 64 pixels, with L entries each, nearest first.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def _clamped(raw: Tensor) -> Tensor:
 def _running(x: Tensor, *, product: bool) -> Tensor:
     """Return running products or sums along the last dimension.
 
-    On CUDA `torch.cumsum` has no algorithm that repeats itself, and is an error where one is asked for. There, and only
-    there, whole shifted copies are combined, log2 L times.
+    On CUDA `torch.cumsum` has no deterministic algorithm, and raises where one is required. Only there are shifted
+    copies combined, log2 L times.
     """
     if x.device.type == "cpu" or not torch.are_deterministic_algorithms_enabled():
         return x.cumprod(-1) if product else x.cumsum(-1)
@@ -40,14 +40,14 @@ def _running(x: Tensor, *, product: bool) -> Tensor:
 
 
 class _BlendWeights(torch.autograd.Function):
-    """Alpha times transmittance; the gradient by hand, which is twice as fast as that of `torch.cumprod`."""
+    """Alpha times transmittance; the hand-derived gradient is twice as fast as that of `torch.cumprod`."""
 
     @staticmethod
     def forward(ctx: Any, raw: Tensor) -> Tensor:
         alpha = raw.clamp(max=MAX_ALPHA)
         passed = 1 - alpha
         behind = _running(passed, product=True)
-        # From the splat on that would leave too little light, none is left.
+        # Zero from the first splat on that would leave too little light.
         transmittance = torch.where(behind >= MIN_TRANSMITTANCE, behind / passed, 0.0)
         weights = alpha.mul_(transmittance)
         ctx.save_for_backward(passed, transmittance, weights)
@@ -57,23 +57,23 @@ class _BlendWeights(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         passed, transmittance, weights = ctx.saved_tensors
-        # A splat adds its own light, and dims by 1 / (1 - alpha) all behind it; the clamp lets gradients pass.
+        # A splat adds its own light, and scales all light from behind by 1 - alpha; gradients pass the clamp.
         along = _running(weights * gradients[0], product=False)
         result: Tensor = transmittance * gradients[0] - (along[..., -1:] - along) / passed
         return result
 
 
 def blend_weights(raw: Tensor) -> Tensor:
-    """Return alpha times the transmittance in front of every splat, of alphas before the clamp, (T, 64, L).
+    """Return alpha times the transmittance in front of every splat, given alphas before the clamp, (T, 64, L).
 
-    It is 0 from the splat on that ends its pixel.
+    The weights are 0 from the splat on that terminates its pixel.
     """
     weights: Tensor = _BlendWeights.apply(raw)  # type: ignore[no-untyped-call]
     return weights
 
 
 def composite(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
-    """Composite C values over what is behind, (T, C, 64), front to back; then the accumulated alpha, (T, C + 1, 64).
+    """Composite C values front to back over what is behind (T, C, 64); append the accumulated alpha, (T, C + 1, 64).
 
     The rows are geometry and values of the entries, (6 + C, T, L).
     """
@@ -81,7 +81,7 @@ def composite(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
 
 
 def over(weights: Tensor, values: Tensor, behind: Tensor) -> Tensor:
-    """Return what splats show over what is behind them, and the accumulated alpha, (T, C + 1, 64).
+    """Blend values over what is behind them; append the accumulated alpha, (T, C + 1, 64).
 
     Weights are (T, 64, L), values (C, T, L), and what is behind broadcasts to (T, C, 64).
     """
@@ -97,8 +97,8 @@ def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
     what is behind it, the mean grows by m alpha d, and the variance V becomes ((1 - m alpha)^2 + v alpha^2) V
     + v alpha^2 d^2. Every term is a square times a non-negative weight: nothing cancels.
 
-    The rows are geometry, mean m and variance v of the factor, a factor of the summand v alpha^2 d^2, whose gradient is
-    its share, and values of the entries, (9 + C, T, L).
+    The rows (9 + C, T, L) are the entries' geometry, mean m and variance v of the random factor, a factor on the
+    summand v alpha^2 d^2, whose gradient is the summand's share, and values.
     """
     alpha = _clamped(block.alphas(rows[:6])).permute(2, 0, 1)[:, :, None]
     m, v, factor = rows[6:9].transpose(1, 2)[..., None, None]
@@ -106,7 +106,7 @@ def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
     values = rows[9:].permute(2, 1, 0)[..., None]
     terms = expected, factor * spread, (1 - expected).square() + spread, values
     mean, variance = behind, torch.zeros_like(behind)
-    entries = zip(*(reversed(x.unbind(0)) for x in terms), strict=True)  # an index each would copy all in the gradient
+    entries = zip(*(reversed(x.unbind(0)) for x in terms), strict=True)  # indexing would copy all in the backward pass
     for e, s, kept, value in entries:
         contrast = value - mean
         variance = kept * variance + s * contrast.square()
@@ -115,5 +115,5 @@ def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
 
 
 def first_order(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
-    """Return ``sum_i r_i alpha_i^2`` for C values r, (T, C, 64); nothing behind is looked at."""
+    """Return ``sum_i r_i alpha_i^2`` for C values r, (T, C, 64); what is behind is ignored."""
     return rows[6:].transpose(0, 1) @ _clamped(block.alphas(rows[:6])).square().transpose(1, 2)

@@ -41,7 +41,7 @@ def project(
     row_x, row_y = (row_x[:, None] * axes).sum(0), (row_y[:, None] * axes).sum(0)
     xx, xy, yy = (row_x * row_x).sum(0) + dilation, (row_x * row_y).sum(0), (row_y * row_y).sum(0) + dilation
     # The determinant as a sum of squares (Cauchy-Binet): xx yy - xy^2 would cancel for needles. Divided by yy before it
-    # is squared: the squares of the squares of the scales would overflow from a million scene sizes on.
+    # is squared: fourth powers of the scales would overflow from a million scene sizes on.
     l22 = torch.rsqrt(yy)
     cross = torch.linalg.cross(row_x, row_y * l22, dim=0)
     l11 = torch.rsqrt((cross * cross).sum(0) + dilation * (xx + yy - dilation) * (l22 * l22))

@@ -1,7 +1,7 @@
-"""The walk over the tile lists: the one place where the alphas of pixels are evaluated in this engine.
+"""The walk over the tile lists, the one place where this engine evaluates alphas at pixels.
 
-Tiles whose lists are about equally long are padded to a block and handed to a formula. Nothing of the size of the
-pixel-Gaussian pairs outlives its block: the gradient evaluates the formula of a block again.
+Tiles with lists of similar length are padded to a block and handed to a formula. Nothing of the size of the
+pixel-Gaussian pairs outlives its block: the backward pass evaluates the formula again.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class Block(NamedTuple):
     """Tiles whose lists are padded to one length.
 
     Args:
-        tiles: their numbers, row by row over the image, shape (T,).
+        tiles: tile numbers, row by row over the image, shape (T,).
         centers: of the tiles, pixels, shape (2, T, 1).
-        gaussians: the Gaussian of every entry, nearest first; the number of Gaussians M is padding, shape (T, L).
+        gaussians: the Gaussian of every entry, nearest first, shape (T, L); M, the number of Gaussians, marks padding.
     """
 
     tiles: Tensor
@@ -59,7 +59,7 @@ class Block(NamedTuple):
 
 
 def pixel_offsets(like: Tensor) -> Tensor:
-    """Return x and y of a tile's pixels from its center, in the dtype and on the device of a tensor, (2, 64, 1)."""
+    """Return x and y of a tile's pixels relative to its center, with the dtype and device of a tensor, (2, 64, 1)."""
     axis = torch.arange(TILE, dtype=like.dtype, device=like.device) - (TILE - 1) / 2
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     return torch.stack([x, y]).view(2, PIXELS, 1)
@@ -68,12 +68,12 @@ def pixel_offsets(like: Tensor) -> Tensor:
 def geometry_rows(splats: Splats) -> Tensor:
     """Return x, y, l11, l21, l22 and the binary logarithm of the opacity of M splats, shape (6, M)."""
     means, factors = splats.projection.means, splats.projection.factors
-    opacities = splats.opacities.clamp_min(MIN_ALPHA)  # what a mask has dropped is in no list, and has a gradient of 0
+    opacities = splats.opacities.clamp_min(MIN_ALPHA)  # masked-out splats are in no list: their gradient is 0
     return torch.cat([means.T, factors.T, torch.log2(opacities)[None]])
 
 
 def blocks(lists: TileLists, device: torch.device) -> Iterator[Block]:
-    """Iterate over all tiles with a non-empty list; a list that alone is too long makes a block of its own."""
+    """Iterate over blocks of all tiles with a non-empty list; a list that is too long gets a block of its own."""
     pairs = BLOCK_PAIRS_CPU if device.type == "cpu" else BLOCK_PAIRS_CUDA
     lengths, tiles = torch.sort(lists.lengths, descending=True, stable=True)
     sizes = lengths.cpu().tolist()
@@ -92,12 +92,12 @@ def blocks(lists: TileLists, device: torch.device) -> Iterator[Block]:
 
 
 def walk(formula: Formula, rows: Tensor, behind: Tensor, lists: TileLists, *, extra: int) -> Tensor:
-    """Evaluate a formula of every tile's list and of what is behind it; differentiable in both.
+    """Evaluate a formula on every tile's list and on what is behind the tile; differentiable in both.
 
     Args:
-        formula: of a block, the rows of its entries (R, T, L), and what is behind its tiles (T, C, 64); returns
-            (T, C + extra, 64), which without any splats is what is behind, and 0.
-        rows: numbers of every splat, the first six `geometry_rows`, shape (R, M).
+        formula: takes a block, the rows of its entries (R, T, L) and what is behind its tiles (T, C, 64); returns
+            (T, C + extra, 64), which without any splats is what is behind, followed by zeros.
+        rows: values of every splat, the first six those of `geometry_rows`, shape (R, M).
         behind: images, shape (C, H, W).
         lists: the splats of every tile.
         extra: channels of the result, images (C + extra, H, W), beyond those of ``behind``.
@@ -107,7 +107,7 @@ def walk(formula: Formula, rows: Tensor, behind: Tensor, lists: TileLists, *, ex
 
 
 class _Walk(torch.autograd.Function):
-    """A formula block by block, whose gradient is taken of one block after the other."""
+    """Evaluates and differentiates a formula block by block."""
 
     @staticmethod
     def forward(ctx: Any, formula: Formula, rows: Tensor, behind: Tensor, lists: TileLists, extra: int) -> Tensor:
@@ -129,7 +129,7 @@ class _Walk(torch.autograd.Function):
         to_entries, to_tiles = torch.zeros_like(entries), upstream[:, : behind.shape[0]].clone()
         for block in ctx.blocks:
             inputs = [x.detach().requires_grad_() for x in (entries[:, block.gaussians], tiles[block.tiles])]
-            # Whoever calls backward() within torch.autocast would have its products computed in 16 bits.
+            # A backward() within torch.autocast would otherwise compute these products in 16 bits.
             with torch.enable_grad(), torch.autocast(rows.device.type, enabled=False):
                 result = ctx.formula(block, *inputs)
                 of_block, of_tiles = torch.autograd.grad(result, inputs, upstream[block.tiles], materialize_grads=True)
@@ -139,7 +139,7 @@ class _Walk(torch.autograd.Function):
 
 
 def pad_entries(rows: Tensor) -> Tensor:
-    """Return rows (R, M) with an absent splat as the last, (R, M + 1)."""
+    """Return rows (R, M) with an invisible splat appended, (R, M + 1)."""
     absent = rows.new_zeros(rows.shape[0], 1)
     absent[5] = _ABSENT
     return torch.cat([rows, absent], dim=1)

@@ -1,7 +1,7 @@
 """Which Gaussian touches which tile, by counting instead of sorting.
 
-Gaussians are put in order of depth by a radix sort, and then each in turn appended to the lists of its tiles: a list
-is in order of depth because it was written in it.
+A radix sort orders the Gaussians by depth. Each in turn is then appended to the lists of its tiles, which are thereby
+in order of depth as well.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = Any
 f4 = np.float32
 _ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
 _MIN, _TILE = f4(MIN_ALPHA), f4(TILE)
-_PARTS = 8  # of the order of depth, each with a count of its own of every tile, so that they can be filled at once
+_PARTS = 8  # of the depth order; each counts its own entries per tile, so that all can be filled in parallel
 _BITS = 12  # of a digit of the radix sort
 
 
@@ -48,7 +48,7 @@ def _squared_radius(opacity: Any) -> Any:
 
 @kernel
 def _nearest_first(depths: Array) -> Any:
-    """Return the order of positive depths, nearest first; equal ones stay in order."""
+    """Return the stable order of positive depths, nearest first."""
     keys, mask, shift = depths.view(np.uint32).copy(), (1 << _BITS) - 1, 0
     order = np.arange(len(keys)).astype(np.int32)
     if len(keys):
@@ -75,9 +75,9 @@ def _measure(
     first: int, last: int, centers: Array, factors: Array, covariances: Array, opacities: Array, height: int,
     ellipses: Array, strips: Array,
 ) -> None:  # fmt: skip
-    """Collect what `_find_spans` needs of every ellipse, its first row of tiles the last, and count its rows of tiles.
+    """Collect what `_find_spans` needs of every ellipse, its first row of tiles last, and count its rows of tiles.
 
-    One row of memory for each: the nearest first are all over the memory, and what counts then is the number of places.
+    An ellipse's values are adjacent: taken nearest first, ellipses are scattered over memory; cache misses dominate.
     """
     size = f4(height)
     for i in range(first, last):
@@ -97,7 +97,7 @@ def _find_spans(
     first: int, last: int, order: Array, ellipses: Array, width: int, height: int, strips: Array, spans: Array,
     entries: Array,
 ) -> None:  # fmt: skip
-    """Find the tiles of every strip, nearest first: within one, an ellipse covers an interval of columns."""
+    """Find the interval of tiles that an ellipse covers in each of its rows of tiles (a strip), nearest first."""
     columns = (width + TILE - 1) // TILE
     for place in range(first, last):
         prefetch(ellipses[order[min(place + 8, len(order) - 1)]])
@@ -142,7 +142,7 @@ def _walk(
 
 
 def _ends(counts: Array) -> Array:
-    """Return where each of consecutive groups starts, and where the last ends."""
+    """Return where each consecutive group starts, and where the last ends."""
     result = np.zeros(counts.shape[0] + 1, np.int64)
     np.cumsum(counts, out=result[1:])
     return result

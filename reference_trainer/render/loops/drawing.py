@@ -1,7 +1,7 @@
 """The loop over a tile: front-to-back compositing of its list, and its gradient.
 
-A pixel's transmittance is negative from the splat on that ends it (`MIN_TRANSMITTANCE`). The way back goes front to
-back as well: what lies behind a splat is what was drawn less what has been passed, so alphas are evaluated once.
+A pixel's transmittance is negative from the splat on that terminates it (`MIN_TRANSMITTANCE`). The backward pass goes
+front to back as well: what lies behind a splat is the picture less what has been passed, so alphas are evaluated once.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ Array = Any
 f4 = np.float32
 _ZERO, _ONE, _LEAST_LIGHT, _LEAST = f4(0), f4(1), f4(MIN_TRANSMITTANCE), f4(MIN_ALPHA)
 
-# Places in a tile's state: what is kept of every pixel stands in one array, so that the compiler sees that nothing
-# overlaps. With an array for each it would give up and not use vector instructions: four times slower.
+# Offsets into a tile's state. All values of the pixels share one array, so that the compiler sees that nothing
+# overlaps; with an array for each it would not vectorize: four times slower.
 _LIGHT, _RED, _GREEN, _BLUE, _DEPTH, _BEHIND, _SLOPE = (i * PIXELS for i in range(7))
 
 
 @inlined
 def _pass(alpha: Any, light: Any) -> Any:
-    """Return the weight of a splat, and what light is left behind it."""
+    """Return the weight of a splat, and the light left behind it."""
     rest = light * (_ONE - alpha)
     goes_on = rest >= _LEAST_LIGHT
     return alpha * light if goes_on else _ZERO, rest if goes_on else -abs(light)
@@ -88,7 +88,7 @@ def _forward(
 
 @inlined
 def _lowered(alpha: Any, factor: Any) -> Any:
-    """Return an alpha times a factor, cut and clamped as others are."""
+    """Return an alpha times a factor, cut off and clamped like any alpha."""
     lower = alpha * factor
     return tiles.clamped(lower) if lower >= _LEAST else _ZERO
 
@@ -98,7 +98,7 @@ def _masked(
     first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array,
     lights: Array, images: Array,
 ) -> None:  # fmt: skip
-    """Draw K pictures of the same lists; what is more in the table are factors of the alphas in each."""
+    """Draw K pictures of the same lists; the last K columns of the table are factors on the alphas in each."""
     count = images.shape[0]
     states, ended, kept = np.empty((count, 4 * PIXELS), f4), np.empty(count, np.bool_), np.empty(CHUNK + 1, np.int64)
     entries, alphas = np.empty((CHUNK + 1, table.shape[1]), f4), np.empty((CHUNK + 1, PIXELS), f4)
@@ -122,7 +122,7 @@ def _masked(
                 for k in range(last_entry):
                     kept[shown] = k
                     shown += entries[k, 9 + picture] > _ZERO
-                kept[shown] = last_entry  # which is nowhere seen
+                kept[shown] = last_entry  # an invisible one
                 for k in range(0, shown, 2):
                     a, b = entries[kept[k]], entries[kept[k + 1]]
                     alpha_a, alpha_b = alphas[kept[k]], alphas[kept[k + 1]]
@@ -141,7 +141,7 @@ def _masked(
 
 
 def _make_backward(absolute: bool) -> Any:
-    """Return the kernel of the gradients, or of the sums of their absolute values in the positions, with a depth."""
+    """Return the kernel of the gradients, or of the sums of absolute gradients of the centers, depth included."""
 
     @kernel
     def _backward(
@@ -182,7 +182,7 @@ def _make_backward(absolute: bool) -> Any:
                         along += s[_DEPTH + p] * table[i, 9]
                     beyond = s[_BEHIND + p] - weight * along
                     s[_BEHIND + p], s[_LIGHT + p] = beyond, rest
-                    # A splat adds T c itself, and dims by 1 / (1 - alpha) all behind it; the clamp lets gradients pass.
+                    # A splat adds T c alpha, and scales all light from behind by 1 - alpha; gradients pass the clamp.
                     s[_SLOPE + p] = raw * (now * along - beyond / (_ONE - alpha)) if rest > _ZERO else _ZERO
                     to_r += weight * s[_RED + p]
                     to_g += weight * s[_GREEN + p]
@@ -211,7 +211,7 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
 
 
 class _Composite(torch.autograd.Function):
-    """Of a table of splats: what light is left, (1, H, W), and their image over the background."""
+    """The light left behind all splats, (1, H, W), and their image over the background, (3, H, W)."""
 
     @staticmethod
     def forward(ctx: Any, splats: Splats, background: Tensor, *_differentiable: Tensor) -> tuple[Tensor, Tensor]:
@@ -233,7 +233,7 @@ class _Composite(torch.autograd.Function):
 
 
 def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Draw splats front to back, see `Engine.composite`; depth as the red of a second picture."""
+    """Draw splats front to back, see `Engine.composite`; depth is the red channel of a second picture."""
     p = splats.projection
     light, image = _Composite.apply(  # type: ignore[no-untyped-call]
         splats, background, p.means, p.factors, splats.opacities, splats.colors
@@ -245,7 +245,7 @@ def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tenso
 
 
 def absolute_gradients(splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
-    """Sum the absolute gradients of positions, see `Engine.absolute_gradients`."""
+    """Sum the absolute gradients of the centers, see `Engine.absolute_gradients`."""
     lists, table = splats.lists, tiles.make_table(splats, splats.projection.depths[:, None])
     rows = table.new_empty(lists.gaussians.shape[0], 2)
     assert lists.slots is not None

@@ -1,4 +1,4 @@
-"""The engine of compiled loops: float32 on a CPU, by hand-derived gradients, the same for any number of threads."""
+"""The engine of compiled loops: float32 on a CPU, with hand-derived gradients, the same for any number of threads."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LoopEngine:
     name = "loops"
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
-        """Keep the lists: the loops pass over those that are too faint."""
+        """Keep the lists: the loops skip splats that are too faint."""
         return splats._replace(opacities=opacities)
 
     project = staticmethod(project)

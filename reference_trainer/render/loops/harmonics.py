@@ -39,7 +39,7 @@ def basis(x: Any, y: Any, z: Any, degree: Any, values: Any) -> None:
 
 @inlined
 def basis_gradient(x: Any, y: Any, z: Any, degree: Any, to_values: Any) -> Any:
-    """Return the gradient in (x, y, z), given that in the basis functions."""
+    """Return the gradient with respect to (x, y, z), given that with respect to the basis functions."""
     g = to_values
     to_x, to_y, to_z = f4(0), f4(0), f4(0)
     if degree > 0:

@@ -5,7 +5,7 @@ Back to front, with ``d_i = c_i - mu_{i+1}`` the contrast of a splat with the me
     mu_i = mu_{i+1} + m alpha_i d_i        V = sum_i spread_i S_i d_i^2        S_i = prod_{j<i} shrink_j
 
 where ``spread = v alpha^2`` and ``shrink = (1 - m alpha)^2 + spread``. Every term of V is a square times a non-negative
-weight: nothing cancels. What the expected accumulated alpha lacks of 1 is ``light``.
+weight: nothing cancels. ``light`` is 1 minus the expected accumulated alpha.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ Array = Any
 f4 = np.float32
 _ZERO, _ONE, _TWO = f4(0), f4(1), f4(2)
 
-# Places in a tile's state, see drawing.py.
+# Offsets into a tile's state, see drawing.py.
 _MEAN, _MEAN_1, _MEAN_2, _LIGHT = (i * PIXELS for i in range(4))
 _VARIANCE, _VARIANCE_1, _VARIANCE_2 = (i * PIXELS for i in range(4, 7))
 _TO_MEAN, _TO_MEAN_1, _TO_MEAN_2, _TO_LIGHT = (i * PIXELS for i in range(7, 11))
 _HIDDEN, _FRONT, _SLOPE, _SIZE = (i * PIXELS for i in range(11, 15))
-# Places in what is kept of an entry.
+# Offsets into what is kept of an entry.
 _RAW, _D0, _D1, _D2, _BEYOND, _D3 = (i * PIXELS for i in range(6))
 
 
@@ -92,7 +92,8 @@ def _make_backward(complete: bool) -> Any:
     """Return the kernel of the gradients.
 
     Args:
-        complete: with those of the accumulated alpha and of the factors' moments, and the shares: a quarter slower.
+        complete: whether to add those of the accumulated alpha and of the factors' moments, and the shares; a quarter
+            slower.
     """
     size = 6 if complete else 5
 
@@ -101,13 +102,13 @@ def _make_backward(complete: bool) -> Any:
         first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array,
         behind: Array, to_mean: Array, to_variance: Array, to_alpha: Array, rows: Array, to_behind: Array,
     ) -> None:  # fmt: skip
-        """Carry gradients back: to what is in front of a splat by what is behind it, then to the splat itself.
+        """Sum up, back to front, what is behind every splat; then carry gradients to the splats, front to back.
 
         With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
-        hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}: walked back to front, as division would fail at 0.
+        hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}, by recursion: a division would fail at 0.
         """
         kept = np.empty(np.diff(starts[first : last + 1]).max() * size * PIXELS, f4)
-        s = np.empty(_SIZE, f4)  # in which _VARIANCE is its gradient
+        s = np.empty(_SIZE, f4)  # _VARIANCE holds the gradient of the variance
         for tile in range(first, last):
             s[_LIGHT : _LIGHT + PIXELS] = _ONE
             s[_HIDDEN : _HIDDEN + PIXELS] = _ZERO
@@ -188,7 +189,7 @@ _backward, _complete_backward = _make_backward(False), _make_backward(True)
 def _gradients(
     lists: TileLists, table: Tensor, behind: Tensor, upstream: Sequence[Tensor], complete: bool
 ) -> list[Tensor]:
-    """Return the gradients of splats, of their multipliers with the shares, (M, 3) or (M, 0), and of what is behind."""
+    """Return the gradients of the splats; of their multipliers, and the shares, (M, 3) or (M, 0); of what is behind."""
     rows = table.new_empty(lists.gaussians.shape[0], 12 if complete else 9)
     to_behind = torch.empty_like(behind)
     assert lists.slots is not None
@@ -198,7 +199,7 @@ def _gradients(
 
 
 class _Moments(torch.autograd.Function):
-    """Mean and variance of the colors, and the expected accumulated alpha, (3, 3 and 1, whole tiles)."""
+    """Mean and variance of the colors, and the expected accumulated alpha: 3, 3 and 1 channels, whole tiles."""
 
     @staticmethod
     def forward(ctx: Any, splats: Splats, multiplier: Tensor, behind: Tensor, *_differentiable: Tensor) -> Any:

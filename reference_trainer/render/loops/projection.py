@@ -1,4 +1,4 @@
-"""From 3D Gaussians to colored 2D ellipses, one Gaussian after the other; the formulas are those of `project`."""
+"""From 3D Gaussians to colored 2D ellipses, one by one; the formulas are those of the engine of PyTorch operations."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _NO_DIRECTION = f4(1e-30)  # a quaternion well below this is taken for 0
 
 @inlined
 def _rotation(quaternions: Array, i: int) -> Any:
-    """Return the rotation matrix of a quaternion, its unit vector, and the factor that makes it one."""
+    """Return a quaternion's rotation matrix, the unit quaternion, and the factor that normalizes it."""
     w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
-    # Divided by the largest component first: the squares of the norm would overflow from 1e19 on, or underflow.
+    # Divided by the largest component first: its square would overflow from 1e19 on, or underflow.
     largest = max(max(abs(w), abs(x)), max(abs(y), abs(z)))
     scale = _ONE / (largest if largest > _NO_DIRECTION else _NO_DIRECTION)
     w, x, y, z = w * scale, x * scale, y * scale, z * scale
     norm = math.sqrt(w * w + x * x + y * y + z * z)
-    inverse = _ONE / norm if norm > f4(1e-12) else _ZERO  # of a zero quaternion nothing follows but the identity
+    inverse = _ONE / norm if norm > f4(1e-12) else _ZERO  # a zero quaternion gives the identity
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     matrix = (
         _ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y),
@@ -80,7 +80,7 @@ def _in_camera(means: Array, i: int, view: Array) -> Any:
 
 @inlined
 def _axes(matrix: Any, row: Any, scales: Any) -> Any:
-    """Project the three scaled axes of a Gaussian on a row vector of the world."""
+    """Project the three scaled axes of a Gaussian onto a row vector in world coordinates."""
     return (
         scales[0] * (row[0] * matrix[0] + row[1] * matrix[3] + row[2] * matrix[6]),
         scales[1] * (row[0] * matrix[1] + row[1] * matrix[4] + row[2] * matrix[7]),
@@ -90,7 +90,7 @@ def _axes(matrix: Any, row: Any, scales: Any) -> Any:
 
 @inlined
 def _rows(slope_x: Any, slope_y: Any, z: Any, view: Array, lens: Array) -> Any:
-    """Return the two rows of (Jacobian x view rotation), linearised at slopes within the limits."""
+    """Return the two rows of (Jacobian x view rotation), linearized at slopes within the limits."""
     forward = view[2, 0], view[2, 1], view[2, 2]
     row_x = _times(lens[0] / z, _plus((view[0, 0], view[0, 1], view[0, 2]), -_clip(slope_x, lens[4]), forward))
     row_y = _times(lens[1] / z, _plus((view[1, 0], view[1, 1], view[1, 2]), -_clip(slope_y, lens[5]), forward))
@@ -149,7 +149,7 @@ def _forward(
                 color = _HALF
                 for j in range((degree + 1) * (degree + 1)):
                     color += values[j] * sh[i, j, c]
-                colors[k, c] = color if not color < _ZERO else _ZERO * color  # nan of minus infinity
+                colors[k, c] = color if not color < _ZERO else _ZERO * color  # minus infinity gives nan
 
 
 @kernel
@@ -268,7 +268,7 @@ def project(
     inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
 ) -> tuple[Projection, Tensor]:
     """Project and color Gaussians, see `Engine.project`."""
-    # Colors are coefficients (N, 1, 3) of degree -1.
+    # Plain colors are passed as coefficients (N, 1, 3) of degree -1.
     sh, band = (inputs["colors"][:, None], -1) if degree is None else (inputs["sh"], degree)
     *projection, colors = _Project.apply(  # type: ignore[no-untyped-call]
         inputs["means"], inputs["quaternions"], inputs["scales"], sh, indices, camera, band

@@ -1,4 +1,4 @@
-"""What the kernels that walk over tiles share: a tile's pixels, the alphas of its list at them, and their gradient."""
+"""What the tile kernels share: a tile's pixels, the alphas of its splats at them, and their gradients."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CHUNK = 16
 """Entries of a list that are read at once."""
 
 X = np.tile(np.arange(TILE, dtype=f4) - f4((TILE - 1) / 2), TILE)
-"""x of every pixel of a tile from its center, row by row."""
+"""x of every pixel relative to its tile's center, row by row."""
 Y = np.repeat(np.arange(TILE, dtype=f4) - f4((TILE - 1) / 2), TILE)
 """y likewise."""
 
@@ -39,7 +39,7 @@ _LEAST = f4(MIN_ALPHA)
 _FAINT = f4(np.log2(MIN_ALPHA))
 _ABSENT = f4(-1e4)  # binary logarithm of an opacity that is 0 everywhere
 
-# The polynomial of degree 5 with the least relative error (7.5e-8) of 2^x on [-1/2, 1/2].
+# The polynomial of degree 5 that approximates 2^x on [-1/2, 1/2] with the least relative error (7.5e-8).
 _P0, _P1, _P2 = f4(1.00000007165467), f4(0.69314696706436), f4(0.24022119723882)
 _P3, _P4, _P5 = f4(0.05550713274154), f4(0.00967554133273), f4(0.00132764717803)
 
@@ -70,12 +70,12 @@ def _fill_table(
 
 
 def whole_tiles(lists: TileLists, *channels: int) -> Tensor:
-    """Return an empty image of whole tiles, (*channels, 8 rows, 8 columns): kernels need not look at borders."""
+    """Return an uninitialized image of whole tiles, (*channels, 8 rows, 8 columns): kernels need no border checks."""
     return torch.empty(*channels, TILE * lists.rows, TILE * lists.columns, dtype=torch.float32, device="cpu")
 
 
 def over_tiles(kernel: Any, lists: TileLists, *arguments: Tensor) -> None:
-    """Call a kernel for all tiles, with their lists and more tensors, of which it fills some that are contiguous."""
+    """Call a kernel for all tiles with their lists and further tensors; those that it fills must be contiguous."""
     arrays = (x.detach().contiguous().numpy() for x in (lists.starts, lists.gaussians, *arguments))
     in_threads(kernel, lists.columns * lists.rows, lists.columns, *arrays, least=16)
 
@@ -83,7 +83,7 @@ def over_tiles(kernel: Any, lists: TileLists, *arguments: Tensor) -> None:
 def sum_rows(rows: Tensor, table: Tensor, lists: TileLists) -> list[Tensor]:
     """Add up the rows of every splat's entries, (P, 9 or more), always in the same order.
 
-    Returns the gradients of means, factors, opacities and colors, and the sums of the columns that are left.
+    Returns the gradients of means, factors, opacities and colors, and the sums of the remaining columns.
     """
     assert lists.offsets is not None
     sums = [table.new_empty(len(table), *shape) for shape in ((2,), (3,), (), (3,), (rows.shape[1] - 9,))]
@@ -105,7 +105,7 @@ def _sum_rows(
                 total[column] += rows[row, column]
         to_means[i, 0], to_means[i, 1] = total[0], total[1]
         to_factors[i, 0], to_factors[i, 1], to_factors[i, 2] = total[2], total[3], total[4]
-        # A splat that a mask has dropped has no logarithm, and a gradient of 0.
+        # A splat dropped by a mask has opacity 0, without a logarithm; its gradient is 0.
         to_opacities[i] = total[5] / max(np.exp2(table[i, 5]), _LEAST)
         to_colors[i, 0], to_colors[i, 1], to_colors[i, 2] = total[6], total[7], total[8]
         for column in range(more.shape[1]):
@@ -114,7 +114,7 @@ def _sum_rows(
 
 @inlined
 def load(images: Any, tile: Any, columns: Any, state: Any, place: Any) -> None:
-    """Copy a tile of images (C, H, W) to a place of its state."""
+    """Copy a tile of images (C, H, W) into its state, from offset ``place`` on."""
     top, left = tile // columns * TILE, tile % columns * TILE
     for c in range(images.shape[0]):
         for p in range(PIXELS):
@@ -123,7 +123,7 @@ def load(images: Any, tile: Any, columns: Any, state: Any, place: Any) -> None:
 
 @inlined
 def store(state: Any, place: Any, images: Any, tile: Any, columns: Any) -> None:
-    """Copy them back."""
+    """Copy a tile's state, from offset ``place`` on, into images (C, H, W)."""
     top, left = tile // columns * TILE, tile % columns * TILE
     for c in range(images.shape[0]):
         for p in range(PIXELS):
@@ -132,7 +132,7 @@ def store(state: Any, place: Any, images: Any, tile: Any, columns: Any) -> None:
 
 @inlined
 def is_faint(table: Any, i: Any) -> Any:
-    """Whether a Gaussian cannot be seen anywhere, as one that a mask has dropped."""
+    """Whether a Gaussian is invisible everywhere, such as one dropped by a mask."""
     return table[i, 5] < _FAINT
 
 
@@ -140,10 +140,10 @@ def is_faint(table: Any, i: Any) -> Any:
 def read_entries(
     gaussians: Any, first: Any, last: Any, step: Any, table: Any, tile: Any, columns: Any, entries: Any
 ) -> Any:
-    """Collect what pixels need of ``range(first, last, step)`` of a tile's list, leaving out who cannot be seen.
+    """Gather the Gaussians at ``range(first, last, step)`` of the lists for a tile, except invisible ones.
 
-    Rows of ``entries`` receive footprint, color, and what else is in the table. Returns how many there are; one more
-    that is nowhere seen follows, so that they can be taken in pairs.
+    Rows of ``entries`` receive footprint, color, and the table's further columns. Returns how many there are; an
+    invisible one follows, so that they can be taken in pairs.
     """
     count = 0
     for e in range(first, last, step):
@@ -163,13 +163,13 @@ def read_entries(
 
 @inlined
 def footprint_of(entry: Any) -> Any:
-    """Return the footprint that was read."""
+    """Return the footprint of an entry from `read_entries`."""
     return entry[0], entry[1], entry[2], entry[3], entry[4], entry[5]
 
 
 @inlined
 def _from_center(table: Any, i: Any, tile: Any, columns: Any) -> Any:
-    """Return the factor of a splat, its mean seen from the center of a tile, and the product of both."""
+    """Return the factor of a splat, its mean relative to the center of a tile, and the product of both."""
     l11, l21, l22 = table[i, 2], table[i, 3], table[i, 4]
     dx = table[i, 0] - f4(tile % columns * TILE + TILE // 2)
     dy = table[i, 1] - f4(tile // columns * TILE + TILE // 2)
@@ -210,9 +210,9 @@ def clamped(raw: Any) -> Any:
 
 @intrinsic
 def _split(_context: Any, _exponent: Any) -> Any:
-    """Return x less the nearest integer n, and 2^n (nothing of use below -126, where every alpha is cut off).
+    """Return x - n and 2^n for the integer n nearest to x (meaningless below -126, where every alpha is cut off).
 
-    `math.exp2` is a call for every number; this is a few instructions for eight or sixteen of them.
+    `math.exp2` is a call for every number; this is a few instructions for eight or sixteen at once.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -227,9 +227,9 @@ def _split(_context: Any, _exponent: Any) -> Any:
 
 @inlined
 def footprint_gradient(table: Any, i: Any, tile: Any, columns: Any, slopes: Any, row: Any) -> None:
-    """Carry gradients of a splat's ln alpha at the pixels of a tile to its geometry.
+    """Carry the gradients of a splat's ln alpha at the pixels of a tile to its geometry.
 
-    The row receives those of x, y, l11, l21, l22 and ln o.
+    The row receives the gradients of x, y, l11, l21, l22 and ln o.
     """
     s, sx, sy, sxx, sxy, syy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
     for q in range(TILE):  # column by column: x is factored out
@@ -256,7 +256,7 @@ def footprint_gradient(table: Any, i: Any, tile: Any, columns: Any, slopes: Any,
 
 @inlined
 def absolute_slopes(table: Any, i: Any, tile: Any, columns: Any, slopes: Any) -> Any:
-    """Sum the absolute gradients of a splat's position, given those of its ln alpha at the pixels of a tile."""
+    """Sum the absolute gradients of a splat's center, given the gradients of its ln alpha at the pixels of a tile."""
     l11, l21, l22, _, _, w1, w2 = _from_center(table, i, tile, columns)
     to_x, to_y = _ZERO, _ZERO
     for p in range(PIXELS):
