@@ -11,7 +11,7 @@
 - :mod:`ca_reg.functional` has the pure functions, :mod:`ca_reg.schedules` rates that change during training,
   :mod:`ca_reg.types` what a render callable may return, :mod:`ca_reg.dynamics` plots of a monitor's log.
 
-Based on "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian Splatting", "the paper" throughout.
+After "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian Splatting", called "the paper" throughout.
 Importing this package loads torch and numpy only.
 """
 

@@ -71,7 +71,7 @@ class Regularizer(Scheduled):
     last: Draw | None = None
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw for one training step; ``x`` is what the rasterizer would receive, None the global generator."""
+        """Draw for one training step, for which ``x`` is what the rasterizer would receive without a regularizer."""
         raise NotImplementedError
 
     def replay(self, x: Params, draw: Draw) -> Params:

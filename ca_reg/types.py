@@ -66,7 +66,7 @@ class MomentsFn(Protocol):
     - ``alpha_mean``: expected accumulated alpha, (H, W), (1, H, W) or (H, W, 1); a score needs it, a penalty does not.
 
     ``background`` is None for the model's own, one color of shape (3,), or an image, one color for each pixel. The
-    renderer must not terminate rays early: splats behind an opaque surface show where the surface's are dropped.
+    renderer must not stop early at an opaque surface: splats behind it show where those of the surface are dropped.
 
     Example:
         >>> from ca_reg.functional import alpha_moments, pixel_moments

@@ -58,8 +58,8 @@ class Field:
     def count_render(self, parameters: tuple[Tensor, ...], place: Hashable) -> bool:
         """Count a training render; return whether it was requested at the same place as the first one of its step.
 
-        An update of the parameters changes their versions, which marks a new step or must not happen within one:
-        raises RuntimeError if steps go by unannounced.
+        A change of the parameters' versions shows that they were trained on: that begins a step, or, if calls of
+        update_learning_rate do, raises a RuntimeError, because such a call is missing.
         """
         versions = tuple((id(x), x._version) for x in parameters)
         trained = self.renders > 0 and versions != self._versions

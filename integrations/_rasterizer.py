@@ -114,8 +114,8 @@ def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
     """Zero the radii of dropped Gaussians, and all other integers that a rasterizer returned per Gaussian.
 
     Densification derives visibility from these. Besides the radii some rasterizers return flags (3dgs-mcmc) or counts
-    (taming-3dgs). Floating-point sums of a Gaussian of opacity 0 are 0 already. Returns the same tuple with integers
-    and bools of shape (N,), (N, 1) or (N, 2) zeroed where ``keep``, (N,) bool, is False.
+    (taming-3dgs); floating-point sums of a Gaussian of opacity 0 are 0 already. Zeroes integers and bools of shape
+    (N,), (N, 1) or (N, 2) where ``keep``, (N,) bool, is False, and returns the tuple.
 
     Raises:
         TypeError: if ``returned`` is not a tuple.

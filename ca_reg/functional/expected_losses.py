@@ -30,8 +30,7 @@ def expected_squared_error(mean: Tensor, variance: Tensor, target: Tensor) -> Te
     Exact for every distribution of ``x``: the bias-variance decomposition. Its average is what dropout training
     minimizes on average when the loss is the mean squared error.
 
-    All arguments are floating-point tensors of one shape, else a TypeError or ValueError is raised; the variance is at
-    least 0.
+    All arguments are floating-point tensors of one shape, else TypeError or ValueError; the variance is at least 0.
 
     Example:
         One splat of alpha 0.8, white over black, is kept in half of the draws, so a pixel is 0 or 0.8:

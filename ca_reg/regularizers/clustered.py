@@ -16,7 +16,7 @@ __all__ = ["ClusteredDropout"]
 
 
 class ClusteredDropout(Regularizer):
-    """Drop random anchors together with their k nearest neighbors, a share ``p`` of all Gaussians in the mean.
+    """Drop random anchors together with their k nearest neighbors, an expected share ``p`` of all Gaussians.
 
     Each Gaussian is an anchor with probability ``a``. One that is in ``c`` clusters (its own, and one for each Gaussian
     that has it among its neighbors) is kept with probability ``(1 - a)^c``. The mean of that over all Gaussians is

@@ -10,7 +10,7 @@ __all__ = ["DropGaussian"]
 
 
 class DropGaussian(GaussianDropout):
-    """Drop all Gaussians alike with the rate ``p t / steps`` at step t, and multiply survivors by ``1 / (1 - rate)``.
+    """Drop all Gaussians at the rate ``p t / steps`` at step t, and multiply survivors by ``1 / (1 - rate)``.
 
     DropGaussian (CVPR 2025): uniform over all N Gaussians, no factor at test time. Survivors may exceed 1, which the
     renderer clamps. It is :class:`~ca_reg.GaussianDropout` with ``compensate`` and a ramp, and has the same exact

@@ -17,11 +17,11 @@ __all__ = ["SHDropout"]
 
 
 class SHDropout(Regularizer):
-    """Take from random Gaussians the spherical harmonics above a degree that rises (Fang et al., "DropAnSH-GS").
+    """Drop the spherical harmonics of random Gaussians above a rising degree (Fang et al., "DropAnSH-GS", CVPR 2026).
 
     A share ``p`` keeps only the degrees up to ``l``, where ``l`` is 0 before the first of ``until``, 1 before the
-    second and so on; from the last on nothing is dropped. ``eval()``: unchanged. After arXiv 2602.20933 (CVPR 2026), as
-    no code was published; with :class:`~ca_reg.regularizers.drop_anchors.AnchorDropout` it is the whole scheme:
+    second and so on; from the last on nothing is dropped. ``eval()``: unchanged. After arXiv 2602.20933, as no code was
+    published; with :class:`~ca_reg.regularizers.drop_anchors.AnchorDropout` it is the whole scheme:
     ``drop_anchors + drop_sh``. Only colors change, so there is no multiplier, and density control counts all Gaussians.
 
     Args:

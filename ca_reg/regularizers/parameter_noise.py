@@ -19,8 +19,7 @@ __all__ = ["ParameterNoise"]
 class ParameterNoise(Regularizer):
     """Multiply each element of a parameter by ``1 + noise`` in training, ``noise ~ N(0, sigma^2)``.
 
-    ``eval()`` changes nothing. A subclass names the parameter, and may override how the noise is applied,
-    :meth:`perturb`.
+    ``eval()`` changes nothing. A subclass names the parameter, and may override :meth:`perturb`, which applies noise.
 
     Args:
         sigma: standard deviation of the relative noise, at least 0, or a schedule of it.
