@@ -133,7 +133,7 @@ class Foreign(Regularizer):
 
     It drops the Gaussians where its attribute ``keep``, (N,) bool, is False, or, without that attribute, those whose
     opacity it sets to 0. The step is passed to its ``set_step`` and to those of its submodules. Test-time values come
-    from a copy in ``eval()`` that shares all tensors, so that the mode of the module itself never changes.
+    from a copy in ``eval()`` that shares all tensors, so they never change the mode of the module itself.
 
     Args:
         module: called as ``module(opacity)``, or ``module(opacity, generator=...)`` if there is a generator.

@@ -38,8 +38,8 @@ class CASettings:
         drop_rate: fraction of the Gaussians that each render drops; None if a regularizer drew instead.
         regularizer: the ``repr`` of the regularizer that drew instead of a dropout at ``drop_rate``; None for dropout.
         threshold: a pixel is visible where the accumulated alpha exceeds this: in all K renders with ``"sampling"``, in
-            the render with all opacities times ``1 - drop_rate`` with ``"adaptive"``, in expectation with the exact
-            methods.
+            the render of the mean opacities (times ``1 - drop_rate`` without a regularizer) with ``"adaptive"``, in
+            expectation with the exact methods.
         ddof: the divisor of the variance is ``samples - ddof``. With 0 it expects (K - 1)/K of the true variance.
         seed: seed of the masks.
         relative_error: standard error, as a fraction of the score, at which adaptive sampling stops.
