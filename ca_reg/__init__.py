@@ -1,15 +1,15 @@
 """Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting, in any code base.
 
 - :class:`GaussianDropout` and :class:`OpacityNoise` regularize the activated opacities on their way to the rasterizer;
-  :func:`scale_opacity` is what dropout needs at test time, :func:`expected_opacity` what noise does.
-- :class:`CAScore` measures co-adaptation with any render callable, by sampling, or exactly if the renderer offers
-  moments, for which :class:`ListMoments` makes do with per-pixel lists; :func:`attribute` and :func:`total_effects`
-  tell which Gaussians it comes from. :class:`CAMonitor` logs it during training, and :func:`color_variance` is the
-  paper's second metric.
-- :class:`CAPenalty` trains with dropout or noise without sampling: the expected render, and the exact co-adaptation as
-  a term of the loss, for a renderer that offers moments.
-- :mod:`ca_reg.functional` holds the same as pure functions, :mod:`ca_reg.schedules` rates that change during training,
-  :mod:`ca_reg.types` what a render callable may return, :mod:`ca_reg.dynamics` the plots of a monitor's log.
+  :func:`scale_opacity` and :func:`expected_opacity` are their test-time counterparts.
+- :class:`CAScore` measures co-adaptation with any render callable: by sampling, or exactly if the renderer offers
+  moments, which :class:`ListMoments` computes from per-pixel lists; :func:`attribute` and :func:`total_effects` tell
+  which Gaussians it comes from. :class:`CAMonitor` logs it during training, and :func:`color_variance` is the paper's
+  second metric.
+- :class:`CAPenalty` replaces sampled dropout or noise in training by the expected render, with the exact co-adaptation
+  as a term of the loss; the renderer must offer moments.
+- :mod:`ca_reg.functional` has the pure functions, :mod:`ca_reg.schedules` rates that change during training,
+  :mod:`ca_reg.types` what a render callable may return, :mod:`ca_reg.dynamics` plots of a monitor's log.
 
 After "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian Splatting", called "the paper" throughout.
 Importing this package loads torch and numpy only.

@@ -1,4 +1,4 @@
-"""Streaming moments of renders: the variance map, and what its sampling error is computed from."""
+"""Streaming moments of renders: the variance map and the sampling error of its mean."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ __all__ = ["Deviations", "RenderMoments"]
 
 
 class RenderMoments:
-    """Sums of the renders seen so far, and of their squares, in groups that take turns.
+    """Running sums of renders and of their squares, pooled in groups that take turns.
 
-    The memory is two images, and an image and a map for each group, however many renders are added: in float32, or
-    in float64 if the renders are. All are taken from the first render: what renders have in common, which would drown
-    their variance in E[x^2] - E[x]^2, is gone before anything is squared. In a pixel where K renders agree and the
-    first differs, the square of the mean still is K - 1 times the variance, so a variance errs by at most about K^2
-    roundings there, and by a few of them as a rule.
+    The memory is two images, plus an image and a map per group, however many renders are added: in float32, or in
+    float64 if the renders are. The first render is subtracted from all: what they have in common, which would drown
+    their variance in E[x^2] - E[x]^2, is gone before anything is squared. At a pixel where the first render alone
+    differs from the K - 1 others, the squared mean still is K - 1 times the variance; the variance there is off by at
+    most about K^2 roundings, elsewhere usually by a few.
 
     Args:
-        groups: in which renders are pooled; each gets every ``groups``-th one.
+        groups: number of groups; each pools every ``groups``-th render.
     """
 
     def __init__(self, groups: int = 1) -> None:
@@ -45,21 +45,21 @@ class RenderMoments:
         self.count += 1
 
     def variance(self, ddof: int) -> Tensor:
-        """Return the variance of every pixel, mean over RGB, (H, W), float64; it divides by ``count - ddof``."""
+        """Return the variance of every pixel with divisor ``count - ddof``, averaged over RGB, (H, W), float64."""
         scatter = _add_squares(self._squares.sum(0), self._sums.sum(0), -1 / self.count)
         return scatter.clamp_(min=0).to(torch.float64) / (3 * (self.count - ddof))
 
     def jackknife_error(self, visible: Tensor) -> float:
         """Return the standard error over masks of the unbiased variance, averaged over the visible pixels (H, W).
 
-        The delete-a-group jackknife: leave out one group after the other and see how the value moves. With groups of
-        one render it is the ordinary jackknife. Groups may differ in size (pseudo-values of Busing, Meijer and van der
-        Leeden 1999). The visible region is held fixed. nan below three renders, where nothing can be left out.
+        The delete-a-group jackknife; with groups of one render the ordinary jackknife. Groups may differ in size
+        (pseudo-values of Busing, Meijer and van der Leeden 1999). The visible region is held fixed. nan below three
+        renders, where none can be left out.
         """
         if self.count < 3:
             return math.nan
         used = min(self.count, self._groups)
-        # Sums over the pixels, in float64 from rows of the image on: of squares, and of the products of groups' sums.
+        # Sums over pixels, in float64 beyond single rows: of the squares, and of the products of the groups' sums.
         squares = (self._squares[:used] * visible).sum(-1).double().sum(-1)
         rows = (self._sums[:used] * visible).flatten(1, 2).transpose(0, 1)
         products = torch.bmm(rows, rows.mT).double().sum(0)
@@ -69,14 +69,14 @@ class RenderMoments:
         left_out = (squares.sum() - squares - others / rest) / (rest - 1)
         whole = (squares.sum() - products.sum() / self.count) / (self.count - 1)
         pseudo = ratios * whole - (ratios - 1) * left_out
-        # The jackknife value, sum over groups of pseudo-values weighted by the share of their renders.
+        # The jackknife estimate: pseudo-values weighted by their groups' shares of the renders.
         center = (pseudo / ratios).sum()
         spread = ((pseudo - center).square() / (ratios - 1)).mean()
         return float(spread.sqrt()) / (3 * int(visible.sum()))
 
 
 class Deviations:
-    """Deviations of renders from the expected image over a fixed region: the error of their variance."""
+    """The sampling error of the variance, from deviations of renders from the expected image over a fixed region."""
 
     def __init__(self, expected: Tensor, visible: Tensor) -> None:
         """Take the expected image (3, H, W) and the visible pixels (H, W)."""
@@ -98,11 +98,11 @@ class Deviations:
     def std_error(self) -> float:
         """Return the standard error over masks of the unbiased variance, averaged over the visible pixels.
 
-        With e_1 .. e_K the deviations as vectors over pixels and channels, and means taken over these, the variance of
-        that estimate is ``Var(mean(e e)) / K + 2 E mean(e e')^2 / (K (K - 1))`` for two independent deviations e and e'
-        (Hoeffding 1948, sec. 5). Neighbors in the row of renders stand for the pairs. The second term is all there is
-        where half of some Gaussians are dropped that do not overlap: every mask is then equally far from the mean. An
-        image that is not quite the expected one makes the error larger, as a rule.
+        With e and e' two independent deviations, as vectors over pixels and channels, and means taken over their
+        elements, the variance of that estimate from K renders is
+        ``Var(mean(e e)) / K + 2 E mean(e e')^2 / (K (K - 1))`` (Hoeffding 1948, sec. 5). Consecutive renders serve as
+        the pairs. At a drop rate of 1/2 the first term vanishes for Gaussians that do not overlap: every mask is then
+        equally far from the mean. An inaccurate expected image usually makes the error larger.
         """
         count = len(self._squares)
         squares, products = (torch.stack(x).to(torch.float64) for x in (self._squares, self._products))

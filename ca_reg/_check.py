@@ -1,8 +1,8 @@
 """Argument checks shared by the package.
 
 Types and shapes go through kornia's checks, whose ``TypeCheckError`` is a :class:`TypeError` and whose ``ShapeError``
-is a :class:`ValueError`; values raise a plain :class:`ValueError`. kornia is imported at the first check and not with
-the package, because it takes longer to load than all the rest.
+is a :class:`ValueError`; bad values raise a plain :class:`ValueError`. kornia is imported at the first check, because
+it takes longer to load than the rest of the package.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ __all__ = [
 ]  # fmt: skip
 
 Rate = float | Tensor
-"""A number, or one for each Gaussian, shape (N,); inside ``torch.compile`` also a scalar tensor, so that a rate that
-changes needs no other graph."""
+"""A number, or one per Gaussian, shape (N,); inside ``torch.compile`` also a scalar tensor, so that a changing rate
+does not trigger a recompilation."""
 
 
 def check_opacity(opacity: Any) -> None:
@@ -37,7 +37,7 @@ def check_opacity(opacity: Any) -> None:
 
 
 def check_opacity_range(opacity: Tensor, upper: float = 1.0) -> None:
-    """Raise unless all opacities lie in [0, upper]. Reads the values, which on a GPU waits for them."""
+    """Raise unless all opacities are finite and in [0, upper]. Reads the values, which synchronizes a GPU."""
     if opacity.numel() == 0:
         return
     low, high = (float(x) for x in torch.aminmax(opacity.detach()))
@@ -62,7 +62,7 @@ def check_per_gaussian(x: Any, opacity: Tensor, name: str) -> None:
 
 
 def check_rate(p: Any, name: str = "p") -> None:
-    """Raise unless ``p`` is a real number in [0, 1), or a tensor (N,) of such. Reads the values of a tensor."""
+    """Raise unless ``p`` is a real number in [0, 1), or a tensor (N,) of such; the tensor's values are read."""
     if _is_in_a_graph(p):
         return
     if isinstance(p, Tensor):
@@ -97,7 +97,7 @@ def check_count(x: Any, name: str, *, minimum: int) -> None:
 
 
 def rate_like(p: Rate, opacity: Tensor) -> Rate:
-    """Return rates that multiply opacities (N,) or (N, 1): a tensor (N,) in their shape and type, a number as it is."""
+    """Return rates that broadcast to opacities (N,) or (N, 1): a tensor (N,) in their shape and dtype, else as is."""
     if not (isinstance(p, Tensor) and p.ndim):
         return p
     check_per_gaussian(p, opacity, "p")
@@ -105,10 +105,10 @@ def rate_like(p: Rate, opacity: Tensor) -> Rate:
 
 
 def is_zero(rate: Rate) -> bool:
-    """Whether there is nothing to do; never, as far as a graph can know."""
+    """Whether the rate is the number 0; False for a tensor, whose values are not read."""
     return not isinstance(rate, Tensor) and rate == 0
 
 
 def _is_in_a_graph(x: Any) -> bool:
-    """Whether ``x`` is a scalar of a graph, whose value was checked where the step was set."""
+    """Whether ``x`` is a tensor in a compiled graph, whose value was checked when the step was set."""
     return isinstance(x, Tensor) and torch.compiler.is_compiling()

@@ -1,4 +1,4 @@
-"""The lines of a monitor's log: one measurement each, in JSON."""
+"""Read a monitor's log, which holds one measurement per line, in JSON."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ __all__ = ["read_log"]
 
 
 def read_log(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Iterate over the measurements of a log, each with its line as it stands in the file.
+    """Iterate over the measurements of a log, each with its raw line.
 
-    What follows the last line's end is left out if it is no measurement: a running or killed process has not finished
-    it.
+    An unterminated last line is skipped if it does not parse: a running or killed process has not finished it.
 
     Raises:
-        ValueError: if another line is no measurement; the message names file and line.
+        ValueError: if another line is not a measurement; the message names file and line.
     """
     *whole, rest = path.read_bytes().split(b"\n")
     for number, line in enumerate(whole, start=1):
@@ -35,7 +34,7 @@ def read_log(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _measurement(line: bytes) -> dict[str, Any]:
-    """Parse a line: numbers, text or null by name, with a step among them."""
+    """Parse a line: numbers, strings or null by name, including an integer ``step``."""
     try:
         record = json.loads(line.decode())
     except RecursionError as error:

@@ -1,4 +1,4 @@
-"""Where random numbers come from."""
+"""Random numbers: draws from an optional generator, and seeded generators."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ __all__ = ["draw_numbers", "seeded"]
 def draw_numbers(
     sample: Callable[..., Tensor], n: int, generator: torch.Generator | None, device: torch.device | str | None
 ) -> Tensor:
-    """Return n float32 numbers of ``torch.rand`` or ``torch.randn``, drawn where the generator is.
+    """Return n float32 numbers of ``torch.rand`` or ``torch.randn``, drawn on the generator's device if one is given.
 
-    Raises a RuntimeError if they are drawn from one while gradients are computed: they would be other ones.
+    Raises a RuntimeError if a generator is used during a backward pass, where a recomputed draw would differ.
     """
     if generator is not None and torch._C._current_graph_task_id() != -1:
         raise RuntimeError(
@@ -29,6 +29,6 @@ def draw_numbers(
 
 
 def seeded(*entropy: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """Return a generator whose numbers follow from integers of at least 0, and differ with each of them."""
+    """Return a generator seeded by all of these non-negative integers."""
     (word,) = np.random.SeedSequence(entropy).generate_state(1, np.uint64)
     return torch.Generator(device).manual_seed(int(word) >> 1)

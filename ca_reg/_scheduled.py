@@ -1,4 +1,4 @@
-"""A module whose rate may follow the step, and that looks at the first opacities."""
+"""The base module: a rate that may follow a schedule, and a range check of the first opacities."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ __all__ = ["Scheduled"]
 
 
 class Scheduled(nn.Module):
-    """A module without parameters whose rate may depend on the step, and that looks at the first opacities.
+    """A module without parameters whose rate may follow a schedule; it checks the range of the first opacities.
 
-    ``state_dict`` holds nothing if the rate is constant, and ``step``, a float64 scalar that may be averaged like a
-    parameter, if it follows a schedule. A checkpoint without it leaves the step as it is, also with ``strict``.
+    If the rate follows a schedule, ``state_dict`` holds ``step``, a float64 scalar that may be averaged like a
+    parameter; else it is empty. A checkpoint without ``step`` leaves it unchanged, even with ``strict``.
 
     Args:
         rate: a number, or a schedule of it; None for a module without one.
     """
 
-    rate_name: ClassVar[str] = ""  # of the argument that is the rate, if one is
+    rate_name: ClassVar[str] = ""  # name of the rate's argument, if there is one
 
     def __init__(self, rate: float | Schedule | None = None) -> None:
         super().__init__()
@@ -48,24 +48,24 @@ class Scheduled(nn.Module):
         check_count(step, "step", minimum=0)
         self.step = int(step)
         if not isinstance(self._schedule, Constant):
-            # A graph reads the rate from a tensor; a number would be a constant of the graph, compiled anew at each
-            # step. A new tensor, because one that was made in inference mode cannot be overwritten outside.
+            # A graph reads the rate from a tensor; a number would be baked in, with a recompilation at each step.
+            # A new tensor, because one created in inference mode cannot be overwritten outside it.
             self._rate = torch.tensor(self._present_rate(), dtype=torch.float64, device="cpu")
 
     def _check_rate(self, rate: float, name: str) -> None:
-        """Raise unless a rate is in its range."""
+        """Raise unless the rate is in range."""
 
     def _present_rate(self, step: int | None = None) -> float:
-        """Return the rate at a step, by default the present one, checked."""
+        """Return the rate at a step, by default the current one, after a check."""
         step = self.step if step is None else step
         rate = self._schedule(step)
         self._check_rate(rate, f"{self.rate_name} at step {step}")
         return rate
 
     def _rate_at(self, step: int) -> Rate:
-        """Return the rate at a step: a number, or inside ``torch.compile`` the present one as a scalar tensor."""
+        """Return the rate at a step: a number, or inside ``torch.compile`` the current one as a scalar tensor."""
         if isinstance(self._schedule, Constant):
-            return self._schedule.value  # checked at construction; a graph that read the step would not outlive it
+            return self._schedule.value  # checked at construction; does not read the step, which would recompile
         if self._rate is not None and torch.compiler.is_compiling():
             return self._rate
         return self._present_rate(step)
@@ -85,18 +85,18 @@ class Scheduled(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _check(self, opacity: Any) -> None:
-        """Check shape and type always, and once that the values are opacities: on a GPU that look costs a wait.
+        """Check shape and dtype, and at the first call the range of the values, which synchronizes a GPU.
 
-        A compiled graph does not look: what it does cannot depend on values.
+        A compiled graph skips the range check: its control flow cannot depend on values.
         """
         check_opacity(opacity)
         if not torch.compiler.is_compiling() and not self._opacity_seen:
-            # Compensated dropout may come before this module: it makes opacities above 1.
+            # Compensated dropout before this module may have raised opacities above 1.
             check_opacity_range(opacity, upper=math.inf)
             self._opacity_seen = True
 
     def extra_repr(self) -> str:
-        """Return the arguments, for ``print``, as far as attributes of the same names tell them."""
+        """Return the constructor arguments that are known from attributes of the same names, for ``print``."""
         rate = self._schedule.value if isinstance(self._schedule, Constant) else self._schedule
         known: dict[str, Any] = {name: x for name, x in vars(self).items() if isinstance(x, int | float | str | tuple)}
         known.setdefault(self.rate_name, rate)

@@ -1,4 +1,4 @@
-"""The settings of a score from the arguments that a caller gave: which method they mean, and its defaults."""
+"""Derive the settings of a score from its arguments: which method they select, and its defaults."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from ca_reg.result import CASettings, Method
 __all__ = ["GROUPS", "LEAST", "ROUND", "make_settings"]
 
 GROUPS = 8
-"""Renders are pooled in at most this many groups, which bounds the memory; with fewer groups the standard error would
-be known less well (relative error about 1/sqrt(2 (groups - 1)), here 27 %)."""
+"""Renders are pooled in at most this many groups, which bounds the memory; fewer groups would make the standard error
+less certain (its relative error is about 1/sqrt(2 (groups - 1)), here 27 %)."""
 
 ROUND = 8
-"""Renders that adaptive sampling adds before it looks at the error again."""
+"""Renders that adaptive sampling adds between checks of the error."""
 
 LEAST = 16
-"""Renders after which it looks for the first time: the error is then known to 18 %. Stopping where an error happens to
-look small makes the stated errors too small, and the more so the less it is known: with 8 renders to 27 %."""
+"""Renders before the first check: the error is then known to 18 %. Stopping where the estimated error happens to be
+small biases it downward, the more so the less certain it is: with 8 renders it is known to 27 %."""
 
 _GIVEN = ("samples", "ddof", "relative_error", "max_samples")
 _APPLIES = {
@@ -48,7 +48,7 @@ def make_settings(
 ) -> CASettings:
     """Find the method and fill in its defaults; raise if an argument is out of range or does not apply.
 
-    ``given`` are samples, ddof, relative_error and max_samples, each None if it is to be found.
+    ``given`` holds samples, ddof, relative_error and max_samples, each None unless the caller set it.
     """
     if drop_rate is not None:
         check_finite(drop_rate, "drop_rate")
@@ -82,7 +82,7 @@ def make_settings(
 
 
 def _method(exact: bool, neutral: bool, relative_error: float | None) -> Method:
-    """Return the method that the arguments ask for."""
+    """Return the method that the arguments select."""
     if exact:
         return "exact_neutral" if neutral else "exact"
     if neutral:

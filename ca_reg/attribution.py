@@ -1,17 +1,16 @@
-"""Which Gaussians co-adapt: two readings of the exact score, one value per Gaussian each.
+"""Which Gaussians co-adapt: two per-Gaussian attributions of the exact score.
 
 *Shares* (:func:`attribute`) add up to the score. The variance of a pixel is a sum over its splats, front to back
-(:func:`ca_reg.functional.contributions`); a share is what the factor of a Gaussian adds to what is known from those in
-front, averaged over those behind. A Gaussian that matters only together with another one in front of it has the whole
-of what they do together.
+(:func:`ca_reg.functional.contributions`); the share of a Gaussian is the variance due to its factor given those in
+front, averaged over those behind. The interaction of two Gaussians counts entirely for the one behind.
 
-*Total effects* (:func:`total_effects`) do not ask for an order. The score is linear in the variance ``v_i`` of the
-factor of every single Gaussian, so ``v_i dV/dv_i`` is exactly by how much the score would fall if this Gaussian alone
-were made certain, its factor fixed at its mean (Sobol's total index, times the variance). What several Gaussians do
-together counts for each of them: no total effect is below the share, and they add up to more than the score.
+*Total effects* (:func:`total_effects`) do not depend on an order. The score is linear in the variance ``v_i`` of each
+Gaussian's factor, so ``v_i dV/dv_i`` is exactly how much the score would fall if the factor of this Gaussian alone were
+fixed at its mean (Sobol's total index, times the variance). Interactions count for each Gaussian involved: no total
+effect is below the share, and together they are at least the score.
 
-Either way pixels are those of the score, and only the draws of the Gaussian itself are removed: a Gaussian that is
-deleted would also change the mean.
+Both refer to the visible pixels of the score, and both remove only the randomness of a Gaussian: deleting it would also
+change the mean.
 """
 
 from __future__ import annotations
@@ -32,12 +31,11 @@ __all__ = ["CAAttribution", "CATotalEffects", "SharesFn", "attribute", "total_ef
 
 
 class SharesFn(Protocol):
-    """A renderer that attributes: ``shares_fn(opacity, view, multiplier, background, weights)``.
+    """A renderer that attributes the variance: ``shares_fn(opacity, view, multiplier, background, weights)``.
 
-    It takes what :class:`~ca_reg.types.MomentsFn` takes, and weights of the pixels, (H, W) in float64. For every
-    Gaussian it returns its :func:`~ca_reg.functional.contributions`, mean over RGB, summed over the pixels with these
-    weights: a tensor of shape (N,), 0 for Gaussians that the view does not see. :meth:`ca_reg.ListMoments.shares` is
-    one.
+    It takes the arguments of :class:`~ca_reg.types.MomentsFn` and weights of the pixels, (H, W) in float64. It returns
+    a tensor of shape (N,): for every Gaussian its :func:`~ca_reg.functional.contributions`, averaged over RGB and
+    summed over the pixels with these weights, 0 if the view does not see it. :meth:`ca_reg.ListMoments.shares` is one.
 
     Example:
         >>> from ca_reg.functional import contributions
@@ -56,7 +54,7 @@ class SharesFn(Protocol):
 class CAAttribution(NamedTuple):
     """The score of a view, split over the Gaussians.
 
-    The shares, (N,) float64, at least 0, add up to ``result.value`` up to rounding; all are 0 if that has no value.
+    The shares, (N,) float64, at least 0, sum to ``result.value`` up to rounding; all are 0 if the score has no value.
     """
 
     shares: Tensor
@@ -64,7 +62,7 @@ class CAAttribution(NamedTuple):
 
 
 class CATotalEffects(NamedTuple):
-    """By how much the score of a view would fall if a single Gaussian were certain.
+    """How much the score of a view would fall if one Gaussian's factor were fixed at its mean, for each Gaussian.
 
     The effects are (N,) float64, at least 0; all are 0 if the score has no value.
     """
@@ -79,9 +77,9 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
     Costs the score and one call of ``shares_fn``.
 
     Args:
-        score: an exact one, :class:`~ca_reg.CAScore` with ``exact``, neutral or not.
+        score: an exact :class:`~ca_reg.CAScore`, neutral or not.
         shares_fn: of the same renderer as the moments of the score.
-        opacity: activated opacities in [0, 1], shape (N,) or (N, 1), neither dropped nor scaled.
+        opacity: activated opacities or :class:`~ca_reg.Params`, as for a call of the score.
         view: passed on to both callables.
 
     Raises:
@@ -89,7 +87,7 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
         ValueError: as for a call of the score, if the score is not exact, or ``shares_fn`` returns another shape.
 
     Example:
-        A red Gaussian in front of a blue one in front of black.
+        A red Gaussian in front of a blue one, over black:
 
         >>> from ca_reg import ListMoments, PixelLists
         >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
@@ -116,10 +114,10 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
 
 
 def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATotalEffects:
-    """Measure a view exactly and find by how much the score would fall if a single Gaussian were certain.
+    """Measure a view exactly and find how much the score would fall if one Gaussian's factor were fixed at its mean.
 
-    Costs the score and a backward pass through its moments callable, which must be differentiable in the multiplier: it
-    is called with a variance per Gaussian, shape (N,), that requires grad.
+    Costs the score, and a forward and backward pass of its moments callable, which must be differentiable in the
+    multiplier: it is called with a variance per Gaussian, shape (N,), that requires grad.
 
     The arguments are those of :func:`attribute`.
 
@@ -128,7 +126,7 @@ def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATota
         ValueError: as for a call of the score, if the score is not exact, or its moments are not differentiable.
 
     Example:
-        As for :func:`attribute`; what the two do together now counts for the one in front as well.
+        The scene of :func:`attribute`; the interaction now counts for the Gaussian in front as well.
 
         >>> from ca_reg import ListMoments, PixelLists
         >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
@@ -160,7 +158,7 @@ def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATota
 
 
 def _measure(score: CAScore, opacity: Tensor | Params, view: Any, name: str) -> ExactView:
-    """Call an exact score, and keep the multiplier and the background that it asked for."""
+    """Call an exact score, and return it with the multiplier and the background of its moments call."""
     if score.exact is None:
         raise ValueError(
             f"{name} needs an exact score, got the method {score.settings.method!r}; make it with "

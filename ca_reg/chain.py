@@ -1,4 +1,4 @@
-"""Several regularizers as one."""
+"""Several regularizers in sequence, as one."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ __all__ = ["Chain", "Foreign"]
 
 
 class Chain(Regularizer):
-    """Regularizers, applied one after the other; what every trainer and hook makes of what it is given.
+    """Regularizers applied one after the other; trainers and hooks wrap whatever they are given in a chain.
 
-    A Gaussian is dropped if a member drops it. Members in ``eval()`` render their test-time value in training, too. At
-    test time the members whose test-time value is a mean give the mean of all of them together, in whatever order they
-    stand; ``nn.Sequential`` would take the mean of the second at the mean of the first.
+    A Gaussian is dropped if any member drops it. Members in ``eval()`` apply their test-time value even in training. At
+    test time the members whose test-time value is a mean contribute their joint mean, in whatever order they are given;
+    ``nn.Sequential`` would evaluate the mean of the second at the mean of the first.
 
     Args:
-        members: regularizers; ``nn.Sequential`` of them are taken apart, and any other module counts as a function of
-            the opacities alone, see :class:`Foreign`.
+        members: regularizers; an ``nn.Sequential`` or another chain is flattened, and any other module is taken for a
+            function of the opacities alone, see :class:`Foreign`.
 
     Raises:
-        TypeError: if a member is no module.
+        TypeError: if a member is not a module.
 
     Example:
         >>> from ca_reg import GaussianDropout, OpacityNoise
@@ -51,7 +51,7 @@ class Chain(Regularizer):
 
     @property
     def needs(self) -> tuple[str, ...]:  # type: ignore[override]
-        """What the members need."""
+        """The fields that the members need."""
         return tuple(dict.fromkeys(name for member in self for name in member.needs))
 
     @property
@@ -66,7 +66,7 @@ class Chain(Regularizer):
 
     @property
     def step(self) -> int:
-        """The training step: the latest that was told to the chain, to a member, or to a part of one."""
+        """The training step: the latest that was set on the chain, a member, or a submodule of one."""
         steps = (getattr(part, "step", 0) for member in self for part in member.modules())
         return max([self._told, *(step for step in steps if isinstance(step, int))])
 
@@ -75,13 +75,13 @@ class Chain(Regularizer):
         self._told = step
 
     def set_step(self, step: int) -> None:
-        """Tell the step to every member."""
+        """Set the step of every member."""
         super().set_step(step)
         for member in self:
             member.set_step(step)
 
     def regularize(self, x: Params, generator: torch.Generator | None = None) -> Params:
-        """Let every member draw in its turn, each for what those before it left."""
+        """Let every member draw in turn, each given the output of the one before."""
         draws: list[Draw | None] = []
         for member in self:
             if member.training:
@@ -103,7 +103,7 @@ class Chain(Regularizer):
         return _together(draws)
 
     def replay(self, x: Params, draw: Draw) -> Params:
-        """Apply the draws of the members, and the test-time value of those that were in ``eval()``."""
+        """Apply the members' draws, and the test-time values of those that were in ``eval()``."""
         for member, own in zip(self, draw.value, strict=True):
             x = member.expected(x) if own is None else member.replay(x, own)
         return x
@@ -129,17 +129,17 @@ class Chain(Regularizer):
 
 
 class Foreign(Regularizer):
-    """A module that knows nothing of this package: from activated opacities (N,) to those to render, in its own mode.
+    """A module that knows nothing of this package, called in its own mode to map activated opacities (N,) to others.
 
-    It drops what its attribute ``keep`` says, (N,) bool, or, without that attribute, what it sets to 0. A ``set_step``
-    of it or of a part of it is told the step. Test-time values come from a copy in ``eval()`` that shares all tensors,
-    so that another thread, or an exception, finds the module as it was.
+    It drops the Gaussians where its attribute ``keep``, (N,) bool, is False, or, without that attribute, those whose
+    opacity it sets to 0. The step is passed to its ``set_step`` and to those of its submodules. Test-time values come
+    from a copy in ``eval()`` that shares all tensors, so they never change the mode of the module itself.
 
     Args:
         module: called as ``module(opacity)``, or ``module(opacity, generator=...)`` if there is a generator.
 
     Raises:
-        TypeError: if it is no module.
+        TypeError: if it is not a module.
 
     Example:
         >>> Foreign(nn.Dropout(0.5)).eval()(torch.full((3,), 0.5))
@@ -154,12 +154,12 @@ class Foreign(Regularizer):
 
     @property
     def takes_generator(self) -> bool:
-        """Whether its ``forward`` has an argument ``generator``, or takes any."""
+        """Whether its ``forward`` takes ``generator``, or any keyword argument."""
         parameters = inspect.signature(self.module.forward).parameters
         return "generator" in parameters or any(x.kind is x.VAR_KEYWORD for x in parameters.values())
 
     def set_step(self, step: int) -> None:
-        """Tell the step to the module and its parts, if they have a `set_step`."""
+        """Pass the step to the `set_step` of the module and its submodules, where they have one."""
         super().set_step(step)
         _tell(self.module, step)
 
@@ -175,11 +175,11 @@ class Foreign(Regularizer):
         return Draw(after, ((after.detach() != 0) | (before.detach() == 0)).reshape(-1))
 
     def replay(self, x: Params, draw: Draw) -> Params:
-        """Take what the module returned."""
+        """Return the opacities that the module returned."""
         return x if draw.value is x.opacities else x._replace(opacities=draw.value)
 
     def expected(self, x: Params) -> Params:
-        """Call the copy in ``eval()``."""
+        """Call a copy of the module in ``eval()``."""
         twin = _evaluating(self.module)
         _tell(twin, x.step)
         opacities: Tensor = twin(x.opacities)
@@ -196,13 +196,13 @@ def _flatten(module: nn.Module) -> list[Regularizer]:
 
 
 def _together(draws: Sequence[Draw | None]) -> Draw:
-    """Return one draw of all members: a Gaussian is kept if none of them drops it."""
+    """Combine the draws of all members: a Gaussian is kept if no member drops it."""
     kept = [draw.keep for draw in draws if draw is not None and draw.keep is not None]
     return Draw(tuple(draws), functools.reduce(torch.logical_and, kept) if kept else None)
 
 
 def _multiplied(members: list[Regularizer], x: Params, *, test: bool = False) -> tuple[Params, Multiplier] | None:
-    """Compose multipliers."""
+    """Compose the members' multipliers; None if one has none."""
     total = Multiplier(1.0, 0.0)
     for member in members:
         one = member.test_multiplied(x) if test else member.multiplied(x)
@@ -213,7 +213,7 @@ def _multiplied(members: list[Regularizer], x: Params, *, test: bool = False) ->
 
 
 def _tell(module: nn.Module, step: int) -> None:
-    """Tell the step to a module and its parts, if they have a `set_step`."""
+    """Pass the step to the `set_step` of a module and its submodules, where they have one."""
     for part in module.modules():
         if callable(set_step := getattr(part, "set_step", None)):
             set_step(step)

@@ -1,4 +1,4 @@
-"""The training-dynamics figure of the paper: co-adaptation and PSNR against the step, from the logs of a monitor."""
+"""The paper's training-dynamics figure: co-adaptation and PSNR against the step, from the logs of a monitor."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def read_dynamics(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[np.floa
 
     Returns:
         Every numeric column by name (``step``, ``gaussians``, ``ca/test``, ``psnr/test``, ...), shape (lines,) each,
-        in order of the steps; nan where a line has no value. Columns of text are left out.
+        sorted by step; nan where a line has no value. Text columns are left out.
 
     Raises:
         FileNotFoundError: if there is no log.
@@ -60,11 +60,11 @@ def read_dynamics(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[np.floa
 def plot_dynamics(
     runs: str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]], *, axes: Sequence[Axes] | None = None
 ) -> tuple[Axes, Axes]:
-    """Draw co-adaptation and PSNR against the step, each on axes of its own.
+    """Plot co-adaptation and PSNR against the step, each on its own axes.
 
-    One color per run; of its groups of views the last one (test) is solid, others are dotted and dashed; nan leaves a
-    gap. The runs are one log or log directory, or several by label; they are drawn on two ``axes``, by default side by
-    side in a new figure. Returns the axes of co-adaptation and those of PSNR.
+    ``runs`` is one log or log directory, or several by label. Each run has one color; its last group of views (test) is
+    solid, the others are dotted or dashed; nan leaves a gap. Draws on two ``axes``, by default side by side in a new
+    figure, and returns them: co-adaptation, PSNR.
 
     Raises:
         ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.

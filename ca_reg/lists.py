@@ -1,8 +1,8 @@
-"""Exact moments of any renderer that can list, per pixel, the Gaussians that it composites.
+"""Exact moments for any renderer that can list the Gaussians it composites at each pixel.
 
-Many code bases can do that: gsplat's ``rasterize_to_indices_in_range`` returns flat lists of Gaussian and pixel
-indices, several forks keep buffers per pixel. Given the alphas of the entries, :class:`ListMoments` is the moments
-callable of :class:`~ca_reg.CAScore`, and its ``shares`` attribute the score to the Gaussians.
+Many code bases can: gsplat's ``rasterize_to_indices_in_range`` returns flat lists of Gaussian and pixel indices,
+several forks keep per-pixel buffers. Given the alphas of the entries, :class:`ListMoments` serves
+:class:`~ca_reg.CAScore` as its moments callable, and :meth:`ListMoments.shares` attributes the score to the Gaussians.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ __all__ = ["ListMoments", "PixelLists"]
 class PixelLists(NamedTuple):
     """What a renderer composites at every pixel of one view, as flat lists of P entries.
 
-    Convention: the entries of one pixel are ordered by depth, the nearest first; those of different pixels may come in
-    any order, also interleaved. No Gaussian appears twice at a pixel.
+    Convention: the entries of one pixel are ordered by depth, the nearest first; entries of different pixels may be
+    interleaved in any order. No Gaussian appears twice at a pixel.
 
     Attributes:
-        gaussians: which of the N Gaussians, integers of shape (P,).
-        pixels: where, ``row * width + column``, integers of shape (P,).
+        gaussians: index of each entry's Gaussian, int32 or int64, shape (P,).
+        pixels: index of each entry's pixel, ``row * width + column``, int32 or int64, shape (P,).
         alphas: alpha of the Gaussian at the pixel, ``min(0.99, opacity * falloff)`` with the opacities that were passed
             in, in [0, 1], shape (P,).
-        colors: of all Gaussians towards this view, shape (N, 3), dtype of ``alphas``.
-        height: of the image.
-        width: of the image.
+        colors: view-dependent colors of all N Gaussians, shape (N, 3), dtype of ``alphas``.
+        height: of the image, in pixels.
+        width: of the image, in pixels.
         background: the model's own, shape (3,); None for black.
     """
 
@@ -49,17 +49,17 @@ class PixelLists(NamedTuple):
 class ListMoments:
     """A moments callable (:class:`~ca_reg.types.MomentsFn`) from per-pixel lists.
 
-    The lists must be complete. Renderers end a pixel behind an opaque surface; what lies further back shines through
-    when splats of the surface are dropped, so a list that ends there misses a part of the variance.
+    The lists must be complete. Renderers stop at an opaque surface, but what lies behind it shows when splats of the
+    surface are dropped, so a list that ends there misses part of the variance.
 
-    Pixels are handled in blocks of similar list length. A block takes about 40 floats per padded entry for a moment,
-    which bounds the memory beyond the lists themselves; a backward pass keeps those of all blocks. Differentiable in
-    everything that ``lists_fn`` is differentiable in, and in the multiplier.
+    Pixels are processed in blocks of similar list length. Beyond the lists themselves, the peak memory is that of one
+    block, about 40 floats per padded entry; a backward pass retains all blocks. Differentiable in everything that
+    ``lists_fn`` is differentiable in, and in the multiplier.
 
     Args:
-        lists_fn: ``lists_fn(opacity, view)`` returns the :class:`PixelLists` of the view with these activated
-            opacities, (N,) or (N, 1) as they were given.
-        elements: largest number of padded entries in a block. A single list that is longer is a block of its own.
+        lists_fn: ``lists_fn(opacity, view)`` returns the :class:`PixelLists` of the view for these activated
+            opacities, (N,) or (N, 1) as the caller gave them.
+        elements: largest number of padded entries in a block; a longer list is a block of its own.
 
     Raises:
         TypeError: if ``lists_fn`` is not callable or ``elements`` not an integer.
@@ -102,7 +102,7 @@ class ListMoments:
             background: shape (3,) or (3, H, W); None for that of the lists.
 
         Raises:
-            TypeError: if the lists are of another type, or a dtype does not fit.
+            TypeError: if ``lists_fn`` returns no :class:`PixelLists`, or a dtype does not fit.
             ValueError: if a shape does not fit, an index is out of range, or an alpha outside [0, 1].
         """
         lists = self._lists(opacity, view)
@@ -120,13 +120,11 @@ class ListMoments:
     def shares(
         self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None, weights: Tensor
     ) -> Tensor:
-        """Return what each Gaussian contributes to a weighted sum of the variance map.
+        """Return what each Gaussian contributes to a weighted sum of the variance map, shape (N,), float64.
 
-        The sum over pixels of ``weights`` times its :func:`~ca_reg.functional.contributions`, mean over RGB. Together
-        they are the weighted sum of the variances.
-
-        The other arguments and errors are those of a call; the weights of the pixels have shape (H, W). Returned are
-        the shares, shape (N,), float64, 0 for Gaussians that are in no list.
+        A Gaussian's share is the sum over pixels of ``weights``, (H, W), times its
+        :func:`~ca_reg.functional.contributions`, averaged over RGB; 0 if it is in no list. The shares add up to the
+        weighted sum of the variances. The other arguments and errors are those of a call.
 
         Example:
             >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
@@ -171,7 +169,7 @@ class ListMoments:
 
 
 class _Block(NamedTuple):
-    """B pixels with lists of up to L entries; in the padding alpha is 0 and the Gaussian is number N."""
+    """B pixels with lists padded to L entries; in the padding alpha is 0 and the Gaussian index is N."""
 
     pixels: Tensor
     gaussians: Tensor
@@ -182,7 +180,7 @@ class _Block(NamedTuple):
 
 
 def _blocks(lists: PixelLists, multiplier: Multiplier, background: Tensor | None, elements: int) -> Iterator[_Block]:
-    """Yield all pixels in blocks, those with long lists first; the fourth channel is an alpha: 1 over 0."""
+    """Yield all pixels in blocks, longest lists first; the fourth channel, 1 for every splat, gives the alpha."""
     n, size = lists.colors.shape[0], lists.height * lists.width
     pixels = lists.pixels.long()
     order = pixels.argsort(stable=True)
@@ -200,7 +198,7 @@ def _blocks(lists: PixelLists, multiplier: Multiplier, background: Tensor | None
     start = 0
     while start < size:
         longest = int(lengths[start])
-        # Lists below half of the longest wait for a later block, so that at most half of a block is padding.
+        # Lists up to half the longest wait for a later block, so at most half of a block is padding.
         similar = int((lengths > longest // 2).sum())
         stop = min(start + max(1, elements // longest), similar)
         which = by_length[start:stop]
@@ -233,7 +231,7 @@ def _behind(lists: PixelLists, background: Tensor | None) -> Tensor:
 
 
 def _per_gaussian(moment: float | Tensor, name: str, lists: PixelLists) -> float | Tensor:
-    """Return a moment of the multiplier as a number, or per Gaussian with an entry for the padding, (N + 1,)."""
+    """Return a moment of the multiplier as a number, or per Gaussian plus an entry for the padding, (N + 1,)."""
     if not isinstance(moment, Tensor):
         return moment
     n = lists.colors.shape[0]

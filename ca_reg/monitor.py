@@ -1,4 +1,4 @@
-"""Co-adaptation while training: scores logged against the step."""
+"""Log co-adaptation scores during training."""
 
 from __future__ import annotations
 
@@ -33,31 +33,30 @@ _log = logging.getLogger(__name__)
 
 
 class CAMonitor(AbstractContextManager["CAMonitor"]):
-    """Log co-adaptation and PSNR of groups of views every so many steps (the paper's training dynamics).
+    """Log co-adaptation and PSNR of groups of views at regular steps (the paper's training dynamics).
 
     Each measurement becomes one line of ``ca.jsonl``, on disk when the call returns: ``step``, ``gaussians`` and for
     each group of views ``ca/<group>``, ``ca_std_error/<group>``, ``ca_reason/<group>``, ``ca_empty_views/<group>`` and
-    ``psnr/<group>``, then the settings of the score. Where there is no value the line says null. If tensorboard is
-    installed, ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` are written as scalars as well. ``backends`` and a
-    line of the logger ``ca_reg.monitor`` (level INFO) say which of the two are in use.
-    :func:`ca_reg.dynamics.plot_dynamics` draws the file.
+    ``psnr/<group>``, then the settings of the score. A missing value is null. If tensorboard is installed,
+    ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` are written as scalars as well. ``backends`` and a message of the
+    logger ``ca_reg.monitor`` (level INFO) tell what is in use. :func:`ca_reg.dynamics.plot_dynamics` plots the file.
 
-    Every measurement uses the same masks per view as long as the number of Gaussians stays, which takes sampling noise
-    out of the comparison of steps.
+    As long as the number of Gaussians stays the same, every measurement of a view uses the same masks, which removes
+    sampling noise from the comparison of steps.
 
     Args:
         score: how to measure. Its ``p`` is also the rate by which opacities are scaled for ``psnr``.
         log_dir: directory of the log and the TensorBoard events; made if it does not exist.
-        views: groups of views by name, usually ``{"train": [...], "test": [...]}``; none empty. The views are passed on
+        views: non-empty groups of views by name, usually ``{"train": [...], "test": [...]}``. The views are passed on
             to the callables as they are.
         every: number of steps between measurements, at least 1.
-        psnr: ``psnr(opacity, view)``, the quality in dB of the view rendered with these opacities, which are already
-            scaled by ``1 - p`` for the test. Called without gradients. None leaves PSNR out.
-        details: ``details(opacity, view)``, what TensorBoard shows of the first view of each group besides the curves,
-            by name: images (3, H, W) in [0, 1], and numbers (N,) as histograms, such as shares. Called without
-            gradients, and only where TensorBoard is installed; images need Pillow.
-        resume_step: None for a new run, which replaces a log that is already there. A resumed run gives the step of its
-            checkpoint: lines up to this step are kept, later ones dropped.
+        psnr: ``psnr(opacity, view)`` returns the PSNR in dB of the view rendered with these opacities, already scaled
+            by ``1 - p`` for test time. Called without gradients. None leaves PSNR out.
+        details: ``details(opacity, view)`` returns, by name, what TensorBoard shows of the first view of each group
+            besides the curves: images (3, H, W) in [0, 1], and numbers (N,), such as shares, as histograms. Called
+            without gradients, and only where TensorBoard is installed; images need Pillow.
+        resume_step: None for a new run, which replaces an existing log. For a resumed run, the step of its checkpoint:
+            lines up to this step are kept, later ones dropped.
 
     Attributes:
         backends: ``("jsonl",)`` or ``("jsonl", "tensorboard")``.
@@ -66,7 +65,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         TypeError: if ``views`` is not a mapping or an argument is of the wrong type.
         ValueError: if there are no views, a group is empty, ``every`` or ``resume_step`` is out of range, or a line of
             the log to resume is damaged.
-        OSError: if the log cannot be written, such as on a full disk; what is in it stays.
+        OSError: if the log cannot be written, such as on a full disk; its earlier lines stay intact.
 
     Example:
         >>> import tempfile
@@ -117,14 +116,14 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         _log.info("co-adaptation is logged to %s (%s)%s", self.path, ", ".join(self.backends), hint)
 
     def __call__(self, step: int, opacity: Tensor) -> dict[str, float | int | str | None] | None:
-        """Measure and log if it is the turn of this step: a multiple of ``every`` that is not in the log yet.
+        """Measure and log if the step is due: a multiple of ``every``, later than the last step in the log.
 
         Args:
             step: the training step.
             opacity: activated opacities of the model in [0, 1], neither dropped nor scaled, shape (N,) or (N, 1).
 
         Returns:
-            What was logged, or None if it was not the turn.
+            The logged record, or None if the step was not due.
 
         Raises:
             TypeError: as for a call of the score, or if ``step`` is not an integer.
@@ -170,7 +169,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
 
     @torch.no_grad()
     def _mean_psnr(self, psnr: Callable[[Tensor, Any], float], opacity: Tensor, group: list[Any]) -> float | None:
-        """Average PSNR over views, each with the opacities of the test; None if it is not finite."""
+        """Average the PSNR over views, with the test-time opacities; None if it is not finite."""
         scaled = scale_opacity(opacity, self.score.p)
         mean = sum(float(psnr(scaled.clone(), view)) for view in group) / len(group)  # it may edit its opacities
         return mean if math.isfinite(mean) else None
@@ -202,7 +201,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         self._writer.flush()
 
     def _append(self, line: bytes) -> None:
-        """Add a line to the log, on disk and whole, or leave the log as it is."""
+        """Append a whole line to the log and sync it to disk, or leave the log as it was."""
         end, rest = self.path.stat().st_size, line
         try:
             while rest:
@@ -215,7 +214,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
 
 
 def _keep_lines(path: Path, resume_step: int | None) -> int:
-    """Drop the lines after ``resume_step``, all if it is None, and return the last step that stays, -1 if none does."""
+    """Drop the lines after ``resume_step``, all if it is None; return the last step that is kept, -1 if none is."""
     kept: list[str] = []
     last = -1
     if resume_step is not None and path.exists():
@@ -229,7 +228,7 @@ def _keep_lines(path: Path, resume_step: int | None) -> int:
             file.writelines(kept)
             file.flush()
             os.fsync(file.fileno())
-        partial.replace(path)  # never a moment without the log on disk
+        partial.replace(path)  # atomic: the log never vanishes from disk
     finally:
         partial.unlink(missing_ok=True)
     return last
@@ -241,5 +240,5 @@ def _summary_writer(folder: Path, resume_step: int | None) -> SummaryWriter | No
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         return None
-    # Hides what the former run wrote beyond the checkpoint; a new run hides all of it.
+    # Hides what the earlier run wrote beyond the checkpoint; for a new run, all of it.
     return SummaryWriter(str(folder), purge_step=0 if resume_step is None else resume_step + 1)

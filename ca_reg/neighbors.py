@@ -1,4 +1,4 @@
-"""The nearest neighbors of every point of a cloud, and how far they are."""
+"""Nearest neighbors in point clouds, and their distances."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from torch import Tensor
 __all__ = ["mean_neighbor_distance", "nearest_distance", "nearest_neighbors"]
 
 SMALLEST_SQUARED_DISTANCE = 1e-7  # INRIA's clamp: coinciding points still get a Gaussian of some size
-TREE_FROM = 4_000  # points; below that the other search takes less time than to import SciPy
+TREE_FROM = 4_000  # points; below that the other search takes less time than importing SciPy
 CHUNK_ELEMENTS = 4_000_000  # distances held at a time: 16 MB in float32
-CHUNK_ROWS = 256  # of the sorted points; more of them span a wider strip, fewer are too many calls
+CHUNK_ROWS = 256  # sorted points per chunk; larger chunks span a wider strip, smaller ones make too many calls
 
 
 @torch.no_grad()
 def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Find the nearest other points of every point, exactly.
 
-    SciPy's tree finds those of many points, on the CPU, if SciPy is installed (``pip install ca_reg[neighbors]``), in a
-    time that grows as N log N; otherwise a search along one axis does, whose time grows nearly as N squared. The two
-    may tell ties apart differently.
+    For many points, SciPy's k-d tree finds them on the CPU in O(N log N), if SciPy is installed
+    (``pip install ca_reg[neighbors]``); otherwise a search along one axis takes nearly O(N^2). The two may break ties
+    differently.
 
     Args:
         points: finite, shape (N, 3), on any device.
         count: number of neighbors k, less than N.
 
     Returns:
-        Squared distances, shape (N, k), and the neighbors' numbers, shape (N, k) int64, nearest first.
+        Squared distances, shape (N, k), and the neighbors' indices, shape (N, k) int64, nearest first.
 
     Raises:
         ValueError: if the shape is not (N, 3), or N is not above k.
@@ -50,7 +50,7 @@ def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _by_tree(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Query SciPy's tree for one more neighbor and take out the point itself."""
+    """Query SciPy's k-d tree for one more neighbor and remove the point itself."""
     from scipy.spatial import cKDTree
 
     coordinates = _on_cpu(points)
@@ -67,7 +67,7 @@ def _on_cpu(points: Tensor) -> Any:
 
 
 def _along_an_axis(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Sort the points along one axis: only those within a strip can be nearer than the neighbors already known."""
+    """Sort the points along one axis: only those in a strip can be nearer than the neighbors already found."""
     n = points.shape[0]
     axis = int((points.amax(0) - points.amin(0)).argmax())
     order = points[:, axis].argsort()
@@ -88,8 +88,8 @@ def _along_an_axis(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _search(ordered: Tensor, start: int, stop: int, low: int, high: int, count: int) -> tuple[Tensor, Tensor]:
-    """Return squared distances and places of the nearest among rows low..high, for every row start..stop."""
-    # By way of matrix products, cdist would return 0 for near duplicates.
+    """Return squared distances and indices of the nearest among rows [low, high) for every row in [start, stop)."""
+    # With matrix products, cdist would return 0 for near duplicates.
     distances = torch.cdist(ordered[start:stop], ordered[low:high], compute_mode="donot_use_mm_for_euclid_dist")
     distances.square_().diagonal(start - low).fill_(torch.inf)
     nearest = distances.topk(count, dim=1, largest=False)
@@ -98,9 +98,9 @@ def _search(ordered: Tensor, start: int, stop: int, low: int, high: int, count: 
 
 @torch.no_grad()
 def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
-    """Return how far the nearest of other points is from every point; shapes (N, D), (M, D) and (N,).
+    """Return the distance from every point, (N, D), to the nearest of the others, (M, D); shape (N,).
 
-    SciPy's tree finds it among many points, as in `nearest_neighbors`; otherwise all distances are computed.
+    Among many others SciPy's k-d tree finds it, as in `nearest_neighbors`; else all distances are computed.
 
     Raises:
         ValueError: if a shape is wrong, or there are no other points.

@@ -1,4 +1,4 @@
-"""What a regularizer works on, and what it drew."""
+"""The input of a regularizer, and the record of one of its draws."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ __all__ = ["Draw", "Params"]
 
 
 class Params(NamedTuple):
-    """What a rasterizer receives of N Gaussians, activated; a regularizer returns it with some fields replaced.
+    """The activated parameters of N Gaussians as a rasterizer receives them; a regularizer returns a modified copy.
 
-    Only the opacities must be there. What else a regularizer looks at or changes, it names in
-    :attr:`Regularizer.needs <ca_reg.Regularizer.needs>`; code that cannot supply it refuses by that name.
+    Only the opacities are required. A regularizer lists the other fields that it reads or changes in
+    :attr:`Regularizer.needs <ca_reg.Regularizer.needs>`; callers that cannot supply one raise an error naming it.
 
-    Convention: world coordinates; quaternions wxyz, not necessarily of length 1; the view matrix is world to camera,
+    Convention: world coordinates; quaternions wxyz, not necessarily normalized; the view matrix is world to camera,
     OpenCV axes (x right, y down, z forward), applied from the left to column vectors.
 
     Attributes:
@@ -24,9 +24,9 @@ class Params(NamedTuple):
         means: centers, world units, shape (N, 3).
         scales: standard deviations along the axes, world units, shape (N, 3).
         quaternions: orientations, shape (N, 4).
-        sh: spherical-harmonic colors, the constant band first, shape (N, K, 3).
-        view_matrix: of the camera that is rendered, shape (4, 4); of the first one if there are several.
-        learned: what the regularizers learn per Gaussian, by name, each (N,).
+        sh: spherical-harmonic coefficients, constant band first, shape (N, K, 3).
+        view_matrix: of the rendered camera, the first if there are several, shape (4, 4).
+        learned: per-Gaussian values that regularizers learn, by name, each (N,).
         step: the training step, which schedules follow.
 
     Example:
@@ -47,12 +47,12 @@ class Params(NamedTuple):
 
 
 class Draw(NamedTuple):
-    """One draw of a regularizer, enough to apply it again.
+    """One draw of a regularizer, with all it takes to replay it.
 
     Attributes:
-        value: whatever its ``replay`` reads: a mask, noise, nothing.
-        keep: which Gaussians were not dropped, shape (N,) bool; None if none was. Density control must not count the
-            others as seen.
+        value: whatever the regularizer's ``replay`` reads, such as a mask or noise; None for nothing.
+        keep: True where a Gaussian was kept, shape (N,) bool; None if none was dropped. Density control must not count
+            dropped Gaussians as seen.
     """
 
     value: Any = None

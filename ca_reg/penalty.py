@@ -19,8 +19,8 @@ __all__ = ["CAPenalty", "PenalizedRender"]
 class PenalizedRender(NamedTuple):
     """What :class:`CAPenalty` returns.
 
-    Image and variance, (3, H, W), are the expected render over the random factors and the variance of its pixels, at
-    least 0; the penalty is weight times the mean of the variance, a scalar: add it to the loss.
+    ``image`` and ``variance``, (3, H, W), are the mean and the variance of the pixels over the random factors;
+    ``penalty``, a scalar to add to the loss, is the weight times the mean of the variance.
     """
 
     image: Tensor
@@ -29,7 +29,7 @@ class PenalizedRender(NamedTuple):
 
 
 class CAPenalty(Scheduled):
-    """Render what dropout training sees on average, and penalize what it sees vary.
+    """Render the mean of what dropout training samples, and penalize its variance.
 
     For the mean squared error, the expected loss of dropout training is the loss of the expected render plus the mean
     variance of its pixels, exactly:
@@ -43,35 +43,34 @@ class CAPenalty(Scheduled):
 
     For the absolute error, the main term of the 3DGS loss, the variance enters in another way:
     ``loss = expected_absolute_error(image, variance, target).mean()`` (:mod:`ca_reg.functional`), without ``penalty``.
-    With any other loss, ``penalty`` is a regularizer of its own, whose weight is a free choice.
+    With any other loss, ``penalty`` is a separate regularizer, whose weight is a free choice.
 
-    ``image`` is also the render for test time, the one with all opacities multiplied by the mean of the multiplier. The
-    two are equal but for what the renderer does to large and small alphas (for a mean of at most 1, and with R the
-    range of the colors and the background): its clamp at 0.99 comes before the factor here and after it there, which
-    moves a color by at most ``R / 99``, whatever the length of the list; its cut-off at 1/255 leaves out splats of
-    scaled opacity, ``R / 255`` at most for each. ``train()`` and ``eval()`` make no difference. No Gaussian is dropped,
-    so density control needs no masked radii.
+    ``image`` is also the test-time render, with all opacities multiplied by the mean of the multiplier. The two are
+    equal up to the renderer's treatment of large and small alphas (for a mean of at most 1, and with R the range of the
+    colors and the background): its clamp at 0.99 comes before the factor here and after it there, which moves a color
+    by at most ``R / 99``, whatever the length of the list; its cut-off at 1/255 omits splats of scaled opacity, at most
+    ``R / 255`` each. ``train()`` and ``eval()`` make no difference. No Gaussian is dropped, so density control needs no
+    masked radii.
 
     Limits: the factors must be independent, one per Gaussian. The clamp and the cut-off of alphas that a factor changed
-    are left out, see :class:`~ca_reg.functional.Multiplier`; plain dropout is exact but for the early stop of a sampled
-    render. Compensated dropout is, too, if the call gets what its survivors hand the rasterizer, ``opacity / (1 - p)``,
-    and ``multiplier`` is ``Multiplier.dropout(p)``; ``image`` is then not the render for test time where opacities
-    exceed ``0.99 (1 - p)``.
+    are not modeled, see :class:`~ca_reg.functional.Multiplier`; plain dropout is exact but for the early termination of
+    a sampled render. So is compensated dropout if the call gets the opacities of survivors, ``opacity / (1 - p)``, and
+    ``multiplier`` is ``Multiplier.dropout(p)``; ``image`` is then not the test-time render where opacities exceed
+    ``0.99 (1 - p)``.
 
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1), neither dropped nor scaled; images are (3, H, W).
-    The first call looks at the opacities.
+    The first call checks that no opacity is negative.
 
     Args:
         moments_fn: the renderer, differentiable, ``moments_fn(opacity, view, multiplier, background)``; see
             :class:`ca_reg.types.MomentsFn`.
-        multiplier: moments of the factor, such as ``Multiplier.dropout(0.2)``; or a callable that makes them from the
-            opacities of shape (N,), at every call, such as ``lambda o: Multiplier.clamped_noise(o, 0.8)``. Gradients
-            flow through it.
+        multiplier: moments of the factor, such as ``Multiplier.dropout(0.2)``; or a callable that computes them from
+            the opacities, (N,), at every call, such as ``lambda o: Multiplier.clamped_noise(o, 0.8)``, with gradients.
         weight: factor of the penalty, at least 0, or a schedule of it.
         layout: order of the axes of the images that ``moments_fn`` returns, ``"CHW"`` or ``"HWC"``.
 
     Attributes:
-        weight: the factor at the present step.
+        weight: the factor at the current step.
         step: the training step, set with :meth:`set_step`; a penalty with a schedule saves it in ``state_dict``.
 
     Raises:
@@ -123,7 +122,7 @@ class CAPenalty(Scheduled):
 
     @property
     def weight(self) -> float:
-        """The factor of the penalty at the present step."""
+        """The factor of the penalty at the current step."""
         return self._present_rate()
 
     def _check_rate(self, rate: float, name: str) -> None:
@@ -146,7 +145,7 @@ class CAPenalty(Scheduled):
             if not isinstance(multiplier, Multiplier):
                 raise TypeError(f"the multiplier callable must return a Multiplier, got {type(multiplier).__name__}.")
         moments = read_moments(self.moments_fn(opacity, view, multiplier, background), layout=self.layout)
-        # In a graph the weight is a float64 scalar, which another scalar does not outweigh.
+        # In a graph the weight is a float64 scalar, which would promote the product to float64.
         penalty = (self._rate_at(self.step) * moments.variance.mean()).to(moments.variance.dtype)
         return PenalizedRender(moments.mean, moments.variance, penalty)
 

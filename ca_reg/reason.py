@@ -1,4 +1,4 @@
-"""Why a score has the value it has: the outcome as data."""
+"""The outcome of a measurement: why a score has the value it has."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Objects by name: ``dropout(0.2) + noise(0.8, scale=True)`` or ``my_module:MyDropout(0.3)`` as text."""
+"""Make objects from text such as ``dropout(0.2) + noise(0.8, scale=True)`` or ``my_module:MyDropout(0.3)``."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ _Factory = TypeVar("_Factory", bound=Callable[..., Any])
 
 
 def imported(module: str, name: str) -> Any:
-    """Return what a module has under a name; modules are looked for in the working directory as well.
+    """Import a module, also from the working directory, and return its attribute ``name``.
 
     Raises ImportError or AttributeError if there is none.
     """
     if "" not in sys.path:
-        sys.path.append("")  # installed commands do not look into the working directory, as python -m does
+        sys.path.append("")  # unlike python -m, installed commands do not search the working directory
     return getattr(importlib.import_module(module), name)
 
 
 class Registry(Generic[T]):
-    """What can be asked for by name, on a command line or in a file.
+    """Factories by name, for expressions on a command line or in a file.
 
-    An expression is one call, or several joined by ``+``. A name without brackets is a call without arguments; a name
-    of the form ``module:Class`` is imported, also from the working directory. Arguments are literals of Python, or
-    calls of the registry's ``values``, such as schedules. Nothing else is evaluated, and what is called belongs to the
-    registry or is a subclass of its base: text from a file cannot call anything else.
+    An expression is one call, or several joined by ``+``. A name without parentheses is a call without arguments; a
+    name of the form ``module:Class`` is imported, also from the working directory. Arguments are Python literals, or
+    calls of the registry's ``values``, such as schedules. Nothing else is evaluated or called: every callable is
+    registered or a subclass of ``base``.
 
     Args:
-        kind: what its members are, for messages.
-        base: the class of all of them.
-        values: functions that may stand among the arguments, by name.
-        known: what makes the members that are there from the start, by name.
+        kind: what the members are called in messages.
+        base: common base class of the members.
+        values: functions that arguments may call, by name.
+        known: the initial factories, by name.
 
     Example:
         >>> from ca_reg.regularizers import REGULARIZERS
@@ -51,7 +51,7 @@ class Registry(Generic[T]):
         self.kind, self.base, self._values, self._factories = kind, base, dict(values), known
 
     def register(self, name: str) -> Callable[[_Factory], _Factory]:
-        """Return a decorator that enters a class, or a function that makes an object, under a name.
+        """Return a decorator that registers a class or a factory function under a name.
 
         Raises:
             ValueError: if the name is taken by something else.
@@ -68,10 +68,10 @@ class Registry(Generic[T]):
         return iter(self._factories)
 
     def __getitem__(self, name: str) -> Callable[..., T]:
-        """Return what makes the objects of a name.
+        """Return the factory of a name, or the class that ``module.Class`` names.
 
         Raises:
-            ValueError: if there is no such name, module or class, or the class is of another kind.
+            ValueError: if there is no such name, module or class, or the class is not a subclass of ``base``.
         """
         if "." not in name:
             if name not in self._factories:
@@ -88,18 +88,18 @@ class Registry(Generic[T]):
         return found
 
     def make(self, text: str, *, imports: bool = True) -> list[T]:
-        """Make the objects of an expression; none of an empty one.
+        """Make the objects of an expression; an empty one makes none.
 
         Args:
             text: the expression.
-            imports: whether ``module:Class`` may be imported; False for text that somebody else wrote.
+            imports: whether ``module:Class`` may be imported; False for text from an untrusted source.
 
         Raises:
-            ValueError: if the text cannot be understood, a name is not known, or an argument is refused; says which.
+            ValueError: if the text does not parse, a name is unknown, or an argument is rejected.
         """
         if not text.strip():
             return []
-        # module:Class is no Python, module.Class is; what stands in quotation marks stays.
+        # Turn module:Class into module.Class, which Python can parse, outside string literals.
         source = re.sub(r"('[^']*'|\"[^\"]*\")|(?<=\w):(?=[A-Za-z_])", lambda found: found[1] or ".", text.strip())
         try:
             node: ast.expr = ast.parse(source, mode="eval").body
@@ -112,10 +112,10 @@ class Registry(Generic[T]):
         return [self._make(term, text, imports) for term in [node, *terms]]
 
     def make_one(self, text: str) -> T:
-        """Make the one object of an expression.
+        """Make the object of an expression that has exactly one.
 
         Raises:
-            ValueError: as `make`, and if it is not one.
+            ValueError: as `make`, and if there is not exactly one.
         """
         made = self.make(text)
         if len(made) != 1:
@@ -137,7 +137,7 @@ class Registry(Generic[T]):
             raise ValueError(f"{ast.unparse(node)!r:.200}: {error}") from error
 
     def _arguments(self, call: ast.Call) -> tuple[list[Any], dict[Any, Any]]:
-        """Evaluate arguments: literals, and calls of the values of the registry."""
+        """Evaluate arguments: literals, and calls of the registry's values."""
         named = {keyword.arg: self._value(keyword.value) for keyword in call.keywords}
         return [self._value(argument) for argument in call.args], named
 

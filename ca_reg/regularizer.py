@@ -1,4 +1,4 @@
-"""The base class of every regularizer: what to draw, how to apply it, what to render at test time."""
+"""The base class of all regularizers: what to draw, how to apply it, what to render at test time."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Given = TypeVar("Given", Tensor, Params)
 
 
 class Learned(NamedTuple):
-    """A number per Gaussian that a regularizer learns; it is cloned, split, pruned and saved with its Gaussian.
+    """A learned number per Gaussian, cloned, split, pruned and saved with its Gaussian.
 
-    ``start`` is its first value, ``rate`` Adam's learning rate.
+    ``start`` is the initial value, ``rate`` Adam's learning rate.
     """
 
     start: float
@@ -28,27 +28,27 @@ class Learned(NamedTuple):
 
 
 class Regularizer(Scheduled):
-    """Changes what a rasterizer receives in training, and says what is to be rendered at test time.
+    """Perturbs what a rasterizer receives in training, and defines what is rendered at test time.
 
-    A regularizer of one's own is a subclass with ``draw`` and ``replay``; if it renders something else than the plain
-    model at test time also ``expected``, and if its draws are independent factors of the opacities, ``multiplied``.
-    With that it works wherever the package's own do: in the bundled trainer, the INRIA hook and its launcher, gsplat,
-    splatfacto-ca, in a :class:`~ca_reg.Chain`, and as the masks of a :class:`~ca_reg.CAScore`. Droppers whose Gaussians
-    are dropped independently of each other only say their rates: :class:`~ca_reg.IndependentDropout`.
+    A custom regularizer is a subclass with ``draw`` and ``replay``; it also overrides ``expected`` if it does not
+    render the plain model at test time, and ``multiplied`` if its draws are independent factors of the opacities. It
+    then works wherever the package's own do: in the bundled trainer, the INRIA hook and its launcher, gsplat,
+    splatfacto-ca, a :class:`~ca_reg.Chain`, and as the masks of a :class:`~ca_reg.CAScore`. To drop Gaussians
+    independently of each other, subclass :class:`~ca_reg.IndependentDropout` and define the rates only.
 
     Called as a module it takes activated opacities, (N,) or (N, 1), or :class:`~ca_reg.Params`, and returns the same
-    kind: a draw in ``train()``, the test-time value in ``eval()``.
+    type: under a new draw in ``train()``, the test-time value in ``eval()``.
 
     Attributes:
-        needs: fields of :class:`~ca_reg.Params` beside the opacities that it reads or changes.
-        learns: what it learns per Gaussian, by name; the bundled trainer alone can supply that.
+        needs: fields of :class:`~ca_reg.Params` besides the opacities that it reads or changes.
+        learns: what it learns per Gaussian, by name; supported by the bundled trainer only.
         drops: whether it may set opacities to 0.
         renders_mean: whether its test-time value is the mean of its draws.
         last: the last draw; None if there was none, or in evaluation.
         step: the training step, set with :meth:`set_step`.
 
     Example:
-        Every second Gaussian dims at random:
+        Dim every second Gaussian at random:
 
         >>> class Flicker(Regularizer):
         ...     drops = False
@@ -71,34 +71,34 @@ class Regularizer(Scheduled):
     last: Draw | None = None
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw for one training step; ``x`` is what the rasterizer would receive, no generator the global one."""
+        """Draw for one training step, for which ``x`` is what the rasterizer would receive without a regularizer."""
         raise NotImplementedError
 
     def replay(self, x: Params, draw: Draw) -> Params:
-        """Return what the rasterizer receives after a draw; ``x`` itself if there is nothing to do."""
+        """Return what the rasterizer receives under a draw; ``x`` itself if the draw changes nothing."""
         raise NotImplementedError
 
     def expected(self, x: Params) -> Params:
-        """Return what is rendered at test time: ``x`` itself unless a subclass says otherwise."""
+        """Return what is rendered at test time: ``x`` itself unless overridden."""
         return x
 
     def multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
-        """Return what to render, and the independent random factor on its alphas, that together are all draws.
+        """Return parameters, and the independent random factor on their alphas, that together reproduce the draws.
 
-        With it a score or a training of this regularizer can be exact: :class:`~ca_reg.functional.Multiplier`. None,
-        the default, where the draws are not of this kind.
+        Exact scores and penalties take this :class:`~ca_reg.functional.Multiplier`. None, the default, means that the
+        draws have no such form.
         """
         return None
 
     def test_multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
-        """Return :meth:`multiplied` as of the test: the same, unless training goes by what it saw at a former step."""
+        """Return :meth:`multiplied` for test time; it differs only if training uses measurements of an earlier step."""
         return self.multiplied(x)
 
     def regularize(self, x: Params, generator: torch.Generator | None = None) -> Params:
-        """Draw, remember the draw in :attr:`last`, and apply it; what trainers and hooks call.
+        """Draw, store the draw in :attr:`last`, and apply it; trainers and hooks call this.
 
         Raises:
-            ValueError: if ``x`` lacks something that the regularizer needs.
+            ValueError: if ``x`` lacks a field that the regularizer needs.
         """
         self.check_needs(x)
         self.last = self.draw(x, generator)
@@ -109,19 +109,19 @@ class Regularizer(Scheduled):
 
         Args:
             x: activated opacities in [0, 1], shape (N,) or (N, 1), or all parameters.
-            drawn: a former draw to apply again, instead of a new one; in training only.
-            generator: source of the draw; the global state of the random numbers is then untouched.
+            drawn: an earlier draw to replay instead of a new one; in training only.
+            generator: source of the draw; the global random state is then untouched.
 
         Returns:
-            As ``x``; the very same object if there is nothing to do.
+            The same type as ``x``; the very same object if nothing changes.
 
         Raises:
             TypeError: if the opacities are not a floating-point tensor.
-            ValueError: if a shape is wrong, the opacities look like logits, something that is needed is missing, or a
-                draw is to be replayed in evaluation.
+            ValueError: if a shape is wrong, the opacities look like logits, a needed field is missing, or ``drawn`` is
+                given in evaluation.
         """
         self._check(x.opacities if isinstance(x, Params) else x)
-        # A graph that read the step would not outlive it; it has the rate from a tensor.
+        # Reading the step would recompile the graph at every step; the graph reads the rate from a tensor.
         step = 0 if torch.compiler.is_compiling() else self.step
         params = x if isinstance(x, Params) else Params(x.reshape(-1) if x.ndim > 1 else x, step=step)
         if not self.training:
@@ -139,7 +139,7 @@ class Regularizer(Scheduled):
         return x if out.opacities is params.opacities else out.opacities.view_as(x)
 
     def check_needs(self, x: Params) -> None:
-        """Raise a ValueError unless all that it needs is there."""
+        """Raise a ValueError unless ``x`` has everything that the regularizer needs."""
         missing = [name for name in self.needs if getattr(x, name) is None]
         missing += [f"learned[{name!r}]" for name in self.learns if name not in (x.learned or {})]
         if missing:
@@ -150,17 +150,17 @@ class Regularizer(Scheduled):
 
     @property
     def keep(self) -> Tensor | None:
-        """Which Gaussians the last draw did not drop, shape (N,) bool; None if it dropped none."""
+        """Which Gaussians the last draw kept, shape (N,) bool; None if it dropped none."""
         return None if self.last is None else self.last.keep
 
     def mask_radii(self, radii: Tensor) -> Tensor:
         """Zero the radii of the Gaussians that the last call dropped, so that density control does not count them.
 
-        If they were counted as seen, their mean gradient would shrink by ``1 - p`` and the threshold in effect rise by
-        ``1 / (1 - p)``.
+        Counted as seen, they would scale the mean gradients by ``1 - p``, which raises the effective densification
+        threshold by ``1 / (1 - p)``.
 
-        The radii are those of all Gaussians as the rasterizer returned them, shape (N,) or (N, ...). Returns the same
-        shape and dtype, the very same tensor if nothing was dropped.
+        Takes the radii of all Gaussians as the rasterizer returned them, shape (N,) or (N, ...). Returns the same shape
+        and dtype, the very same tensor if nothing was dropped.
 
         Raises:
             ValueError: if the number of Gaussians is not that of the last call.

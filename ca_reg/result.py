@@ -1,4 +1,4 @@
-"""What a score returns: for one view, and for the mean over views."""
+"""The results of a score: for one view, and for the mean over views."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ if TYPE_CHECKING:
 __all__ = ["CAResult", "CASettings", "CASummary", "LimitEstimate", "Method", "summarize"]
 
 Method = Literal["sampling", "adaptive", "exact", "exact_neutral"]
-"""How a score was made: see :class:`CASettings`."""
+"""How a score was computed: see :class:`CASettings`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CASettings:
-    """The choices behind a score. A score without them cannot be compared with another.
+    """The choices behind a score, without which it cannot be compared with another.
 
-    The background that the renderer composites on matters as well (up to ``1 - threshold`` of it shows inside the
-    visible region); it belongs to the render callable, so report it beside these.
+    The background that the renderer composites over matters as well (up to ``1 - threshold`` of it shows inside the
+    visible region); the render callable decides it, so report it along with these.
 
-    What does not apply to a method is None: an exact score has neither samples nor ddof nor a seed.
+    Settings that do not apply to the method are None: an exact score has neither samples nor ddof nor a seed.
 
     Args:
         method: ``"sampling"``, the paper's protocol with a fixed number of renders; ``"adaptive"``, as many renders as
-            the error asks for; ``"exact"``, the limit of infinitely many, from the moments of the renderer; or
+            the target error takes; ``"exact"``, the limit of infinitely many, from the renderer's moments; or
             ``"exact_neutral"``, the same over the expected color of each pixel instead of the background.
-        samples: number of renders K; None for adaptive scores too, where it is decided at each view.
-        drop_rate: fraction of the Gaussians that is dropped in each; None where a regularizer decides.
-        regularizer: what drew instead of a dropout at the drop rate; None for that.
+        samples: number of renders K; also None for adaptive scores, where it is decided for each view.
+        drop_rate: fraction of the Gaussians that each render drops; None if a regularizer drew instead.
+        regularizer: the ``repr`` of the regularizer that drew instead of a dropout at ``drop_rate``; None for dropout.
         threshold: a pixel is visible where the accumulated alpha exceeds this: in all K renders with ``"sampling"``, in
-            the render with all opacities times ``1 - drop_rate`` with ``"adaptive"``, in expectation with the exact
-            methods.
-        ddof: the variance divides by ``samples - ddof``. With 0 its expectation is (K - 1)/K of the true variance.
-        seed: where the masks come from.
+            the render of the mean opacities (times ``1 - drop_rate`` without a regularizer) with ``"adaptive"``, in
+            expectation with the exact methods.
+        ddof: the divisor of the variance is ``samples - ddof``. With 0 it expects (K - 1)/K of the true variance.
+        seed: seed of the masks.
         relative_error: standard error, as a fraction of the score, at which adaptive sampling stops.
         max_samples: number of renders at which it stops in any case.
     """
@@ -82,7 +82,7 @@ class _Score(CASettings):
 
     @property
     def expected_fraction(self) -> float:
-        """The share of its limit for infinitely many renders that the score is expected to be, given the region.
+        """The expected score as a fraction of its limit for infinitely many renders, given the visible region.
 
         ``(K - 1) / (K - ddof)``: 0.8 for the paper's 5 renders with ``ddof=0``; 1 for scores without that bias.
         """
@@ -95,8 +95,8 @@ class _Score(CASettings):
         """The score for infinitely many renders, as estimated from these: both numbers over ``expected_fraction``.
 
         It corrects the bias of the variance and nothing else. The visible region of the paper's protocol shrinks with
-        every further render, and keeping the pixels that stayed covered prefers masks that change little: an exact or
-        adaptive score, whose region is that of the expected alpha, can still differ by more than the error.
+        every further render and favors pixels that vary little, so an exact or adaptive score, whose region is that of
+        the expected alpha, can differ by more than the error.
 
         Example:
             >>> from ca_reg import CAScore
@@ -108,7 +108,7 @@ class _Score(CASettings):
         return LimitEstimate(self.value / self.expected_fraction, self.std_error / self.expected_fraction)
 
     def as_dict(self) -> dict[str, float | int | str | None]:
-        """Return all numbers and names, ready for JSON: nan becomes None, maps are left out."""
+        """Return all numbers and strings, ready for JSON: nan becomes None, maps are left out."""
         out: dict[str, float | int | str | None] = {}
         for field in fields(self):
             x = getattr(self, field.name)
@@ -126,26 +126,24 @@ class CAResult(_Score):
     Args:
         value: the score: variance of the renders, mean over RGB and over the visible pixels; nan unless ``reason`` is
             ``Reason.OK``.
-        std_error: standard error of ``value`` over the choice of masks; 0 if it is exact; nan below three samples,
-            without a value, and for an adaptive score none of whose renders differed.
+        std_error: standard error of ``value`` over the choice of masks; 0 for an exact score; nan below three samples,
+            without a value, and if no render of an adaptive score differed although some Gaussians were dropped.
         variance: variance of every pixel, mean over RGB, shape (H, W), float64, visible or not.
         visible: pixels that count, shape (H, W), bool.
         reason: why the value is what it is.
 
-    The settings of the score come with it, see :class:`CASettings`; ``samples`` is the number of renders that were
-    made, also if it was adaptive, and None if the score is exact.
+    The other fields are the settings of the score, see :class:`CASettings`; for an adaptive score ``samples`` is the
+    number of renders that this view took.
     """
 
     variance: Tensor
     visible: Tensor
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the standard deviation of every pixel as a heat map; pixels that do not count stay gray.
+        """Plot the standard deviation of every pixel as a heat map; pixels that do not count stay gray.
 
-        The map shows the root of ``variance``, in units of color: a few pixels hold most of the variance and would
-        leave the rest black.
-
-        Drawn on ``ax``, by default in a new figure; returned for titles and ``ax.figure.savefig(path)``.
+        The map shows the square root of ``variance``, in units of color: a few pixels hold most of the variance, and
+        beside them the rest would be black. Draws on ``ax``, by default in a new figure, and returns it.
 
         Raises:
             ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
@@ -169,9 +167,9 @@ class CASummary(_Score):
     Args:
         value: mean over the views that have a value; nan unless ``reason`` is ``Reason.OK``.
         std_error: standard error of ``value`` over the choice of masks, the views held fixed.
-        reason: ``NOT_FINITE`` if any view is, ``EMPTY`` if all views are, ``NO_VIEWS`` without views, else ``OK``.
+        reason: ``NOT_FINITE`` if it holds for any view, ``EMPTY`` if for all, ``NO_VIEWS`` without views, else ``OK``.
         views: number of views that were measured.
-        empty_views: how many of them have no visible pixel, and hence no share in ``value``.
+        empty_views: number of views without a visible pixel, which ``value`` leaves out.
     """
 
     views: int
@@ -185,7 +183,7 @@ def summarize(results: Iterable[CAResult]) -> CASummary:
         results: at least one, all made with the same settings.
 
     Raises:
-        ValueError: if there is none, or the settings differ.
+        ValueError: if there are no results, or their settings differ.
 
     Example:
         >>> from ca_reg import CAScore
@@ -204,10 +202,10 @@ def summarize(results: Iterable[CAResult]) -> CASummary:
 
 
 class ViewTally:
-    """Sums over views, as one tensor so that ranks can add theirs up."""
+    """Sums over views, in one tensor that ranks can all-reduce."""
 
     def __init__(self) -> None:
-        # sum of values, sum of squared errors, views, empty views, views that are not finite
+        # sum of values, sum of squared standard errors, views, empty views, views that are not finite
         self.sums = torch.zeros(5, dtype=torch.float64)
 
     def add(self, result: CAResult) -> None:
@@ -239,7 +237,7 @@ class ViewTally:
 
 
 def new_axes(count: int = 1) -> Any:
-    """Return the axes of a new figure, an array of several side by side, or say how to get matplotlib."""
+    """Return the axes of a new figure, an array if ``count`` is above 1; raise ImportError without matplotlib."""
     try:
         import matplotlib.pyplot as plt
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Rates that change during training: small frozen callables ``schedule(step) -> float``."""
+"""Rates that change during training: small immutable callables ``schedule(step) -> float``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ca_reg._check import check_count, check_finite
 __all__ = ["SCHEDULES", "Constant", "ExponentialDecay", "LinearRamp", "Schedule", "StartStop", "as_schedule"]
 
 Schedule = Callable[[int], float]
-"""Anything that maps a training step to a rate. The modules check the rate whenever they use it."""
+"""Any callable that maps a training step to a rate. Modules check the rate at each use."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class LinearRamp:
-    """A straight line from one rate to another, constant before and after.
+    """A linear ramp from one rate to another, constant before and after.
 
     Args:
         start_value: rate up to ``start_step``.
@@ -79,12 +79,12 @@ class LinearRamp:
 
 @dataclass(frozen=True)
 class StartStop:
-    """A rate that holds from one step up to another, and 0 outside.
+    """A constant rate between two steps, 0 outside.
 
     Args:
         value: the rate while ``start <= step < stop``.
         start: first step with the rate.
-        stop: first step without it again; None for never.
+        stop: first step at which the rate is 0 again; None for never.
 
     Raises:
         ValueError: if ``value`` is not finite or ``stop`` does not come after ``start``.
@@ -115,13 +115,13 @@ class StartStop:
 
 @dataclass(frozen=True)
 class ExponentialDecay:
-    """A rate that goes from one value to another by a constant factor per step, and is 0 outside.
+    """Exponential decay, or growth, from one rate to another between two steps, 0 outside.
 
     Args:
         start_value: rate at ``start``, above 0.
-        end_value: rate that ``stop`` would have, above 0.
-        start: first step with a rate.
-        stop: first step without it again, greater than ``start``.
+        end_value: rate approached at ``stop``, above 0.
+        start: first step of the decay.
+        stop: first step at which the rate is 0 again, greater than ``start``.
 
     Raises:
         ValueError: if a value is not finite and above 0, or ``stop`` does not come after ``start``.
@@ -152,7 +152,7 @@ class ExponentialDecay:
 
 
 SCHEDULES = {"ramp": LinearRamp, "between": StartStop, "decay": ExponentialDecay}
-"""What may stand for a number in an expression, such as ``dropout(ramp(0, 0.2, 0, 10_000))``."""
+"""Schedules by their names in expressions, such as ``dropout(ramp(0, 0.2, 0, 10_000))``."""
 
 
 def as_schedule(rate: float | Schedule) -> Schedule:

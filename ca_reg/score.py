@@ -37,7 +37,7 @@ __all__ = ["CAScore", "view_position"]
 
 
 class ExactView(NamedTuple):
-    """An exact score and what the moments callable was asked for, in its own layout; no background is the model's."""
+    """An exact score and the arguments of its moments call; the background is in the callable's own layout."""
 
     result: CAResult
     opacity: Tensor
@@ -54,65 +54,63 @@ class CAScore:
     rate ``1 - (1 - p)/2``, alpha above 0.8, population variance, opacities not scaled and without noise, colors not
     clamped.
 
-    Read the numbers with their error. At 5 samples a single pixel's variance is known to about 70 %; the mean over an
-    image is better, and ``std_error`` says by how much: a delete-a-group jackknife over the renders with the visible
-    region held fixed. It errs on the large side when samples are few (by some 15 % at 5 samples, 50 % at 3), and needs
-    at least three.
+    Read the score with its error. At 5 samples the variance of a single pixel is known to about 70 %. The mean over an
+    image is known better: ``std_error`` estimates its error by a delete-a-group jackknife over the renders, with the
+    visible region held fixed. With few samples it is too large (by some 15 % at 5, 50 % at 3); it needs at least three.
 
-    The memory does not grow with ``samples``: renders are pooled in at most 8 groups, each with one image and one map
-    of the precision of the renders, at least float32.
+    The memory does not grow with ``samples``: renders are pooled in at most 8 groups of one image and one map each, in
+    the precision of the renders, at least float32.
 
-    Two other methods go to the limit of infinitely many renders. For the paper's region, the pixels that all renders
-    cover, there is no such limit, because it shrinks with every render; both take the pixels whose *expected* alpha
-    exceeds the threshold, a region that no draw has a part in.
+    Two other methods approach the limit of infinitely many renders. The paper's region, the pixels that all renders
+    cover, has no such limit, because it shrinks with every render; both methods take the pixels whose *expected* alpha
+    exceeds the threshold, a region that does not depend on the draws.
 
     - *Exact*: give ``exact`` if the renderer offers moments (:func:`ca_reg.functional.pixel_moments`). Nothing is
       sampled, the error is 0, and neither the seed nor the index of the view matters. With ``neutral`` each pixel is
-      composited over its own expected color (:func:`ca_reg.functional.neutral_background`), so that a hole no longer
-      shows the background, and only disagreement between the colors of the Gaussians counts.
-    - *Adaptive*: give ``relative_error``. From 16 renders on, 8 are added at a time until the standard error is at most
-      this fraction of the score. One more render, with all opacities times ``1 - drop_rate``, is the expected image up
-      to the renderer's clamp and cut-off of small alphas: its alpha decides the region. The error is itself estimated,
-      to 18 % or better. Where a dozen Gaussians make the picture, stopping where it looks small makes scores too low
-      by up to 0.6 of it; docs/studies.md has the calibration.
+      composited over its own expected color (:func:`ca_reg.functional.neutral_background`), so that holes do not show
+      the background, and only disagreement between the colors of the Gaussians counts.
+    - *Adaptive*: give ``relative_error``. After the first 16 renders, 8 are added at a time until the standard error is
+      at most this fraction of the score. One more render, with all opacities multiplied by ``1 - drop_rate``, decides
+      the region: up to the renderer's clamp and cut-off of alpha it is the expected image. The standard error is itself
+      an estimate, good to 18 % or better. In images of a dozen Gaussians, stopping where it looks small biases scores
+      downward by up to 0.6 standard errors; docs/studies.md has the calibration.
 
     Convention: ``opacity`` is activated, in [0, 1], (N,) or (N, 1), and neither scaled nor dropped; images are
     (3, H, W), or (H, W, 3) with ``layout="HWC"``. Regularizers inside the callable must be off.
 
     Args:
-        render_fn: the renderer of the model, ``render_fn(opacity, view)``; see :class:`ca_reg.types.RenderFn`. Not used
-            by an exact score, which takes None.
+        render_fn: the renderer of the model, ``render_fn(opacity, view)``; see :class:`ca_reg.types.RenderFn`. Exact
+            scores ignore it.
         samples: number of renders K, at least 2; by default 5, or as many as ``relative_error`` asks for.
         p: dropout rate that the model was trained with, 0 if it was trained without (or with compensated) dropout.
-        drop_rate: fraction of the Gaussians to drop in each render, in [0, 1); by default ``1 - (1 - p)/2``, that is
-            half of those that training left.
-        regularizer: whose draws of the opacities take the place of that dropout, such as
+        drop_rate: fraction of the Gaussians to drop in each render, in [0, 1); by default ``1 - (1 - p)/2``, which
+            keeps half as many as training did.
+        regularizer: draws opacities in place of that dropout, such as
             :class:`~ca_reg.regularizers.ClusteredDropout`, which drops neighbors together; ``p`` and ``drop_rate`` then
-            do not apply. An exact or adaptive score needs its ``multiplied``. If it looks at more than opacities, give
-            the score :class:`~ca_reg.Params`.
+            do not apply. An exact or adaptive score needs its ``multiplied``. If it reads more than opacities, call the
+            score with :class:`~ca_reg.Params`.
         threshold: accumulated alpha above which a pixel is visible.
-        ddof: the variance divides by ``samples - ddof``: 0 as in the released code, 1 for an unbiased estimate. By
-            default 0; always 1 for adaptive scores, whose expectation would depend on the number of renders otherwise.
+        ddof: the divisor of the variance is ``samples - ddof``: 0, the default, as in the released code, 1 for an
+            unbiased estimate. Always 1 for adaptive scores, which would otherwise depend on the number of renders.
         layout: order of the axes of the images, ``"CHW"`` or ``"HWC"``.
         alpha_fn: for renderers that return no alpha: ``alpha_fn(opacity, view)`` renders the same view with all colors
-            1 over a background of 0, or returns an alpha of its own. It is called once per render and so doubles the
-            cost; if it is given, an alpha from ``render_fn`` is not used. The two may share an output buffer.
-        seed: seed of the masks. They are drawn on the CPU from (seed, view index) alone: the same on every device, and
-            adding a view does not change the masks of the others. A larger number of renders continues the masks of a
-            smaller one.
+            1 over a background of 0, or returns the alpha itself. It is called once per render, which doubles the
+            cost, and replaces any alpha from ``render_fn``. The two may share an output buffer.
+        seed: seed of the masks. They are drawn on the CPU from (seed, view index) alone, so they are the same on every
+            device, and adding a view does not change those of the others. More renders extend the same sequence.
         exact: moments of the model's renderer, ``exact(opacity, view, multiplier, background)``; see
             :class:`ca_reg.types.MomentsFn`. The score is then exact.
         neutral: make the exact score independent of the background; takes two calls of ``exact``.
-        relative_error: standard error to sample for, as a fraction of the score, above 0.
-        max_samples: number of renders at which adaptive sampling gives up, at least 16, by default 256. The standard
-            error of the result then says how far it came.
+        relative_error: target standard error of adaptive sampling, as a fraction of the score, above 0.
+        max_samples: number of renders at which adaptive sampling stops in any case, at least 16, by default 256. The
+            standard error of the result may then exceed the target.
 
     Raises:
         TypeError: if an argument is of the wrong type.
         ValueError: if one is out of range, or does not apply to the method.
 
     Example:
-        A wall of ten layers of different gray; with a layer missing the next one shows through.
+        A wall of ten gray layers; where one is missing, the next shows.
 
         >>> def render_fn(opacity: Tensor, view: None) -> tuple[Tensor, Tensor]:
         ...     transmittance = torch.cumprod(1 - opacity, 0)
@@ -193,19 +191,20 @@ class CAScore:
         self.reset()
 
     def __call__(self, opacity: Tensor | Params, view: Any, *, index: int = 0) -> CAResult:
-        """Measure one view, and forget it.
+        """Measure one view without counting it in :meth:`compute`.
 
         Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1); or all parameters that a regularizer needs.
+            opacity: activated opacities in [0, 1], shape (N,) or (N, 1); or :class:`~ca_reg.Params` with all that the
+                regularizer needs.
             view: passed on to the callables as it is.
-            index: position of the view among all views, at least 0; it decides the masks together with the seed.
+            index: position of the view among all views, at least 0; determines the masks together with the seed.
 
         Returns:
             The score with its maps. Without visible pixels the value is nan and ``reason`` says so.
 
         Raises:
             TypeError: if ``opacity`` or a render is not of the right type.
-            ValueError: if a shape is wrong, ``opacity`` looks like logits, or no alpha can be had.
+            ValueError: if a shape is wrong, ``opacity`` looks like logits, or there is no alpha.
         """
         x = self._params(opacity)
         check_count(index, "index", minimum=0)
@@ -217,7 +216,7 @@ class CAScore:
             return sample(self.render_fn, x, view, index)
 
     def _params(self, given: Tensor | Params) -> Params:
-        """Check what a score is asked of, and return all that is known of the Gaussians, without gradients."""
+        """Check the opacities or parameters that a score was called with, and return them with opacities detached."""
         x = given if isinstance(given, Params) else Params(given, step=self.regularizer.step)
         check_opacity(x.opacities)
         check_opacity_range(x.opacities)
@@ -228,12 +227,12 @@ class CAScore:
         """Measure one view and count it in the mean that :meth:`compute` returns.
 
         Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
-            view: passed on to the callables as it is.
-            index: position of the view among all views, which gives every view masks of its own. By default the views
-                are counted from the last reset on, and over ranks as if dealt out in turn, as
+            opacity: as for a call of the score.
+            view: as for a call of the score.
+            index: position of the view among all views, which gives every view its own masks. By default views are
+                counted from the last reset, and over ranks as if dealt out in turn, as
                 :class:`torch.utils.data.DistributedSampler` does without shuffling: the result then is that of a single
-                process. Give the position in the whole set if they are split in another way.
+                process. Give the position in the whole set if the views are split in another way.
 
         Raises:
             TypeError, ValueError: as for a call of the score.
@@ -244,10 +243,10 @@ class CAScore:
         return result
 
     def compute(self) -> CASummary:
-        """Return the mean over the views counted so far; over those of all ranks if torch.distributed is initialized.
+        """Return the mean over the views counted so far, on all ranks if torch.distributed is initialized.
 
-        Views without visible pixels have no share in the mean; ``empty_views`` counts them. The standard error is that
-        of the mean over the masks, the views held fixed. On several ranks every rank must call this.
+        Views without visible pixels are left out of the mean; ``empty_views`` counts them. The standard error is over
+        the choice of masks, with the views held fixed. On several ranks every rank must call this.
         """
         tally = ViewTally()
         tally.sums = self._tally.sums.clone()
@@ -264,7 +263,7 @@ class CAScore:
         self._updates = 0
 
     def _exact(self, moments_fn: MomentsFn, x: Params, view: Any) -> ExactView:
-        """Read the score off the moments of the renderer."""
+        """Compute the score from the renderer's moments."""
         settings = self.settings
         rendered, multiplier = self._multiplied(x)
         opacity = rendered.opacities.view_as(x.opacities)
@@ -278,7 +277,7 @@ class CAScore:
 
         broken, background = False, None
         if settings.method == "exact_neutral":
-            # Over black the mean is sum w c, and the expected alpha sum w: no background has to be taken out again.
+            # Over black the mean is sum w c and the expected alpha sum w: their ratio is the neutral background.
             over_black, total = moments(opacity.new_zeros(3))
             black, broken = _finite(over_black.mean, total, total, 0)
             neutral = (black / torch.where(total > 0, total, 1.0)).nan_to_num(0.0, 0.0, 0.0)
@@ -296,7 +295,7 @@ class CAScore:
         return ExactView(result, opacity, multiplier, background)
 
     def _sample(self, render_fn: RenderFn, x: Params, view: Any, index: int) -> CAResult:
-        """Render a fixed number of times; the visible pixels are those that every render covers (the protocol)."""
+        """Render a fixed number of times; a pixel is visible if every render covers it (the paper's protocol)."""
         settings = self.settings
         assert settings.samples is not None
         assert settings.ddof is not None
@@ -311,15 +310,15 @@ class CAScore:
         value, reason = _mean(variance, visible, broken)
         std_error = math.nan
         if reason is Reason.OK:
-            # For a given visible region the two variances differ by this factor exactly, and so do their errors.
+            # For a given visible region this factor relates the unbiased variance to this one, and so their errors.
             std_error = moments.jackknife_error(visible) * (moments.count - 1) / (moments.count - settings.ddof)
         return self._result(value, std_error, variance, visible, reason, moments.count)
 
     def _adapt(self, render_fn: RenderFn, x: Params, view: Any, index: int) -> CAResult:
         """Render until the error is small enough, over the pixels that the expected image covers.
 
-        The region must not come from the renders that the variance comes from: pixels that happen to be covered happen
-        to vary little, and the error over masks would have to include how the region varies.
+        The region must not come from the sampled renders: pixels that they all happen to cover happen to vary little,
+        and the error would have to include the variation of the region.
         """
         settings = self.settings
         assert settings.max_samples is not None
@@ -328,7 +327,7 @@ class CAScore:
         visible = alpha > settings.threshold
         expected, broken = _finite(expected, alpha, visible, 0)
         moments, deviations = RenderMoments(), Deviations(expected, visible)
-        del expected, alpha  # they may be a buffer of the renderer, which the next render fills
+        del expected, alpha  # may be buffers of the renderer, which the next render overwrites
         result = None
         renders = self._renders(render_fn, self._drawn(x, index, settings.max_samples), view)
         for k, (image, alpha) in enumerate(renders, start=1):
@@ -346,18 +345,18 @@ class CAScore:
         return result
 
     def _error(self, value: float, deviations: Deviations) -> float:
-        """Return the standard error of an adaptive score; renders that do not differ say nothing about it."""
+        """Return the standard error of an adaptive score; nan if no render differed, unless nothing is dropped."""
         if value == 0:
             return 0.0 if self.settings.drop_rate == 0 else math.nan
         return deviations.std_error() if math.isfinite(value) else math.nan
 
     def _is_settled(self, result: CAResult) -> bool:
-        """Whether further renders are not needed: the error is small enough, or there is no value to refine."""
+        """Whether to stop rendering: the error is small enough, or there is no value to refine."""
         target = self.settings.relative_error
         return result.reason is not Reason.OK or (target is not None and result.std_error <= target * result.value)
 
     def _multiplied(self, x: Params) -> tuple[Params, Multiplier]:
-        """Return what to render, and the factor on its alphas, that are all draws."""
+        """Return the regularizer's ``multiplied``, or raise if it has none."""
         multiplied = self.regularizer.multiplied(_flat(x))
         if multiplied is None:
             raise ValueError(
@@ -367,7 +366,7 @@ class CAScore:
         return multiplied
 
     def _drawn(self, x: Params, index: int, count: int) -> Iterator[Tensor]:
-        """Yield the opacities of one view under one random draw after the other, each time a new tensor."""
+        """Yield the opacities of one view under ``count`` random draws, each a new tensor."""
         generator, flat = seeded(self.seed, index), _flat(x)
         for _ in range(count):
             drawn, *others = self.regularizer.replay(flat, self.regularizer.draw(flat, generator))
@@ -379,7 +378,7 @@ class CAScore:
             yield (drawn.clone() if drawn is flat.opacities else drawn).view_as(x.opacities)
 
     def _renders(self, render_fn: RenderFn, drawn: Iterator[Tensor], view: Any) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield colors and alpha with one masked opacity after the other, as many at once as the renderer offers."""
+        """Yield colors and alpha for each draw of the opacities, several per call if the renderer has ``many``."""
         many = getattr(render_fn, "many", None)
         if many is None or self.alpha_fn is not None:
             yield from (self._render(render_fn, opacity, view) for opacity in drawn)
@@ -388,9 +387,9 @@ class CAScore:
                 yield from (self._read(x) for x in zip(*many(torch.stack(some), view), strict=True))
 
     def _render(self, render_fn: RenderFn, opacity: Tensor, view: Any) -> tuple[Tensor, Tensor]:
-        """Render colors (3, H, W) and alpha (H, W) with masked opacities."""
+        """Render colors (3, H, W) and alpha (H, W) with these opacities."""
         if self.alpha_fn is not None:
-            # Copies: the second pass may fill the buffer of the first, and either may edit its opacities in place.
+            # Copies: the second pass may overwrite the buffer of the first, and either may edit opacities in place.
             image = read_rendering(render_fn(opacity.clone(), view), layout=self.layout).image.clone()
             alpha = read_alpha_pass(self.alpha_fn(opacity, view), image, layout=self.layout)
             return image, alpha.to(image.device)
@@ -416,22 +415,22 @@ class CAScore:
 
 
 def _flat(x: Params) -> Params:
-    """Return the same with opacities of shape (N,)."""
+    """Return ``x`` with opacities of shape (N,)."""
     return x._replace(opacities=x.opacities.reshape(-1))
 
 
 def view_position(count: int, group: dist.ProcessGroup | None = None) -> int:
-    """Return the position among the views of all ranks of the one that comes after ``count`` others on this rank."""
+    """Return the position, among the views of all ranks, of the view that follows ``count`` others on this rank."""
     if not (dist.is_available() and dist.is_initialized()):
         return count
     return dist.get_rank(group) + dist.get_world_size(group) * count
 
 
 def _finite(colors: Tensor, alpha: Tensor, cover: Tensor, threshold: float) -> tuple[Tensor, bool]:
-    """Return colors (3, H, W) with 0 for those that are not finite, and whether these matter, or one in alpha (H, W).
+    """Return colors (3, H, W) with pixels that are not finite set to 0, and whether a non-finite value matters.
 
-    They do unless alpha is 0 there and ``cover`` (H, W) at most the threshold; some renderers divide 0 by 0 where
-    nothing covers a pixel. They always do if no pixel is left.
+    In alpha (H, W) any does. In the colors it does unless alpha is 0 there and ``cover`` (H, W) at most the threshold,
+    because some renderers divide 0 by 0 where nothing covers a pixel; it always does if no pixel is finite.
     """
     if bool((colors.sum() + alpha.sum()).isfinite()):
         return colors, False

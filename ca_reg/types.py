@@ -1,4 +1,4 @@
-"""What a renderer looks like to this package, and the reading of what it returns."""
+"""The interface that a renderer offers to this package, and the parsing of what it returns."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _FORMS = (
 
 
 class RenderFn(Protocol):
-    """A renderer of one's own model: ``render_fn(opacity, view)``.
+    """A user's renderer of a model: ``render_fn(opacity, view)``.
 
-    It renders ``view``, whatever that is, with ``opacity`` in place of the model's own activated opacities, and returns
-    one of
+    It renders ``view``, an object of any type, with ``opacity`` in place of the model's own activated opacities, and
+    returns one of
 
     - a tuple ``(image, alpha)`` in either order, or ``(image,)``;
     - the image alone;
@@ -41,9 +41,9 @@ class RenderFn(Protocol):
     floating-point torch tensors or numpy arrays, and a leading batch axis of 1 is dropped. Longer tuples are refused:
     in ``(color, radii, depth, alpha)`` nothing but the position tells depth from alpha.
 
-    A renderer that draws several opacities of one view faster than one after the other offers a method
-    ``many(opacities, view)``: of opacities stacked along a first axis, at most 8, it returns two sequences, images and
-    alphas. A score calls it in place of the renderer.
+    A renderer that is faster on several sets of opacities at once may offer a method ``many(opacities, view)``. It
+    takes up to 8 sets, stacked along a new first axis, and returns two sequences, images and alphas. A score then calls
+    it instead.
 
     Example:
         >>> def render_fn(opacity: Tensor, view: str) -> tuple[Tensor, Tensor]:
@@ -52,7 +52,7 @@ class RenderFn(Protocol):
     """
 
     def __call__(self, opacity: Tensor, view: Any, /) -> Any:
-        """Render ``view`` with these activated opacities, of the shape that the score was given."""
+        """Render ``view`` with these activated opacities, whose shape is the one the score was given."""
 
 
 class MomentsFn(Protocol):
@@ -65,8 +65,8 @@ class MomentsFn(Protocol):
     - ``variance``: variances of the colors, same shape;
     - ``alpha_mean``: expected accumulated alpha, (H, W), (1, H, W) or (H, W, 1); a score needs it, a penalty does not.
 
-    ``background`` is None for the model's own, one color of shape (3,), or an image, one color for each pixel. No
-    early stop is allowed that ignores the factors: splats behind an opaque surface shine through its dropped ones.
+    ``background`` is None for the model's own, one color of shape (3,), or an image, one color for each pixel. The
+    renderer must not stop early at an opaque surface: splats behind it show where those of the surface are dropped.
 
     Example:
         >>> from ca_reg.functional import alpha_moments, pixel_moments
@@ -85,14 +85,14 @@ class MomentsFn(Protocol):
 
 
 class Rendering(NamedTuple):
-    """One RGB image (3, H, W) with its accumulated alpha (H, W), None if the renderer returned none."""
+    """One RGB image (3, H, W) and its accumulated alpha (H, W), None if the renderer returned none."""
 
     image: Tensor
     alpha: Tensor | None = None
 
 
 class ExactMoments(NamedTuple):
-    """Moments of one image over the random factors: images (3, H, W); the alpha is None if none was returned."""
+    """Moments of one image over the random factors, (3, H, W); ``alpha_mean`` is None if none was returned."""
 
     mean: Tensor
     variance: Tensor
@@ -100,11 +100,11 @@ class ExactMoments(NamedTuple):
 
 
 def read_rendering(result: Any, *, layout: Layout = "CHW") -> Rendering:
-    """Bring what a :class:`RenderFn` returned into one form, torch tensors that share memory with torch results.
+    """Normalize what a :class:`RenderFn` returned; tensors in it are not copied.
 
     Raises:
-        TypeError: if the result is of another kind, or not floating point.
-        ValueError: if a shape does not fit, a name is missing, or ``layout`` is unknown.
+        TypeError: if the result is of an unsupported type, has no image, or is not floating point.
+        ValueError: if a shape does not fit, a tuple has more than two members, or ``layout`` is unknown.
 
     Example:
         >>> result = {"rgb": np.zeros((4, 5, 3), np.float32), "accumulation": np.ones((4, 5, 1), np.float32)}
@@ -125,12 +125,12 @@ def read_rendering(result: Any, *, layout: Layout = "CHW") -> Rendering:
 
 
 def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Tensor:
-    """Read the accumulated alpha off a white-on-black render, whose colors are all 1 over a background of 0.
+    """Read the accumulated alpha (H, W) off a white-on-black render, whose colors are all 1 over a background of 0.
 
-    The result may also be the alpha itself, (H, W), (1, H, W) or (H, W, 1). Returned is (H, W), the size of the image.
+    The result may also be the alpha itself, (H, W), (1, H, W) or (H, W, 1).
 
     Raises:
-        TypeError: if the result is of another kind, or not floating point.
+        TypeError: if the result is of an unsupported type, or not floating point.
         ValueError: if its size is not that of ``image``, (3, H, W).
 
     Example:
@@ -152,7 +152,7 @@ def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Te
 
 
 def read_moments(result: Any, *, layout: Layout = "CHW") -> ExactMoments:
-    """Bring what a :class:`MomentsFn` returned into one form, torch tensors.
+    """Normalize what a :class:`MomentsFn` returned.
 
     Raises:
         TypeError: if a member is missing or not floating point.
@@ -212,7 +212,7 @@ def _read_tuple(result: tuple[Any, ...] | list[Any], layout: Layout) -> Renderin
 
 
 def _by_name(result: Any, names: tuple[str, ...]) -> Any:
-    """Look up the first of ``names`` that a mapping or an object has, and that is not None."""
+    """Return the first value under one of ``names``, in a mapping or an object, that is not None."""
     for name in names:
         value = result.get(name) if isinstance(result, Mapping) else getattr(result, name, None)
         if value is not None:
@@ -263,7 +263,7 @@ def _read_alpha(x: Any, image: Tensor) -> Tensor:
 
 
 def _as_plane(x: Tensor, image: Tensor) -> Tensor | None:
-    """Return a one-channel picture of the size of ``image`` as (H, W); None if it is not one."""
+    """Return a one-channel map of the size of ``image`` as (H, W); None if ``x`` is not one."""
     height, width = image.shape[1:]
     if tuple(x.shape) in ((height, width), (1, height, width), (height, width, 1)):
         return x.reshape(height, width)
@@ -271,7 +271,7 @@ def _as_plane(x: Tensor, image: Tensor) -> Tensor | None:
 
 
 def _describe(result: Any) -> str:
-    """Name the kind of a result and the shapes in it."""
+    """Describe the type of a result and the shapes in it."""
     if isinstance(result, tuple | list):
         return "(" + ", ".join(_describe(x) for x in result) + ")"
     if isinstance(result, Mapping):

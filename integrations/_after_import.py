@@ -1,4 +1,4 @@
-"""Call a function right after a module is imported, whenever that happens."""
+"""Import hook: call a function right after a module is imported, whenever that happens."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["AfterImport"]
 
 
 class AfterImport(MetaPathFinder):
-    """Call back with a module once it is imported, whoever does; with one that is, at :meth:`start`.
+    """Call back with a module right after its import, by whomever; at :meth:`start` if it is imported already.
 
     Example:
         >>> import colorsys
@@ -28,21 +28,21 @@ class AfterImport(MetaPathFinder):
         self._callbacks = callbacks
 
     def start(self) -> None:
-        """Hand over what is imported, and watch for the rest."""
+        """Call back with the modules that are imported already, and watch for the others."""
         for name, callback in self._callbacks.items():
             if name in sys.modules:
                 callback(sys.modules[name])
         sys.meta_path.insert(0, self)
 
     def stop(self) -> None:
-        """Watch no longer; without effect if it was not watching."""
+        """Stop watching; no effect if not watching."""
         if self in sys.meta_path:
             sys.meta_path.remove(self)
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Let the other finders find the module, and call back once its own loader has run it."""
+        """Let the other finders find the module, and call back once its loader has executed it."""
         callback = self._callbacks.get(fullname)
         if callback is None:
             return None
@@ -57,6 +57,6 @@ class AfterImport(MetaPathFinder):
             run(module)
             callback(module)
 
-        # On the instance, of which there is one per module: the type of the loader is what inspect and pickle look at.
+        # On the instance, one per module, so that the loader keeps its type, which inspect and pickle look at.
         spec.loader.exec_module = exec_module  # type: ignore[method-assign]
         return spec

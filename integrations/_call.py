@@ -1,4 +1,4 @@
-"""One call of a rasterizer: its Gaussians as `Params`, and what a regularizer made of them back among its arguments."""
+"""Translate between the arguments of a rasterizer call and `Params`, and apply regularizers to the call."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from ._tally import Skip, Tally
 
 __all__ = ["Call", "chain_of"]
 
-_OF_CALL = ("view_matrix", "step")  # fields that no argument with a row for each Gaussian holds
+_OF_CALL = ("view_matrix", "step")  # fields that are not per Gaussian
 
 
 def chain_of(regularizer: nn.Module) -> Chain:
-    """Return a chain of what a user gave; refuse what is no module (TypeError), or learns per Gaussian (ValueError)."""
+    """Wrap a user's regularizer in a chain; TypeError if it is not a module, ValueError if it learns per Gaussian."""
     chain = Chain(regularizer)
     if chain.learns:
         raise ValueError(
@@ -30,12 +30,12 @@ def chain_of(regularizer: nn.Module) -> Chain:
 
 
 class Call:
-    """A call of a function whose bound arguments may be changed before it is made.
+    """A call of a rasterizer whose bound arguments may be changed before it is made.
 
     Attributes:
-        arguments: by name.
-        names: of the arguments, by field of :class:`~ca_reg.Params`, where the two names differ.
-        instead: what takes their place in some calls, for messages.
+        arguments: the bound arguments by name.
+        names: argument names by field of :class:`~ca_reg.Params`, where the two differ.
+        instead: which arguments replace these in some calls, for messages.
     """
 
     names: ClassVar[Mapping[str, str]] = {}
@@ -52,7 +52,7 @@ class Call:
 
     @classmethod
     def check(cls, chain: Chain, signature: inspect.Signature) -> None:
-        """Raise a ValueError if a regularizer asks for what no call with this signature can supply."""
+        """Raise a ValueError if a regularizer needs a field that no call with this signature can supply."""
         for name in chain.needs:
             if name not in Params._fields or cls.names.get(name, name) not in (*signature.parameters, *_OF_CALL):
                 raise ValueError(
@@ -61,7 +61,7 @@ class Call:
                 )
 
     def get(self, field: str) -> Tensor | None:
-        """Return a field as the rasterizer takes it; None if this call is without."""
+        """Return a field as the rasterizer takes it; None if this call does not have it."""
         value: Tensor | None = self.arguments.get(self.names.get(field, field))
         return value
 
@@ -75,7 +75,7 @@ class Call:
         self.arguments[name] = value.reshape(self.arguments[name].shape)
 
     def params(self, chain: Chain, step: int) -> Params:
-        """Return the opacities (N,) and what else the regularizers need, batches as one set; raise if one lacks."""
+        """Return the opacities (N,) and the other needed fields, batches flattened; ValueError if one is missing."""
         opacities = self.arguments["opacities"].reshape(-1)
         found: dict[str, Any] = {}
         for name in chain.needs:
@@ -93,7 +93,7 @@ class Call:
         return Params(opacities, step=step, **found)
 
     def train(self, chain: Chain, step: int, tally: Tally, generator: torch.Generator | None) -> Tensor | None:
-        """Take what a draw leaves of the Gaussians; return which it did not drop, None if it dropped none."""
+        """Apply a draw to the arguments; return which Gaussians it kept, None if it dropped none."""
         given = self.params(chain, step)
         if self._replace(given, chain(given, generator=generator)):
             tally.count_regularized(step)
@@ -102,7 +102,7 @@ class Call:
         return chain.keep
 
     def evaluate(self, chain: Chain, step: int, tally: Tally) -> None:
-        """Take the test-time values."""
+        """Apply the test-time values to the arguments."""
         given = self.params(chain, step)
         if self._replace(given, chain.expected(given)):
             tally.scaled += 1
@@ -110,7 +110,7 @@ class Call:
             tally.skipped[Skip.NOTHING_TO_SCALE] += 1
 
     def _replace(self, before: Params, after: Params) -> bool:
-        """Hand what has changed to the rasterizer; return whether anything has."""
+        """Put the changed fields into the arguments; return whether there were any."""
         changed = [name for name in Params._fields if getattr(after, name) is not getattr(before, name)]
         for name in changed:
             self.put(name, getattr(after, name))
@@ -118,5 +118,5 @@ class Call:
 
 
 def _who(chain: Chain, attribute: str, *names: str) -> str:
-    """Return the types of the members that need, or learn, something."""
+    """Return the type names of the members that need, or learn, one of these names."""
     return ", ".join(type(member).__name__ for member in chain if set(names) & set(getattr(member, attribute)))

@@ -1,7 +1,7 @@
-"""What the `render` function that called the rasterizer was asked for.
+"""Find out from the calling `render` function what a rasterizer call is for.
 
-The tensors do not tell a viewer's render from a training render, nor whose field they are. The variables of the calling
-function do, in every code base of the family and whatever was imported when; they are read and nothing else.
+The tensors tell neither a viewer's render from a training render nor which model they belong to. The local variables of
+the calling function do, in every code base of the family and in any import order; they are only read.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from ca_reg import Chain, OpacityNoise
 
 __all__ = ["Caller", "calling_render", "find_instance", "is_viewer", "refuse_a_second_regularizer"]
 
-_OUTWARD = 8  # frames to search: torch.nn.Module puts two between the rasterizer and its caller
+_OUTWARD = 8  # foreign frames to search for a render function
 
 
 class Caller(NamedTuple):
-    """Who asks for a render.
+    """The function that asks for a render.
 
     Args:
-        variables: those of the calling function.
-        place: where it stands in the script, with all calls that led there: in a loop the same for each render.
+        variables: its local variables.
+        place: code and instruction of each frame from it outward: the same for all renders of one call in a loop.
     """
 
     variables: Mapping[str, Any]
@@ -32,7 +32,7 @@ class Caller(NamedTuple):
 
 
 def calling_render() -> Caller:
-    """Return the nearest calling function named render..., else the nearest foreign one."""
+    """Return the nearest caller named render..., else the nearest outside of this package and torch."""
     stack = [frame for frame, _ in walk_stack(sys._getframe(1))]
     foreign = [frame for frame in stack if _is_foreign(frame.f_globals.get("__name__", ""))][:_OUTWARD]
     renders = [frame for frame in foreign if frame.f_code.co_name.startswith("render")]
@@ -52,15 +52,15 @@ def find_instance(variables: Mapping[str, Any], classes: tuple[type, ...]) -> An
 
 
 def is_viewer(variables: Mapping[str, Any], camera: str | None) -> bool:
-    """Whether a viewer asked for the render: such are made with gradients on, before that of the training.
+    """Whether a viewer asked for the render; it does so with gradients enabled, before the training render.
 
-    ``camera`` is the name of the class of a viewer's cameras, None if there is no viewer.
+    ``camera`` is the class name of the viewer's cameras, None if there is no viewer.
     """
     return camera is not None and any(type(x).__name__ == camera for x in variables.values())
 
 
 def refuse_a_second_regularizer(variables: Mapping[str, Any], chain: Chain) -> None:
-    """Raise a RuntimeError if the calling render, that of the paper's code, does itself what the chain does."""
+    """Raise a RuntimeError if the calling render, as in the paper's code, already does what the chain does."""
     perturbs = any(isinstance(member, OpacityNoise) for member in chain) and variables.get("train", True)
     for name, kind, applies in (
         ("dropout_factor", "GaussianDropout", chain.drops),

@@ -1,4 +1,4 @@
-"""What all hooks share: what they did, and an eye on a training that goes on without being regularized."""
+"""The base class of hooks: installation, counts, and a watchdog for training that is not regularized."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from ._tally import Tally
 
 __all__ = ["Hook"]
 
-_NAMES = ("opacity", "opacities")  # of the group of parameters, in the INRIA family and in gsplat's trainers
+_NAMES = ("opacity", "opacities")  # parameter groups in the INRIA family and in gsplat's trainers
 
 
 class Hook(abc.ABC):
-    """Regularizes scripts that are not edited, from `install` to `uninstall`, or in a ``with`` block.
+    """Regularizes scripts without edits, from `install` to `uninstall`, or within a ``with`` block.
 
-    Steps of an optimizer count if one of its groups of parameters is named ``opacity`` or ``opacities``: others train
-    networks, poses or exposures.
+    Optimizer steps count if a parameter group is named ``opacity`` or ``opacities``: other optimizers train networks,
+    poses or exposures.
 
     Args:
-        patience: how many steps may go by without a regularized render: such steps in a row, or training steps without
-            a render in all; 0 for any number.
+        patience: number of optimizer steps in a row without a regularized render, and total number of training steps
+            without a render, beyond which an error is raised; 0 for no limit.
 
     Attributes:
-        tally: what was done so far.
+        tally: counts of what was done so far.
 
     Raises:
-        TypeError: if ``patience`` is no integer.
+        TypeError: if ``patience`` is not an integer.
         ValueError: if it is negative.
     """
 
@@ -39,28 +39,28 @@ class Hook(abc.ABC):
         check_count(patience, "patience", minimum=0)
         self.tally = Tally()
         self._patience = patience
-        self._optimized = self._idle = 0  # steps of optimizers: all, and those since the last regularized render
+        self._optimized = self._idle = 0  # optimizer steps: all, and those since the last regularized render
         self._handle: Any = None
 
     @abc.abstractmethod
     def install(self) -> Self:
-        """Put the hook in force, `_watch` among it, and return it."""
+        """Install the hook, call `_watch`, and return the hook."""
 
     @abc.abstractmethod
     def uninstall(self) -> None:
-        """Put back what was there, `_unwatch` among it."""
+        """Restore the original state, and call `_unwatch`."""
 
     @abc.abstractmethod
     def _explain(self) -> str:
-        """Say what may be the cause of a training that is not regularized, and what to do."""
+        """Explain why training may not have been regularized, and what to do."""
 
     def problem(self) -> str | None:
-        """Say what went wrong unnoticed, and the way out; None if all is well, and with a patience of 0."""
+        """Describe a failure to regularize and its remedy; None if there was none, and with a patience of 0."""
         shortfall = self._patience and self.tally.shortfall(self._optimized)
         return f"{shortfall} {self._explain()}" if shortfall else None
 
     def __enter__(self) -> Self:
-        """Install the hook, unless it is."""
+        """Install the hook unless it is installed."""
         return self.install() if self._handle is None else self
 
     def __exit__(
@@ -69,27 +69,27 @@ class Hook(abc.ABC):
         """Uninstall the hook.
 
         Raises:
-            RuntimeError: if a training came to its end without being regularized, see :meth:`problem`.
+            RuntimeError: if training ended without being regularized, see :meth:`problem`.
         """
         self.uninstall()
         if error is None and self._optimized and (problem := self.problem()):
             raise RuntimeError(problem)
 
     def note_regularized(self) -> None:
-        """Take note of a training render that was regularized, or that the schedule leaves alone."""
+        """Record a training render that was regularized, or whose scheduled rate is 0."""
         self._idle = 0
 
     def note_lost(self) -> None:
-        """Take note of a training step without a render."""
+        """Record a training step without a render; raise RuntimeError if there are too many."""
         self.tally.lost += 1
         self._check(self.tally.lost, "training steps had no render that could be regularized")
 
     def _watch(self) -> None:
-        """Look at the steps of all optimizers."""
+        """Start watching the steps of all optimizers."""
         self._handle = register_optimizer_step_post_hook(self._stepped)
 
     def _unwatch(self) -> None:
-        """Look at them no longer; without effect if it did not."""
+        """Stop watching; no effect if not watching."""
         if self._handle is not None:
             self._handle.remove()
             self._handle = None

@@ -1,4 +1,4 @@
-"""Which training step every field of Gaussians is in, and how often it was rendered in that step."""
+"""Track the training step of every field, one set of Gaussians each, and its renders in that step."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from torch import Tensor
 __all__ = ["Field", "Iterations", "Steps", "leaf_of"]
 
 Steps = Literal["updates", "parameters"]
-"""What tells the steps: calls of ``update_learning_rate``, or the parameters, when they have changed."""
+"""What marks a new step: a call of ``update_learning_rate``, or a change of the parameters."""
 
-_FINISHED = 2**31  # the step of a field that is only evaluated: every schedule has come to its end
+_FINISHED = 2**31  # the step of a field that is only evaluated: past the end of every schedule
 _RENDERS_WITHOUT_STEP = 256  # of one field; no code base renders so many views in one step
-_NODES = 1000  # of the graph behind the opacities to search for a parameter
+_NODES = 1000  # largest number of autograd nodes to search for a parameter
 
 
 class Field:
-    """One set of Gaussians in training: its number, from 0, its step, 0 if not known, and what begins the next."""
+    """One set of Gaussians in training: its index, from 0, its step, 0 if unknown, and its renders in that step."""
 
     def __init__(self, index: int, step: int, steps: Steps) -> None:
         self.index = index
@@ -36,16 +36,16 @@ class Field:
         return max(self.step, 1)
 
     def begin(self, step: int) -> None:
-        """Enter a step."""
+        """Begin a step."""
         self.step, self.renders = step, 0
 
     def update(self, iteration: int) -> bool:
-        """Take note of a call of update_learning_rate; return False if the step that ends had no training render.
+        """Process a call of update_learning_rate; return False if the step that ends had no training render.
 
-        It is called once per step, but its argument may have an offset (DNGaussian), so that calls are counted from the
-        first argument on. FSGS and CoR-GS call it at the end of a step, which shows at the first call.
+        It is called once per step, but its argument may have an offset (DNGaussian), so calls are counted from the
+        first argument on. FSGS and CoR-GS call it at the end of a step, which is detected at the first call.
 
-        If the parameters tell the steps, only the first call counts: it says where a resumed training goes on.
+        If parameters mark the steps, only the first call counts: it tells at which step a resumed training continues.
         """
         rendered = self._updates_end_step is None or self._by_parameters or self.renders > 0
         if self._updates_end_step is None:
@@ -56,10 +56,10 @@ class Field:
         return rendered
 
     def count_render(self, parameters: tuple[Tensor, ...], place: Hashable) -> bool:
-        """Count a training render; return whether it is asked for at the place of the first one of its step.
+        """Count a training render; return whether it was requested at the same place as the first one of its step.
 
-        Raises RuntimeError if steps go by without anyone saying so. Whoever trains the parameters changes their
-        versions; that begins a step, or must not happen within one.
+        A change of the parameters' versions shows that they were trained on: that begins a step, or, if calls of
+        update_learning_rate do, raises a RuntimeError, because such a call is missing.
         """
         versions = tuple((id(x), x._version) for x in parameters)
         trained = self.renders > 0 and versions != self._versions
@@ -80,9 +80,9 @@ class Field:
 
 
 class Iterations:
-    """The fields of one training, found by their model or, where that is not known, by a parameter.
+    """The fields of one training, identified by their model or, where that is unknown, by a parameter.
 
-    ``lose_step`` is called when a step of a field goes by without a training render.
+    ``lose_step`` is called when a step of a field ends without a training render.
     """
 
     def __init__(self, steps: Steps, lose_step: Callable[[], None]) -> None:
@@ -93,8 +93,8 @@ class Iterations:
         self._lose_step = lose_step
 
     def field(self, owner: Any) -> Field:
-        """Return the field of a model or of a parameter; a new one at first sight."""
-        # Densification replaces the parameters: new ones succeed those that are gone, one step later.
+        """Return the field of a model or of a parameter; a new one if it was not seen before."""
+        # Densification replaces parameters: a new one takes over the field of one that is gone, one step later.
         self._vacant += [field for ref, field in self._fields if ref() is None]
         self._fields = [(ref, field) for ref, field in self._fields if ref() is not None]
         for ref, field in self._fields:
@@ -110,18 +110,18 @@ class Iterations:
         return field
 
     def evaluation_step(self, owner: Any) -> int:
-        """Return the step of a model or a parameter, else of any; after all schedules if nothing was ever trained."""
+        """Return the step of a model or parameter, else the latest of any; past all schedules if none was trained."""
         trained = [(ref(), field.training_step) for ref, field in self._fields if field.step or field.renders]
         steps = [step for known, step in trained if known is owner] or [step for _, step in trained]
         return max(steps, default=_FINISHED)
 
     def update(self, model: Any, iteration: int) -> None:
-        """Take note of a call of update_learning_rate, unless the steps are said explicitly."""
+        """Process a call of update_learning_rate, unless steps are set explicitly."""
         if self._step is None and not self.field(model).update(iteration):
             self._lose_step()
 
     def step(self, step: int) -> None:
-        """Enter a step with all fields."""
+        """Begin a step of all fields."""
         rendered = self._step is None or any(field.renders for _, field in self._fields)
         self._step = step
         for _, field in self._fields:
@@ -131,7 +131,7 @@ class Iterations:
 
 
 def leaf_of(x: Tensor) -> Tensor | None:
-    """Return a parameter that a tensor was computed from, always the same one of the same computation; None if none."""
+    """Return a parameter that a tensor was computed from, the same one for the same computation; None if none."""
     if x.is_leaf:
         return x
     nodes: list[Any] = [x.grad_fn]

@@ -1,4 +1,4 @@
-"""Render with other opacities than the model's, past all regularizers."""
+"""Render with opacities other than the model's, bypassing all regularizers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["is_overridden", "override"]
 
 
 class _Override(NamedTuple):
-    """What is in force in one thread: for which rasterizers, with which opacities, and the calls so far."""
+    """The override of one thread: its rasterizers, its opacities, and the calls so far."""
 
     rasterizers: tuple[type, ...]
     opacity: Tensor
@@ -27,20 +27,20 @@ class _Override(NamedTuple):
 
 _current: ContextVar[_Override | None] = ContextVar("_current", default=None)
 _lock = threading.Lock()
-_patches: dict[type, tuple[ClassPatch, int]] = {}  # of every class, and how many overrides need it
+_patches: dict[type, tuple[ClassPatch, int]] = {}  # patch and number of active overrides of every class
 
 
 def is_overridden() -> bool:
-    """Whether this thread renders with other opacities, which no regularizer must change."""
+    """Whether this thread renders with overridden opacities, which regularizers must not change."""
     return _current.get() is not None
 
 
 @contextmanager
 def override(rasterizers: Sequence[type], opacity: Tensor) -> Iterator[list[ForwardCall]]:
-    """Give the rasterizers these opacities in place of those that this thread calls them with.
+    """Replace the opacities that this thread passes to the rasterizers.
 
-    The classes are patched once for all threads, and put back when the last of them is done; renders of other threads
-    go through unchanged. The opacities are activated, of all Gaussians, (N,) or (N, 1). Yields the calls so far.
+    The classes are patched once for all threads, and restored when the last override ends; renders of other threads are
+    unchanged. The opacities are activated, of all Gaussians, (N,) or (N, 1). Yields the list of calls so far.
     """
     mine = _Override(tuple(rasterizers), opacity, [])
     with ExitStack() as undo:
@@ -53,14 +53,14 @@ def override(rasterizers: Sequence[type], opacity: Tensor) -> Iterator[list[Forw
 
 
 def _acquire(rasterizer: type) -> None:
-    """Patch a class unless another thread has."""
+    """Patch a class unless an active override has."""
     with _lock:
         patch, users = _patches.get(rasterizer) or (ClassPatch(rasterizer, "forward", _make(rasterizer)), 0)
         _patches[rasterizer] = patch, users + 1
 
 
 def _release(rasterizer: type) -> None:
-    """Put a class back unless another thread needs it."""
+    """Restore a class unless another override needs the patch."""
     with _lock:
         patch, users = _patches[rasterizer]
         if users > 1:
@@ -71,7 +71,7 @@ def _release(rasterizer: type) -> None:
 
 
 def _make(rasterizer: type) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return what wraps the forward of a class."""
+    """Return the function that wraps the forward of a class."""
     signature = forward_signature(rasterizer)
 
     def make(forward: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,4 +1,4 @@
-"""Replace one attribute of a class, and put it back exactly."""
+"""Replace a method of a class, and restore it exactly."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _INHERITED = object()
 
 
 class ClassPatch:
-    """A method of a class, its own or an inherited one, replaced by what ``make`` makes of it until :meth:`remove`.
+    """Replaces a method of a class, its own or inherited, by ``make(method)`` until :meth:`remove`.
 
     Example:
         >>> class Greeter:
@@ -29,13 +29,13 @@ class ClassPatch:
     def __init__(self, owner: type, name: str, make: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
         self.owner = owner
         self.name = name
-        # From the dictionary of the class: getattr would turn a staticmethod into what it wraps.
+        # From the class dictionary: getattr would unwrap a staticmethod.
         self._before = vars(owner).get(name, _INHERITED)
         self._replacement = make(getattr(owner, name))
         setattr(owner, name, self._replacement)
 
     def check_removable(self) -> None:
-        """Raise RuntimeError if someone replaced the method again, whose replacement would be lost."""
+        """Raise RuntimeError if the method was replaced again since; that replacement would be lost."""
         now = vars(self.owner).get(self.name, _INHERITED)
         if now is not self._replacement:
             raise RuntimeError(
@@ -44,7 +44,7 @@ class ClassPatch:
             )
 
     def remove(self) -> None:
-        """Put the method back: the same object, or none if it was inherited; raises as `check_removable`."""
+        """Restore the same object, or delete the attribute if it was inherited; raises as `check_removable`."""
         self.check_removable()
         if self._before is _INHERITED:
             delattr(self.owner, self.name)

@@ -1,4 +1,4 @@
-"""The rasterizers of the INRIA family: where they are, what their calls look like, what they return."""
+"""The rasterizers of the INRIA family: how to find them, their calls, and their outputs."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ForwardCall(Call):
         return next(iter(self.arguments.values()))
 
     def get(self, field: str) -> Tensor | None:
-        """Return a field; spherical harmonics are one even where "dc" holds the first band."""
+        """Return a field; "dc", where a rasterizer takes the first band separately, is prepended to ``sh``."""
         if field == "view_matrix":
             matrix = getattr(getattr(self.rasterizer, "raster_settings", None), "viewmatrix", None)
             return None if matrix is None else matrix.T
@@ -58,7 +58,7 @@ class ForwardCall(Call):
 
 
 def check_installed(rasterizers: Iterable[str]) -> None:
-    """Raise ImportError unless the module of one, ``module:Class``, is there; does not import it."""
+    """Raise ImportError unless the module of one, ``module:Class``, can be found; does not import it."""
     if not _installed(rasterizers):
         raise ImportError(
             f"none of the rasterizers {', '.join(rasterizers)} is installed. Install the one in the submodules of your "
@@ -68,13 +68,13 @@ def check_installed(rasterizers: Iterable[str]) -> None:
 
 
 def _installed(rasterizers: Iterable[str]) -> list[str]:
-    """Return the names of the modules that can be imported."""
+    """Return the modules of rasterizers that can be found."""
     modules = dict.fromkeys(rasterizer.partition(":")[0] for rasterizer in rasterizers)
     return [name for name in modules if name in sys.modules or find_spec(name.partition(".")[0]) is not None]
 
 
 def class_in(module: ModuleType, name: str) -> type | None:
-    """Return a class of a module, None if it has none of this name."""
+    """Return a class of a module by name, None if there is none."""
     found = getattr(module, name, None)
     return found if isinstance(found, type) else None
 
@@ -88,7 +88,7 @@ def rasterizer_classes() -> list[type]:
 
 
 def is_of_the_family(rasterizer: type) -> bool:
-    """Whether the forward of a class has the arguments of the family."""
+    """Whether the forward of a class takes the family's arguments."""
     return not _signature(rasterizer)[1]
 
 
@@ -100,7 +100,7 @@ def _signature(rasterizer: type) -> tuple[inspect.Signature, list[str]]:
 
 
 def forward_signature(rasterizer: type) -> inspect.Signature:
-    """Return the signature of a rasterizer's forward; raise TypeError if it has not the arguments of the family."""
+    """Return the signature of a rasterizer's forward; raise TypeError if it lacks the family's arguments."""
     signature, missing = _signature(rasterizer)
     if missing:
         raise TypeError(
@@ -111,14 +111,15 @@ def forward_signature(rasterizer: type) -> inspect.Signature:
 
 
 def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
-    """Zero what a rasterizer counted for dropped Gaussians: in every integer it returned per Gaussian, radii first.
+    """Zero the radii of dropped Gaussians, and all other integers that a rasterizer returned per Gaussian.
 
-    Densification takes these for what was seen. Besides the radii some rasterizers return flags (3dgs-mcmc) or counts
-    (taming-3dgs). Floating-point sums of a Gaussian of opacity 0 are 0 already. Returned is the same tuple with
-    integers, or bools, of shape (N,), (N, 1) or (N, 2) zeroed where ``keep``, (N,) bool, is False.
+    Densification derives visibility from these. Besides the radii some rasterizers return flags (3dgs-mcmc) or counts
+    (taming-3dgs); floating-point sums of a Gaussian of opacity 0 are 0 already. Zeroes integers and bools of shape
+    (N,), (N, 1) or (N, 2) where ``keep``, (N,) bool, is False, and returns the tuple.
 
     Raises:
-        TypeError, ValueError: if no tuple came, or none of its members counts the Gaussians.
+        TypeError: if ``returned`` is not a tuple.
+        ValueError: if no member is such a per-Gaussian tensor.
     """
     if not isinstance(returned, tuple):
         raise TypeError(f"the rasterizer returned {type(returned).__name__}, expected a tuple with colors and radii.")
@@ -135,18 +136,18 @@ def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
         x * keep.view(-1, *[1] * (x.ndim - 1)).to(x.device) if is_count else x
         for x, is_count in zip(returned, counts, strict=True)
     ]
-    # A named tuple stays one.
+    # Keep named tuples.
     made: tuple[Any, ...] = returned._make(members) if hasattr(returned, "_make") else tuple(members)
     return made
 
 
 def white_alpha(call: ForwardCall) -> Tensor:
-    """Measure the accumulated alpha (H, W) of a call: all colors 1 over a background of 0, opacities as they are."""
+    """Measure the accumulated alpha (H, W) of a call by repeating it with all colors 1 over a background of 0."""
     settings = call.rasterizer.raster_settings
     opacities: Tensor = call.arguments["opacities"]
     before = dict(call.arguments)
     call.rasterizer.raster_settings = settings._replace(bg=torch.zeros_like(settings.bg))
-    # "dc" holds the first band where a rasterizer takes it apart from the others.
+    # "dc" holds the first band where a rasterizer takes it separately.
     call.arguments.update({name: None for name in ("shs", "dc") if name in before})
     call.arguments["colors_precomp"] = opacities.new_ones(opacities.shape[0], 3)
     try:

@@ -13,7 +13,7 @@ __all__ = ["find_script", "run_script", "set_command_line"]
 
 
 def find_script(name: Path) -> Path | None:
-    """Return the file of a script, or of a command that an installed package brings, such as ``ns-train``."""
+    """Return the file of a script, or of an installed command such as ``ns-train``; None if there is none."""
     if name.is_file():
         return name
     command = shutil.which(name, path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
@@ -21,15 +21,15 @@ def find_script(name: Path) -> Path | None:
 
 
 def set_command_line(script: Path | str, arguments: Sequence[str]) -> None:
-    """Give the script its command line, and its folder, or the present one, as the first place to import from."""
+    """Set ``sys.argv``, and ``sys.path[0]`` to the folder of the script, or for a module to the working directory."""
     sys.argv = [str(script), *arguments]
-    # The first place is now the folder that `python -m` was called in; with -P (Python 3.11) there is no such place.
+    # `python -m` has put the working directory there; with -P (Python 3.11) there is no such entry.
     if not getattr(sys.flags, "safe_path", False):
         sys.path[0] = str(script.resolve().parent) if isinstance(script, Path) else os.getcwd()
 
 
 def run_script(script: Path | str) -> None:
-    """Run a script as the main program; what it raises is raised here, SystemExit and KeyboardInterrupt, too."""
+    """Run a script as the main program; its exceptions, SystemExit and KeyboardInterrupt included, pass through."""
     if isinstance(script, Path):
         runpy.run_path(str(script), run_name="__main__")
     else:

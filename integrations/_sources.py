@@ -1,4 +1,4 @@
-"""What the source of a code base says about itself, read without running it."""
+"""Static analysis of a code base's source: its imports, its rasterizers and its model classes."""
 
 from __future__ import annotations
 
@@ -18,14 +18,13 @@ _NOT_READ = {"submodules", "build", "site-packages"}  # extensions and environme
 
 @dataclass
 class Sources:
-    """What the files of a code base say.
+    """What the files of a code base import and define.
 
     Args:
-        packages: first names of all modules that are imported.
-        rasterizers: of every foreign module that a ``...Rasterizer`` or its ``...RasterizationSettings`` are imported
-            from, those names.
+        packages: top-level names of all imported modules.
+        rasterizers: names ``...Rasterizer`` and ``...RasterizationSettings`` imported from foreign modules, by module.
         models: classes with a method ``update_learning_rate``, as ``module:Class``.
-        root: the folder of the script, or that above it if it imports files from there.
+        root: the folder of the script, or its parent if files are imported from there.
     """
 
     packages: set[str] = field(default_factory=set)
@@ -40,7 +39,7 @@ class Sources:
         return [f"{module}:{name}" for module, names in found for name in sorted(names) if name.endswith(_SUFFIXES[0])]
 
     def need(self, name: str) -> bool:
-        """Whether a package is imported, or one that is built on it, as nerfstudio is on gsplat."""
+        """Whether a package is imported, or one that requires it, as nerfstudio requires gsplat."""
         found = set(self.packages)
         for package in self.packages:
             with suppress(PackageNotFoundError):
@@ -48,10 +47,10 @@ class Sources:
         return name in found
 
     def read(self, path: Path, folder: Path) -> list[tuple[int, str]]:
-        """Read a file of the folder; return the modules that it may import, each with the dots before its name."""
+        """Read a file of the folder; return the modules it may import, each with its relative-import level."""
         try:
             nodes = list(ast.walk(ast.parse(path.read_bytes())))
-        except SyntaxError:  # Python will say so when it runs it
+        except SyntaxError:  # Python will report it at run time
             return []
         modules = list(_imports(nodes))
         self.packages |= {name.partition(".")[0] for level, name in modules if level == 0}
@@ -69,10 +68,10 @@ class Sources:
 
 
 def read_script(script: Path | str) -> Sources:
-    """Read a script, and the files that it imports, itself or through others.
+    """Read a script, and the files that it imports, directly or through others.
 
-    They lie beside it, or beside its folder if it writes to ``sys.path``. The script is the path of a file, or the name
-    of a module in the present folder; so it is below.
+    They are searched in its folder, and also in the parent folder if the script mentions ``sys.path``. The script is
+    the path of a file, or the name of a module in the working directory.
     """
     folder = script.resolve().parent if isinstance(script, Path) else Path.cwd()
     start = script if isinstance(script, Path) else folder / f"{script.replace('.', '/')}.py"
@@ -97,7 +96,7 @@ def read_script(script: Path | str) -> Sources:
 
 
 def read_folder(folder: Path) -> Sources:
-    """Read all files of a folder and of those below, but for the sources of its extensions."""
+    """Read all Python files under a folder, except those of extensions, environments and hidden folders."""
     sources = Sources()
     for path in sorted(folder.rglob("*.py")):
         inner = path.relative_to(folder).parts
@@ -107,13 +106,13 @@ def read_folder(folder: Path) -> Sources:
 
 
 def _is_own(folder: Path, module: str) -> bool:
-    """Whether a module is a part of the folder, and no extension that is to be installed from there."""
+    """Whether a module is part of the folder, and not an extension to be installed from there."""
     place = folder / module.partition(".")[0]
     return place.with_suffix(".py").is_file() or (place.is_dir() and not (place / "setup.py").is_file())
 
 
 def _imports(nodes: list[ast.AST]) -> Iterator[tuple[int, str]]:
-    """Iterate over the modules that a file may import, each with the number of dots before its name."""
+    """Iterate over the modules that a file may import, each with its relative-import level."""
     for node in nodes:
         if isinstance(node, ast.Import):
             yield from ((0, alias.name) for alias in node.names)

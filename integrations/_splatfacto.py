@@ -1,4 +1,4 @@
-"""What is added to a splatfacto model: regularized Gaussians, and the co-adaptation score among its image metrics."""
+"""The mixin for splatfacto models: regularized Gaussians, and the co-adaptation score among the image metrics."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _of_the_model: ContextVar[Rasterization | None] = ContextVar("_of_the_model", de
 
 
 class _Dispatch:
-    """Stands in for `rasterization` in a module: calls that of the model which renders, else the original."""
+    """Stands in for `rasterization` in a module: calls the function of the rendering model, else the original."""
 
     def __init__(self, original: Rasterization) -> None:
         self.original = original
@@ -35,20 +35,20 @@ class _Dispatch:
         return out
 
 
-_Splatfacto: Any = object  # the class that comes next in the order of inheritance
+_Splatfacto: Any = object  # stands for the next class in the MRO
 
 
 class CoAdaptation(_Splatfacto):  # type: ignore[misc]
-    """Comes before `SplatfactoModel` among the bases of a model; the config has the fields that are read here.
+    """Mixin to list before `SplatfactoModel` among the bases; the config needs the fields of `SplatfactoCAModelConfig`.
 
-    The regularizers are no submodules: checkpoints are those of splatfacto, and load either way.
+    The regularizers are not submodules: checkpoints are those of splatfacto, and interchangeable with them.
     """
 
     holder: ModuleType
-    """The module whose name `rasterization` the renders of the model look up."""
+    """The module in which the model's render looks up `rasterization`."""
 
     def populate_modules(self) -> None:
-        """Make the parts of the model, and what regularizes and measures it."""
+        """Create the parts of the model, its regularizers and its score."""
         super().populate_modules()
         if not isinstance(self.holder.rasterization, _Dispatch):
             self.holder.rasterization = _Dispatch(self.holder.rasterization)  # type: ignore[attr-defined]
@@ -74,16 +74,16 @@ class CoAdaptation(_Splatfacto):  # type: ignore[misc]
         return outputs
 
     def update_to_step(self, step: int) -> None:
-        """Take note of the step of a checkpoint that is loaded, which schedules follow in evaluation."""
+        """Pass the step of a loaded checkpoint to the regularizers, whose schedules follow it in evaluation."""
         super().update_to_step(step)
         self._regularized.chain.set_step(step)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Measure an evaluation image; adds `ca`, `ca_std_error`, `ca_visible`, and a picture `ca`.
+        """Measure an evaluation image; adds the metrics `ca`, `ca_std_error`, `ca_visible`, and an image `ca`.
 
-        They are left out if ``outputs["rgb"]`` is not what this model has just rendered, whole and in evaluation.
+        They are left out if ``outputs["rgb"]`` is not a full render of this model in evaluation.
         """
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         camera = self._cameras.get(outputs["rgb"])
@@ -110,7 +110,7 @@ class CoAdaptation(_Splatfacto):  # type: ignore[misc]
 
 @contextmanager
 def _rasterizing_by(rasterization: Rasterization) -> Iterator[None]:
-    """Let this thread rasterize by a function of the model for a while; the viewer renders in a thread of its own."""
+    """Let this thread rasterize with the given function; the viewer renders in its own thread."""
     token = _of_the_model.set(rasterization)
     try:
         yield

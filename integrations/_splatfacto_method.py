@@ -1,4 +1,4 @@
-"""The classes and the method that need nerfstudio; imported by `ca_reg.integrations.nerfstudio` alone."""
+"""The classes and the method that need nerfstudio; imported only by `ca_reg.integrations.nerfstudio`."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class SplatfactoCAModel(CoAdaptation, SplatfactoModel):  # type: ignore[misc]
 
 
 def make_method() -> MethodSpecification:
-    """Return splatfacto's own method with the model exchanged, and nothing else."""
-    # Not at the top: nerfstudio loads this while it imports that module, after it has filled the dictionary.
+    """Return splatfacto's own method with only the model replaced."""
+    # Not at the top: nerfstudio loads this while it imports that module, after filling the dictionary.
     from nerfstudio.configs.method_configs import method_configs
 
     config = deepcopy(method_configs["splatfacto"])
@@ -51,6 +51,6 @@ def make_method() -> MethodSpecification:
     return MethodSpecification(config, "Splatfacto with Gaussian dropout, opacity noise and the co-adaptation score")
 
 
-# Saved runs name their classes by module; the public one is where they stay.
+# Saved runs refer to classes by module: use the public one, which will not move.
 for _class in (SplatfactoCAModelConfig, SplatfactoCAModel):
     _class.__module__ = "ca_reg.integrations.nerfstudio"

@@ -1,4 +1,4 @@
-"""What a hook did: how many renders it changed, and why it left the others alone."""
+"""Counts of what a hook did: renders it changed, and renders it left alone by reason."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class Tally:
     """Counts of rasterizer calls.
 
     Args:
-        regularized: training renders whose opacities were dropped or perturbed.
-        scaled: renders without gradients, or for a viewer, with the test-time opacities.
-        skipped: renders left alone, by the reason.
-        first_step: of the regularized renders; None if there were none.
-        last_step: of the regularized renders; None if there were none.
+        regularized: training renders whose Gaussians were dropped or perturbed.
+        scaled: renders without gradients, or for a viewer, with test-time values.
+        skipped: renders left alone, by reason.
+        first_step: step of the first regularized render; None if there was none.
+        last_step: step of the last regularized render; None if there was none.
         lost: training steps without a render that could be regularized.
     """
 
@@ -45,16 +45,16 @@ class Tally:
     lost: int = 0
 
     def count_regularized(self, step: int) -> None:
-        """Count a regularized render of a step."""
+        """Count a regularized render."""
         self.regularized += 1
         self.first_step = step if self.first_step is None else self.first_step
         self.last_step = step
 
     def shortfall(self, optimizer_steps: int) -> str | None:
-        """Say that a run was not, or hardly, regularized; None if it was.
+        """Describe how a run fell short of being regularized; None if it did not.
 
-        A training is if nine of ten steps had a render that was regularized, or that the schedule left alone at some
-        steps; a script that only renders, which optimizer steps of Gaussians tell from one, if it made a test render.
+        Training counts as regularized if some render was, and renders that were, or had a rate of 0, outnumber lost
+        steps nine to one. A script that only renders, without optimizer steps of Gaussians, needs a test render.
         """
         rendered = self.regularized + self.skipped[Skip.RATE_ZERO]
         if not (rendered or optimizer_steps or self.lost):
@@ -71,7 +71,7 @@ class Tally:
         return vars(self) | {"skipped": {reason.name.lower(): count for reason, count in self.skipped.items()}}
 
     def lines(self) -> list[str]:
-        """Return the counts in words, a line each."""
+        """Return the counts in words, one per line."""
         steps = "" if self.first_step is None else f", steps {self.first_step} to {self.last_step}"
         lines = [f"{self.regularized} renders regularized{steps}", f"{self.scaled} renders scaled for evaluation"]
         lines += [f"{count} renders left alone: {reason.value}" for reason, count in self.skipped.most_common()]

@@ -1,4 +1,4 @@
-"""The rasterizers and the models of a code base, wrapped as soon as they are imported."""
+"""Wrap the rasterizers and the models of a code base as soon as they are imported."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ __all__ = ["Wrapped"]
 
 
 class Wrapped:
-    """Classes whose methods are wrapped from `start` to `stop`; those named ``module:Class`` once they are imported.
+    """Classes whose methods are wrapped from `start` to `stop`, those given as ``module:Class`` once imported.
 
     Args:
         rasterizers: classes or names, which must be of the INRIA family.
-        candidates: names of further ones, left alone if they are not.
+        candidates: names of further rasterizers, left alone if they are not of the family.
         models: names of classes with a method ``update_learning_rate``.
-        rasterize: what makes the calls of rasterizers.
+        rasterize: handles every call of a rasterizer.
         update: is called with a model and an iteration before its learning rate is updated.
         check: is called with the signature of a rasterizer, and may raise.
 
     Attributes:
-        models: those that were imported so far.
-        names: of the rasterizers that were, for messages.
+        models: the model classes wrapped so far.
+        names: names of the rasterizers wrapped so far, for messages.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Wrapped:
         self.names: list[str] = []
         self._patches: list[ClassPatch] = []
         self._rasterize, self._update, self._check = rasterize, update, check
-        self._updated: Any = None  # the model within whose update_learning_rate the script is
+        self._updated: Any = None  # the model whose update_learning_rate is running
         self._given = [x for x in rasterizers if isinstance(x, type)]
         found: dict[str, Callable[[type], None]] = dict.fromkeys(candidates, self._wrap_candidate)
         found |= dict.fromkeys((x for x in rasterizers if isinstance(x, str)), self._wrap_rasterizer)
@@ -58,18 +58,18 @@ class Wrapped:
         self._imports = AfterImport(dict.fromkeys(self._wanted, self._imported))
 
     def start(self) -> None:
-        """Wrap what is imported, and watch for the rest; raises what `Wrapped` does for classes."""
+        """Wrap what is imported, and watch for the rest; raises if a class cannot be wrapped."""
         for rasterizer in self._given:
             self._wrap_rasterizer(rasterizer)
         self._imports.start()
 
     def check_removable(self) -> None:
-        """Raise RuntimeError if someone wrapped a method again."""
+        """Raise RuntimeError if a method was wrapped again since."""
         for patch in self._patches:
             patch.check_removable()
 
     def stop(self) -> None:
-        """Put the classes back as they were, and watch no longer."""
+        """Restore the classes, and stop watching."""
         self._imports.stop()
         while self._patches:
             self._patches.pop().remove()
@@ -102,7 +102,7 @@ class Wrapped:
             def regularized_forward(*args: Any, **kwargs: Any) -> Any:
                 return self._rasterize(ForwardCall(forward, signature.bind(*args, **kwargs)))
 
-            # A compiled render is cut here: what follows reads the variables of its caller.
+            # Graph break in a compiled render: what follows reads the local variables of the caller.
             eager: Callable[..., Any] = torch.compiler.disable(regularized_forward)  # type: ignore[no-untyped-call]
             vars(eager)["ca_reg_hook"] = self
             return eager
@@ -111,14 +111,14 @@ class Wrapped:
         self.names.append(f"{rasterizer.__module__}.{rasterizer.__qualname__}")
 
     def _wrap_model(self, model: type) -> None:
-        """Listen to the learning rate updates of a model."""
+        """Intercept the learning rate updates of a model."""
         if not hasattr(model, "update_learning_rate"):
             return
 
         def make(update: Callable[..., Any]) -> Callable[..., Any]:
             @functools.wraps(update)
             def update_learning_rate(model: Any, iteration: int, *args: Any, **kwargs: Any) -> Any:
-                if self._updated is model:  # a class that calls that of its base
+                if self._updated is model:  # called by an override in a subclass
                     return update(model, iteration, *args, **kwargs)
                 self._update(model, int(iteration))
                 self._updated = model

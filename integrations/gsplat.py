@@ -1,11 +1,11 @@
 """Regularizers for every code base that calls ``gsplat.rasterization``.
 
-In a script of one's own, one line wraps the function:
+In your own script, one line wraps the function:
 
     rasterization = regularized(gsplat.rasterization, GaussianDropout(0.2))
 
-In a script that is not to be edited, :func:`install` replaces it before the script is loaded. The co-adaptation score
-of a gsplat model is in :mod:`ca_reg.integrations.gsplat_model`.
+For scripts that are not to be edited, :func:`install` replaces it before the script is loaded. To score a gsplat model,
+see :mod:`ca_reg.integrations.gsplat_model`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = ["Installation", "Rasterization", "Regularized", "install", "load_gspl
 Rasterization = Callable[..., tuple[Any, ...]]
 """``gsplat.rasterization``, or a function with its arguments that returns its ``info`` last."""
 
-_HOLDERS = ("gsplat", "gsplat.rendering")  # the two public places that scripts import the functions from
+_HOLDERS = ("gsplat", "gsplat.rendering")  # the public modules that scripts import the functions from
 
 
 def regularized(
@@ -37,26 +37,26 @@ def regularized(
 ) -> Regularized:
     """Wrap ``gsplat.rasterization`` so that the Gaussians pass through a regularizer.
 
-    A call trains if the regularizer is in ``train()``, gradients are enabled, and the opacities require one; any other
+    A call trains if the regularizer is in ``train()``, gradients are enabled, and the opacities require grad; any other
     call evaluates, whatever the mode of the module: test views under ``no_grad`` get the scaled opacities of ``eval()``
-    without a word from the script. Evaluation leaves the module as it is, so that another thread may train with it. All
-    cameras of a call see the same draw, by the view matrix of the first. A schedule needs ``set_step``, as always.
+    without changes to the script. Evaluation does not modify the module, so another thread may train with it. All
+    cameras of a call share one draw, made for the view matrix of the first. A schedule needs ``set_step``, as always.
 
     Dropped Gaussians leave no trace in density control: their ``info["radii"]`` are 0, in the shapes of gsplat 1.4
-    ([C, N]) and later ([C, N, 2]). In packed mode gsplat itself does not list them, from 1.5 on.
+    ([C, N]) and later ([C, N, 2]). In packed mode gsplat 1.5 and newer does not list them.
 
     Convention: activated opacities, [..., N]; several batches are drawn as one set of Gaussians.
 
     Args:
         rasterization: ``gsplat.rasterization`` or ``gsplat.rasterization_2dgs``, or a function with the same arguments.
         regularizer: a :class:`~ca_reg.Regularizer` or any other module, or several, as :class:`~ca_reg.Chain` takes
-            them. Spherical harmonics are ``colors`` with a ``sh_degree``.
+            them. Spherical harmonics are ``colors`` passed with ``sh_degree``.
         generator: source of the draws, passed to every member.
 
     Raises:
         TypeError: if ``rasterization`` has no argument ``opacities``, or ``regularizer`` is not a module.
-        ValueError: if ``rasterization`` is regularized already, or the regularizer learns numbers per Gaussian; at a
-            call, if that lacks what the regularizer needs.
+        ValueError: if ``rasterization`` is regularized already, or the regularizer learns per Gaussian or needs what no
+            call can supply; at a call, if that lacks what the regularizer needs.
         RuntimeError: at a call in training that drops Gaussians, if there are no radii to zero: in packed mode where
             gsplat lists Gaussians of opacity 0 (before 1.5, and 2DGS), or where ``info`` has none.
 
@@ -84,7 +84,7 @@ class _Call(Call):
     instead = "covars take the place of scales and quats, colors without sh_degree or for each camera that of sh"
 
     def get(self, field: str) -> Tensor | None:
-        """Return a field; of several cameras the first."""
+        """Return a field; the view matrix is that of the first camera."""
         if field == "view_matrix":
             matrices: Tensor = self.arguments["viewmats"]
             return matrices.reshape(-1, 4, 4)[0]
@@ -99,10 +99,10 @@ class Regularized:
     """A rasterization whose Gaussians pass through a regularizer; made by :func:`regularized`.
 
     Attributes:
-        rasterization: the function underneath.
+        rasterization: the wrapped function.
         regularizer: the module, as given.
-        chain: what is made of it.
-        tally: what was done; of an :class:`Installation`, by all its functions.
+        chain: the same as a :class:`~ca_reg.Chain`.
+        tally: counts of what was done; in an :class:`Installation`, by all its functions.
     """
 
     _eager: Any = None
@@ -127,28 +127,28 @@ class Regularized:
         self._generator = generator
         self._hook = hook
         self._packed_is_safe = False
-        # A compiled caller is cut here. On the class, so that instances can be pickled; now, because it imports dynamo.
+        # Graph break in compiled callers. On the class, so that instances can be pickled; here, as it imports dynamo.
         if Regularized._eager is None:
             Regularized._eager = torch.compiler.disable(Regularized._rasterize)  # type: ignore[no-untyped-call]
         functools.update_wrapper(self, rasterization)
 
     @property
     def trained(self) -> int:
-        """Number of training calls that were regularized; not of those at a rate of 0."""
+        """Number of training calls that were regularized, without those at a rate of 0."""
         return self.tally.regularized
 
     def __call__(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Rasterize with regularized opacities; takes and returns what ``rasterization`` does."""
+        """Rasterize with regularized Gaussians; takes and returns what ``rasterization`` does."""
         out: tuple[Any, ...] = self._eager(args, kwargs, trains=self.regularizer.training)
         return out
 
     def evaluate(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Rasterize with the opacities of ``eval()``, whatever the mode; otherwise like a call."""
+        """Rasterize with the test-time values, whatever the mode; otherwise like a call."""
         out: tuple[Any, ...] = self._eager(args, kwargs, trains=False)
         return out
 
     def _rasterize(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, trains: bool) -> tuple[Any, ...]:
-        """Rasterize in a mode."""
+        """Rasterize in training mode if ``trains`` and gradients reach the opacities, else in evaluation mode."""
         call = _Call(self.rasterization, self._signature.bind(*args, **kwargs))
         opacities: Tensor = call.arguments["opacities"]
         trains = trains and torch.is_grad_enabled() and opacities.requires_grad
@@ -162,7 +162,7 @@ class Regularized:
             if self._hook is not None:
                 self._hook.note_regularized()
         *images, info = call()
-        # Several ranks exchange their Gaussians inside the call, after gsplat (1.5 on) has left out those of opacity 0.
+        # Distributed calls exchange Gaussians between ranks, after gsplat (from 1.5 on) has culled those of opacity 0.
         if keep is not None and not call.arguments.get("distributed"):
             self._hide_dropped(info, keep.view(opacities.shape))
         return (*images, info)
@@ -180,7 +180,7 @@ class Regularized:
             per_camera = keep.unsqueeze(-2)  # [..., 1, N]
             info["radii"] = radii * (per_camera if radii.ndim == per_camera.ndim else per_camera.unsqueeze(-1))
         elif not self._packed_is_safe:
-            # Looked at once: on a GPU the look costs a wait, and it is the version of gsplat that decides.
+            # Checked once: the check synchronizes a GPU, and its outcome depends on the version of gsplat only.
             batches = info.get("batch_ids")
             listed = gaussians if batches is None else batches * keep.shape[-1] + gaussians
             if not bool(keep.reshape(-1)[listed.long()].all()):
@@ -193,12 +193,12 @@ class Regularized:
 
 
 class Installation(Hook):
-    """What :func:`install` changed; undone by :meth:`uninstall` or at the end of a ``with`` block.
+    """The replacements that :func:`install` made; undone by :meth:`uninstall` or at the end of a ``with`` block.
 
     Attributes:
-        rasterization: what is in the place of ``gsplat.rasterization``.
-        functions: all that was replaced, by name: what is in the place of each.
-        tally: what all of them did.
+        rasterization: the replacement of ``gsplat.rasterization``.
+        functions: all replacements, by name of the function.
+        tally: counts of what all of them did.
     """
 
     rasterization: Regularized
@@ -235,11 +235,11 @@ class Installation(Hook):
 
     @property
     def trained(self) -> int:
-        """Number of training calls, of all functions, that were regularized; not of those at a rate of 0."""
+        """Number of training calls, of all functions, that were regularized, without those at a rate of 0."""
         return self.tally.regularized
 
     def uninstall(self) -> None:
-        """Put back what was there; a second call does nothing."""
+        """Restore the original functions; a second call does nothing."""
         self._unwatch()
         while self._replaced:
             (holder, name), original = self._replaced.popitem()
@@ -258,20 +258,20 @@ class Installation(Hook):
 def install(regularizer: nn.Module, *, generator: torch.Generator | None = None, patience: int = 100) -> Installation:
     """Replace gsplat's functions for scripts that are not edited.
 
-    They are ``rasterization`` and what else is named ``rasterization...`` and takes opacities (2DGS), in ``gsplat`` and
-    in ``gsplat.rendering``. Do it before the script is imported: what has imported a name already keeps the old
-    function. Nobody tells the regularizer the step of such a script: its step is the number of training calls so far.
+    These are the functions named ``rasterization...`` that take opacities, 2DGS included, in ``gsplat`` and in
+    ``gsplat.rendering``. Install before the script is imported: modules that have imported a name already keep the old
+    function. Such a script does not set the step: the regularizer's step is the number of training calls so far.
 
     Args:
         regularizer: as for :func:`regularized`.
         generator: as for :func:`regularized`.
-        patience: how many steps of an optimizer with a group of parameters named ``opacities`` may go by in a row
-            without a regularized call, before a RuntimeError ends the training; 0 for any number.
+        patience: number of steps in a row, of optimizers with a parameter group ``opacity`` or ``opacities``, without a
+            regularized call, beyond which a RuntimeError ends the training; 0 for no limit.
 
     Raises:
         ImportError: if gsplat is missing.
-        TypeError: as :func:`regularized`.
-        ValueError: if it is installed already, or ``patience`` is negative.
+        TypeError: as :func:`regularized`, or if ``patience`` is not an integer.
+        ValueError: as :func:`regularized`, in particular if installed already, or if ``patience`` is negative.
 
     Example:
         >>> import runpy
@@ -285,12 +285,12 @@ def install(regularizer: nn.Module, *, generator: torch.Generator | None = None,
 
 
 def _takes_opacities(function: Any) -> bool:
-    """Whether this is a function with an argument of that name."""
+    """Whether this is a callable with an argument ``opacities``."""
     return callable(function) and "opacities" in inspect.signature(function).parameters
 
 
 def load_gsplat(device: torch.device | None = None) -> Any:
-    """Return the module ``gsplat``; raise ImportError without it, RuntimeError if it cannot render on a device."""
+    """Return the module ``gsplat``; raise ImportError without it, RuntimeError if it cannot render on ``device``."""
     if device is not None and device.type != "cuda":
         raise RuntimeError(f"gsplat renders on CUDA devices only, and the Gaussians are on {device}: move them there.")
     try:
@@ -300,5 +300,5 @@ def load_gsplat(device: torch.device | None = None) -> Any:
 
 
 def unregularized(rasterization: Rasterization) -> Rasterization:
-    """Return the function underneath if ``rasterization`` is regularized, else itself."""
+    """Return the wrapped function if ``rasterization`` is regularized, else ``rasterization`` itself."""
     return rasterization.rasterization if isinstance(rasterization, Regularized) else rasterization

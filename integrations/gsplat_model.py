@@ -1,4 +1,4 @@
-"""A gsplat model as a renderer and as per-pixel lists: what the co-adaptation score asks for."""
+"""Render a gsplat model, and list what it composites per pixel, for the co-adaptation score."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .gsplat import load_gsplat, unregularized
 __all__ = ["GsplatModel", "GsplatView"]
 
 _TILE = 16
-_ALL = 2**31 - 1  # batches of Gaussians per tile: all of them
+_ALL = 2**31 - 1  # end of the range of Gaussian batches per tile: all of them
 
 
 class GsplatView(NamedTuple):
@@ -28,8 +28,8 @@ class GsplatView(NamedTuple):
     Attributes:
         viewmat: world to camera, shape (4, 4).
         K: intrinsics, pixels, shape (3, 3).
-        width: of the image.
-        height: of the image.
+        width: of the image, in pixels.
+        height: of the image, in pixels.
     """
 
     viewmat: Tensor
@@ -40,17 +40,17 @@ class GsplatView(NamedTuple):
 
 @dataclass(frozen=True)
 class GsplatModel:
-    """Gaussians that gsplat renders, but for their opacities. Needs a CUDA device.
+    """Gaussians to be rendered by gsplat, without their opacities. Needs a CUDA device.
 
     ``CAScore(model.render)`` samples; ``CAScore(exact=ListMoments(model.lists))`` is exact and needs gsplat 1.5 or
-    newer. Both leave a regularizer that wraps or replaces ``gsplat.rasterization`` out of the way.
+    newer. Both bypass a regularizer that wraps or replaces ``gsplat.rasterization``.
 
     Args:
         means: world coordinates, shape (N, 3).
         quats: orientation, wxyz, shape (N, 4).
         scales: standard deviations, activated, shape (N, 3).
-        colors: RGB, shape (N, 3), or with ``sh_degree`` the spherical harmonics, shape (N, K, 3).
-        sh_degree: highest band to evaluate; None for colors.
+        colors: RGB, shape (N, 3), or with ``sh_degree`` spherical-harmonic coefficients, shape (N, K, 3).
+        sh_degree: highest degree to evaluate; None for RGB.
         background: color behind everything, shape (3,); None for black.
         near_plane: as in ``gsplat.rasterization``.
         eps2d: as in ``gsplat.rasterization``.
@@ -75,7 +75,7 @@ class GsplatModel:
     antialiased: bool = False
 
     def render(self, opacity: Tensor, view: GsplatView) -> tuple[Tensor, Tensor]:
-        """Render a view with activated opacities (N,) or (N, 1), as :class:`~ca_reg.CAScore` asks.
+        """Render a view with activated opacities (N,) or (N, 1): a render callable for :class:`~ca_reg.CAScore`.
 
         Returns:
             Image (3, H, W) and accumulated alpha (H, W).
@@ -101,10 +101,10 @@ class GsplatModel:
         return colors[0].permute(2, 0, 1), alphas[0, ..., 0]
 
     def lists(self, opacity: Tensor, view: GsplatView) -> PixelLists:
-        """List what every pixel composites, without an early stop: what :class:`~ca_reg.ListMoments` needs.
+        """List what every pixel composites, without early termination, for :class:`~ca_reg.ListMoments`.
 
-        Differentiable in everything but the choice of the pairs, as the rasterizer is. Arguments and errors are those
-        of :meth:`render`.
+        Differentiable, as the rasterizer is, in everything but which Gaussian covers which pixel. Arguments and errors
+        are those of :meth:`render`.
         """
         gsplat = load_gsplat(self.means.device)
         camera = self._camera(view)
@@ -134,11 +134,11 @@ class GsplatModel:
         )
 
     def _camera(self, view: GsplatView) -> dict[str, Any]:
-        """The arguments that all of gsplat's functions name alike, for one camera."""
+        """Return the camera arguments that gsplat's functions share, for one camera."""
         return {"viewmats": view.viewmat[None], "Ks": view.K[None], "width": view.width, "height": view.height}
 
     def _colors(self, gsplat: Any, view: GsplatView) -> Tensor:
-        """Colors towards a view, (N, 3)."""
+        """Return the view-dependent colors, (N, 3)."""
         if self.sh_degree is None:
             return self.colors
         harmonics = gsplat.spherical_harmonics
@@ -154,7 +154,7 @@ class GsplatModel:
 def _pairs(
     gsplat: Any, radii: Tensor, means2d: Tensor, depths: Tensor, conics: Tensor, opacities: Tensor, view: GsplatView
 ) -> tuple[Tensor, Tensor]:
-    """Return Gaussian and pixel of every alpha of at least 1/255, nearest first at every pixel, shapes (P,)."""
+    """Return Gaussian and pixel indices of all alphas of at least 1/255, nearest first at every pixel, (P,) each."""
     columns, rows = -(-view.width // _TILE), -(-view.height // _TILE)
     _, intersections, order = gsplat.isect_tiles(
         means2d, radii, depths, tile_size=_TILE, tile_width=columns, tile_height=rows
@@ -163,7 +163,7 @@ def _pairs(
     gaussians, pixels, _ = gsplat.rasterize_to_indices_in_range(
         range_start=0,
         range_end=_ALL,
-        # gsplat ends a pixel at a transmittance of 1e-4. Infinite light never ends, and the lists must be complete.
+        # gsplat stops at a transmittance of 1e-4; an infinite one never falls below that, so the lists are complete.
         transmittances=torch.full((1, view.height, view.width), torch.inf, device=means2d.device),
         means2d=means2d,
         conics=conics,
@@ -179,7 +179,7 @@ def _pairs(
 
 @functools.lru_cache
 def _largest_alpha(device: torch.device) -> float:
-    """The clamp of this gsplat (0.999 up to 1.5, then 0.99), read off an opaque splat over the center of a pixel."""
+    """Return this gsplat's clamp of alpha (0.999 up to 1.5, then 0.99), from a render of one opaque splat."""
     one, eye = torch.ones(1, 3, device=device), torch.eye(4, device=device)
     intrinsics = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]], device=device)
     model = GsplatModel(one * eye[2, :3], eye[:1], one, one)

@@ -1,9 +1,9 @@
-"""Regularize the code bases that grew out of the INRIA 3DGS code: one hook on their rasterizer, no edits.
+"""Regularize code bases derived from the INRIA 3DGS code: one hook on their rasterizer, no edits.
 
 3DGS, DNGaussian, FSGS, CoR-GS, Binocular3DGS, MVGS, AbsGS, DropGaussian and the paper's own code have one thing in
-common: they hand activated opacities to ``GaussianRasterizer``, and take what was seen from the radii that come back.
-:class:`RasterizerHook` wraps its ``forward``. :func:`ca_reg.integrations.inria_score.render_fn` scores such models, and
-``python -m ca_reg.integrations.run`` hooks a training script without touching it.
+common: they pass activated opacities to ``GaussianRasterizer``, and derive visibility from the radii it returns.
+:class:`RasterizerHook` wraps its ``forward``. :func:`ca_reg.integrations.inria_score.render_fn` makes such models
+scorable, and ``python -m ca_reg.integrations.run`` hooks a training script without editing it.
 """
 
 from __future__ import annotations
@@ -31,54 +31,54 @@ from ._wrapped import Wrapped
 __all__ = ["DEFAULT_MODEL", "RasterizerHook", "Scope", "Steps"]
 
 Scope = Literal["main", "all"]
-"""Which training renders of an iteration are regularized: the first of every model, with those that follow it in the
-same loop of the script (a batch), or all; always with one mask."""
+"""Which training renders of an iteration are regularized: the first of every model and further ones from the same place
+in the script (a batch), or all; always with the same mask."""
 
 DEFAULT_MODEL = "scene.gaussian_model:GaussianModel"
-_MANY_ZEROS = 1e-3  # share of opacities that are 0 by no rounding
+_MANY_ZEROS = 1e-3  # share of zero opacities beyond what rounding explains
 
 
 class RasterizerHook(Hook):
     """Regularize every render of an INRIA-style code base, as a context manager or with install and uninstall.
 
-    Training renders (gradients on, opacities and positions trained) get regularized opacities, and the radii of dropped
-    Gaussians are zeroed on the way out: visibility, densification and pruning are those of a render without them.
-    Renders under ``no_grad`` and those for a viewer get the test-time opacities. All others are left alone, such as
-    depth renders with constant opacities or detached positions; :attr:`tally` counts them with the reason.
+    Training renders (gradients enabled, opacities and positions trained) get regularized Gaussians, and the radii of
+    dropped ones are zeroed on return: visibility, densification and pruning are those of a render without them.
+    Renders under ``no_grad`` and for a viewer get the test-time values. All others, such as depth renders with constant
+    opacities or detached positions, are left alone; :attr:`tally` counts them by reason.
 
-    The training step, which schedules and masks follow, is read off the ``update_learning_rate`` of the ``models``; a
-    code base without it says it with :meth:`step`, or lets the parameters tell. The masks
-    depend on the seed, the model and the step alone, and the global random numbers are untouched: with and without the
-    hook a script picks the same cameras.
+    The training step, which schedules and masks follow, is inferred from calls of ``update_learning_rate`` of the
+    ``models``; for a code base without it, call :meth:`step` or infer it from the parameters (``steps``). The masks
+    depend on the seed, the model and the step alone, and the global random state is untouched: a script picks the same
+    cameras with and without the hook.
 
-    A training that goes by without being regularized is an error, raised in its :meth:`step`, its
-    ``update_learning_rate``, its ``optimizer.step()`` or its ``backward()``; see ``patience``.
+    Training without regularization is an error, raised in :meth:`step`, ``update_learning_rate``,
+    ``optimizer.step()`` or ``backward()``; see ``patience``.
 
     Args:
         regularizer: a :class:`~ca_reg.Regularizer`, or several, as :class:`~ca_reg.Chain` takes them; any other module
             must take ``generator=`` in its ``forward``. The hook sets its mode and its step.
         scope: "main" regularizes the first training render of every model and iteration, as the paper's code does, and
-            those of the same place in the script, which are its batch (MVGS, 4DGaussians); it leaves second views and
-            pseudo views alone, which are rendered elsewhere. "all" regularizes all. The mask is one.
+            further ones from the same place in the script, its batch (MVGS, 4DGaussians); second views and pseudo
+            views, which are rendered elsewhere, are left alone. "all" regularizes all. All share the same mask.
         seed: of the masks and the noise.
         rasterizer: the class to hook, or its name as ``module:Class``; by default those of
             ``diff_gaussian_rasterization`` and ``diff_gaussian_rasterization_abs``, as soon as they are imported.
-        candidates: names of classes to hook beside the default, if they turn out to be rasterizers of the family.
-        models: names of the classes of Gaussian models.
-        steps: "updates" takes calls of ``update_learning_rate`` for the steps; "parameters" takes the first render
-            after a change of the positions or opacities for the beginning of one.
-        viewer: name of the class of the cameras that a viewer renders with; None if there is no viewer.
-        patience: how many steps may go by without a regularized render: optimizer steps of Gaussians in a row, or
-            training steps in all; 0 for any number.
-        allow_zeros: do not take exact zeros among the incoming opacities for a dropout of the code base's own.
+        candidates: names of classes to hook besides the default, if they turn out to be rasterizers of the family.
+        models: names of the Gaussian model classes, as ``module:Class``.
+        steps: what marks a new step: "updates", a call of ``update_learning_rate``; "parameters", the first render
+            after a change of the positions or opacities.
+        viewer: class name of the cameras that a viewer renders with; None if there is no viewer.
+        patience: number of optimizer steps of Gaussians in a row without a regularized render, and total number of
+            training steps without a render, beyond which an error is raised; 0 for no limit.
+        allow_zeros: accept exact zeros among the incoming opacities, by default taken for the code base's own dropout.
 
     Attributes:
-        tally: what was done so far.
+        tally: counts of what was done so far.
 
     Raises:
-        TypeError: if ``regularizer`` is no module, or takes no ``generator``.
-        ValueError: if ``scope`` or ``steps`` is unknown, ``patience`` negative, or there is no regularizer or one that
-            learns numbers per Gaussian; at a render, if that lacks what the regularizer needs.
+        TypeError: if ``regularizer`` is not a module or takes no ``generator``, or a number is not an integer.
+        ValueError: if ``scope`` or ``steps`` is unknown, ``seed`` or ``patience`` negative, the regularizer empty or
+            one that learns per Gaussian; at a render, if that lacks what the regularizer needs.
 
     Example:
         >>> class GaussianRasterizer(nn.Module):
@@ -136,12 +136,12 @@ class RasterizerHook(Hook):
         self._hooked: list[str] = []  # names of the classes, for messages
 
     def install(self) -> Self:
-        """Wrap the rasterizers, those that are imported and those that will be; return the hook.
+        """Wrap the rasterizers, now or once they are imported; return the hook.
 
         Raises:
             ImportError: if no rasterizer is installed and none was given.
-            RuntimeError: if this hook or another one is in force already.
-            TypeError: if the rasterizer is not one of the INRIA family.
+            RuntimeError: if this hook or another one is installed already.
+            TypeError: if the rasterizer is not of the INRIA family.
             ValueError: if it does not take what the regularizer needs.
         """
         if self._wrapped is not None:
@@ -165,11 +165,10 @@ class RasterizerHook(Hook):
         return self
 
     def uninstall(self) -> None:
-        """Put the classes back exactly as they were.
+        """Restore the classes exactly.
 
         Raises:
-            RuntimeError: if the hook is not installed, or someone wrapped the classes again since; nothing is then
-                changed.
+            RuntimeError: if the hook is not installed, or the classes were wrapped again since; nothing changes then.
         """
         if self._wrapped is None:
             raise RuntimeError("this hook is not installed.")
@@ -180,7 +179,7 @@ class RasterizerHook(Hook):
         self._wrapped = None
 
     def step(self, step: int) -> None:
-        """Say which training step begins, counted from 1; ``update_learning_rate`` is no longer looked at."""
+        """Begin a training step, counted from 1; from then on ``update_learning_rate`` is ignored."""
         self._iterations.step(step)
 
     def _explain(self) -> str:
@@ -194,7 +193,7 @@ class RasterizerHook(Hook):
         )
 
     def _rasterize(self, call: ForwardCall) -> Any:
-        """Decide what a call of the rasterizer is for, and make it."""
+        """Classify a call of the rasterizer, and make it accordingly."""
         if is_overridden():
             return self._leave(call, Skip.SCORE)
         means, opacities = call.arguments["means3D"], call.arguments["opacities"]
@@ -208,7 +207,7 @@ class RasterizerHook(Hook):
         if not means.requires_grad:
             return self._leave(call, Skip.DETACHED_MEANS)
         parameters = tuple(x for x in (means if means.is_leaf else None, leaf_of(opacities)) if x is not None)
-        # Without a model a parameter tells the fields apart; where none is found, all calls belong to one field.
+        # Without a model, a parameter identifies the field; without either, all calls belong to one field.
         field = self._iterations.field(model if model is not None else parameters[0] if parameters else self)
         if not field.count_render(parameters, place) and self._scope == "main":
             return self._leave(call, Skip.FURTHER_VIEW)
@@ -217,7 +216,7 @@ class RasterizerHook(Hook):
         return self._train(call, field)
 
     def _leave(self, call: ForwardCall, reason: Skip) -> Any:
-        """Make a call as it is."""
+        """Make a call unchanged."""
         self.tally.skipped[reason] += 1
         return call()
 
@@ -233,7 +232,7 @@ class RasterizerHook(Hook):
     def _train(self, call: ForwardCall, field: Field) -> Any:
         """Make a call with regularized Gaussians, and hide the dropped ones from densification."""
         step = field.training_step
-        # The same for every render of an iteration, so that all of them drop the same Gaussians.
+        # The same seed for every render of an iteration, so that all drop the same Gaussians.
         generator = seeded(self._seed, field.index, step, device=call.arguments["opacities"].device)
         self._chain.train().set_step(step)
         keep = call.train(self._chain, step, self.tally, generator)
@@ -255,7 +254,7 @@ class RasterizerHook(Hook):
             )
 
     def _refuse_to_train_on_a_viewer(self, gradient: Tensor) -> None:
-        """Raise: a gradient came back from a render for a viewer."""
+        """Raise: a gradient arrived from a render taken for a viewer's."""
         raise RuntimeError(
             f"a render for a viewer is trained on: its camera is a {self._viewer}, which the hook takes for that of a "
             "viewer, so that it was scaled and not regularized. If the training views are of this class, say that "

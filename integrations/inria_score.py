@@ -1,4 +1,4 @@
-"""The co-adaptation score of models of INRIA-style code bases: their `render` as a render callable."""
+"""The co-adaptation score for INRIA-style code bases: their `render` as a render callable."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ __all__ = ["render_fn"]
 def render_fn(
     render: Callable[..., Any], gaussians: Any, pipe: Any, background: Tensor, *, rasterizer: type | None = None
 ) -> RenderFn:
-    """Turn the ``render`` of an INRIA-style code base into what :class:`ca_reg.CAScore` takes.
+    """Turn the ``render`` of an INRIA-style code base into a render callable for :class:`ca_reg.CAScore`.
 
-    The opacities are replaced on their way into the rasterizer, so neither the model nor ``render`` is touched, and a
-    :class:`~ca_reg.integrations.inria.RasterizerHook` leaves these renders alone. The image is the one that ``render``
-    returns; so is the alpha if it has a name there (the paper's code, Binocular3DGS, CoR-GS, DNGaussian). Else a second
-    pass with the same opacities measures it, white on black: a depth is never taken for an alpha.
+    The opacities are replaced on their way into the rasterizer, so neither the model nor ``render`` is modified, and a
+    :class:`~ca_reg.integrations.inria.RasterizerHook` leaves these renders alone. Image and alpha are those that
+    ``render`` returns, the alpha if it is named (the paper's code, Binocular3DGS, CoR-GS, DNGaussian). Else a second
+    pass with the same opacities measures it, white on black: a depth is never mistaken for an alpha.
 
     Args:
         render: ``render(view, gaussians, pipe, background)`` of the code base.
         gaussians: its model.
         pipe: its pipeline settings.
         background: color, shape (3,).
-        rasterizer: the class that ``render`` uses; by default those that are installed.
+        rasterizer: the class that ``render`` uses; by default the installed ones.
 
     Returns:
         A callable ``(opacity, view) -> Rendering(image (3, H, W), alpha (H, W))``.

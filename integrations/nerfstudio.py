@@ -2,19 +2,19 @@
 
 Nothing has to be imported: where both packages are installed, ``ns-train splatfacto-ca --data ...`` trains it, with
 ``--pipeline.model.dropout``, ``--pipeline.model.opacity-noise``, ``--pipeline.model.regularizer`` and
-``--pipeline.model.ca-samples`` beside the options of splatfacto. Evaluation images are logged with ``ca``,
-``ca_std_error`` and ``ca_visible``, the share of the pixels that count; where that is 0, ``ca`` is nan.
+``--pipeline.model.ca-samples`` besides the options of splatfacto. Evaluation images are logged with ``ca``,
+``ca_std_error`` and ``ca_visible``, the share of visible pixels; where that is 0, ``ca`` is nan.
 
-The score is the paper's, with half of the Gaussians that training left, except that splatfacto clamps its colors.
+The score is the paper's, keeping half as many Gaussians as training did, except that splatfacto clamps its colors.
 Exported PLY files hold the opacities as trained; viewers other than nerfstudio's have to scale them by 1 - dropout.
 
-The names of this module are made when they are asked for:
+The names of this module are created on access:
 
 - ``splatfacto_ca``: the ``MethodSpecification``. nerfstudio loads it in every ``ns-train``, whatever the method, and an
-  exception would end that; so where it cannot be had this is an :class:`Unavailable`, which nerfstudio reports in one
-  line and goes on.
-- ``SplatfactoCAModel``, ``SplatfactoCAModelConfig``: for methods of one's own. Where they cannot be had, asking for one
-  raises an ImportError.
+  exception would end that; if it cannot be created this is an :class:`Unavailable`, which nerfstudio reports in one
+  line before it continues.
+- ``SplatfactoCAModel``, ``SplatfactoCAModelConfig``: for custom methods. If they are not available, access raises an
+  ImportError.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["SplatfactoCAModel", "SplatfactoCAModelConfig", "Unavailable", "splat
 
 
 class Unavailable:
-    """Stands in for the method where it cannot be had; its text says why."""
+    """Stands in for the method where it is not available; its ``repr`` says why."""
 
     def __init__(self, error: Exception) -> None:
         self.error = error
@@ -35,7 +35,7 @@ class Unavailable:
             "splatfacto-ca (which needs nerfstudio 1.1.1 or newer with its gsplat, the extra nerfstudio of ca_reg: "
             f"{type(self.error).__name__}: {self.error})"
         )
-        # nerfstudio prints this by rich, which takes square brackets for markup and raises if they do not match.
+        # nerfstudio prints this with rich, which parses square brackets as markup and raises if they do not match.
         return text.replace("[", "(").replace("]", ")")
 
 
@@ -46,7 +46,7 @@ def __getattr__(name: str) -> Any:
         from . import _splatfacto_method
 
         return _splatfacto_method.make_method() if name == "splatfacto_ca" else getattr(_splatfacto_method, name)
-    except Exception as error:  # whatever an incompatible nerfstudio comes up with
+    except Exception as error:  # whatever an incompatible nerfstudio raises
         unavailable = Unavailable(error)
         if name == "splatfacto_ca":
             return unavailable

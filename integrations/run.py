@@ -3,13 +3,13 @@
     python -m ca_reg.integrations.run --dropout 0.2 train.py -s scene -m output --iterations 10000
     python -m ca_reg.integrations.run --dropout 0.2 simple_trainer.py default --data_dir scene
 
-runs the script as Python itself would, with a :class:`~ca_reg.integrations.inria.RasterizerHook` in force, or, if it
-imports gsplat, with :func:`~ca_reg.integrations.gsplat.install`, and says at the end, however that comes about, what
-was regularized. The options of this launcher stand before the script, all that follows belongs to the script; ``-m
-module arguments...`` runs a module instead.
+runs the script as Python itself would, with a :class:`~ca_reg.integrations.inria.RasterizerHook` installed, or, if it
+imports gsplat, with :func:`~ca_reg.integrations.gsplat.install`, and reports what was regularized when it ends, in
+whatever way. The options of the launcher come before the script, everything after it belongs to the script; ``-m module
+arguments...`` runs a module instead.
 
-The exit code is that of the script, and not 0 if the script succeeded but was not regularized; a training of which this
-shows earlier is ended.
+The exit code is that of the script, or 1 if the script succeeded but was not regularized; training that turns out not
+to be regularized is aborted.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from .inria import DEFAULT_MODEL, RasterizerHook, Scope, Steps
 
 __all__ = ["main"]
 
-_OF_INRIA = ("scope", "rasterizer", "outputs", "steps", "viewer", "allow_zeros")  # mean nothing to gsplat's scripts
+_OF_INRIA = ("scope", "rasterizer", "outputs", "steps", "viewer", "allow_zeros")  # do not apply to gsplat's scripts
 _REPORTED = ("script", "arguments", "regularizer", "dropout", "noise", "start", "ramp", "scope", "seed", "cpu")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the launcher; what the script raises, its exit code among it, passes through.
+    """Run the launcher; exceptions of the script, SystemExit included, pass through.
 
     Args:
-        arguments: of the launcher, the script and the arguments of the script; those of the process by default.
+        arguments: launcher options, script and script arguments; by default those of the process.
     """
     options = _parse(arguments)
     hook: Hook | None = options.hook
@@ -62,13 +62,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _uninstall(hook: Hook) -> None:
-    """Uninstall a hook unless the script has wrapped the class once more."""
+    """Uninstall a hook unless the script has wrapped the class again."""
     with suppress(RuntimeError):
         hook.uninstall()
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Read and check the options before anything runs; `hook` is what they ask for."""
+    """Parse and check the options before anything runs; adds the `hook` that they ask for."""
     parser = argparse.ArgumentParser(
         prog="python -m ca_reg.integrations.run",
         description="Run a training or render script of the INRIA 3DGS family or of gsplat, regularized, with no edit.",
@@ -103,7 +103,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         if not options.module:
             parser.error("-m needs the name of a module")
         options.script, *options.arguments = options.module
-        # Of the package alone: to find a module in it would import it, before the hook is there.
+        # Only the package: finding a submodule would import the package, before the hook is installed.
         if find_spec(options.script.partition(".")[0]) is None:
             parser.error(f"there is no module {options.script}")
     elif options.script is None or (script := find_script(options.script)) is None:
@@ -119,7 +119,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     if options.patience < 0:
         parser.error("--patience must be at least 0")
     if options.report is not None:
-        options.report = options.report.absolute()  # the script may change the folder
+        options.report = options.report.absolute()  # the script may change the working directory
         if not options.report.parent.is_dir():
             parser.error(f"there is no folder {options.report.parent} for the report")
     if options.rasterizer is not None and options.rasterizer.count(":") != 1:
@@ -146,7 +146,7 @@ def _hook(options: argparse.Namespace) -> Hook | None:
     members = list(parse(options.regularizer))
     for kind, rate in ((GaussianDropout, options.dropout), (OpacityNoise, options.noise)):
         if rate is not None:
-            kind(rate)  # a schedule is checked at its steps only
+            kind(rate)  # checks the rate, which a schedule does only at each step
             members.append(kind(scheduled(rate)))
     if not members:
         return None
@@ -168,7 +168,7 @@ def _hook(options: argparse.Namespace) -> Hook | None:
 
 @contextmanager
 def _reported(options: argparse.Namespace, hook: Hook | None) -> Iterator[None]:
-    """Say at the end, whatever it is, what was done; exit with 1 if that is not what was asked for."""
+    """Report what was done, however the script ends; exit with 1 if that is not what was asked for."""
     ended, problem = "finished", None
     try:
         yield

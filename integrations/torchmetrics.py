@@ -1,4 +1,4 @@
-"""The co-adaptation score as a metric of torchmetrics: it resets, syncs over ranks and joins a MetricCollection."""
+"""The co-adaptation score as a torchmetrics metric: it resets, syncs over ranks and joins a MetricCollection."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ _numbers = count()
 class CAScoreMetric(_Metric):  # type: ignore[misc]
     """The mean co-adaptation score of the views seen since the last reset, as a torchmetrics metric.
 
-    ``update(opacity, view)`` measures one view, ``forward`` does so and returns its score, ``compute`` returns the mean
-    over views and ranks as a scalar, which Lightning's ``self.log`` and a ``MetricCollection`` take as they take any
-    other; ``summary`` returns the same mean with its standard error, its reason and the number of views without a
-    value. Such views have no share in the mean; without any view that has a value it is nan.
+    ``update(opacity, view)`` measures one view, ``forward`` also returns its score, ``compute`` returns the mean over
+    views and ranks as a scalar, as Lightning's ``self.log`` and a ``MetricCollection`` expect; ``summary`` returns the
+    same mean with its standard error, its reason and the number of views without visible pixels. Such views are left
+    out of the mean, which is nan without any others.
 
-    In a collection call by name, ``collection.update(preds=..., target=..., opacity=..., view=...)``: every metric
-    takes the arguments that it knows. A copy of the metric measures the same model, which is not copied. A sampler that
-    repeats views to give all ranks equally many makes them count twice, as for any metric.
+    In a collection pass arguments by name, ``collection.update(preds=..., target=..., opacity=..., view=...)``: every
+    metric takes those that it knows. A copy of the metric measures the same model, which is not copied. Views that a
+    sampler repeats to give all ranks equally many count twice, as in any metric.
 
     Convention: ``opacity`` is activated, in [0, 1], (N,) or (N, 1), and neither scaled nor dropped.
 
     Args:
         score: a render callable for the paper's protocol, or a :class:`ca_reg.CAScore` with other settings, such as an
-            exact one. What the score itself has counted is neither used nor changed.
+            exact one. The score's own count of views is neither used nor changed.
         kwargs: passed on to ``torchmetrics.Metric``, such as ``process_group``, ``sync_on_compute``.
 
     Attributes:
@@ -85,14 +85,14 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
         super().__init__(**kwargs)
         self.score = score if isinstance(score, CAScore) else CAScore(score)
         self.add_state("sums", default=ViewTally().sums, dist_reduce_fx="sum")
-        # A collection lets metrics of equal state share their updates, and scores are small enough to look equal to
-        # its allclose, or are all empty at first. Two digits, because it compares with a relative tolerance.
+        # A collection lets metrics of equal state share their updates, and scores are small enough to look equal in
+        # its allclose, or all empty at first. Two digits in base 4096, because it compares with a relative tolerance.
         digits = torch.tensor(divmod(next(_numbers), 4096), dtype=torch.float64)
         self.add_state("identity", default=digits, dist_reduce_fx="max")
 
     def forward(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> Tensor:
         """Measure one view, count it, and return its score as a scalar; arguments as for :meth:`update`."""
-        # The base class resets for the time of the call, and with it the count of the updates.
+        # The base class resets the metric during the call, and with it the count of updates.
         index = self._position(self.update_count) if index is None else index
         value: Tensor = super().forward(opacity, view, index=index)
         return value
@@ -112,7 +112,7 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
         return torch.tensor(self._summarize().value, dtype=self.sums.dtype, device=self.sums.device)
 
     def summary(self) -> CASummary:
-        """Return the same mean with all that is known about it; on several ranks every rank must call this."""
+        """Return the mean with its standard error, reason and counts; on several ranks every rank must call this."""
         with self.sync_context(dist_sync_fn=self.dist_sync_fn, should_sync=self.sync_on_compute):
             return self._summarize()
 
@@ -125,7 +125,7 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
         return self._plot(val, ax)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> CAScoreMetric:
-        # clone() copies deeply, and the render callable may be a method of the model.
+        # clone() makes a deep copy, and the render callable may be a method of the model.
         memo[id(self.score)] = self.score
         twin = type(self).__new__(type(self))
         memo[id(self)] = twin
@@ -133,11 +133,11 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
         return twin
 
     def _position(self, before: int) -> int:
-        """Return the position of the view that comes after ``before`` others on this rank."""
+        """Return the position of the view that follows ``before`` others on this rank."""
         return view_position(before, self.process_group)
 
     def _summarize(self) -> CASummary:
-        """Read the state."""
+        """Summarize the state."""
         tally = ViewTally()
         tally.sums = self.sums.cpu()
         return tally.summary(self.score.settings)

@@ -22,10 +22,10 @@ def draw_keep_mask(
     Args:
         n: number of Gaussians.
         p: drop rate in [0, 1); a number, or one for each Gaussian, shape (n,).
-        generator: source of the draw; the global state of the random numbers is then untouched. It decides where the
-            numbers are drawn, so one CPU generator gives the same mask for every device. Not inside a function that
+        generator: source of the draw; the global random state is then untouched. The numbers are drawn on its device,
+            so a CPU generator gives the same mask on every device. Not inside a function that
             ``torch.utils.checkpoint`` recomputes: draw outside it.
-        device: where the mask is returned; by default where it was drawn.
+        device: device of the returned mask; by default where it was drawn.
 
     Returns:
         True where the Gaussian stays, shape (n,), bool.
@@ -53,8 +53,8 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: b
     """Set the opacities of dropped Gaussians to zero (paper, Eq. dropout_train).
 
     A dropped Gaussian gets an opacity and a gradient of exactly zero. The rasterizer may still report a radius for it:
-    zero that as well (``radii * keep``) before it reaches density control, or the mean gradients there shrink by
-    ``1 - p`` and fewer Gaussians are made.
+    zero that as well (``radii * keep``) before density control sees it, or the mean gradients shrink by ``1 - p`` and
+    fewer Gaussians are densified.
 
     Args:
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
@@ -62,8 +62,8 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: b
         p: the rate or rates that ``keep`` was drawn with; used only by ``compensate``.
         compensate: multiply the survivors by ``1 / (1 - p)``, so that the mean over masks is ``opacity`` and nothing
             needs to be scaled at test time. Survivors may then exceed 1; they are not clamped here, because every
-            3DGS rasterizer clamps the alpha of a splat at 0.99 or 0.999. With that clamp the mean alpha is lower than
-            that of ``opacity`` where this exceeds ``0.99 (1 - p)``.
+            3DGS rasterizer clamps the alpha of a splat, at 0.99 or 0.999. Where ``opacity`` exceeds ``0.99 (1 - p)``
+            that clamp lowers the mean alpha.
 
     Returns:
         The masked opacities, a new tensor of the same shape and dtype.
@@ -84,7 +84,7 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: b
     check_rate(p)
     if keep.dtype != torch.bool:
         raise TypeError(f"keep must be a bool tensor, got {keep.dtype}; compare with a threshold to get a mask.")
-    # Not a product: 0 * inf and 0 * nan would leak into what is dropped, forward and backward.
+    # Not a product: 0 * inf and 0 * nan would put nan where Gaussians are dropped, forward and backward.
     masked = opacity.masked_fill(~keep.view_as(opacity), 0.0)
     return masked * (1.0 / (1.0 - rate_like(p, opacity))) if compensate else masked
 
@@ -94,8 +94,8 @@ def gaussian_dropout(
 ) -> tuple[Tensor, Tensor | None]:
     """Draw a mask and apply it: :func:`draw_keep_mask`, then :func:`apply_dropout`.
 
-    Arguments and errors are theirs. Returns the masked opacities and the mask of shape (N,); with ``p = 0`` the very
-    same ``opacity`` and None: nothing is drawn.
+    Arguments and errors are theirs. Returns the masked opacities and the mask of shape (N,). With ``p = 0`` nothing is
+    drawn: returns the very same ``opacity`` and None.
 
     Example:
         >>> opacity, keep = gaussian_dropout(torch.full((4, 1), 0.5), 0.2)

@@ -1,8 +1,8 @@
-"""Pixel losses in expectation over the random factors, from the mean and the variance of the pixel alone.
+"""Expected pixel losses over the random factors, from the mean and the variance of the pixel alone.
 
-Training with sampled dropout or noise minimizes the expectation of the loss of one draw, with the noise of that draw in
-every gradient. With the exact moments of a pixel (:func:`~ca_reg.functional.pixel_moments`) the expectation itself can
-be minimized: of the squared error exactly, of the absolute error as far as the pixel is normally distributed.
+Training with sampled dropout or noise minimizes an expected loss through single draws, with their noise in every
+gradient. With the exact moments of a pixel (:func:`~ca_reg.functional.pixel_moments`) the expectation itself can be
+minimized: that of the squared error exactly, that of the absolute error insofar as the pixel is normally distributed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["expected_absolute_error", "expected_squared_error"]
 # Standard deviation of what rounding to 8 bits adds to a photograph: uniform over one of 255 steps.
 _ROUNDING = 1.0 / (255.0 * math.sqrt(12.0))
 
-# From here on erf is 1 and exp(-x^2) lost beside it, and soon so small that processors take many times as long for it.
+# Beyond this erf(x) rounds to 1 and exp(-x^2) is negligible; further out it is subnormal, which is slow to compute.
 _FAR = 9.0
 
 
@@ -30,7 +30,7 @@ def expected_squared_error(mean: Tensor, variance: Tensor, target: Tensor) -> Te
     Exact for every distribution of ``x``: the bias-variance decomposition. Its average is what dropout training
     minimizes on average when the loss is the mean squared error.
 
-    All are floating-point tensors of one shape, else a TypeError or ValueError is raised; the variance is at least 0.
+    All arguments are floating-point tensors of one shape, else TypeError or ValueError; the variance is at least 0.
 
     Example:
         One splat of alpha 0.8, white over black, is kept in half of the draws, so a pixel is 0 or 0.8:
@@ -66,13 +66,13 @@ def expected_absolute_error(mean: Tensor, variance: Tensor, target: Tensor, *, m
     ``|d| <= E |x - t| <= sqrt(d^2 + variance)`` (Jensen), and the approximation lies in the same interval, with
     ``s^2`` in place of the variance: it is never below the absolute error of the mean.
 
-    ``min_std`` keeps the gradient in the variance finite, which is ``1 / (s sqrt(2 pi))`` at ``d = 0``. It stands for a
-    normal error of that size in the target. The default is the rounding of a photograph to 8 bits, 0.29 / 255; it adds
-    at most ``min_std sqrt(2 / pi)``, 0.23 / 255, to the result, and that only where ``d`` and the variance are 0.
+    ``min_std`` bounds the gradient in the variance, ``1 / (s sqrt(2 pi))`` at ``d = 0``. It models a normal error of
+    that size in the target; the default is the rounding of a photograph to 8 bits, 0.29 / 255. It adds at most
+    ``min_std sqrt(2 / pi)``, 0.23 / 255, to the result, and that only where ``d`` and the variance are 0.
 
     Args:
         mean: expected value of ``x``, any shape, float32 or float64.
-        variance: its variance, at least 0, same shape. Not checked: looking at it would wait for the GPU.
+        variance: its variance, at least 0, same shape. Not checked, which would synchronize the GPU.
         target: ``t``, same shape.
         min_std: smallest standard deviation, above 0, in the units of ``x``; its square must not underflow.
 
@@ -103,7 +103,7 @@ def expected_absolute_error(mean: Tensor, variance: Tensor, target: Tensor, *, m
 
 
 class _ExpectedAbsoluteError(torch.autograd.Function):
-    """Of a normal variable of mean d and variance v: ``E = d dE/dd + 2 v dE/dv``, by the derivatives themselves."""
+    """``E |x|`` for a normal x of mean d and variance v, from its derivatives: ``E = d dE/dd + 2 v dE/dv``."""
 
     generate_vmap_rule = True
 

@@ -12,8 +12,8 @@ many samples. From the front it reads ``sum_i v alpha_i^2 (c_i - mu_{i+1})^2 S_i
 brackets of all splats in front: a sum of non-negative terms, one per splat, without the cancellation of a difference of
 mean squares. A splat counts by how much its color differs from the expected color behind it.
 
-Limits: the factors must be independent, one per Gaussian (not one per anchor or cluster). The variance is that over all
-draws, whereas the paper's score takes only pixels that stay covered in every sample. Renderers cut alphas below 1/255,
+Limits: the factors must be independent, one per Gaussian (not one per anchor or cluster). The variance is over all
+draws, whereas the paper's score takes only pixels that stay covered in every sample. Renderers skip alphas below 1/255,
 clamp them at 0.99 and stop behind opaque splats; :class:`~ca_reg.functional.Multiplier` says what this changes.
 """
 
@@ -44,7 +44,7 @@ def pixel_moments(
     """Return the exact mean and variance of pixels under a random factor per splat.
 
     Exact up to rounding, in float32 and float64, and differentiable in every tensor. The variance is the sum of
-    :func:`contributions`. In float32 squares overflow from colors of 1e19 on.
+    :func:`contributions`. In float32, squares of colors above 1e19 overflow.
 
     Convention: splats are ordered by depth, the nearest first.
 
@@ -74,9 +74,9 @@ def contributions(
 ) -> Tensor:
     """Return what each splat contributes to the variance of the pixel: ``v alpha_i^2 (c_i - mu_{i+1})^2 S_i``.
 
-    The contributions are at least 0 and sum to the variance, so added up over pixels by the index of the Gaussian they
-    attribute the whole score. The i-th one is the part of the variance that is due to the factor of splat i, given
-    those in front, averaged over those behind; splats behind it matter only by their expected color.
+    The contributions are at least 0 and sum to the variance; summed over pixels by the index of the Gaussian, they
+    attribute the whole score. The i-th is the part of the variance due to the factor of splat i, given those in front,
+    averaged over those behind; splats behind it matter only through their expected color.
 
     Arguments, order and errors are those of :func:`pixel_moments`. Returns shape (..., n, C), 0 in the padding.
 
@@ -89,7 +89,7 @@ def contributions(
 
 
 def alpha_moments(alphas: Tensor, multiplier: Multiplier) -> PixelMoments:
-    """Return the exact mean and variance of the accumulated alpha: that of white splats over black.
+    """Return the exact mean and variance of the accumulated alpha, as of a pixel of white splats over black.
 
     Arguments, order and errors are those of :func:`pixel_moments`. Mean and variance have shape (...).
 
@@ -103,11 +103,11 @@ def alpha_moments(alphas: Tensor, multiplier: Multiplier) -> PixelMoments:
 
 
 def neutral_background(alphas: Tensor, colors: Tensor, multiplier: Multiplier) -> Tensor:
-    """Return the background that leaves the mean as it is: the ``b`` for which the expected pixel is ``b`` itself.
+    """Return the background ``b`` over which the expected pixel is ``b`` itself.
 
-    Over a fixed background a pixel varies also because dropped splats open a hole. Composited over its own expected
-    color a hole shows what was expected there, and only disagreement between the colors of the splats counts; the
-    variance no longer depends on the choice of a background. From ``mu_1 = sum_i w_i c_i + (1 - sum_i w_i) b`` with the
+    Over a fixed background a pixel also varies because dropped splats open holes. Composited over the expected color,
+    a hole shows what was expected there, and only disagreement between the colors of the splats counts; the variance
+    no longer depends on the choice of a background. From ``mu_1 = sum_i w_i c_i + (1 - sum_i w_i) b`` with the
     expected blend weights ``w_i = m alpha_i prod_{j<i} (1 - m alpha_j)``, the condition ``mu_1 = b`` gives
 
         b = sum_i w_i c_i / sum_i w_i
@@ -137,10 +137,10 @@ def neutral_background(alphas: Tensor, colors: Tensor, multiplier: Multiplier) -
 def first_order_variance(alphas: Tensor, colors: Tensor, multiplier: Multiplier) -> Tensor:
     """Return the paper's closed form ``v sum_i (c_i alpha_i)^2`` (appendix, Eq. ca_final, where v is ``p (1 - p)``).
 
-    An approximation, for comparison with :func:`pixel_moments`. It drops the transmittance, so that hidden splats count
-    like visible ones, and what lies behind a splat, so that its color counts instead of its contrast; there is no
-    background. It is right for a single splat over black and in the limit of small accumulated alpha over black, and
-    otherwise mostly too large, the more so the longer the list.
+    An approximation, for comparison with :func:`pixel_moments`. It ignores the transmittance, so that hidden splats
+    count like visible ones, and what lies behind a splat, so that its color counts instead of its contrast; there is no
+    background. It is right over black for a single splat and in the limit of small accumulated alpha; otherwise it is
+    mostly too large, the more so the longer the list.
 
     Arguments and errors are those of :func:`pixel_moments`; of the multiplier only the variance matters. Returns the
     approximate variance per pixel and channel, shape (..., C).
@@ -164,7 +164,7 @@ def _moments(
     spread = _per_splat(multiplier.variance, alphas, "variance") * alphas.square()
     means = [_background(background, alphas, colors)]
     for weight, color in zip(reversed(expected.unbind(-1)), reversed(colors.unbind(-2)), strict=True):
-        # lerp and not a sum of products: equal colors then have no contrast at all, not one of rounding errors.
+        # lerp, not a sum of products: equal colors then have exactly zero contrast, without rounding errors.
         means.append(torch.lerp(means[-1], color, weight[..., None]))
     mean = torch.stack(means[::-1], dim=-2)
     weight = spread * _product_in_front((1.0 - expected).square() + spread)
@@ -174,7 +174,7 @@ def _moments(
 def _product_in_front(factors: Tensor) -> Tensor:
     """Product of the factors of all splats in front of each, shape (..., n)."""
     products = [torch.ones_like(factors.sum(-1))]
-    for factor in factors.unbind(-1):  # the gradient of cumprod has no algorithm on CUDA that repeats itself
+    for factor in factors.unbind(-1):  # not cumprod, whose gradient is nondeterministic on CUDA
         products.append(products[-1] * factor)
     return torch.stack(products, dim=-1)[..., : factors.shape[-1]]
 
@@ -221,7 +221,7 @@ def _check_lists(alphas: Tensor, colors: Tensor) -> None:
 
 def _check_finite(x: Tensor, name: str) -> None:
     """Raise unless all values are finite, also in the padding: an alpha of 0 does not keep a nan out."""
-    # The sum first: it is several times cheaper than a look at every value, but may overflow where those are finite.
+    # The sum first: it is several times cheaper than checking every value, but may overflow though all are finite.
     if not bool(x.detach().sum().isfinite()) and not bool(x.isfinite().all()):
         raise ValueError(f"{name} must be finite, got nan or infinity.")
 
@@ -231,7 +231,7 @@ def _check_alphas(alphas: Tensor) -> None:
     from kornia.core.check import KORNIA_CHECK_IS_TENSOR
 
     KORNIA_CHECK_IS_TENSOR(alphas, "alphas must be a torch tensor of shape (..., n).")
-    # The products of long lists leave nothing of the 8 or 11 bits of the short dtypes.
+    # The 8 or 11 significant bits of the 16-bit dtypes do not survive the products over long lists.
     if alphas.dtype not in (torch.float32, torch.float64):
         raise TypeError(
             f"alphas must be a floating-point tensor, float32 or float64, got {alphas.dtype}; convert it with .float()."

@@ -12,7 +12,7 @@ from ca_reg._check import Rate, check_finite, check_opacity_range, check_rate
 
 __all__ = ["Multiplier"]
 
-# Beyond this many standard deviations a normal tail is zero in float64, so a cut there is no cut.
+# Beyond this many standard deviations a normal tail is zero in float64, so a cut there has no effect.
 _FAR = 40.0
 
 
@@ -20,7 +20,7 @@ _FAR = 40.0
 class Multiplier:
     """Mean ``m`` and variance ``v`` of the factor ``xi`` in ``alpha -> xi alpha``, drawn independently per splat.
 
-    Dropout and opacity noise are both of this kind, and the first two moments of a pixel depend on nothing else:
+    Dropout and opacity noise both have this form, and the mean and variance of a pixel depend on nothing else of it:
 
     =============================== ======================= ==================
     regularizer                     mean                    variance
@@ -31,7 +31,7 @@ class Multiplier:
     opacity noise, clipped draw     ``1``                   ``0.516 sigma^2``
     =============================== ======================= ==================
 
-    The product of two is the multiplier of one after the other, if they are drawn independently.
+    The product of two multipliers is that of both factors applied in turn, drawn independently.
 
     Args:
         mean: at least 0; a number for all splats, or a tensor with one value per splat or Gaussian.
@@ -39,7 +39,7 @@ class Multiplier:
 
     Raises:
         TypeError: if a field is neither a number nor a tensor.
-        ValueError: if a value is negative or not finite. For tensors this reads the values, which on a GPU waits.
+        ValueError: if a value is negative or not finite. For tensors the check synchronizes a GPU.
 
     Example:
         >>> both = Multiplier.dropout(0.5) * Multiplier.opacity_noise(1.0)
@@ -58,8 +58,8 @@ class Multiplier:
                 raise ValueError(f"the {name} of a multiplier must be finite and at least 0, got a value that is not.")
 
     def __mul__(self, other: Multiplier) -> Multiplier:
-        """Return the multiplier of both, one after the other, drawn independently."""
-        # (v1 + m1^2)(v2 + m2^2) - m1^2 m2^2, multiplied out: no cancellation.
+        """Return the multiplier of both factors applied in turn, drawn independently."""
+        # (v1 + m1^2)(v2 + m2^2) - m1^2 m2^2, expanded to avoid cancellation.
         variance = (
             self.variance * other.variance
             + self.variance * (other.mean * other.mean)
@@ -71,15 +71,15 @@ class Multiplier:
     def dropout(cls, p: Rate, *, compensate: bool = False) -> Multiplier:
         """Return the multiplier of :func:`~ca_reg.functional.gaussian_dropout` (paper, Eq. dropout_train).
 
-        Exact for renderers that clamp alpha, because a factor of 0 or 1 commutes with the clamp. With ``compensate``
-        it is exact where ``alpha <= 0.99 (1 - p)`` only: survivors above that are clamped by the renderer but not here,
-        which moves mean and variance without a useful bound. Exact for compensated dropout, whatever the alphas, is
-        this: hand the renderer ``opacity / (1 - p)``, as its survivors have it, and take the multiplier *without*
-        ``compensate``.
+        Exact even for renderers that clamp alpha, because a factor of 0 or 1 commutes with the clamp. With
+        ``compensate`` it is exact only where ``alpha <= 0.99 (1 - p)``: survivors above that are clamped by the
+        renderer but not here, which shifts mean and variance without a useful bound. For compensated dropout that is
+        exact at any alpha, give the renderer the survivors' opacities, ``opacity / (1 - p)``, and use the multiplier
+        *without* ``compensate``.
 
         Raises:
-            TypeError: if ``p`` is neither a number nor one for each Gaussian.
-            ValueError: if ``p`` is outside [0, 1).
+            TypeError: if ``p`` is neither a number nor a tensor.
+            ValueError: if ``p`` is outside [0, 1), or a tensor not of shape (N,).
         """
         check_rate(p)
         return cls(1.0, p / (1.0 - p)) if compensate else cls(1.0 - p, p * (1.0 - p))
@@ -89,7 +89,7 @@ class Multiplier:
         """Return the multiplier ``1 + eps`` of opacity noise, eps normal, without the clamp of the opacity to [0, 1].
 
         A good approximation while few draws reach the clamp, that is for ``sigma`` well below 1 and opacities well
-        below ``1 / (1 + sigma)``; :meth:`clamped_noise` is without that restriction.
+        below ``1 / (1 + sigma)``; :meth:`clamped_noise` includes the clamp.
 
         With ``clip`` the draw is clipped to [-sigma, sigma], which leaves 0.516 of its variance.
 
@@ -103,17 +103,17 @@ class Multiplier:
 
     @classmethod
     def clamped_noise(cls, opacity: Tensor, sigma: float, *, clip: bool = False) -> Multiplier:
-        """Return the multiplier of :func:`~ca_reg.functional.opacity_noise`, the clamp to [0, 1] included.
+        """Return the multiplier of :func:`~ca_reg.functional.opacity_noise`, including the clamp to [0, 1].
 
-        Per Gaussian, ``xi = clamp(o (1 + eps), 0, 1) / o`` is one plus ``sigma`` times a standard normal number that is
-        cut at ``-1 / sigma`` and at ``(1 / o - 1) / sigma``, whose moments are elementary. The upper cut lowers the
-        mean of opacities near 1, the lower one raises the mean of all. Differentiable in ``opacity``.
+        Per Gaussian, ``xi = clamp(o (1 + eps), 0, 1) / o`` is one plus ``sigma`` times a standard normal number clamped
+        to ``[-1 / sigma, (1 / o - 1) / sigma]``, whose moments have a closed form. The upper bound lowers the mean of
+        opacities near 1, the lower one raises that of all. Differentiable in ``opacity``.
 
-        After compensated dropout the noise acts on the opacities of the survivors, ``o / (1 - p)``, which may exceed 1:
-        give it those. The result is then the factor of what the renderer is to be given, ``min(o, 1)``; times
-        ``Multiplier.dropout(p)``, without its ``compensate``, it is that of both.
+        After compensated dropout the noise acts on the survivors' opacities, ``o / (1 - p)``, which may exceed 1: pass
+        those. The result is then the factor on ``min(o, 1)``, which the renderer must be given; its product with
+        ``Multiplier.dropout(p)``, without ``compensate``, covers both.
 
-        Left out is what the renderer does to the noisy alpha. With R the range of the colors and the background:
+        The renderer's treatment of the noisy alpha is not modeled. With R the range of the colors and the background:
 
         - its clamp at 0.99 moves each sampled color, hence the mean and the standard deviation of the pixel, by at
           most ``R / 99``, whatever the length of the list;
@@ -127,7 +127,7 @@ class Multiplier:
 
         Returns:
             Mean and variance per Gaussian of ``clamp(o (1 + eps), 0, 1) / min(o, 1)``, shape and dtype of ``opacity``.
-            At ``o = 0`` the limit of small opacities.
+            At ``o = 0`` it is the limit of small opacities.
 
         Raises:
             TypeError: if ``opacity`` is not a floating-point tensor, or ``sigma`` not a number.
@@ -146,12 +146,12 @@ class Multiplier:
         if sigma == 0:
             return cls(torch.ones_like(opacity), torch.zeros_like(opacity))
         cut = 1.0 if clip else _FAR
-        # Above 1 the variance is a small difference: float64.
+        # Above 1 the variance is a small difference of larger terms, hence float64.
         raised = opacity.double() if bool((opacity > 1).any()) else opacity
-        # At half the opacity from which on the cut is ``cut``: keeps 0 * inf out of the gradient at o = 0.
+        # Up to twice this floor the upper cut is ``cut`` anyway; it keeps 0 * inf out of the gradient at o = 0.
         raised = raised.clamp(min=0.5 / (1.0 + cut * sigma))
         highest = ((1.0 - raised) / (sigma * raised)).clamp(max=cut)
-        # A clipped draw may leave all opacities of a survivor at 1: then both cuts are one.
+        # A clipped draw may leave a survivor's opacity always at 1: the two cuts then coincide.
         lowest = (-highest).clamp(min=min(1.0 / sigma, cut))
         (up, up_square), (down, down_square) = _upper_half(highest), _upper_half(lowest)
         shift, over = up - down, raised.clamp(min=1.0)
@@ -162,12 +162,12 @@ class Multiplier:
 def _upper_half(x: Tensor) -> tuple[Tensor, Tensor]:
     """``x^k Q(x)`` plus the integral of ``t^k phi(t)`` over [0, x] for k = 1, 2; sums of positive terms for x >= 0.
 
-    There they are mean and mean square of ``min(max(z, 0), x)`` for a standard normal z. What is cut at ``-a`` and at
-    any ``b >= -a`` has the mean ``first(b) - first(a)`` and the mean square ``second(b) + second(a)``.
+    For x >= 0 these are the mean and the mean square of ``min(max(z, 0), x)``, z standard normal. Clamped to [-a, b],
+    z has the mean ``first(b) - first(a)`` and the mean square ``second(b) + second(a)``, for any ``b >= -a``.
     """
     tail = 0.5 * torch.erfc(x / math.sqrt(2.0))
     half_square = 0.5 * x.square()
     first = x * tail - torch.expm1(-half_square) / math.sqrt(2.0 * math.pi)
-    # The incomplete gamma function is 2 * integral of t^2 phi(t) over [0, x], whose form with erf cancels for small x.
+    # Twice the integral of t^2 phi(t) over [0, x]; the form with erf would cancel for small x.
     gamma = torch.special.gammainc(torch.full_like(x, 1.5), half_square)
     return first, x.square() * tail + 0.5 * torch.copysign(gamma, x)

@@ -24,10 +24,10 @@ def draw_opacity_noise(
     Args:
         n: number of Gaussians.
         sigma: standard deviation, at least 0.
-        clip: clip the draw to [-sigma, sigma], as the authors' released code does and the paper does not say. The
+        clip: clip the draw to [-sigma, sigma], as the authors' released code does but the paper does not mention. The
             variance is then 0.516 sigma^2.
         generator: source of the draw, with the limits of :func:`~ca_reg.functional.draw_keep_mask`.
-        device: where the noise is returned; by default where it was drawn.
+        device: device of the returned noise; by default where it was drawn.
 
     Returns:
         The relative noise, shape (n,), float32 whatever the opacities are.
@@ -51,11 +51,11 @@ def draw_opacity_noise(
 def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:
     """Return ``opacity * (1 + noise)``, clamped to [0, 1] (paper, opacity noise injection).
 
-    The clamp stops the gradient of the opacities that it moves. It also takes away some of the noise of opacities near
-    1, whose mean therefore falls.
+    Where the clamp acts, the gradient is 0. It removes some of the upward noise of opacities near 1, which lowers their
+    mean.
 
     Args:
-        opacity: activated opacities in [0, 1], shape (N,) or (N, 1), as those that are returned.
+        opacity: activated opacities in [0, 1], shape (N,) or (N, 1); the result has the same shape and dtype.
         noise: relative noise, shape (N,).
 
     Raises:
@@ -68,9 +68,9 @@ def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:
     """
     check_opacity(opacity)
     check_per_gaussian(noise, opacity, "noise")
-    # In the wider dtype of the two, and rounded once: 1 + noise has 8 bits in bfloat16.
+    # Computed in the wider of the two dtypes and rounded once: in bfloat16, 1 + noise would have 8 bits.
     noisy = opacity * (1.0 + noise.view_as(opacity))
-    # Not clamp, whose gradient at the bounds themselves is 1 in torch 2.13 and 0 in torch 2.15.
+    # Not clamp, whose gradient at the bounds is 1 in torch 2.13 and 0 in torch 2.15.
     return noisy.masked_fill(noisy < 0.0, 0.0).masked_fill(noisy > 1.0, 1.0).to(opacity.dtype)
 
 
@@ -80,7 +80,7 @@ def opacity_noise(
     """Draw noise and apply it: :func:`draw_opacity_noise`, then :func:`apply_opacity_noise`.
 
     Arguments and errors are theirs; the paper tunes ``sigma`` in [0.05, 0.8]. Returns the noisy opacities in [0, 1] and
-    the noise of shape (N,); with ``sigma = 0`` the very same ``opacity`` and None: nothing is drawn.
+    the noise of shape (N,). With ``sigma = 0`` nothing is drawn: returns the very same ``opacity`` and None.
 
     Example:
         >>> noisy, noise = opacity_noise(torch.full((4,), 0.5), 0.1)

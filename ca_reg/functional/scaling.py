@@ -14,12 +14,12 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
     """Scale opacities by ``1 - p``, the mean of dropout at rate ``p`` (paper, strategy C).
 
     A pixel is linear in the factor of each of its splats, so the image of the scaled opacities *is* the mean image over
-    all masks, but for the rasterizer's clamp and cut-off of alpha. Use it once: on a model trained with uncompensated
-    dropout, when it is rendered for a test or exported.
+    all masks, up to the rasterizer's clamp and cut-off of alpha. Apply it once: to a model trained with uncompensated
+    dropout, when it is rendered at test time or exported.
 
     Args:
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1); returned as they are with ``p = 0``.
-        p: the drop rate of the training, in [0, 1); a number, or one for each Gaussian, shape (N,).
+        p: the drop rate in training, in [0, 1); a number, or one for each Gaussian, shape (N,).
 
     Raises:
         TypeError: if ``opacity`` is not a floating-point tensor.
@@ -36,22 +36,22 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
 
 
 def expected_opacity(opacity: Tensor, sigma: float, *, clip: bool = False) -> Tensor:
-    """Return the mean of the opacities under clamped noise, what :func:`scale_opacity` is to dropout.
+    """Return the mean of the opacities under clamped noise, the counterpart of :func:`scale_opacity`.
 
     The mean of :func:`~ca_reg.functional.opacity_noise` is not ``opacity``, because the clamp to [0, 1] cuts the draws
     of opaque Gaussians from above and those of all from below: at ``sigma = 0.8`` an opacity of 1 has the mean 0.72, a
     faint one 1.04 times itself. A pixel is linear in the opacity of each of its splats, so the image of the means *is*
-    the mean image over all draws, but for the rasterizer's clamp and cut-off of alpha. The paper renders with
+    the mean image over all draws, up to the rasterizer's clamp and cut-off of alpha. The paper renders with
     ``opacity`` itself.
 
-    Use it once: on a model trained with the noise, when it is rendered for a test or exported. After dropout as well,
-    scale the result: ``scale_opacity(expected_opacity(opacity, sigma), p)`` is the mean under both. The other order is
-    not, because the factor of the noise depends on the opacity.
+    Apply it once: to a model trained with the noise, when it is rendered at test time or exported. If dropout was used
+    as well, ``scale_opacity(expected_opacity(opacity, sigma), p)`` is the mean under both. The other order is not,
+    because the factor of the noise depends on the opacity.
 
     Args:
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1); returned as they are with ``sigma = 0``.
-        sigma: standard deviation of the relative noise of the training, at least 0.
-        clip: the draw was clipped to [-sigma, sigma].
+        sigma: standard deviation of the relative noise in training, at least 0.
+        clip: whether the draws were clipped to [-sigma, sigma].
 
     Raises:
         TypeError: if ``opacity`` is not a floating-point tensor or ``sigma`` not a number.

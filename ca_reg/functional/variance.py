@@ -15,9 +15,9 @@ __all__ = ["ColorVariance", "color_variance"]
 class ColorVariance(NamedTuple):
     """Color variance of an image and of its pixels.
 
-    The value is the mean over the covered pixels, a scalar, nan if there are none, which the reason then says. The
-    variance of a pixel, (...), is the mean over RGB, 0 where nothing covers it; covered, (...) bool, are the pixels
-    whose weights do not sum to zero.
+    ``value``, a scalar, is the mean over the covered pixels; without any it is nan, and ``reason`` is ``EMPTY``.
+    ``variance``, (...), is the mean over RGB at each pixel, 0 where nothing covers it. ``covered``, (...) bool, is True
+    where the weights do not sum to zero.
     """
 
     value: Tensor
@@ -30,9 +30,9 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
     """Measure the color variance CV of pixels from the splats that are blended into them (paper, appendix, CV metric).
 
     Per pixel and channel ``sum_i w_i (c_i - m)^2 / sum_i w_i`` with the weighted mean ``m``: the paper's
-    ``E[c^2] - E[c]^2`` without its cancellation. Differentiable in both arguments.
+    ``E[c^2] - E[c]^2`` without cancellation. Differentiable in both arguments.
 
-    Convention: any order of the splats will do, as long as both arguments share it. The background is not a splat.
+    Convention: the splats may be in any order that both arguments share. The background is not a splat.
 
     Args:
         weights: blend weights ``w_i = alpha_i T_i``, at least 0, shape (..., n). A zero stands for no splat, so lists
@@ -41,7 +41,7 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
 
     Raises:
         TypeError: if an argument is not a tensor.
-        ValueError: if the shapes do not match, a weight is negative, or one or a color is NaN or infinite.
+        ValueError: if the shapes do not match, a weight is negative, or a weight or color is NaN or infinite.
 
     Example:
         >>> weights = torch.tensor([[0.5, 0.5], [0.3, 0.0], [0.0, 0.0]])
@@ -70,7 +70,7 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
     share = (weights / torch.where(covered, total, 1.0)[..., None])[..., None]
     mean = (share * colors).sum(-2, keepdim=True)
     variance = (share * (colors - mean).square()).sum(-2).mean(-1)
-    # What is not finite in the colors reaches the variance, also with a weight of 0: the small map tells of the large.
+    # Non-finite colors reach the variance even with a weight of 0, so checking that smaller map first is enough.
     if not bool(variance.isfinite().all()) and not bool(colors.isfinite().all()):
         raise ValueError("colors must be finite, got NaN or infinity.")
     reason = Reason.OK if bool(covered.any()) else Reason.EMPTY

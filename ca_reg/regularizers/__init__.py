@@ -1,4 +1,4 @@
-"""Every regularizer, one file each, and their registry: what ``--regularizer`` and the launcher know by name."""
+"""All regularizers, one per module, and the registry that ``--regularizer`` and the launcher look names up in."""
 
 from ca_reg.chain import Chain
 from ca_reg.registry import Registry
@@ -45,19 +45,19 @@ REGULARIZERS: Registry[Regularizer] = Registry(
     sh_noise=SHNoise,
     soft=SoftDropout,
 )
-"""What can be asked for by name; ``REGULARIZERS.register("name")`` adds a class."""
+"""The regularizers by name; the decorator ``REGULARIZERS.register("name")`` adds a class."""
 
 
 def parse(text: str, *, imports: bool = True) -> Chain:
-    """Make regularizers of an expression: names of the registry or ``module:Class``, joined by ``+``.
+    """Parse an expression into regularizers: registered names or ``module:Class``, joined by ``+``.
 
     Args:
         text: such as ``"dropout(0.2) + noise(0.8, scale=True)"``, ``"dropout(ramp(0, 0.2, 0, 10_000))"`` or
-            ``"my_module:MyDropout(0.3)"``; an empty one makes an empty chain.
-        imports: whether ``module:Class`` may be imported; False for text that somebody else wrote.
+            ``"my_module:MyDropout(0.3)"``; an empty text makes an empty chain.
+        imports: whether ``module:Class`` may be imported; False for text from an untrusted source.
 
     Raises:
-        ValueError: if it cannot be understood; says what.
+        ValueError: as :meth:`Registry.make <ca_reg.registry.Registry.make>`.
 
     Example:
         >>> [type(member).__name__ for member in parse("dropout(0.2) + noise(0.8)")]

@@ -1,4 +1,4 @@
-"""What rules for the rates look at: neighbors, ranks and depths, and when they look again."""
+"""Measurements that drop rates depend on, neighbors, ranks and depths, and when they are refreshed."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ __all__ = [
 
 
 class Refreshed(nn.Module):
-    """A tensor of one row per Gaussian that is computed anew ``every`` so many steps, and when their number changes.
+    """A cached tensor, one row per Gaussian, recomputed every ``every`` steps and when the number of Gaussians changes.
 
-    Without a step between two calls it is computed anew unless the very same means come again, unchanged: one object
-    may score several models. ``state_dict`` holds the tensor and its step, so that a resumed run goes on with them; a
-    checkpoint without them starts afresh. Not noticed is a pruning of as many Gaussians as were added, until the next
-    time.
+    If the step has not advanced it is recomputed unless the very same means come again, unmodified: one object may
+    score several models. ``state_dict`` holds the tensor and its step, so that a resumed run continues with them; a
+    checkpoint without them starts afresh. Pruning as many Gaussians as are added goes unnoticed until the next refresh.
     """
 
     value: Tensor | None
@@ -41,18 +40,18 @@ class Refreshed(nn.Module):
         self.register_buffer("value", None, persistent=False)
 
     def forward(self, x: Params, compute: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return ``compute(means)``, of now or of a former step."""
+        """Return ``compute(means)``, fresh or cached."""
         assert x.means is not None
         means = x.means.detach()
         if self.value is None or not self.holds(x):
-            with torch.inference_mode(False):  # what is found in a test may serve in training
+            with torch.inference_mode(False):  # a value computed at test time may be used in training
                 self.value, self.since = compute(means), x.step
             self._seen = weakref.ref(x.means), _version(x.means)
         self.value = self.value.to(means.device)
         return self.value
 
     def holds(self, x: Params) -> bool:
-        """Whether the present value still serves."""
+        """Whether the cached value is still valid."""
         assert x.means is not None
         assert self.value is not None
         if len(self.value) != len(x.means):
@@ -74,10 +73,10 @@ class Refreshed(nn.Module):
 
 
 class SurroundingsDropout(IndependentDropout):
-    """Drop independently, at rates that follow from what is around each Gaussian; a subclass says from what and how.
+    """Drop independently, at rates that depend on each Gaussian's surroundings; a subclass measures them.
 
-    In training that is computed every so many steps (:class:`Refreshed`), at test time from the model that is rendered.
-    The other arguments are those of :class:`~ca_reg.IndependentDropout`.
+    In training the measurement is refreshed every ``every`` steps (:class:`Refreshed`), at test time it is that of the
+    rendered model. The other arguments are those of :class:`~ca_reg.IndependentDropout`.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("means",)
@@ -89,24 +88,24 @@ class SurroundingsDropout(IndependentDropout):
         self.trained, self.tested = Refreshed(every), Refreshed(1)
 
     def measure(self, means: Tensor) -> Tensor:
-        """Return what the rates follow from, one row per Gaussian."""
+        """Return the measurement that the rates depend on, one row per Gaussian."""
         raise NotImplementedError
 
     def rates_from(self, x: Params, look: Callable[[], Tensor]) -> Rate:
-        """Return the rates; ``look()`` returns what was measured, and is not to be called where there is no rate."""
+        """Return the rates; ``look()`` returns the measurement, and should not be called while the rate is 0."""
         raise NotImplementedError
 
     def rates(self, x: Params) -> Rate:
-        """Return the rates by the neighbors of some former step."""
+        """Return the rates from the measurement of training, which may be cached."""
         return self.rates_from(x, lambda: self.trained(x, self.measure))
 
     def test_rates(self, x: Params) -> Rate:
-        """Return the rates by the neighbors of now, whatever the steps before."""
+        """Return the rates from a measurement of ``x`` itself."""
         return self.rates_from(x, lambda: self.tested(x, self.measure))
 
 
 class RankedDropout(SurroundingsDropout):
-    """Rates between two bounds, by the rank of something that is measured: the base of density and geometry."""
+    """Rates between two bounds, linear in the rank of a measurement: the base of density and geometry dropout."""
 
     def __init__(
         self,
@@ -130,12 +129,12 @@ class RankedDropout(SurroundingsDropout):
 
 
 def _version(x: Tensor) -> int:
-    """Return how often a tensor was changed in place, as far as PyTorch counts that."""
+    """Return a tensor's in-place version counter, 0 for an inference tensor, which has none."""
     return 0 if x.is_inference() else x._version
 
 
 def neighbors_of(means: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Return distances and numbers of the k nearest others, (N, k) each; of all others, if these are fewer."""
+    """Return distances and indices of the k nearest neighbors, (N, k) each; of all others if there are fewer."""
     count = min(k, len(means) - 1)
     if count < 1:
         return means.new_zeros(len(means), 0), torch.zeros(len(means), 0, dtype=torch.int64, device=means.device)
@@ -144,15 +143,15 @@ def neighbors_of(means: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def mean_distances(means: Tensor, k: int) -> Tensor:
-    """Return the mean distance to the k nearest others, (N,); 0 if there are none."""
+    """Return the mean distance to the k nearest neighbors, (N,); 0 if there are none."""
     distances, _ = neighbors_of(means, k)
     return distances.sum(1) / max(distances.shape[1], 1)
 
 
 def relative_ranks(values: Tensor) -> Tensor:
-    """Return ranks from 0, the smallest, to 1, (N,); equal values share the mean of their ranks, so it is always 1/2.
+    """Return ranks from 0, the smallest, to 1, (N,), with mean 1/2; equal values share the mean of their ranks.
 
-    One outlier moves the others by 1 / (N - 1), where it would decide the result of ``(x - min) / (max - min)``.
+    An outlier moves the others by at most 1 / (N - 1), where it would dominate ``(x - min) / (max - min)``.
 
     Example:
         >>> relative_ranks(torch.tensor([5.0, 1.0, 5.0, 1e9, 0.0]))
@@ -168,7 +167,7 @@ def relative_ranks(values: Tensor) -> Tensor:
 
 
 def camera_depths(x: Params) -> Tensor:
-    """Return the depths of the centers along the camera's axis, (N,), negative behind the camera.
+    """Return the depths of the centers along the camera's z axis, (N,), negative behind the camera.
 
     Convention: the view matrix is world to camera, for column vectors: its third row is the viewing direction.
     """

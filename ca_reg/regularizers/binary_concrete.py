@@ -1,4 +1,4 @@
-"""Soft masks from the binary concrete distribution: the base class of every dropout that dims instead of dropping."""
+"""Soft masks from the binary concrete distribution: the base class of dropouts that dim Gaussians instead."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ __all__ = ["BinaryConcrete", "concrete_moments"]
 
 
 class BinaryConcrete(Regularizer):
-    """Multiply each opacity by a soft mask ``1 - z`` of its own; a subclass says the logits of the drop rates.
+    """Multiply each opacity by its own soft mask ``1 - z``; a subclass defines the logits of the drop rates.
 
     With ``u ~ U(0, 1)`` and the rate ``p`` of the Gaussian,
 
         z = sigmoid((logit p + logit u) / temperature)
 
-    is the binary concrete distribution (Maddison et al. 2017), which tends to a mask of dropout as the temperature
-    tends to 0. ``train()``: ``opacity * clamp(1 - z, floor, 1 - floor)``. ``eval()``: the opacity times the mean of
-    that factor, :func:`concrete_moments`. No opacity becomes 0, so that density control counts all Gaussians as seen.
+    has the binary concrete distribution (Maddison et al. 2017); as the temperature tends to 0, ``1 - z`` tends to a
+    dropout mask. ``train()``: ``opacity * clamp(1 - z, floor, 1 - floor)``. ``eval()``: the opacity times the mean of
+    that factor, :func:`concrete_moments`. No Gaussian is dropped, so density control counts all as seen.
 
     Args:
         temperature: above 0 and at most 1.
-        floor: least factor, in [0, 0.5); the largest is ``1 - floor``.
+        floor: smallest factor, in [0, 0.5); the largest is ``1 - floor``.
 
     Raises:
         ValueError: if one is out of range.
@@ -56,7 +56,7 @@ class BinaryConcrete(Regularizer):
         self.floor = floor
 
     def logits(self, x: Params) -> Rate:
-        """Return ``log(p / (1 - p))`` of the drop rates at ``x``: a number, or one for each Gaussian, shape (N,)."""
+        """Return ``log(p / (1 - p))`` of the drop rates for ``x``: a number, or one for each Gaussian, shape (N,)."""
         raise NotImplementedError
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
@@ -75,21 +75,21 @@ class BinaryConcrete(Regularizer):
         return x._replace(opacities=x.opacities * self.multiplied(x)[1].mean)
 
     def multiplied(self, x: Params) -> tuple[Params, Multiplier]:
-        """Return ``x``, and the soft mask as its factor; exact but for the renderer's cut-off of faint alphas."""
+        """Return ``x`` and the moments of the soft mask; exact up to the renderer's clamp and cut-off of alphas."""
         return x, Multiplier(*concrete_moments(self.logits(x), self.temperature, self.floor))
 
 
 def concrete_moments(logits: Rate, temperature: float, floor: float = 0.0) -> tuple[Rate, Rate]:
     """Return mean and variance of ``y = clamp(1 - z, floor, 1 - floor)``, z as in :class:`BinaryConcrete`.
 
-    ``y`` exceeds a level s between the two bounds if ``logit u < -temperature logit s - logit p``, that is with the
+    ``y`` exceeds a level s between the two bounds if ``logit u < -temperature logit s - logit p``, that is with
     probability ``T(s) = sigmoid(-temperature logit s - logit p)``. Integrated over s from bound to bound,
 
         E y = floor + integral T(s) ds,     E (y - floor)^2 = integral 2 (s - floor) T(s) ds
 
-    which the double-exponential rule does to rounding, the logarithms at 0 and 1 included. Rates above 1/2 are taken
-    thus and rates below mirrored, ``y -> 1 - y``, so that nothing cancels at either end. The logits,
-    ``log(p / (1 - p))``, are a number or any tensor; mean and variance are the same, differentiable.
+    which double-exponential quadrature evaluates up to rounding, including the logarithms at 0 and 1. This is done for
+    rates above 1/2, and mirrored, ``y -> 1 - y``, for those below, so that nothing cancels at either end. The logits,
+    ``log(p / (1 - p))``, are a number or a tensor of any shape; so are mean and variance, which are differentiable.
 
     Example:
         >>> mean, variance = concrete_moments(torch.tensor([-2.0, 0.0, 2.0]), 0.1)
@@ -99,7 +99,7 @@ def concrete_moments(logits: Rate, temperature: float, floor: float = 0.0) -> tu
     if not isinstance(logits, Tensor):
         mean, variance = concrete_moments(torch.tensor(logits, dtype=torch.float64), temperature, floor)
         return float(mean), float(variance)
-    t = torch.linspace(-3.25, 3.25, 53, dtype=torch.float64)  # up to where the weights reach rounding
+    t = torch.linspace(-3.25, 3.25, 53, dtype=torch.float64)  # up to where the weights fall below rounding
     y = math.pi * t.sinh()
     s, complement = torch.sigmoid(y), torch.sigmoid(-y)
     span = 1.0 - 2.0 * floor

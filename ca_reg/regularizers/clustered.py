@@ -1,4 +1,4 @@
-"""Dropping neighbors together."""
+"""Dropout of Gaussians together with their neighbors, at a given expected share."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ __all__ = ["ClusteredDropout"]
 
 
 class ClusteredDropout(Regularizer):
-    """Drop random anchors together with their k nearest neighbors, a share ``p`` of all Gaussians in the mean.
+    """Drop random anchors together with their k nearest neighbors, an expected share ``p`` of all Gaussians.
 
-    With each anchor drawn at the rate ``a``, a Gaussian that is in ``c`` clusters (its own, and one for each Gaussian
-    that has it among its neighbors) stays with the probability ``(1 - a)^c``. ``a`` is solved from the mean of that
-    over all Gaussians, so the expected dropped share is ``p``, to 1e-6, whatever the overlaps; that of a
-    single draw scatters more than with independent masks, by about the root of ``k + 1``. Single Gaussians differ: who
-    is a neighbor of many is dropped more often than an outlier.
+    Each Gaussian is an anchor with probability ``a``. One that is in ``c`` clusters (its own, and one for each Gaussian
+    that has it among its neighbors) is kept with probability ``(1 - a)^c``. The mean of that over all Gaussians is
+    solved for ``a``, so the expected dropped share is ``p``, to 1e-6, whatever the overlaps; the share of a single draw
+    scatters about ``sqrt(k + 1)`` times as much as with independent masks. Gaussians differ: a neighbor of many is
+    dropped more often than an outlier.
 
-    ``train()``: ``opacity * keep``; ``eval()``: nothing. The draws are not independent, so there is no multiplier.
+    ``train()``: ``opacity * keep``; ``eval()``: unchanged. The draws are not independent, so there is no multiplier.
 
     Args:
         p: expected share of dropped Gaussians in [0, 1), or a schedule of it.
-        k: neighbors that go with an anchor; all others, if these are fewer.
-        every: steps between two looks at the neighbors.
+        k: neighbors dropped with an anchor; all others if there are fewer.
+        every: steps between neighbor searches.
 
     Raises:
         ValueError: if ``p`` is outside [0, 1), or ``k`` or ``every`` below 1.
 
     Example:
-        The two of each pair go together:
+        Each pair is dropped together:
 
         >>> means = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [5.0, 0, 0], [5.1, 0, 0]])
         >>> x = Params(torch.ones(4), means=means)
@@ -57,12 +57,12 @@ class ClusteredDropout(Regularizer):
         check_rate(rate, name)
 
     def anchor_rate(self, rate: Rate, neighbors: Tensor) -> Rate:
-        """Return the rate of the anchors, given ``p`` of the step and the numbers of everybody's neighbors, (N, k)."""
+        """Return the rate of the anchors, given ``p`` at the step and the neighbor indices of all Gaussians, (N, k)."""
         clusters = 1 + neighbors.flatten().bincount(minlength=len(neighbors))
         counts = clusters.bincount().double().cpu()
         sizes = torch.arange(len(counts), dtype=torch.float64)
         stay = 1.0
-        for _ in range(30):  # Newton's steps, all downward, because the mean is convex in `stay`
+        for _ in range(30):  # Newton's method from above, monotone because the mean is convex in `stay`
             excess = float(counts @ stay**sizes / counts.sum()) - (1 - float(rate))
             slope = float(counts @ (sizes * stay ** (sizes - 1)) / counts.sum())
             stay -= excess / slope
@@ -71,7 +71,7 @@ class ClusteredDropout(Regularizer):
         return 1 - stay
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw anchors, and drop them with their neighbors."""
+        """Draw anchors, to be dropped with their neighbors."""
         rate, count = self._rate_at(x.step), len(x.opacities)
         if is_zero(rate) or not count:
             return Draw()
@@ -82,5 +82,5 @@ class ClusteredDropout(Regularizer):
         return Draw(keep, keep)
 
     def replay(self, x: Params, draw: Draw) -> Params:
-        """Set the opacities of the dropped to 0."""
+        """Set the opacities of dropped Gaussians to 0."""
         return x if draw.keep is None else x._replace(opacities=functional.apply_dropout(x.opacities, draw.keep))

@@ -20,15 +20,15 @@ class ConcreteDropout(BinaryConcrete):
 
     ``train()``: ``opacity * (1 - z)``, ``z = sigmoid((logit p + logit u) / 0.1)`` with ``u ~ U(0, 1)``. ``eval()``: the
     opacity times the mean of ``1 - z``; the paper does not say what it renders. The logit of p is a parameter of the
-    Gaussian, ``Params.learned["dropout_logits"]``: it is cloned, split, pruned and saved with it. The exact multiplier
-    is differentiable in it.
+    Gaussian, ``Params.learned["dropout_logits"]``, cloned, split, pruned and saved with it. The exact multiplier is
+    differentiable in it.
 
     Nothing keeps the rates up: a loss that only fits the photographs lowers them, and the paper finds more
     co-adaptation than without a regularizer (test CA 0.0053 against 0.0020).
 
     Args:
-        p: the rate that each Gaussian starts with, in (0, 1). The paper does not say it; Gal et al. 2017 start at 0.1.
-        rate: learning rate of the logits. The paper does not say it; the default is that of the opacities' logits.
+        p: initial rate of each Gaussian, in (0, 1). The paper does not give it; Gal et al. 2017 start at 0.1.
+        rate: learning rate of the logits. The paper does not give it; the default is that of the opacity logits.
         temperature: 0.1 in the paper.
 
     Raises:
@@ -58,6 +58,6 @@ class ConcreteDropout(BinaryConcrete):
         return {"dropout_logits": Learned(math.log(self.p / (1 - self.p)), self.rate)}
 
     def logits(self, x: Params) -> Tensor:
-        """Return what was learned."""
+        """Return the learned logits."""
         assert x.learned is not None, "checked by check_needs"
         return x.learned["dropout_logits"]

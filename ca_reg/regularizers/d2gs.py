@@ -1,4 +1,4 @@
-"""The dropout of D2GS: the near and the dense more often."""
+"""The dropout of D2GS: near Gaussians, and those in dense regions, are dropped more often."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ QUANTILES = (0.33, 0.67)  # of the depths, between the tiers
 class D2GSDropout(SurroundingsDropout):
     """Drop by depth and density (Song et al., "D2GS", ICLR 2026; code Insta360-Research-Team/DDGS).
 
-    ``p = rate(step) tier (depth_weight nearness + density_weight density)``. Nearness is 1 less the rank of the depth,
-    density the rank of minus the mean distance to the k nearest neighbors, both in [0, 1]. The tier is 1 up to the
-    33rd percentile of the depths, 0.7 up to the 67th, then 0.3. ``train()``: ``opacity * keep``; ``eval()``: nothing,
-    as there. In the mean 0.36 of ``rate`` is dropped if depth and density are unrelated.
+    ``p = rate(step) tier (depth_weight nearness + density_weight density)``. Nearness is 1 minus the rank of the depth,
+    density the rank of the negated mean distance to the k nearest neighbors, both in [0, 1]. The tier is 1 up to the
+    33rd percentile of the depths, 0.7 up to the 67th, then 0.3. ``train()``: ``opacity * keep``; ``eval()``: unchanged,
+    as in the source. With the default weights the mean of ``p`` is 0.36 of ``rate`` if depth and density are unrelated.
 
     With ``literal`` it does what the published code does (read at commit d665f22 of a fork that has its history):
 
-    - the depth is the *column* of the view matrix times the center, right for cameras without rotation only;
-    - both scores are ``(value - min) / (max - min)``, so that one outlier pushes all others together;
-    - densities are computed at step 1 and every ``every`` steps alone: with more Gaussians than then all count as 0.5,
-      with fewer the first numbers are taken, whosever they are.
+    - the depth is the *column* of the view matrix times the center, which is right only for cameras without rotation;
+    - both scores are ``(value - min) / (max - min)``, so that one outlier squeezes all others together;
+    - densities are computed only at step 1 and every ``every`` steps: if Gaussians have been added since, all count as
+      0.5; if some were removed, the first N values are taken, whichever Gaussians they belonged to.
 
-    That it counts each point among its own neighbors changes nothing but a factor, which cancels.
+    The published code counts each point among its own neighbors, which only adds a factor that cancels.
 
     Convention: the view matrix is world to camera; depth is along its third axis.
 
     Args:
-        rate: the largest rate, or a schedule of it. Theirs rises from 0.05 to 0.3 over 10,000 steps.
-        depth_weight: of nearness, at least 0. Theirs is 0.3, and 0.15 to 0.7 in the script for single scenes.
-        density_weight: of density, at least 0. Theirs is 0.7, and 0.3 to 0.85 for single scenes.
-        k: number of neighbors. Theirs is 6 with the point itself.
-        every: steps between two looks at the neighbors, as theirs.
-        literal: do what their code does.
-        scale: scale the opacities in evaluation; they do not.
+        rate: the largest rate, or a schedule of it. The source's rises from 0.05 to 0.3 over 10,000 steps.
+        depth_weight: of nearness, at least 0. In the source 0.3, and 0.15 to 0.7 in its script for single scenes.
+        density_weight: of density, at least 0. In the source 0.7, and 0.3 to 0.85 for single scenes.
+        k: number of neighbors. In the source 6, including the point itself.
+        every: steps between neighbor searches, as in the source.
+        literal: do what the published code does.
+        scale: scale the opacities in evaluation, which the source does not.
 
     Raises:
         ValueError: if a weight is negative, or ``k`` or ``every`` below 1.
@@ -93,7 +93,7 @@ class D2GSDropout(SurroundingsDropout):
         return density if self.literal else relative_ranks(density)
 
     def rates_from(self, x: Params, look: Callable[[], Tensor]) -> Rate:
-        """Return the rates; 0 while the schedule is."""
+        """Return the rates; 0 while the schedule is 0."""
         rate = self._rate_at(x.step)
         if is_zero(rate) or not len(x.opacities):
             return 0.0
@@ -112,7 +112,7 @@ class D2GSDropout(SurroundingsDropout):
 
 
 class _ByStepsAlone(Refreshed):
-    """Computes at step 1 and the multiples of ``every``, however many Gaussians there are by then."""
+    """Recomputed at step 1 and at multiples of ``every`` only, even if the number of Gaussians changes in between."""
 
     def holds(self, x: Params) -> bool:
         return x.step != 1 and x.step % self.every != 0
@@ -124,5 +124,5 @@ def _min_max(values: Tensor) -> Tensor:
 
 
 def _first(density: Tensor, count: int) -> Tensor:
-    """Return the first of the stored densities, scaled, or 1/2 for all if they are too few."""
+    """Return the first ``count`` stored densities, normalized, or 1/2 for all if there are too few."""
     return density.new_full((count,), 0.5) if len(density) < count else _min_max(density[:count])

@@ -13,15 +13,15 @@ class DensityDropout(RankedDropout):
     """Drop at rates from ``low``, the sparsest, to ``high``, the densest (paper, appendix, density-based dropout).
 
     ``p = low + (high - low) rank``, with the rank in [0, 1] of the density, which falls with the mean distance to the k
-    nearest neighbors. ``train()`` and ``eval()`` are those of dropout: ``opacity * keep`` and ``opacity * (1 - p)``.
-    The paper gives the rates and that they are mapped linearly, but not ``k``, nor the density itself; by ranks neither
-    an outlier nor two Gaussians at one place decide all rates, and their mean is always ``(low + high) / 2``.
+    nearest neighbors. As for dropout, ``train()`` returns ``opacity * keep`` and ``eval()`` ``opacity * (1 - p)``. The
+    paper gives the rates and their linear mapping, but neither ``k`` nor the measure of density; with ranks neither an
+    outlier nor two coinciding Gaussians dominate the rates, whose mean is always ``(low + high) / 2``.
 
     Args:
         low: rate of the sparsest, in [0, 1). The paper uses 0.2.
         high: rate of the densest, in [0, 1). The paper uses 0.5.
-        k: number of neighbors; 3 are those from which 3DGS takes its first scales.
-        every: steps between two looks at the neighbors; those between 3DGS's own density controls.
+        k: number of neighbors; 3DGS initializes its scales from 3.
+        every: steps between neighbor searches; by default 3DGS's densification interval.
         compensate: scale the survivors in training rather than all opacities in evaluation.
         scale: scale the opacities in evaluation, as the paper does.
 

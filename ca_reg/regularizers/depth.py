@@ -1,4 +1,4 @@
-"""The depth rule of DOC-GS: the nearer, the more often, without steps between depths."""
+"""The depth-dependent dropout of DOC-GS: the nearer a Gaussian, the more often it is dropped, without tiers."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class DepthDropout(IndependentDropout):
     """Drop by depth, continuously (after Li et al., "DOC-GS", arXiv 2604.06739; no code was published).
 
     ``p = rate(step) (near + (far - near) rank)``, with the rank in [0, 1] of the depth. ``train()``: ``opacity *
-    keep``; ``eval()``: nothing.
+    keep``; ``eval()``: unchanged.
 
-    Known of the source: the rate of a Gaussian is a continuous function of its depth, it rises during training, and to
-    put it in the place of D2GS's three tiers raised the PSNR from 20.74 to 21.12 dB (LLFF, 3 views). Not known: the
-    function, its direction and its constants. Here it is the straight line between D2GS's tiers, at D2GS's rates; the
-    other direction is ``depth(near=0.3, far=1.0)``.
+    Known from the source: the rate of a Gaussian is a continuous function of its depth and rises during training;
+    replacing D2GS's three tiers by it raised the PSNR from 20.74 to 21.12 dB (LLFF, 3 views). Not known: the function,
+    its direction and its constants. Here it is linear in the rank between D2GS's outer tiers, at D2GS's rates; the
+    opposite direction is ``depth(near=0.3, far=1.0)``.
 
     Convention: the view matrix is world to camera; depth is along its third axis.
 
@@ -54,7 +54,7 @@ class DepthDropout(IndependentDropout):
         self.near, self.far = near, far
 
     def rates(self, x: Params) -> Rate:
-        """Return the rates; 0 while the schedule is."""
+        """Return the rates; 0 while the schedule is 0."""
         rate = self._rate_at(x.step)
         if is_zero(rate):
             return 0.0

@@ -1,4 +1,4 @@
-"""DropAnSH-GS, first half: anchors are dropped with their neighbors."""
+"""The first half of DropAnSH-GS: anchors are dropped together with their neighbors."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ RATE = LinearRamp(0.0, 0.02, 0, 10_000)
 class AnchorDropout(ClusteredDropout):
     """Drop anchors, drawn at ``rate``, and their k nearest neighbors (Fang et al., "DropAnSH-GS", CVPR 2026).
 
-    ``train()``: ``opacity * keep``, without compensation; ``eval()``: nothing. After arXiv 2602.20933, as no code was
-    published. :class:`~ca_reg.regularizers.clustered.ClusteredDropout` is the same by the share that is dropped, here
-    at most ``1 - (1 - rate)^(k + 1)`` in the mean: 20 % at the rate of 0.02.
+    ``train()``: ``opacity * keep``, without compensation; ``eval()``: unchanged. After arXiv 2602.20933, as no code was
+    published. :class:`~ca_reg.regularizers.clustered.ClusteredDropout` is parameterized by the dropped share instead,
+    which is here ``1 - (1 - rate)^(k + 1)`` at most in expectation: 20 % at a rate of 0.02.
 
     Args:
-        rate: of the anchors, or a schedule of it. Theirs rises from 0 to 0.02 until the end of the training; the
+        rate: of the anchors, or a schedule of it. The paper's rises from 0 to 0.02 until the end of training; the
             default takes 10,000 steps for that.
-        k: neighbors that go with an anchor, as theirs.
-        every: steps between two looks at the neighbors; the paper does not say.
+        k: neighbors dropped with an anchor, as in the paper.
+        every: steps between neighbor searches; the paper does not say.
 
     Raises:
         ValueError: if a constant rate is outside [0, 1), or ``k`` or ``every`` below 1.

@@ -1,4 +1,4 @@
-"""DropGaussian: dropout whose rate grows during training, its survivors compensated."""
+"""DropGaussian: dropout at a rate that grows during training, with compensated survivors."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ __all__ = ["DropGaussian"]
 
 
 class DropGaussian(GaussianDropout):
-    """Drop all Gaussians alike with the rate ``p t / steps`` at step t, and multiply survivors by ``1 / (1 - rate)``.
+    """Drop all Gaussians at the rate ``p t / steps`` at step t, and multiply survivors by ``1 / (1 - rate)``.
 
-    DropGaussian (CVPR 2025): uniform over all N Gaussians, no factor at test time. Survivors may exceed 1, for the
-    renderer to clamp. It is :class:`~ca_reg.GaussianDropout` with ``compensate`` and a ramp, so its exact multiplier is
-    that one's.
+    DropGaussian (CVPR 2025): uniform over all N Gaussians, no factor at test time. Survivors may exceed 1, which the
+    renderer clamps. It is :class:`~ca_reg.GaussianDropout` with ``compensate`` and a ramp, and has the same exact
+    multiplier.
 
     Args:
-        p: rate at the end of the ramp, in [0, 1); the source has 0.2.
-        steps: length of the ramp; the source trains 10,000 steps. After it the rate stays. A shorter training should
-            give its own length: 3,000 steps of the default reach 0.06.
+        p: rate at the end of the ramp, in [0, 1); 0.2 in the source.
+        steps: length of the ramp, after which the rate is constant; the source trains for 10,000 steps. Shorter
+            trainings should pass their own length: 3,000 steps of the default reach 0.06.
 
     Raises:
         TypeError: if ``p`` is not a number or ``steps`` not an integer.

@@ -1,4 +1,4 @@
-"""DropAnSH-GS, second half: some Gaussians show only their low degrees of color."""
+"""The second half of DropAnSH-GS: random Gaussians lose their high-degree spherical harmonics."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ __all__ = ["SHDropout"]
 
 
 class SHDropout(Regularizer):
-    """Take from random Gaussians the spherical harmonics above a degree that rises (Fang et al., "DropAnSH-GS").
+    """Drop the spherical harmonics of random Gaussians above a rising degree (Fang et al., "DropAnSH-GS", CVPR 2026).
 
     A share ``p`` keeps only the degrees up to ``l``, where ``l`` is 0 before the first of ``until``, 1 before the
-    second and so on; after the last nothing is dropped. ``eval()``: nothing. After arXiv 2602.20933 (CVPR 2026), as no
-    code was published; with :class:`~ca_reg.regularizers.drop_anchors.AnchorDropout` it is the whole scheme:
-    ``drop_anchors + drop_sh``. Only colors change, so there is no multiplier, and density control counts
-    every Gaussian.
+    second and so on; from the last on nothing is dropped. ``eval()``: unchanged. After arXiv 2602.20933, as no code was
+    published; with :class:`~ca_reg.regularizers.drop_anchors.AnchorDropout` it is the whole scheme:
+    ``drop_anchors + drop_sh``. Only colors change, so there is no multiplier, and density control counts all Gaussians.
 
     Args:
-        p: rate in [0, 1), or a schedule of it. Theirs is 0.2.
-        until: the steps at which the degree rises. Theirs are 2,000, 4,000 and 6,000.
+        p: rate in [0, 1), or a schedule of it. 0.2 in the paper.
+        until: the steps at which the degree rises. 2,000, 4,000 and 6,000 in the paper.
 
     Raises:
-        ValueError: if ``p`` is outside [0, 1), or ``until`` does not rise.
+        ValueError: if ``p`` is outside [0, 1), or ``until`` is not sorted.
 
     Example:
         >>> x = Params(torch.ones(1000), sh=torch.ones(1000, 16, 3), step=2500)
@@ -55,7 +54,7 @@ class SHDropout(Regularizer):
         check_rate(rate, name)
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw who shows all degrees, (N,) bool, beside the number of bands that the others show."""
+        """Draw which Gaussians keep all degrees, (N,) bool, and note how many coefficients the others keep."""
         assert x.sh is not None
         rate, degree = self._rate_at(x.step), bisect_right(self.until, x.step)
         bands = (degree + 1) ** 2
@@ -64,7 +63,7 @@ class SHDropout(Regularizer):
         return Draw((functional.draw_keep_mask(len(x.sh), rate, generator=generator, device=x.sh.device), bands))
 
     def replay(self, x: Params, draw: Draw) -> Params:
-        """Set the higher bands of the drawn to 0."""
+        """Set the higher coefficients of the other Gaussians to 0."""
         if draw.value is None:
             return x
         assert x.sh is not None

@@ -1,4 +1,4 @@
-"""The paper's Gaussian dropout: every Gaussian with the same rate."""
+"""The paper's Gaussian dropout: the same rate for every Gaussian."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ class GaussianDropout(IndependentDropout):
     ``train()``: ``opacity * keep``. ``eval()``: ``opacity * (1 - p)``, the mean over all masks. With ``compensate`` the
     survivors are multiplied by ``1 / (1 - p)`` in training instead, and evaluation leaves the opacities as they are.
     The two schemes are not equivalent: compositing is not linear in the opacities, and rasterizers clamp the alpha of
-    survivors, so that Gaussians of an opacity above ``0.99 (1 - p)`` are more opaque in evaluation than the mean over
+    survivors, so that Gaussians of opacity above ``0.99 (1 - p)`` are more opaque in evaluation than in the mean over
     all masks. The module has no parameters; put it between the activation of the opacities and the rasterizer.
 
     Dropped Gaussians must leave no trace in density control: pass the radii through
     :meth:`~ca_reg.Regularizer.mask_radii`.
 
-    Inside ``torch.compile`` one graph serves all steps, with ``fullgraph=True`` as well: the values of the opacities
-    are then not looked at, and a schedule draws also where its rate is 0. Inside ``torch.utils.checkpoint`` draw
-    without ``generator``, or outside and give ``keep``. :class:`OpacityNoise` does the same.
+    Inside ``torch.compile`` one graph serves all steps, even with ``fullgraph=True``: the values of the opacities are
+    then not checked, and a schedule draws even where its rate is 0. Inside ``torch.utils.checkpoint`` draw without
+    ``generator``, or draw outside and pass ``keep``. The same holds for :class:`OpacityNoise`.
 
-    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call refuses those below 0, as logits are.
+    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call rejects negative ones as logits.
 
     Args:
         p: drop rate in [0, 1), or a schedule of it. The paper uses 0.2.
         compensate: scale the survivors in training rather than all opacities in evaluation.
 
     Attributes:
-        keep: the last mask, True where the Gaussian stayed, (N,) bool; None if nothing was dropped.
-        p: the rate at the present step.
+        keep: the last mask, True where the Gaussian was kept, (N,) bool; None if nothing was dropped.
+        p: the rate at the current step.
         step: the training step, set with :meth:`set_step`; a module with a schedule saves it in ``state_dict``.
 
     Raises:
@@ -64,7 +64,7 @@ class GaussianDropout(IndependentDropout):
 
     @property
     def p(self) -> float:
-        """The drop rate at the present step."""
+        """The drop rate at the current step."""
         return self._present_rate()
 
     def forward(  # type: ignore[override]
@@ -72,11 +72,11 @@ class GaussianDropout(IndependentDropout):
     ) -> Given:
         """Return the opacities to render.
 
-        As :meth:`Regularizer.forward <ca_reg.Regularizer.forward>`; ``keep``, (N,) bool, is a former mask to apply
-        again instead of drawing one, in training only.
+        As :meth:`Regularizer.forward <ca_reg.Regularizer.forward>`; ``keep``, (N,) bool, is an earlier mask to replay
+        instead of drawing one, in training only.
         """
         return super().forward(opacity, drawn=None if keep is None else Draw(keep, keep), generator=generator)
 
     def rates(self, x: Params) -> Rate:
-        """Return the rate of the step."""
+        """Return the rate at the step."""
         return self._rate_at(x.step)

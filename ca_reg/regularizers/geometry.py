@@ -13,19 +13,19 @@ __all__ = ["GeometryDropout", "surface_variation"]
 class GeometryDropout(RankedDropout):
     """Drop at rates from ``low``, on planes, to ``high``, in scattered volumes (paper, geometry-aware dropout).
 
-    ``p = low + (high - low) rank``, with the rank in [0, 1] of :func:`surface_variation`. ``train()`` and ``eval()``
-    are those of dropout: ``opacity * keep`` and ``opacity * (1 - p)``.
+    ``p = low + (high - low) rank``, with the rank in [0, 1] of :func:`surface_variation`. As for dropout, ``train()``
+    returns ``opacity * keep`` and ``eval()`` ``opacity * (1 - p)``.
 
     The paper has one sentence about it, "estimate local geometric complexity by computing structural variation among
-    each Gaussian's nearest neighbors", and calls it infeasible at O(N^3). Its measure, direction, rates and ``k`` are
-    not given: here the measure is the standard one of a point's surroundings, and the rates are those of the paper's
-    density-based dropout. With neighbors from a tree it takes O(N log N).
+    each Gaussian's nearest neighbors", and calls it infeasible at O(N^3). It does not give the measure, its direction,
+    the rates or ``k``: here the measure is the standard one for point clouds, and the rates are those of the paper's
+    density-based dropout. With neighbors from a k-d tree it takes O(N log N).
 
     Args:
         low: rate where the surroundings vary least, in [0, 1).
         high: rate where they vary most, in [0, 1).
         k: number of neighbors.
-        every: steps between two looks at the neighbors; those between 3DGS's own density controls.
+        every: steps between neighbor searches; by default 3DGS's densification interval.
         compensate: scale the survivors in training rather than all opacities in evaluation.
         scale: scale the opacities in evaluation, as the paper does.
 
@@ -59,13 +59,13 @@ class GeometryDropout(RankedDropout):
 
 
 def surface_variation(means: Tensor, k: int) -> Tensor:
-    """Return the share of the smallest eigenvalue in the covariance of each point (N, 3) and its k nearest neighbors.
+    """Return the smallest eigenvalue of the covariance of each point (N, 3) and its k neighbors, as a share of all.
 
     The definition is that of Pauly, Gross and Kobbelt, "Efficient simplification of point-sampled surfaces" (2002). In
-    [0, 1/3], (N,): 0 on a plane or a line, 1/3 where all directions are alike; 0 if all points coincide.
+    [0, 1/3], (N,): 0 on a plane or a line or if all points coincide, 1/3 if the covariance is isotropic.
     """
     _, numbers = neighbors_of(means, k)
-    # In the order of their numbers: Gaussians with the same neighbors then have the same value, and the same rank.
+    # Sorted by index: Gaussians with the same members then get exactly the same value, and the same rank.
     members = torch.cat([torch.arange(len(means), device=means.device)[:, None], numbers], dim=1).sort(dim=1).values
     offsets = means[members] - means[members[:, :1]]
     offsets = offsets - offsets.mean(1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Dropping Gaussians independently of each other: the base class of every dropout that is a rule for the rates."""
+"""Dropout of Gaussians independently of each other: the base class of dropouts that only define the rates."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ __all__ = ["IndependentDropout"]
 
 
 class IndependentDropout(Regularizer):
-    """Drop each Gaussian with a rate of its own, independently of the others; a subclass says the rates.
+    """Drop each Gaussian at its own rate, independently of the others; a subclass defines the rates.
 
     ``train()``: ``opacity * keep``, with ``compensate`` times ``1 / (1 - p)``. ``eval()``: with ``scale``
-    ``opacity * (1 - p)``, the mean over all masks; otherwise, and after ``compensate``, the opacities as they are.
+    ``opacity * (1 - p)``, the mean over all masks; otherwise, and with ``compensate``, the opacities unchanged.
 
     Args:
-        schedule: a rate that follows the step, for :attr:`step` to be saved with it.
+        schedule: a rate, or a schedule of one, for subclasses to build on; with a schedule the step is saved.
         compensate: scale the survivors in training rather than all opacities in evaluation.
         scale: scale the opacities in evaluation, as the paper does; most published schemes do not.
 
@@ -42,7 +42,7 @@ class IndependentDropout(Regularizer):
         self.renders_mean = compensate or scale
 
     def rates(self, x: Params) -> Rate:
-        """Return the drop rates in [0, 1) at ``x``: a number, or one for each Gaussian, shape (N,)."""
+        """Return the drop rates in [0, 1) for ``x``: a number, or one for each Gaussian, shape (N,)."""
         raise NotImplementedError
 
     def test_rates(self, x: Params) -> Rate:
@@ -50,7 +50,7 @@ class IndependentDropout(Regularizer):
         return self.rates(x)
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw which Gaussians stay."""
+        """Draw which Gaussians are kept."""
         rates = self.rates(x)
         if is_zero(rates):
             return Draw()
@@ -59,7 +59,7 @@ class IndependentDropout(Regularizer):
         return Draw(keep, keep)
 
     def replay(self, x: Params, draw: Draw) -> Params:
-        """Set the opacities of the dropped to 0."""
+        """Set the opacities of dropped Gaussians to 0, and compensate the others if asked to."""
         if draw.keep is None:
             return x
         rates = self.rates(x) if self.compensate else 0.0
@@ -67,18 +67,18 @@ class IndependentDropout(Regularizer):
         return x._replace(opacities=opacities)
 
     def expected(self, x: Params) -> Params:
-        """Scale by ``1 - p``, or not."""
+        """Scale by ``1 - p`` with ``scale`` and without ``compensate``."""
         if self.compensate or not self.scale:
             return x
         opacities = functional.scale_opacity(x.opacities, self.test_rates(x))
         return x if opacities is x.opacities else x._replace(opacities=opacities)
 
     def multiplied(self, x: Params) -> tuple[Params, Multiplier]:
-        """Return the opacities of survivors, and the factor 0 or 1: exact where a rasterizer clamps the alpha, too."""
+        """Return the survivors' opacities, and a factor of 0 or 1: exact even if the rasterizer clamps alpha."""
         return self._multiplied(x, self.rates(x))
 
     def test_multiplied(self, x: Params) -> tuple[Params, Multiplier]:
-        """Return the same at the rates of the test."""
+        """Return the same at the test-time rates."""
         return self._multiplied(x, self.test_rates(x))
 
     def _multiplied(self, x: Params, rates: Rate) -> tuple[Params, Multiplier]:

@@ -1,4 +1,4 @@
-"""The paper's opacity noise."""
+"""The paper's multiplicative noise on the opacities."""
 
 from __future__ import annotations
 
@@ -23,24 +23,23 @@ class OpacityNoise(ParameterNoise):
     very same tensor. With dropout it comes second: ``nn.Sequential(GaussianDropout(0.2), OpacityNoise(0.8))``.
 
     With ``scale``, which the paper does not have, ``eval()`` returns the mean over all draws instead,
-    :func:`~ca_reg.functional.expected_opacity` at the present ``sigma``. The clamp makes that mean differ from the
-    opacity (0.72 for an opacity of 1 at ``sigma = 0.8``), so the model was fitted with other opacities than those of
-    ``eval()`` without it. Of models that were trained at ``sigma = 0.8`` it raises the test PSNR by 0.47 dB on fern and
-    0.50 dB on lego, see docs/studies.md. The training is the same. Then the noise comes first,
+    :func:`~ca_reg.functional.expected_opacity` at the current ``sigma``; training is the same. The clamp makes that
+    mean differ from the opacity (0.72 for an opacity of 1 at ``sigma = 0.8``), so without ``scale`` the model is
+    evaluated at opacities other than those it was fitted with. For models trained at ``sigma = 0.8``, ``scale`` raises
+    the test PSNR by 0.47 dB on fern and 0.50 dB on lego, see docs/studies.md. The noise then comes before dropout,
     ``nn.Sequential(OpacityNoise(0.8, scale=True), GaussianDropout(0.2))``: in training the order of the two does not
     matter, because a factor of 0 or 1 commutes with the clamp; in evaluation the noise must see the plain opacities.
 
-    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call refuses those below 0, as logits are.
+    Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call rejects negative ones as logits.
 
     Args:
         sigma: standard deviation of the relative noise, at least 0, or a schedule of it.
         clip: clip the noise to [-sigma, sigma], as the authors' released code does.
-        scale: return the mean opacities in evaluation. That looks at their values, which ends a graph of
-            ``torch.compile``.
+        scale: return the mean opacities in evaluation. This reads their values, which breaks a ``torch.compile`` graph.
 
     Attributes:
         noise: the last draw, (N,) float32; None if there was none.
-        sigma: the standard deviation at the present step.
+        sigma: the standard deviation at the current step.
         step: the training step, set with :meth:`set_step`; a module with a schedule saves it in ``state_dict``.
 
     Raises:
@@ -59,7 +58,7 @@ class OpacityNoise(ParameterNoise):
         tensor([0.1040, 0.7213])
     """
 
-    drops = False  # what its clamp leaves at 0 is still counted as seen, as in the paper's code
+    drops = False  # Gaussians that the clamp sets to 0 still count as seen, as in the paper's code
     field = "opacities"
 
     def __init__(self, sigma: float | Schedule, *, clip: bool = False, scale: bool = False) -> None:
@@ -71,8 +70,8 @@ class OpacityNoise(ParameterNoise):
     ) -> Given:
         """Return the opacities to render.
 
-        As :meth:`Regularizer.forward <ca_reg.Regularizer.forward>`; ``noise``, (N,), is a former draw to apply again
-        instead of a new one, in training only. With ``scale`` an opacity above 1 is a ValueError in evaluation.
+        As :meth:`Regularizer.forward <ca_reg.Regularizer.forward>`; ``noise``, (N,), is an earlier draw to replay
+        instead of a new one, in training only. With ``scale``, opacities above 1 raise a ValueError in evaluation.
         """
         return super().forward(opacity, drawn=None if noise is None else Draw(noise), generator=generator)
 
@@ -81,17 +80,17 @@ class OpacityNoise(ParameterNoise):
         return functional.apply_opacity_noise(values, noise)
 
     def expected(self, x: Params) -> Params:
-        """With ``scale`` the mean over all draws."""
+        """Return the mean over all draws with ``scale``, else ``x`` itself."""
         sigma = self._rate_at(x.step)
         if not self.scale or is_zero(sigma):
             return x
         return x._replace(opacities=functional.expected_opacity(x.opacities, float(sigma), clip=self.clip))
 
     def multiplied(self, x: Params) -> tuple[Params, Multiplier]:
-        """Return the opacities, at most 1, and their factor with its clamp.
+        """Return the opacities, clamped to 1, and the moments of their clamped noise.
 
-        Left out is the renderer's own clamp of the noisy alphas, which moves a color by at most 1/99 of the colors'
-        range: :meth:`~ca_reg.functional.Multiplier.clamped_noise`.
+        The renderer's clamp and cut-off of the noisy alphas are not modeled, see
+        :meth:`~ca_reg.functional.Multiplier.clamped_noise`.
         """
         sigma = self._rate_at(x.step)
         if is_zero(sigma):

@@ -17,18 +17,18 @@ __all__ = ["ParameterNoise"]
 
 
 class ParameterNoise(Regularizer):
-    """Multiply each number of a parameter by ``1 + noise`` in training, ``noise ~ N(0, sigma^2)``.
+    """Multiply each element of a parameter by ``1 + noise`` in training, ``noise ~ N(0, sigma^2)``.
 
-    ``eval()`` changes nothing. A subclass says which parameter, and may say how the noise is applied: :meth:`perturb`.
+    ``eval()`` changes nothing. A subclass names the parameter, and may override :meth:`perturb`, which applies noise.
 
     Args:
         sigma: standard deviation of the relative noise, at least 0, or a schedule of it.
-        clip: clip the noise to [-sigma, sigma], as the paper's released code does with that of the opacities.
+        clip: clip the noise to [-sigma, sigma], as the paper's released code does for the opacities.
 
     Attributes:
-        field: of :class:`~ca_reg.Params` that the noise is on.
+        field: the field of :class:`~ca_reg.Params` that is perturbed.
         noise: the last draw, float32, the shape of the parameter; None if there was none.
-        sigma: the standard deviation at the present step.
+        sigma: the standard deviation at the current step.
 
     Raises:
         TypeError: if ``sigma`` is neither a number nor callable.
@@ -54,7 +54,7 @@ class ParameterNoise(Regularizer):
 
     @property
     def sigma(self) -> float:
-        """The standard deviation at the present step."""
+        """The standard deviation at the current step."""
         return self._present_rate()
 
     @property

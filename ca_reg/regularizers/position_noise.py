@@ -16,13 +16,13 @@ __all__ = ["PositionNoise"]
 class PositionNoise(ParameterNoise):
     """Shift every center at random, in units of the distance to its nearest neighbor (paper, appendix, position noise).
 
-    ``train()``: ``mean + sigma d n`` with ``n`` of three standard normal numbers and ``d`` the distance; ``eval()``:
-    nothing. Gaussians at one place do not move. The draws do not multiply an alpha, so there is no multiplier.
+    ``train()``: ``mean + sigma d n`` with ``n`` three standard normal numbers and ``d`` the distance; ``eval()``:
+    unchanged. Coinciding Gaussians do not move. The noise does not multiply alphas, so there is no multiplier.
 
     Args:
         sigma: standard deviation per axis in units of ``d``, at least 0, or a schedule of it. The paper tries 0.1, 0.3
-            and 0.5, and finds that all of them blur.
-        every: steps between two looks at the neighbors; those between 3DGS's own density controls.
+            and 0.5, and finds that all of them blur the images.
+        every: steps between neighbor searches; by default 3DGS's densification interval.
 
     Raises:
         ValueError: if ``sigma`` is negative or not finite, or ``every`` below 1.
@@ -42,7 +42,7 @@ class PositionNoise(ParameterNoise):
         self.distances = Refreshed(every)
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw the shifts, world units, (N, 3)."""
+        """Draw the shifts in world units, (N, 3)."""
         noise = super().draw(x, generator).value
         if noise is None:
             return Draw()

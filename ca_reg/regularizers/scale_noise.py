@@ -14,8 +14,8 @@ class ScaleNoise(ParameterNoise):
     """Multiply each scale by ``1 + noise`` in training, ``noise ~ N(0, sigma^2)`` (paper, appendix, scale noise).
 
     ``eval()`` changes nothing, as in the paper. The three axes of a Gaussian are drawn independently, which the paper
-    leaves open. A factor below 0 stands for its absolute value, which gives the same covariance, and is returned as
-    that. The draws are no factors of the opacities, so there is no exact multiplier.
+    leaves open. Negative scales are replaced by their absolute values, which give the same covariance. The noise does
+    not multiply alphas, so there is no exact multiplier.
 
     Args:
         sigma: standard deviation of the relative noise, at least 0, or a schedule of it. The paper tries 0.1 to 0.7:

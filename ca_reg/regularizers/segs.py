@@ -1,4 +1,4 @@
-"""SE-GS's perturbation of all that a Gaussian is, except its color."""
+"""SE-GS's perturbation of all parameters of a Gaussian except its color."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ __all__ = ["SEGSNoise"]
 class SEGSNoise(Regularizer):
     """Add noise to centers, raw opacities, raw scales and rotations in training (SE-GS, ICCV 2025, its perturbation).
 
-    To each column of the raw parameters, ``x, y, z``, the logit of the opacity, the logarithms of the three scales and
-    the six numbers of the rotation, is added
+    Each column of the raw parameters (``x, y, z``, the logit of the opacity, the logarithms of the three scales, six
+    numbers for the rotation) is shifted by
 
         n * ratio * max(mean |column|, 1),   n ~ N(0, 1),   ratio = first (last / first)^((t - start) / (stop - start))
 
     from step ``start`` to ``stop``. The six numbers are the first two rows of the rotation matrix (Zhou et al. 2019),
-    made a rotation again by Gram-Schmidt. ``eval()`` changes nothing, as the source renders its unperturbed field.
+    orthonormalized again by Gram-Schmidt. ``eval()`` changes nothing, as the source renders its unperturbed field.
 
-    What differs: the source trains two fields and perturbs the second, every 500 steps, for good, and only those
-    Gaussians that lie under pixels which its first field has drawn differently over time, as the trainer's density
-    control ``self_ensembling`` does. With one field there is no such selection: all Gaussians are perturbed, at each
-    step anew, and the training sees the perturbed ones. There is no exact multiplier, because the draws are no factors
-    of the opacities. The floor of 1 on the mean makes the noise of the centers depend on the unit of the world.
+    Unlike here, the source trains two fields and perturbs the second, every 500 steps, permanently, and only the
+    Gaussians under pixels that its first field has rendered differently over time; the trainer's density control
+    ``self_ensembling`` does that. With one field there is no such selection: all Gaussians are perturbed, anew at each
+    step, and trained as perturbed. The noise does not just multiply alphas, so there is no exact multiplier. The floor
+    of 1 on the mean makes the noise of the centers depend on the world unit.
 
     Args:
         first: the ratio at ``start``, above 0.
         last: the ratio at ``stop``, above 0.
-        start: first step with noise. The source collects its first three sets of pictures until 2,000.
-        stop: first step without it again; 500 before the end of the source's 10,000.
+        start: first step with noise. The source collects its first three sets of images until 2,000.
+        stop: first step without noise again; 500 before the end of the source's 10,000.
 
     Raises:
         ValueError: if a ratio is not above 0 or ``stop`` does not come after ``start``.
@@ -63,7 +63,7 @@ class SEGSNoise(Regularizer):
         if is_zero(ratio):
             return Draw()
         means, scales, rows = _geometry(x)
-        logits = x.opacities[:, None].logit(eps=1e-6)  # finite where another regularizer has dropped one
+        logits = x.opacities[:, None].logit(eps=1e-6)  # finite even where another regularizer has dropped a Gaussian
         draws = []
         for raw in (means, logits, scales.log(), rows.flatten(1)):
             noise = functional.draw_opacity_noise(raw.numel(), ratio, generator=generator, device=raw.device)

@@ -11,9 +11,9 @@ __all__ = ["SHNoise"]
 class SHNoise(ParameterNoise):
     """Multiply each SH coefficient by ``1 + noise`` in training, ``noise ~ N(0, sigma^2)`` (paper, appendix, SH noise).
 
-    ``eval()`` changes nothing, as in the paper. All bands have noise, the constant one too, each coefficient of each
-    channel its own, which the paper leaves open. Colors do not change who covers whom: the paper finds little effect on
-    co-adaptation. The draws are no factors of the opacities, so there is no exact multiplier.
+    ``eval()`` changes nothing, as in the paper. Each coefficient of each channel has its own noise, in all bands
+    including the constant one, which the paper leaves open. Colors do not affect occlusion: the paper finds little
+    effect on co-adaptation. The noise does not multiply alphas, so there is no exact multiplier.
 
     Args:
         sigma: standard deviation of the relative noise, at least 0, or a schedule of it. The paper tries 0.1, 0.3 and

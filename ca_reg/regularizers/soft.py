@@ -14,20 +14,20 @@ __all__ = ["SoftDropout"]
 class SoftDropout(BinaryConcrete):
     """Multiply opacities by ``omega = clamp(1 - sigmoid((logit u + logit q) / temperature), 0.2, 0.8)``, q ~ U(0, 1).
 
-    The soft mask of UGOD (ICRA 2026). There a network says the uncertainty u of a Gaussian from its position, rotation,
-    scale and the view; here a rule does: the same u for all, or ``by_size`` in proportion to the rank of the largest
-    scale, from 0 for the smallest Gaussian to 2 u for the largest, because large Gaussians are those that few pixels
-    of few views hold in place. UGOD renders ``opacity * (1 - u) * omega``; its ``1 - u``, which is not random, is left
-    to the opacity here.
+    The soft mask of UGOD (ICRA 2026). There a network predicts the uncertainty u of a Gaussian from its position,
+    rotation, scale and the view; here it follows a rule: the same u for all, or, with ``by_size``, proportional to the
+    rank of the largest scale, from about 0 for the smallest Gaussian to about 2 u for the largest, because large
+    Gaussians are constrained by few pixels of few views. UGOD renders ``opacity * (1 - u) * omega``; the factor
+    ``1 - u``, which is not random, is left to the opacity here.
 
-    ``eval()``: the opacity times the mean of omega. UGOD draws at test time, too; a module left in ``train()`` does.
+    ``eval()``: the opacity times the mean of omega. UGOD draws at test time, too, as a module left in ``train()`` does.
 
     Args:
-        u: the (mean) uncertainty, in (0, 1), ``by_size`` in (0, 0.5]. UGOD has no such constant; 0.2 is the drop rate
-            of the paper.
-        by_size: whether it grows with the rank of the size.
+        u: the (mean) uncertainty, in (0, 1), with ``by_size`` in (0, 0.5]. UGOD has no such constant; 0.2 is the drop
+            rate of the paper.
+        by_size: whether the uncertainty grows with the rank of the size.
         temperature: above 0 and at most 1; 0.1 in UGOD's code, 0.2 for its results on Mip-NeRF 360.
-        floor: the least omega; the largest is ``1 - floor``. 0.2 in UGOD.
+        floor: the smallest omega; the largest is ``1 - floor``. 0.2 in UGOD.
 
     Raises:
         ValueError: if an argument is out of range.
@@ -50,7 +50,7 @@ class SoftDropout(BinaryConcrete):
 
     @property
     def needs(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The scales, if the rule is about the size."""
+        """The scales, with ``by_size``."""
         return ("scales",) if self.by_size else ()
 
     def logits(self, x: Params) -> Rate:
