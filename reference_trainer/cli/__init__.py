@@ -31,7 +31,7 @@ __all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run ``ca-reg``; errors that a user can mend end with one line and exit code 2, an interruption with 130."""
+    """Run ``ca-reg``; errors that a user can fix exit with one line and code 2, an interruption with 130."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     try:
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if hasattr(computing, "device"):
             check_device(computing.device, here=not (isinstance(command, Compare) and command.elsewhere))
         command()
-    except BrokenPipeError:  # the reader of the output, such as head, has seen enough
+    except BrokenPipeError:  # the reader of the output, such as head, has stopped reading
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except (ValueError, OSError, ImportError, RuntimeError) as error:
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _parse(arguments: Sequence[str]) -> Any:
-    """Return the command with its options; exits where they cannot be understood."""
+    """Return the command with its options; exits if they cannot be parsed."""
     peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
     peek.add_argument("--recipe", choices=list(RECIPES))
     peek.add_argument("--iterations", type=int, default=argparse.SUPPRESS)
@@ -77,7 +77,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "warmup": Warmup(),
         "version": Version(),
     }
-    # In the list of the commands the first paragraph of each; the command's own help has all of it.
+    # The list of commands shows the first paragraph of each docstring, the command's own help all of it.
     texts = {name: inspect.getdoc(type(command)) or "" for name, command in defaults.items()}
     short = {name: text.partition("\n\n")[0] for name, text in texts.items() if name not in arguments}
     commands: Any = tyro.extras.subcommand_type_from_defaults(defaults, descriptions=texts | short)

@@ -1,4 +1,4 @@
-"""The option that chooses what draws, and the command that prepares it."""
+"""The option that chooses the rendering engine, and the command that compiles it."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _ENGINE_HELP = (
 
 @dataclass(frozen=True)
 class Drawing:
-    """What draws; the same for all commands that render."""
+    """The rendering engine, for all commands that render."""
 
     engine: Annotated[_Engine, tyro.conf.arg(help=_ENGINE_HELP)] = None
 
     def begin(self, device: str, *, trains: bool = False) -> None:
-        """Choose the engine of this process and its workers, and say which it is.
+        """Choose the engine of this process and its workers, and print which it is.
 
         Args:
-            device: where is drawn.
-            trains: whether all loops will be needed: those that are not compiled yet are compiled now, with progress.
+            device: where to render.
+            trains: whether all loops will be needed: those not compiled yet are then compiled now, with progress.
         """
         from reference_trainer.render import describe_engine, use_engine
 
@@ -44,7 +44,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class DrawingOfSweep(Drawing):
-    """The same under another name, where --engine says where the runs are done."""
+    """The same option as --drawing-engine, for commands whose --engine says where runs execute."""
 
     engine: Annotated[_Engine, tyro.conf.arg(name="drawing-engine", help=_ENGINE_HELP)] = None
 

@@ -1,4 +1,4 @@
-"""What can be asked for by name, the recipes, and what is installed."""
+"""Commands that list the known names, the recipes, and the installed versions."""
 
 from __future__ import annotations
 

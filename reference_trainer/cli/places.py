@@ -1,4 +1,4 @@
-"""Where a model is looked at: on the scene of a run, or of a PLY, which may have none."""
+"""The views at which a model is measured or shown: of a run's own scene, of a PLY's scene, or on an orbit."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class PlyScene(SceneOptions):
 
 
 def place_of(source: Path, scene: PlyScene, orbit: OrbitOptions) -> SceneOptions | OrbitOptions | None:
-    """Return where a PLY is looked at; None for the folder of a run, which has a scene of its own.
+    """Return the scene or orbit of a PLY; None for the folder of a run, which has its own scene.
 
     Raises:
-        ValueError: if options were given that do not apply.
+        ValueError: if options are given that do not apply.
     """
     if source.is_dir() or source.suffix.lower() != ".ply":
         if (scene, orbit) != (PlyScene(), OrbitOptions()):

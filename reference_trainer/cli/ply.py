@@ -1,4 +1,4 @@
-"""Commands about PLY files. One class per command, its fields are the options."""
+"""Commands on PLY files: one class per command, whose fields are its options."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ __all__ = ["Bake", "Clean"]
 class Bake:
     """Give a PLY its test-time opacities, for other viewers.
 
-    Such as times 1 - p after dropout p, of which viewers know nothing. A comment in the file says so.
+    Other viewers do not know that after dropout p, for example, opacities are to be scaled by 1 - p. A comment in the
+    file records that it was done.
     """
 
     ply: Annotated[Path, tyro.conf.Positional]
@@ -39,11 +40,11 @@ class Bake:
 
 @dataclass(frozen=True)
 class Clean:
-    """Take out of a PLY the Gaussians that co-adapt most; refine.
+    """Remove the Gaussians of a PLY that co-adapt most; refine.
 
-    Most for what they contribute, with a table of before and after. On the photographs of its scene a few training
-    steps close the holes; without a scene, on an orbit, they stay. For models that were trained without a regularizer:
-    after dropout there is little to take out.
+    Most relative to what they contribute; prints a table of before and after. A few training steps on the photographs
+    of the scene close the holes; without a scene, on an orbit, they stay. For models that were trained without a
+    regularizer: after dropout there is little to remove.
     """
 
     ply: Annotated[Path, tyro.conf.Positional]
@@ -51,7 +52,7 @@ class Clean:
     scene: Annotated[PlyScene, tyro.conf.arg(name="")] = field(default_factory=PlyScene)
     orbit: Orbit = field(default_factory=OrbitOptions)
     fraction: float = 0.1
-    """Of the Gaussians to take out."""
+    """Fraction of the Gaussians to remove."""
     refine: int = 100
     """Training steps afterwards; 0 for none."""
     regularizer: str | None = None

@@ -1,4 +1,4 @@
-"""The command that finds the cameras of photographs. Its fields are the options."""
+"""The command that finds the cameras of photographs; its fields are its options."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ class Poses:
     """
 
     photos: Annotated[Path, tyro.conf.Positional]
-    """Folder of the photographs, two at least."""
+    """Folder of the photographs, at least two."""
     out: Path | None = None
-    """Another scene folder to write, with copies of the photographs; by default theirs."""
+    """Another scene folder to write to, with copies of the photographs; by default theirs."""
     camera: str | None = None
-    """COLMAP's name of the lens, such as OPENCV; by default SIMPLE_PINHOLE below 8 photographs, else SIMPLE_RADIAL."""
+    """COLMAP's camera model, such as OPENCV; by default SIMPLE_PINHOLE below 8 photographs, else SIMPLE_RADIAL."""
     seed: int = 0
-    """Decides everything random."""
+    """Seed of all randomness."""
 
     def __call__(self) -> None:
         """Run the command."""

@@ -1,4 +1,4 @@
-"""Commands to look at runs: a page about them, or one of them live. One class each, its fields are the options."""
+"""Commands to look at runs: a page about several, or one live. One class per command, whose fields are its options."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ __all__ = ["Report", "View"]
 class Report:
     """Write one HTML file about runs: scores, views, 3D models.
 
-    The models turn, in colors or in co-adaptation heat. It needs nothing but a browser: no server, no network. Several
-    runs on one scene stand side by side.
+    The models can be turned, in their colors or in co-adaptation heat. The file needs only a browser: no server, no
+    network. Several runs on one scene are shown side by side.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs of `ca-reg train` on one scene, finished or not."""
     out: Path | None = None
-    """The file; by default report.html in the folder of the run, or in the one that all of them are in."""
+    """The file; by default report.html in the folder of the run, or in the deepest one common to all runs."""
     views: int = 8
-    """Views of each split that are shown, evenly chosen."""
+    """Views of each split that are shown, evenly spaced."""
     device: Device = "cpu"
     drawing: Draw = field(default_factory=Drawing)
 
@@ -42,9 +42,9 @@ class Report:
 
 @dataclass(frozen=True)
 class View:
-    """Turn a run, or any 3DGS PLY, live in a browser.
+    """Explore a run, or any 3DGS PLY, live in a browser.
 
-    Render, co-adaptation, depth or heat, drawn by the renderer. Needs ca_reg[viewer]; Ctrl-C ends it.
+    Shows render, co-adaptation, depth or heat, as this package draws them. Needs ca_reg[viewer]; Ctrl-C ends it.
     """
 
     run: Annotated[Path, tyro.conf.Positional]
@@ -54,7 +54,7 @@ class View:
     regularizer: str | None = None
     """Draw it as if it had been trained with these, such as "dropout(0.2)"."""
     port: int = PORT
-    """Of the page, on this machine; 0 for any."""
+    """Port of the page on this machine; 0 for any free one."""
     device: Device = "cpu"
     drawing: Draw = field(default_factory=Drawing)
 
@@ -67,7 +67,7 @@ class View:
         where = place_of(self.run, self.scene, self.orbit)
         shared: dict[str, Any] = {"regularizer": self.regularizer, "device": self.device}
         with Viewer(self.port) as viewer:
-            self.drawing.begin(self.device, trains=True)  # nobody waits for a compiler later
+            self.drawing.begin(self.device, trains=True)  # so that no later picture waits for the compiler
             if where is None:
                 model, scene, _ = of_run(self.run, **shared)
                 viewer.show(model, measured_views(scene, print))

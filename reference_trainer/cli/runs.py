@@ -1,4 +1,4 @@
-"""Commands about runs: plan, train, evaluate, render, compare. One class per command, its fields are the options."""
+"""Commands on runs: plan, train, evaluate, render, compare. One class per command, whose fields are its options."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from reference_trainer.training.recipes import RECIPES
 __all__ = ["PORT", "Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
 
 PORT = 8080
-"""Of the viewer."""
+"""Default port of the viewer."""
 PICTURES_FROM = 400
-"""Steps between measurements from which on pictures of each cost less than 2 % of a training: they take 7 steps' time
-(fern at 252x189, 40,110 Gaussians)."""
+"""Smallest interval of measurements, in steps, at which pictures cost less than 2 % of a training: those of one
+measurement take the time of 7 steps (fern at 252x189, 40,110 Gaussians)."""
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
 Folder = Annotated[
@@ -48,7 +48,7 @@ Given = Annotated[frozenset[str], tyro.conf.Suppress]  # filled in from the comm
 
 
 def given_fields(arguments: Sequence[str]) -> frozenset[str]:
-    """Return the fields of `TrainConfig` that a command line sets, be it to their default.
+    """Return the fields of `TrainConfig` that a command line sets, even if to their default.
 
     Example:
         >>> sorted(given_fields(["train", "--sh-degree", "3", "--densify_every=100", "--no-analytic"]))
@@ -59,7 +59,7 @@ def given_fields(arguments: Sequence[str]) -> frozenset[str]:
 
 
 def _chosen(scene: SceneOptions, folder: str | None) -> SceneOptions:
-    """Return the options of a scene whose folder may also be given as the first argument."""
+    """Return the options of a scene with its folder, which may be given as the first argument or as --path."""
     if folder is not None and scene.path not in (SceneOptions().path, folder):
         raise ValueError(f"give the scene as the first argument or as --path, not both: got {folder} and {scene.path}.")
     return scene if folder is None else replace(scene, path=folder)
@@ -69,8 +69,8 @@ def _chosen(scene: SceneOptions, folder: str | None) -> SceneOptions:
 class Demo:
     """Train the built-in scene with and without the regularizers.
 
-    From three views; needs no files and takes minutes. Ends with a table of test quality and co-adaptation, a plot of
-    the dynamics, and pictures.
+    From three views; needs no files and takes minutes. Gives a table of test quality and co-adaptation, a plot of the
+    dynamics, and pictures.
     """
 
     out: Path = Path("runs/demo")
@@ -175,7 +175,7 @@ class Train:
 class Plan:
     """Say what training will use of a scene, and why.
 
-    And what it leaves out; trains nothing.
+    Also says what it leaves out; trains nothing.
     """
 
     folder: Folder = None
@@ -247,7 +247,7 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Render a run's views as PNG, or a flight as GIF, too."""
+    """Render a run's views as PNG, or a flight also as GIF."""
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of a run of `ca-reg train`."""
@@ -269,7 +269,7 @@ class Render:
 
 @dataclass(frozen=True)
 class EveryScene(SceneOptions):
-    """The options that hold for every scene of a comparison."""
+    """The scene options shared by all scenes of a comparison."""
 
     path: Annotated[str, tyro.conf.Suppress] = "synthetic"  # each scene has its own
 
@@ -316,7 +316,7 @@ class Compare:
 
     @property
     def elsewhere(self) -> bool:
-        """Whether the runs may be done on other machines, whose devices are not known here."""
+        """Whether runs may execute on other machines, whose devices are unknown here."""
         return self.engine != "processes" and bool(self.address or os.environ.get("RAY_ADDRESS"))
 
     def __call__(self) -> None:

@@ -1,4 +1,4 @@
-"""Studies of trained models. One class per study, its fields are the options."""
+"""Studies of the method and of trained models: one class per study, whose fields are its options."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ErrorRuntime:
     max_samples: int = 1024
     """Largest number of renders."""
     seeds: int = 3
-    """Independent sequences of masks."""
+    """Number of independent sequences of masks."""
     device: Device = "cpu"
 
     def __call__(self) -> None:
@@ -49,7 +49,7 @@ class Attribution:
     split: Literal["test", "train"] = "test"
     """Which views."""
     drop_rate: float = 0.5
-    """Of the score."""
+    """Drop rate of the score."""
     device: Device = "cpu"
 
     def __call__(self) -> None:
@@ -76,39 +76,39 @@ class OwnScene(SceneOptions):
     """A scene of one's own."""
 
     path: str = ""
-    """A scene of your own instead of the declared ones, or "synthetic"; the options that follow are of it."""
+    """A scene of your own instead of the declared ones, or "synthetic"; the following options are for it."""
 
 
 @dataclass(frozen=True)
 class Paper:
-    """Test the paper's claims: train what they need on scenes, keep a row of figures for each, and say what holds.
+    """Test the paper's claims: train what they need, keep a row of figures for each training, and say what holds.
 
     What is kept is not trained again: the same command continues, and claims share trainings.
     """
 
     claims: tuple[str, ...] = ()
-    """1 to 17, or comparisons by the names with which --list ends; by default all."""
+    """1 to 17, or comparisons by the names at the end of --list; by default all."""
     scenes: tuple[str, ...] = ()
-    """Of the declared scenes, on which not every claim is tested; by default all."""
+    """Names of declared scenes, on which not every claim is tested; by default all."""
     data: Path = field(default_factory=lambda: Path(os.environ.get("CA_REG_DATA", "data")))
-    """Where the folders of the declared scenes are, each with the name of its scene; by default $CA_REG_DATA."""
+    """Parent of the declared scenes' folders, each named like its scene; by default $CA_REG_DATA, else data."""
     scene: Annotated[OwnScene, tyro.conf.arg(name="")] = field(default_factory=OwnScene)
     recipe: str = "3dgs"
-    """Of all trainings but those that are about another."""
+    """Recipe of all trainings that do not name another."""
     iterations: int = 3_000
     """Steps of every training, to which all schedules are scaled."""
     seeds: int = 3
     """Number of seeds; a claim needs two to be judged."""
     list: bool = False
-    """List the trainings, which are kept and how long the others may take; train nothing."""
+    """List the trainings, with those that are kept and the time that the others may take; train nothing."""
     pages: tuple[Path, ...] = ()
-    """Write what is kept between the marks of these Markdown files; train nothing."""
+    """Update these Markdown files with what is kept, between their marks; train nothing."""
     figure: Path | None = None
-    """Draw what dropout and noise change by their strength and the number of views into this PNG; train nothing."""
+    """Plot the effect of dropout and noise against their strength and the number of views; train nothing."""
     out: Path = Path("runs/paper")
-    """Folder for the trainings at work, which are removed when they are kept."""
+    """Folder for the trainings, each removed once its row is kept."""
     rows: Path | None = None
-    """Folder of what is kept, NAME.json for each scene; by default --out."""
+    """Folder of the kept rows, NAME.json for each scene; by default --out."""
     jobs: int = 1
     """Trainings at a time."""
     device: Device = "cpu"

@@ -26,22 +26,22 @@ from reference_trainer.scenes.scene import View, Viewpoint
 __all__ = ["Evaluation", "ViewScores", "ca_picture", "error_picture", "evaluate", "glance"]
 
 CA_PICTURE_RANGE = 0.02
-"""Variance that gets the brightest color in CA heat maps."""
+"""Variance that maps to the brightest color of CA heat maps."""
 ERROR_PICTURE_RANGE = 0.25
-"""Absolute error, the mean of the channels, that gets the brightest color."""
+"""Absolute error, averaged over channels, that maps to the brightest color."""
 
 
 @dataclass(frozen=True)
 class ViewScores:
-    """What was measured at one view; nan where a quantity does not exist, as ``psnr`` without a photograph.
+    """What was measured at one view; nan where a quantity does not exist, such as ``psnr`` without a photograph.
 
-    ``ca`` is the paper's protocol; ``ca_half`` the same at a drop rate of 0.5 for every model, which compares models of
-    different dropout rates on equal terms; ``ca_exact`` the limit for infinitely many samples, at the drop rate of
-    ``ca`` and over the pixels whose expected alpha is above 0.8; ``ca_exact_half`` the same at a drop rate of 0.5;
-    ``ca_neutral`` that of ``ca_exact`` with every pixel over its own expected color, which the background has no part
-    in; ``visible`` the share of pixels that ``ca`` covers; ``covered`` the mean alpha of the test-time image;
-    ``depth_abs_rel`` to ``depth_log10`` the `DepthErrors` of the test-time image where the true depth is known;
-    ``ca_reason`` why ``ca`` is nan, if it is.
+    ``ca`` follows the paper's protocol; ``ca_half`` does so at drop rate 0.5 for every model, which compares models of
+    different dropout rates on equal terms. ``ca_exact`` is the limit for infinitely many samples, at the drop rate of
+    ``ca`` and over the pixels whose expected alpha is above 0.8; ``ca_exact_half`` the same at drop rate 0.5;
+    ``ca_neutral`` is ``ca_exact`` with every pixel composited on its own expected color, so that the background does
+    not count. ``visible`` is the share of pixels that ``ca`` covers, ``covered`` the mean alpha of the test-time image.
+    ``depth_abs_rel`` to ``depth_log10`` are the `DepthErrors` of the test-time image where the true depth is known.
+    ``ca_reason`` says why ``ca`` is nan, if it is.
     """
 
     name: str
@@ -76,9 +76,9 @@ class Evaluation:
     def mean(self, split: str, quantity: str) -> float:
         """Return the mean of a quantity over the views of a split that have it; nan if none has.
 
-        Of ``ca_std_error`` it is the standard error of the mean of ``ca``: the masks of a view are drawn from the seed
-        and its position alone, independently of those of the others, so the squares of the errors add up. nan if a view
-        that has a score has no error, as with two samples.
+        For ``ca_std_error`` it is the standard error of the mean of ``ca``: masks are drawn independently for every
+        view, from the seed and its position, so the squared errors add up. nan if a view has a score without an error,
+        as with two samples.
         """
         views = [view for view in self.views if view.split == split]
         if quantity == "ca_std_error":
@@ -113,8 +113,8 @@ def evaluate(
 ) -> Evaluation:
     """Measure a model at views, with their photographs or without.
 
-    Images are compared as floats clamped to [0, 1], without a detour over 8 bits. Where a view has a mask, PSNR counts
-    the pixels inside it, and SSIM and LPIPS see white outside: the DTU protocol.
+    Images are compared as floats clamped to [0, 1], not rounded to 8 bits. If a view has a mask, PSNR counts the pixels
+    inside it, and SSIM and LPIPS see white outside (the DTU protocol).
 
     Args:
         model: what to measure.
@@ -122,12 +122,11 @@ def evaluate(
         samples: K of the CA score.
         seed: of the CA score's masks.
         perceptual: a perceptual metric, or None to leave it out.
-        pictures: a folder with one for each split, for two PNG files per view: the render, and a panel of photograph,
-            render, error and CA map, or without a photograph of the render and the maps of all CA scores; None for no
-            pictures.
-        keep: a file for the scores of the views that are done, see `KeptRecords`: an interrupted evaluation continues
-            with the next view. The caller removes it when the result is written.
-        say: receives the number and the name of each view before it is measured, and the time left.
+        pictures: folder for two PNG files per view, ``<split>/<view>``: the render, and a panel of photograph, render,
+            error and CA map, or without a photograph of render, CA, exact CA and neutral CA; None for no pictures.
+        keep: file for the scores of finished views, see `KeptRecords`: an interrupted evaluation continues with the
+            next view. The caller removes it once the result is written.
+        say: receives the number and name of each view before it is measured, and the time left.
 
     Returns:
         Scores per view and their means.
@@ -143,7 +142,7 @@ def evaluate(
     members = [(split, *each) for split, group in views.items() for each in enumerate(group)]
     names = [name for group in views.values() for name in file_names([view.name for view in group])]
     photographs = (view.image.to(model.background.device) for _, _, view in members if isinstance(view, View))
-    # Weights of one name may differ: what the metric says of a photograph tells.
+    # Weights may differ under one name: the metric of a photograph and its mirror image tells them apart.
     metric = perceptual and [perceptual.name, *(float(perceptual(x, x.flip(2))) for x in islice(photographs, 1))]
     kept = KeptRecords(keep, (model, views, samples, seed, metric, machine()), say)
     done: list[ViewScores] = []
@@ -172,7 +171,7 @@ def _measure(
     perceptual: LPIPS | None,
     files: Sequence[Path],
 ) -> ViewScores:
-    """Measure one view, and write its picture and its panel if there are files for them."""
+    """Measure one view, and write its render and its panel if ``files`` names them."""
     opacities = model.gaussians.opacities
     truth = view.depth if isinstance(view, View) else None
     out = model.test_rendering(view, depth=truth is not None)
@@ -184,7 +183,7 @@ def _measure(
         pair = on_white(image, view.mask), on_white(view.image, view.mask)
         quality = psnr(image, view.image, view.mask), ssim(*pair), math.nan if perceptual is None else perceptual(*pair)
     found: dict[Any, CAResult] = {}
-    for score in scores:  # those of dropout at 1/2 are the same twice
+    for score in scores:  # some coincide for models trained without dropout, whose drop rate is 1/2 anyway
         if score.settings not in found:
             found[score.settings] = score(opacities, view, index=index)
     ca, half, exact, exact_half, neutral = (found[score.settings] for score in scores)
@@ -221,11 +220,11 @@ def _measure(
 
 @torch.no_grad()
 def glance(model: TrainedModel, view: View) -> dict[str, Tensor]:
-    """Return what is worth a look while a model trains: pictures of a view, and the shares of the exact score.
+    """Return what is worth watching while a model trains: pictures of a view, and the shares of the exact score.
 
     Returns:
-        ``"render"``, ``"error"`` and ``"co-adaptation"``, (3, H, W), and of the Gaussians that have one ``"log10 of
-        share"``; both of the latter at drop rate 1/2.
+        ``"render"``, ``"error"`` and ``"co-adaptation"``, (3, H, W), and ``"log10 of share"`` of the Gaussians that
+        have a share; the last two at drop rate 1/2.
     """
     image = model.test_rendering(view).image.clamp(0, 1)
     score = model.exact_ca_score(drop_rate=0.5)
@@ -235,15 +234,15 @@ def glance(model: TrainedModel, view: View) -> dict[str, Tensor]:
 
 
 def _maps(results: Mapping[str, CAResult]) -> dict[str, Tensor]:
-    """Return the pictures of scores by name and value."""
+    """Return the maps of scores, titled with name and value."""
     return {f"{name} {result.value * 1e3:.2f}e-3": ca_picture(result) for name, result in results.items()}
 
 
 def ca_picture(result: CAResult) -> Tensor:
-    """Return the variance of a score as a picture (3, H, W), gray where a pixel does not count."""
+    """Return the variance of a score as a heat map (3, H, W), gray where a pixel does not count."""
     return heat_map(result.variance.masked_fill(~result.visible, math.nan).float(), CA_PICTURE_RANGE)
 
 
 def error_picture(image: Tensor, photograph: Tensor) -> Tensor:
-    """Return the absolute difference of two pictures (3, H, W), mean of the channels, as a picture."""
+    """Return the absolute difference of two pictures (3, H, W), averaged over channels, as a heat map."""
     return heat_map((image - photograph).abs().mean(0), ERROR_PICTURE_RANGE)

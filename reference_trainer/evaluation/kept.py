@@ -1,4 +1,4 @@
-"""Finished parts of a long measurement, kept in a file so that it continues where it was interrupted."""
+"""Finished parts of a long measurement, kept in a file so that it can continue where it was interrupted."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from reference_trainer.json_files import read_json
 __all__ = ["PARTIAL", "KeptRecords", "fingerprint"]
 
 PARTIAL = "evaluation.partial.json"
-"""What the file is called in the folder of an evaluation."""
+"""Name of the file in the folder of an evaluation."""
 
 
 class KeptRecords:
-    """What was measured so far, by key; every record is on the disk before the next one is measured.
+    """What was measured so far, by key; every record is on disk before the next one is measured.
 
-    Records that were made under anything else than ``depends_on``, and those of a damaged file, are not used: the
-    measurement starts anew, and says so. Whoever has written the final result removes the file.
+    Records made under another ``depends_on``, or in a damaged file, are deleted: the measurement starts anew, and says
+    so. The caller removes the file once the final result is written.
 
     Args:
         file: where to keep them; None keeps nothing.
-        depends_on: all that decides the records, see `fingerprint`.
-        say: receives what became of the records that were there.
+        depends_on: everything the records depend on, see `fingerprint`.
+        say: receives what became of existing records.
 
     Raises:
-        OSError: if the file is there and cannot be read.
+        OSError: if the file exists and cannot be read or removed.
 
     Example:
         >>> import tempfile
@@ -64,20 +64,20 @@ class KeptRecords:
                 say(f"{len(records)} measured before, kept: {file}")
                 return
             reason = "they belong to another model, scene, setting or machine"
-        # At once: the first picture of the new measurement must not be found beside an old record.
+        # Immediately, or a picture of the new measurement could be taken for that of an old record.
         file.unlink()
         say(f"records of an interrupted measurement in {file} are not used, {reason}: everything is measured anew")
 
     def get(self, key: str, files: Iterable[Path] = ()) -> dict[str, Any] | None:
-        """Return a record, or None if there is none, or one of the files that were written with it is gone."""
+        """Return a record, or None if there is none or one of the files written with it is gone."""
         record = self._records.get(key)
         return record if record is not None and all(file.is_file() for file in files) else None
 
     def add(self, key: str, record: Mapping[str, Any]) -> None:
-        """Keep a record of strings and numbers, nan and infinity among them.
+        """Keep a record of strings and numbers, including nan and infinity.
 
         Raises:
-            OSError: if it cannot be written; the records before it are kept.
+            OSError: if it cannot be written; earlier records are kept.
         """
         if self._file is None:
             return
@@ -89,8 +89,8 @@ class KeptRecords:
 def fingerprint(x: object) -> str:
     """Return a digest of tensors, numbers, strings and None, nested in dataclasses, mappings, lists and tuples.
 
-    Equal values give equal digests in every process; the device of a tensor counts, because results depend on it.
-    Raises TypeError if there is anything else.
+    Equal values give equal digests in every process; a tensor's device counts, because results depend on it.
+    Raises TypeError for anything else.
 
     Example:
         >>> fingerprint([torch.zeros(2), 3]) == fingerprint([torch.zeros(2), 3]) != fingerprint([torch.zeros(2), 4])
@@ -103,12 +103,12 @@ def fingerprint(x: object) -> str:
 
 
 def _digest(records: object) -> str:
-    """Return a digest of what JSON makes of records, the same before it is written and after it is read."""
+    """Return a digest of records as JSON, the same before writing and after reading."""
     return fingerprint(json.dumps(records))
 
 
 def _parts(x: object) -> Iterator[Any]:
-    """Iterate over buffers that tell values apart: what has parts says their number first."""
+    """Yield buffers that encode a value unambiguously: a sequence is preceded by its length."""
     if isinstance(x, Tensor):
         yield f"{x.dtype} {tuple(x.shape)} {x.device};".encode()
         yield x.detach().cpu().reshape(-1).contiguous().view(torch.uint8).numpy()

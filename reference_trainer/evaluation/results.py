@@ -1,4 +1,4 @@
-"""Results as data: JSON files, Markdown tables, means with their spread, and the machine they come from."""
+"""Results as data: JSON files, Markdown tables, means with their spread, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _ABSENT = "n/a"
 
 
 def write_json(path: str | Path, data: object) -> None:
-    """Write nested plain data as indented JSON; the file appears at once or not at all, missing folders are made.
+    """Write nested plain data as indented JSON, atomically; missing folders are made.
 
-    NaN and infinities become null, because JSON has no word for them. Raises TypeError for what is no plain data, among
-    it keys that are no strings, and OSError if the file cannot be written.
+    NaN and infinities become null, because JSON cannot represent them. Raises TypeError for anything but plain data,
+    including keys that are no strings, and OSError if the file cannot be written.
 
     Example:
         >>> import tempfile
@@ -40,7 +40,7 @@ def write_json(path: str | Path, data: object) -> None:
 
 
 def mean_std(values: Iterable[float]) -> tuple[float, float]:
-    """Return mean and sample standard deviation (divided by n - 1) of the finite values; nan of none, or of one.
+    """Return mean and sample standard deviation (n - 1) of the finite values; nan if there are too few.
 
     Example:
         >>> mean_std([1.0, 3.0, math.nan])
@@ -52,10 +52,10 @@ def mean_std(values: Iterable[float]) -> tuple[float, float]:
 
 
 def format_mean_std(values: Iterable[float], *, unit: float = 1.0) -> str:
-    """Return mean and spread as text: two digits of the deviation, and the mean to the same place.
+    """Return mean and standard deviation as text: two digits of the deviation, the mean to the same place.
 
     Values that are not finite are left out, and the text says how many remain; a mean without a deviation has four
-    digits, and no value at all is ``"n/a"``. ``unit`` is what one counts in: with 1e-3, 0.0023 is written 2.3.
+    digits, and no value at all gives ``"n/a"``. Values are in units of ``unit``: with 1e-3, 0.0023 is written 2.3.
 
     Example:
         >>> format_mean_std([20.39, 20.51, 20.63])
@@ -75,16 +75,16 @@ def format_mean_std(values: Iterable[float], *, unit: float = 1.0) -> str:
         return _ABSENT
     if not std > 0:
         return f"{_number(mean)}{' ± 0' if std == 0 else ''}{note}"
-    # Rounding first: a deviation of 0.0999 is 0.10, which has one place less.
+    # Round first: a deviation of 0.0999 becomes 0.10, with one decimal less.
     decimals = max(0, 1 - math.floor(math.log10(float(f"{std:.1e}"))))
     return f"{mean:.{decimals}f} ± {std:.{decimals}f}{note}"
 
 
 def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
-    """Return rows, mappings from column to content, as a Markdown table with a line break at its end.
+    """Return rows, mappings from column to content, as a Markdown table that ends with a line break.
 
-    Text is kept, fractions get four digits; what is missing, None or not finite becomes ``n/a``. The columns, at least
-    one, are also the headers; the first is aligned left, the others right.
+    Text is kept, floats get four digits; what is missing, None or not finite becomes ``n/a``. The columns, at least
+    one, are also the headers; the first is left-aligned, the others right-aligned.
 
     Example:
         >>> print(markdown_table([{"run": "baseline", "PSNR": 19.36}, {"run": "dropout"}], ["run", "PSNR"]), end="")
@@ -111,14 +111,14 @@ def machine() -> dict[str, str | int]:
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "torch": str(torch.__version__),  # with its build, such as +cpu, which an index's metadata may leave out
+        "torch": str(torch.__version__),  # with its build, such as +cpu, which the package metadata may lack
         "kornia": version("kornia"),
         "ca_reg": ca_reg.__version__,
         "cpu": _cpu_name(),
         "cores": os.cpu_count() or 0,
         "threads": torch.get_num_threads(),
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
-        "engine": describe_engine("cpu"),  # what draws on the processor
+        "engine": describe_engine("cpu"),
     }
 
 
@@ -127,7 +127,7 @@ def _plain(data: object) -> object:
     if isinstance(data, float):
         return data if math.isfinite(data) else None
     if isinstance(data, Mapping):
-        # json.dumps would turn the key 1 into "1" and None into "null" without a word.
+        # json.dumps would silently turn the key 1 into "1" and None into "null".
         if wrong := [key for key in data if not isinstance(key, str)]:
             raise TypeError(f"keys must be strings, got {wrong[0]!r}.")
         return {key: _plain(value) for key, value in data.items()}
@@ -143,14 +143,14 @@ def _cell(value: object) -> str:
 
 
 def _number(value: float) -> str:
-    """Return four significant digits, and never fewer than all before the point."""
+    """Return a number with four significant digits, but with all digits before the decimal point."""
     if not math.isfinite(value):
         return _ABSENT
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def _cpu_name() -> str:
-    """Return the processor's name; Linux tells it in /proc only."""
+    """Return the processor's name; on Linux only /proc has it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""What Gaussians contribute to the renders, how much of the score is theirs, and how much they co-adapt for it."""
+"""Per-Gaussian attribution: weight in the renders, share of the exact score, and their quotient."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ __all__ = [
 ]
 
 PER_WEIGHT_SCALE = (0.1, 10.0)
-"""Ends of the color scale of shares per blend weight, in units of the mean."""
+"""Ends of the color scale for shares per blend weight, in units of the mean."""
 
 _TOP = (0.001, 0.01, 0.1)
 
 
 @dataclass(frozen=True)
 class Heat:
-    """How much every Gaussian of a model co-adapts for what it contributes to some views.
+    """How much every Gaussian of a model co-adapts relative to its contribution to some views.
 
     Args:
-        shares: of `mean_shares`, (N,).
-        weights: of `blend_weights`, (N,).
+        shares: from `mean_shares`, (N,).
+        weights: from `blend_weights`, (N,).
         results: the exact score of every view.
     """
 
@@ -49,9 +49,9 @@ class Heat:
 
     @classmethod
     def of(cls, model: TrainedModel, views: Sequence[Viewpoint], *, drop_rate: float = 0.5) -> Heat:
-        """Measure a model; arguments and errors are those of `mean_shares`, and a ValueError if all scores are 0.
+        """Measure a model; arguments and errors are those of `mean_shares`, plus a ValueError if all scores are 0.
 
-        The weights are those of the plain opacities where the ones of the test depend on the camera.
+        If the test-time opacities depend on the camera, the weights are those of the plain opacities.
         """
         shares, results = mean_shares(model, views, drop_rate=drop_rate)
         if not shares.any():
@@ -65,19 +65,19 @@ class Heat:
 
     @property
     def mean(self) -> float:
-        """The score over the sum of the weights."""
+        """The mean heat: the score over the sum of the weights."""
         return (self.shares.sum() / self.weights.sum()).item()
 
     @property
     def ranks(self) -> Tensor:
-        """The part of the Gaussians that comes before each in the order of the heat, (N,), in [0, 1)."""
+        """The fraction of Gaussians that precede each one by increasing heat, (N,), in [0, 1)."""
         return self.values.argsort().argsort() / len(self.shares)
 
 
 def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:
-    """Return the weight with which every Gaussian enters the test-time renders, summed over all pixels and views.
+    """Return the weight of every Gaussian in the test-time renders, summed over all pixels and views.
 
-    The image is linear in the colors, so the weights are the gradient of its sum: no approximation.
+    The image is linear in the colors, so these are exactly the gradient of its sum.
 
     Args:
         model: what to measure.
@@ -95,15 +95,15 @@ def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:
 
 
 def share_per_weight(shares: Tensor, weights: Tensor) -> Tensor:
-    """Return how much Gaussians co-adapt for what they contribute.
+    """Return how much Gaussians co-adapt relative to what they contribute.
 
     Args:
         shares: shape (N,), float64.
-        weights: of `blend_weights`, shape (N,).
+        weights: from `blend_weights`, shape (N,).
 
     Returns:
-        The quotients, shape (N,): 0 for a Gaussian without a share, infinite for one that only shows where others are
-        dropped.
+        The quotients, shape (N,): 0 for a Gaussian without a share, infinite for one that is visible only when others
+        are dropped.
 
     Example:
         >>> share_per_weight(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([4.0, 0.0, 0.0]))
@@ -113,7 +113,7 @@ def share_per_weight(shares: Tensor, weights: Tensor) -> Tensor:
 
 
 def all_but_highest(values: Tensor, fraction: float) -> Tensor:
-    """Return who stays, (N,) bool, without that fraction of all Gaussians whose values (N,) are highest and not 0."""
+    """Return a mask (N,) that excludes the ``fraction`` of all Gaussians with the highest values, (N,), if positive."""
     first = values.argsort(descending=True, stable=True)[: round(fraction * len(values))]
     keep = torch.ones_like(values, dtype=torch.bool)
     keep[first[values[first] > 0]] = False
@@ -121,7 +121,7 @@ def all_but_highest(values: Tensor, fraction: float) -> Tensor:
 
 
 def colored_by(gaussians: Gaussians, values: Tensor, low: float, high: float) -> Gaussians:
-    """Return the same Gaussians with a color that tells a value, see `heat_colors`, the same from every direction."""
+    """Return the same Gaussians in view-independent colors that show a value each, see `heat_colors`."""
     colors = heat_colors(values, low, high).to(gaussians.sh_dc)
     return replace(gaussians, sh_dc=((colors - 0.5) / SH_C0)[:, None], sh_rest=torch.zeros_like(gaussians.sh_rest))
 
@@ -129,7 +129,7 @@ def colored_by(gaussians: Gaussians, values: Tensor, low: float, high: float) ->
 def mean_shares(
     model: TrainedModel, views: Sequence[Viewpoint], *, drop_rate: float = 0.5
 ) -> tuple[Tensor, list[CAResult]]:
-    """Split the exact score of several views over the Gaussians.
+    """Attribute the exact score of several views to the Gaussians.
 
     Args:
         model: what to measure.
@@ -137,8 +137,8 @@ def mean_shares(
         drop_rate: of the score.
 
     Returns:
-        Shares, mean over the views that have a score, shape (N,), float64, which add up to the mean of these scores;
-        and the result of every view.
+        Shares, averaged over the views that have a score, shape (N,), float64, which add up to the mean score; and the
+        result of every view.
 
     Raises:
         ValueError: if no view has a score.
@@ -148,20 +148,20 @@ def mean_shares(
 
 
 def mean_effects(model: TrainedModel, views: Sequence[Viewpoint], *, drop_rate: float = 0.5) -> Tensor:
-    """Return the total effects of the Gaussians in the same way as `mean_shares` their shares."""
+    """Return the total effects of the Gaussians, averaged as the shares in `mean_shares`."""
     score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
     return _mean_over_views(lambda view: total_effects(score, opacities, view), views)[0]
 
 
 def concentration(shares: Tensor) -> dict[str, float]:
-    """Return how few Gaussians hold how much of the score.
+    """Return how concentrated the score is on few Gaussians.
 
     Args:
         shares: at least 0, not all 0, shape (N,).
 
     Returns:
-        Under ``"top 1%"`` and the like the part of the score that this part of the Gaussians holds, the largest shares
-        first; under ``"half"`` the smallest part of the Gaussians that holds half of the score.
+        Under ``"top 1%"`` and the like the fraction of the score held by the Gaussians with the largest shares; under
+        ``"half"`` the smallest fraction of the Gaussians that holds half of the score.
 
     Example:
         >>> shares = torch.ones(1000)
@@ -183,7 +183,7 @@ def _mean_over_views(
     for view in views:
         values, result = measure(view)
         results.append(result)
-        total = total.to(values) + values  # all 0 without a score
+        total = total.to(values) + values  # values are 0 without a score
     count = sum(result.reason is Reason.OK for result in results)
     if count == 0:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Scores as Markdown tables: of one evaluation, of a run, of a comparison. CA is in units of 1e-3."""
+"""Scores as Markdown tables, for one evaluation, a run or a comparison. CA is in units of 1e-3."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _NOT_EVERYWHERE = ("psnr", "ssim", "lpips", "depth_abs_rel", "depth_rmse", "dept
 
 
 def evaluation_table(data: Mapping[str, Any]) -> str:
-    """Return one row per view and the means of the splits; what only some views have only if one has it.
+    """Return one row per view and the means of the splits, without quantities that no view has.
 
     The data are those of `Evaluation.as_dict`, or of a file that holds them, such as ``results.json``.
     """
@@ -54,11 +54,11 @@ def summary(results: dict[str, Any]) -> str:
 
 
 def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Return one row per strategy, every entry the mean and sample standard deviation over the seeds.
+    """Return one row per strategy with means and sample standard deviations over the seeds.
 
-    CA is the paper's protocol, whose drop rate depends on p; "exact CA at 1/2" is the limit of
-    infinitely many samples that drop half of the Gaussians, whatever the model was trained with.
-    Of a scene without test views there is the exact CA instead, at and around the training views.
+    CA follows the paper's protocol, whose drop rate depends on p; "exact CA at 1/2" is the limit of infinitely many
+    samples at drop rate 1/2, whatever the model was trained with. Without test views, exact CA at, between and around
+    the training views takes its place.
 
     Args:
         runs: for every strategy the content of ``results.json`` of each seed.
@@ -82,7 +82,7 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
 
 
 def _table(first: str, rows: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
-    """Return labelled rows of quantities in their units; None and nan become n/a."""
+    """Return labeled rows of quantities in their units; None and nan become n/a."""
     cells: list[dict[str, object]] = []
     for label, row in rows.items():
         known = {_TITLES.get(name, name): row[name] / _unit(name) for name in names if row[name] is not None}
@@ -91,5 +91,5 @@ def _table(first: str, rows: Mapping[str, Mapping[str, Any]], names: Sequence[st
 
 
 def _unit(name: str) -> float:
-    """Return what a quantity is counted in."""
+    """Return the unit in which a quantity is shown."""
     return 1e-3 if name.startswith("ca") else 1.0

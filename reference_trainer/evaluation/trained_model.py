@@ -1,4 +1,4 @@
-"""A trained model and the ways to render and to score it."""
+"""A trained model, and how it is rendered and scored."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ __all__ = ["MaskedRenders", "TrainedModel"]
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """A trained model and how it is to be used at test time.
+    """A trained model and how it is used at test time.
 
     Args:
         gaussians: the parameters.
         background: color behind them, shape (3,).
-        regularizer: what it was trained with, an expression of `ca_reg.regularizers.parse`; it decides what is rendered
-            at test time, and the drop rate of the paper's CA protocol.
-        step: of the training, which schedules follow.
+        regularizer: what it was trained with, an expression for `ca_reg.regularizers.parse`; it decides the test-time
+            opacities and the drop rate of the paper's CA protocol.
+        step: of the training, for schedules.
         sh_degree: highest band of spherical harmonics to use; None for all.
-        for_rendering: whether the opacities are those of the test already, and the plain ones are not known.
+        for_rendering: whether the opacities are the test-time ones already and the plain ones are unknown.
     """
 
     gaussians: Gaussians
@@ -51,34 +51,34 @@ class TrainedModel:
 
     @cached_property
     def chain(self) -> Chain:
-        """The regularizers of the training."""
+        """The regularizers it was trained with."""
         return parse(self.regularizer)
 
     @property
     def dropout(self) -> float:
-        """The share of the Gaussians that every step left out, all alike and without making up for it; 0 for others."""
+        """The rate of all uniform, uncompensated dropout combined, at ``step``; 0 without any."""
         rates = [m.rates(self._plain) for m in self.chain if isinstance(m, GaussianDropout) and not m.compensate]
         return 1.0 - math.prod(1.0 - float(rate) for rate in rates)
 
     @property
     def factor(self) -> float | None:
-        """The factor of all opacities at test time; None where it depends on the Gaussian."""
+        """The factor on all opacities at test time; None if it depends on the Gaussian."""
         uniform = all(isinstance(member, GaussianDropout) or not member.renders_mean for member in self.chain)
         return 1.0 - self.dropout if uniform else None
 
     @property
     def depends_on_camera(self) -> bool:
-        """Whether the opacities at test time are others for every camera: no file of Gaussians can hold them."""
+        """Whether the test-time opacities depend on the camera, so that no file of Gaussians can hold them."""
         return any(member.renders_mean and "view_matrix" in member.needs for member in self.chain)
 
     @property
     def without_camera(self) -> TrainedModel:
-        """The model itself, or the plain one where the opacities at test time are others for every camera."""
+        """The model itself, or if its test-time opacities depend on the camera, the one with plain opacities."""
         return replace(self, regularizer="") if self.depends_on_camera else self
 
     @property
     def test_opacities(self) -> Tensor:
-        """The opacities to render with at test time, shape (N,), if they do not depend on the camera."""
+        """The test-time opacities, shape (N,); only for models where they do not depend on the camera."""
         return self._tested(self._plain).opacities
 
     @property
@@ -89,17 +89,17 @@ class TrainedModel:
         return x if self.for_rendering else self.chain.expected(x)
 
     def test_rendering(self, view: Viewpoint, *, depth: bool = False) -> Rendering:
-        """Render a view as at test time, with its depth or without; co-adaptation goes by the plain opacities."""
+        """Render a view with the test-time opacities; CA is measured on the plain ones instead, see `render`."""
         tested = self._tested(self.gaussians.params(view.camera, step=self.step))
         return render_gaussians(tested, view.camera, self.background, sh_degree=self.sh_degree, depth=depth)
 
     def render(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
-        """Render a view with given opacities (N,): the render callable of `CAScore`; image (3, H, W), alpha (H, W)."""
+        """Render a view with given opacities (N,), the render function of `CAScore`: image (3, H, W), alpha (H, W)."""
         out = self.rendering(opacities, view)
         return out.image, out.alpha
 
     def rendering(self, opacities: Tensor, view: Viewpoint) -> Rendering:
-        """Render a view with given opacities (N,), with everything that the renderer tells."""
+        """Render a view with given opacities (N,); return everything the renderer gives."""
         return render_gaussians(
             self.gaussians, view.camera, self.background, opacities=opacities, sh_degree=self.sh_degree
         )
@@ -107,7 +107,7 @@ class TrainedModel:
     def moments(
         self, opacities: Tensor, view: Viewpoint, multiplier: Multiplier, background: Tensor | None = None
     ) -> MomentImages:
-        """Render the exact moments of a view under random factors: the moments callable of `CAScore`.
+        """Render the exact moments of a view under random factors: the ``exact`` function of `CAScore`.
 
         The background is the model's own, or one of shape (3,) or (3, H, W).
         """
@@ -118,7 +118,7 @@ class TrainedModel:
     def shares(
         self, opacities: Tensor, view: Viewpoint, multiplier: Multiplier, background: Tensor | None, weights: Tensor
     ) -> Tensor:
-        """Attribute a weighted sum of the variance to the Gaussians: the shares callable of `ca_reg.attribute`.
+        """Attribute a weighted sum of the variance to the Gaussians: the shares function of `ca_reg.attribute`.
 
         The background is the model's own, or one of shape (3,) or (3, H, W); the pixels' weights have shape (H, W). The
         result is float64, shape (N,), 0 for Gaussians outside the view.
@@ -129,26 +129,26 @@ class TrainedModel:
         return shares
 
     def splats(self, opacities: Tensor, view: Viewpoint) -> Splats:
-        """Project the model with given opacities (N,) and list it per tile."""
+        """Project the model with given opacities (N,) and bin the splats into tiles."""
         return splat(**arguments(self.gaussians, opacities), camera=view.camera, sh_degree=self.sh_degree)
 
     def ca_score(
         self, *, samples: int = 5, drop_rate: float | None = None, seed: int = 0, render_fn: RenderFn | None = None
     ) -> CAScore:
-        """Return the paper's CA protocol for this model; ``render_fn`` is for one that changes."""
+        """Return the paper's CA protocol for this model; pass a ``render_fn`` if the model still changes."""
         renders = render_fn or MaskedRenders(self)
         return CAScore(renders, samples=samples, p=self.dropout, drop_rate=drop_rate, seed=seed)
 
     def exact_ca_score(self, *, drop_rate: float | None = None, neutral: bool = False) -> CAScore:
-        """Return its limit for infinitely many samples, over the region of expected alpha above 0.8."""
+        """Return the limit of `ca_score` for infinitely many samples, over the pixels of expected alpha above 0.8."""
         return CAScore(exact=self.moments, p=self.dropout, drop_rate=drop_rate, neutral=neutral)
 
 
 class MaskedRenders:
-    """The render callable of a `CAScore` over a model that does not change.
+    """The render function of a `CAScore` for a model that does not change.
 
-    Projection, colors, tile lists and their order are made once for a view, for all Gaussians, and the masks of a view
-    are drawn in one pass. The images are those of `TrainedModel.render`.
+    Projection, colors and sorted tile lists are computed once per view, for all Gaussians, and all masks of a view are
+    drawn in one pass. The images are those of `TrainedModel.render`.
 
     Args:
         model: what to render.
@@ -165,9 +165,9 @@ class MaskedRenders:
         return images[0], alphas[0]
 
     def many(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
-        """Render a view with each of some opacities (K, N); images (K, 3, H, W), alphas (K, H, W)."""
+        """Render a view with K sets of opacities (K, N); images (K, 3, H, W), alphas (K, H, W)."""
         plain = self._model.gaussians.opacities
-        if bool((opacities > plain).any()):  # the lists would be too short
+        if bool((opacities > plain).any()):  # the lists for the plain opacities would be too short
             return draw_masks(self._model.splats(opacities.amax(0), view), opacities, background=self._model.background)
         if self._splats is None or view is not self._view:
             self._view, self._splats = view, self._model.splats(plain, view)

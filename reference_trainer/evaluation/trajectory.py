@@ -1,4 +1,4 @@
-"""Viewpoints from given ones: flights through cameras, and what a scene is measured from."""
+"""Viewpoints derived from cameras: flights through them, and the views that a scene is measured at."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["interpolate_cameras", "measured_views"]
 
 
 def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """Move through cameras in their order, in equal steps: positions on straight lines, orientations on great arcs.
+    """Move through cameras in order, in equal steps: positions along straight lines, orientations along great arcs.
 
-    ``frames`` counts the first and the last given camera; intrinsics and size are those of the first. Raises ValueError
-    if there are fewer than two cameras or frames.
+    ``frames`` includes the first and the last camera; intrinsics and size are those of the first. Raises ValueError if
+    there are fewer than two cameras or frames.
 
     Example:
         >>> first = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
@@ -41,9 +41,9 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 def measured_views(scene: Scene, say: Callable[[str], None]) -> dict[str, Sequence[Viewpoint]]:
     """Return the views of a scene that a model is measured at, by split: ``"train"`` and ``"test"``.
 
-    Where all photographs are trained on, which is said, viewpoints without one take the place of the test views:
-    ``"between"``, half the way from each training camera to its nearest neighbor, and ``"around"``, as far away on the
-    other side. The orientation turns on at the same rate. A single camera has neither.
+    If all photographs are trained on, viewpoints without one replace the test views, and ``say`` is told so:
+    ``"between"``, halfway from each training camera to its nearest neighbor, and ``"around"``, as far in the opposite
+    direction. Orientations are inter- and extrapolated alike. A single camera has neither.
     """
     if scene.test:
         return {"train": scene.train, "test": scene.test}

@@ -1,1 +1,1 @@
-"""One HTML page about runs, which needs nothing but a browser: figures, pictures, and the models to turn around."""
+"""A self-contained HTML page about runs: figures, pictures, and the models in an interactive 3D view."""

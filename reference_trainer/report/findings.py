@@ -1,4 +1,4 @@
-"""What a report shows of one run: its pictures, and how much every Gaussian co-adapts for what it contributes."""
+"""What a report shows of one run: its pictures, and how much every Gaussian co-adapts relative to its contribution."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ __all__ = ["Findings", "find"]
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found of a run.
+    """What a report knows about a run.
 
     Args:
         label: what the page calls it.
         model: at its last checkpoint.
-        opacities: that it is drawn with, (N,).
+        opacities: that the page draws it with, (N,).
         scene: what it was trained on.
-        views: what it is looked at from, by split; those that were not trained on come first.
-        pictures: per view, by ``"render"``, ``"error"`` and ``"co-adaptation"``, and a ``"caption"``.
-        heat: of the exact score over these views; None if no view has a score.
+        views: that it is shown from, by split, the training views last.
+        pictures: per view, ``"render"`` and where they exist ``"error"`` and ``"co-adaptation"``, and a ``"caption"``.
+        heat: of the exact score over these views; None if there is no score to attribute.
         notes: what is missing, and why.
     """
 
@@ -51,16 +51,16 @@ class Findings:
     notes: list[str]
 
     def packed(self, low: float, high: float) -> dict[str, Any]:
-        """Return the model as the page draws it: arrays of little-endian numbers in base64.
+        """Return the model as the page draws it, with arrays as little-endian numbers in base64.
 
         ``geometry`` holds 16 float32 per Gaussian: position (3), opacity, covariance (xx, xy, xz, yy, yz, zz), rank by
-        share per weight in [0, 1), 0, color of the heat (3), 0. ``colors`` holds the coefficients of the spherical
-        harmonics, (N, (degree + 1)^2, 3) in float16. ``held`` is the part of the score that the highest ranks hold, for
-        0, 1, ... 100 % of the Gaussians.
+        share per weight in [0, 1), 0, color of the heat (3), 0. ``colors`` holds the spherical harmonics coefficients,
+        (N, (degree + 1)^2, 3) in float16. ``held`` is the fraction of the score held by the 0, 1, ... 100 % of the
+        Gaussians of highest rank.
 
         Args:
-            low: share per weight that gets the darkest color.
-            high: the one that gets the brightest.
+            low: share per weight of the darkest color.
+            high: share per weight of the brightest color.
         """
         gaussians, n = self.model.gaussians, len(self.model.gaussians)
         axes = rotation_matrices(gaussians.quaternions) * gaussians.scales[:, None]
@@ -85,7 +85,7 @@ class Findings:
         }
 
     def attribution(self) -> dict[str, object]:
-        """Return how few Gaussians hold how much of the score; empty without one."""
+        """Return the row of the table on how concentrated the score is; empty without heat."""
         if self.heat is None:
             return {}
         held = concentration(self.heat.shares)
@@ -97,12 +97,12 @@ class Findings:
 
 @torch.no_grad()
 def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
-    """Draw a run's last checkpoint from its views, and split the exact score at drop rate 1/2 over its Gaussians.
+    """Draw a run's last checkpoint from its views, and attribute the exact score at drop rate 1/2 to its Gaussians.
 
     Args:
         run: its folder.
         label: what the page calls it.
-        views: how many of each split, evenly chosen.
+        views: how many of each split, evenly spaced.
         device: where to render.
 
     Raises:
@@ -126,7 +126,7 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
 
 
 def _pictures(model: TrainedModel, view: Viewpoint, result: CAResult | None) -> dict[str, str]:
-    """Return the pictures of a view and what stands below them."""
+    """Return the pictures of a view and their caption."""
     image = model.test_rendering(view).image.clamp(0, 1)
     found, said = {"render": jpeg(image)}, []
     if isinstance(view, View):

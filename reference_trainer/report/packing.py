@@ -1,4 +1,4 @@
-"""Pictures and numbers as text that stands in a page."""
+"""Pictures and numbers as text to embed in a page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["data_uri", "jpeg", "numbers"]
 
 
 def data_uri(content: bytes, kind: str) -> str:
-    """Return content of a MIME type as an address that needs no file.
+    """Return content of the MIME type ``kind`` as a data URI.
 
     Example:
         >>> data_uri(b"<svg/>", "image/svg+xml")
@@ -23,14 +23,14 @@ def data_uri(content: bytes, kind: str) -> str:
 
 
 def jpeg(image: Tensor) -> str:
-    """Return an image (3, H, W) in [0, 1] as the address of a JPEG of high quality."""
+    """Return an image (3, H, W) in [0, 1] as the data URI of a high-quality JPEG."""
     file = BytesIO()
     as_pillow(image).save(file, "JPEG", quality=93, subsampling=0)
     return data_uri(file.getvalue(), "image/jpeg")
 
 
 def numbers(x: Tensor, kind: str) -> str:
-    """Return a tensor, row by row, as numbers of a NumPy type in base64.
+    """Return a tensor, row-major, as numbers of the NumPy type ``kind`` in base64.
 
     Example:
         >>> import torch

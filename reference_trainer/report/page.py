@@ -1,4 +1,4 @@
-"""The page: what was found of every run, and what the runs left in their folders, as one HTML file."""
+"""The report page: the `Findings` of every run and the files of its folder as one HTML file."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ def write_report(
     device: str = "cpu",
     say: Callable[[str], None] = print,
 ) -> Path:
-    """Write a page about runs on one scene that opens without a server and without a network.
+    """Write a page about runs on one scene that opens without a server or a network.
 
-    It shows what was trained on what, the scores, CA and PSNR against the step, every model to turn around (all
-    together) in its colors or in the heat of its co-adaptation, the views as photograph, render, error and CA map, and
-    how few Gaussians hold how much of the score. The heat is the share of the exact score at drop rate 1/2 per blend
-    weight, over the views of the page, on one logarithmic scale for all runs around the mean of the first. What a run
+    It shows what was trained on what, the scores, CA and PSNR against the step, every model in 3D (all turn together)
+    in its colors or its co-adaptation heat, the views as photograph, render, error and CA map, and how concentrated the
+    score is on few Gaussians. The heat is the share of the exact score at drop rate 1/2 per blend weight, over the
+    views of the page, on one logarithmic scale for all runs around the mean of the first run that has one. What a run
     lacks is left out, and the page says so.
 
     Args:
         runs: their folders, finished or not.
-        out: the file; by default ``report.html`` in the folder of the run, or in the one that all of them are in.
-        views: how many views of each split are shown and looked from, evenly chosen.
+        out: the file; by default ``report.html`` in the folder of the run, or in the deepest folder common to all.
+        views: how many views of each split are shown and measured, evenly spaced.
         device: where to render.
         say: receives the progress.
 
@@ -87,7 +87,7 @@ def write_report(
 
 
 def labels(runs: Sequence[Path]) -> list[str]:
-    """Return what each run is called: its folder, as far down from the others as needed to tell them apart.
+    """Return a label for each run: its path below the folder common to all, the name of a single one.
 
     Raises:
         ValueError: if there is no run, or one is given twice.
@@ -104,7 +104,7 @@ def labels(runs: Sequence[Path]) -> list[str]:
 
 
 def _part(name: str) -> str:
-    """Return a file that the page is made of."""
+    """Return the text of one of the page's template files."""
     return (files(__package__) / name).read_text("utf-8")
 
 
@@ -156,7 +156,7 @@ def _settings(runs: dict[str, Path]) -> str:
 
 
 def _dynamics(runs: dict[str, Path]) -> tuple[str, list[str]]:
-    """Return the figure of CA and PSNR against the step as an address, empty without any, and what is missing."""
+    """Return the figure of CA and PSNR against the step as a data URI, empty without data, and notes on gaps."""
     logged, missing = {}, []
     for label, run in runs.items():
         try:
@@ -173,7 +173,7 @@ def _dynamics(runs: dict[str, Path]) -> tuple[str, list[str]]:
 
 
 def _views(found: Sequence[Findings]) -> list[dict[str, Any]]:
-    """Return every view with its camera, its photograph, and its pictures of every run that was measured there."""
+    """Return every view with its camera, its photograph, and the pictures of every run that was drawn there."""
     views: dict[tuple[str, str, str], dict[str, Any]] = {}
     for number, each in enumerate(found):
         pictures = iter(each.pictures)

@@ -1,1 +1,1 @@
-"""Runs: from photographs to scores in a folder, many of them side by side, and anyone's model in place of a run."""
+"""Runs, from photographs to scores in a folder; grids of runs; and measuring anyone's PLY like a run."""

@@ -1,4 +1,4 @@
-"""Give a finished model the opacities of the test for viewers, once."""
+"""Bake test-time opacities into a finished model, for viewers that know nothing of regularizers."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ __all__ = ["bake_ply"]
 
 
 def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> str:
-    """Write a PLY with the opacities that a model is to be rendered with, such as times 1 - p after dropout p.
+    """Write a PLY with a model's test-time opacities, such as those times 1 - p after dropout p.
 
-    Viewers know nothing of regularizers and would show the plain opacities. A header comment records what was done;
-    with it, no program of this package does it again. The layout is that of `save_ply`; unknown properties are left
-    out.
+    A header comment records what was done, so that no program of this package does it again. The layout is that of
+    `save_ply`; unknown properties are dropped.
 
     Args:
         source: the PLY of a model that was trained with regularizers, opacities plain.
         target: the file to write; it must not exist.
-        regularizer: what it was trained with, such as ``"dropout(0.2)"``, where the PLY does not say so.
+        regularizer: what it was trained with, such as ``"dropout(0.2)"``, if the PLY does not say.
 
     Returns:
         The expression of the regularizers.
 
     Raises:
-        ValueError: if nobody says what it was trained with, the expression cannot be understood, the test-time
-            opacities are the plain ones, or those of the source are scaled already.
+        ValueError: if the regularizers are unknown or cannot be parsed, the test-time opacities are the plain ones or
+            depend on the camera, or those of the source are test-time ones already.
         FileExistsError: if the target exists: plain opacities are needed to train on and are never overwritten.
         FileNotFoundError: if there is no source.
 

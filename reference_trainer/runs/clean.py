@@ -1,4 +1,4 @@
-"""Take out of a finished model what co-adapts most for what it contributes."""
+"""Remove from a finished model the Gaussians that co-adapt most relative to their contribution."""
 
 from __future__ import annotations
 
@@ -35,28 +35,28 @@ def clean_ply(
     device: str = "cpu",
     say: Callable[[str], None] = print,
 ) -> dict[str, Evaluation]:
-    """Write a model without the Gaussians of the highest share of the exact score per blend weight, then refined.
+    """Write a model without the Gaussians of highest share of the exact score per blend weight, and refined.
 
-    Shares, at drop rate 1/2, and weights are those of the training views, or of the orbit. What is taken out leaves
-    holes, which a few steps on the photographs close; without a scene they stay, and so they do with ``refine=0``.
+    Shares (at drop rate 1/2) and weights are measured at the training views, or at those of the orbit. The removal
+    leaves holes, which a few training steps on the photographs close; without a scene or with ``refine=0`` they stay.
 
     Args:
         ply: a standard 3DGS PLY.
         where: its scene, or an orbit around it.
         out: the file to write, opacities plain; it must not exist.
-        fraction: of the Gaussians to take out, in (0, 1); those without a share stay.
+        fraction: of the Gaussians to remove, in (0, 1); those without a share stay.
         refine: training steps afterwards, without densification, with the regularizers of the model.
-        background: as of `score_ply`.
-        regularizer: as of `score_ply`.
+        background: as in `score_ply`.
+        regularizer: as in `score_ply`.
         device: where to render and train.
-        say: receives the progress and a table: quality and co-adaptation before and after.
+        say: receives the progress, and a table of quality and co-adaptation before and after.
 
     Returns:
-        The evaluations of the table, by its rows.
+        The evaluations by row of the table.
 
     Raises:
-        ValueError: as `score_ply`, if ``fraction`` or ``refine`` is out of range, no view has a score, or the opacities
-            of the PLY are those of the test, which cannot be trained.
+        ValueError: as `score_ply`, if ``fraction`` or ``refine`` is out of range, no view has a score, or the PLY has
+            only test-time opacities, which cannot be trained.
         FileExistsError: if ``out`` exists.
         FileNotFoundError: if the PLY or the scene is missing.
     """
@@ -84,7 +84,7 @@ def clean_ply(
 
 
 def refined(model: TrainedModel, scene: Scene, steps: int, device: str = "cpu") -> TrainedModel:
-    """Return a model after some steps of training on a scene, with the learning rates of the end of a training.
+    """Return a model after some more training steps on a scene, at the final learning rate of the means.
 
     No Gaussian is added or removed. Errors are those of `Trainer`.
     """
@@ -100,7 +100,7 @@ def refined(model: TrainedModel, scene: Scene, steps: int, device: str = "cpu") 
 
 
 def _table(found: dict[str, Evaluation]) -> str:
-    """Return the means of every split before and after."""
+    """Return a table with the means of every split, one row per model."""
     rows: list[dict[str, object]] = []
     for name, evaluation in found.items():
         row: dict[str, object] = {"model": name, "Gaussians": evaluation.gaussians}

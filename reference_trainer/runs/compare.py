@@ -1,4 +1,4 @@
-"""The same training with different regularizers over several scenes and seeds."""
+"""Comparisons: the same training with different regularizers over several scenes and seeds."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ NAMED: dict[str, set[str]] = {
     "analytic-dropout": {"dropout"},
     "analytic-noise": {"noise"},
 }
-"""The settings of the paper's comparison, and dropout and noise in expectation: which rates they keep."""
+"""Strategies of the paper's comparison, and analytic dropout and noise: which of the two rates each uses."""
 
 
 def strategies(
     names: Sequence[str], config: TrainConfig, *, dropout: float = 0.2, noise: float = 0.8
 ) -> dict[str, TrainConfig]:
-    """Return the settings of a comparison, by a name that may be that of a folder.
+    """Return the settings of a comparison, by names that can serve as folder names.
 
     Args:
         names: keys of `NAMED`, or expressions of regularizers, such as ``"d2gs"`` or ``"dropout(0.1) + noise(0.4)"``.
         config: everything else.
-        dropout: rate of those of `NAMED`.
-        noise: standard deviation of those of `NAMED`.
+        dropout: rate for those of `NAMED`.
+        noise: standard deviation for those of `NAMED`.
 
     Raises:
-        ValueError: if an expression cannot be understood, or ``config`` has regularizers beyond the two rates.
+        ValueError: if an expression cannot be parsed, or ``config`` is analytic or has a ``regularizer``.
 
     Example:
         >>> made = strategies(["analytic-dropout", "dropout(0.1) + noise(0.4)"], TrainConfig())
@@ -68,12 +68,12 @@ def strategies(
 
 
 def scene_folders(paths: Sequence[str], options: SceneOptions, out: Path) -> dict[Path, SceneOptions]:
-    """Return the folder of the comparison of every scene: ``out`` for a single one, else ``out/<name of the scene>``.
+    """Return the scenes of a comparison by folder: ``out`` for a single scene, else ``out/<scene name>`` for each.
 
     Args:
         paths: of the scenes, or ``"synthetic"``.
-        options: all other options, which hold for every scene.
-        out: folder of the whole.
+        options: all other options, shared by all scenes.
+        out: folder of the comparison.
 
     Raises:
         ValueError: if there is no scene, or two have the same name.
@@ -87,7 +87,7 @@ def scene_folders(paths: Sequence[str], options: SceneOptions, out: Path) -> dic
     names = [path if path == "synthetic" else Path(path).resolve().name for path in paths]
     if not names or len(set(names)) < len(names):
         raise ValueError(f"expected at least 1 scene, and scenes whose folders have different names, got {[*paths]}.")
-    shared = dataclasses.asdict(options)  # a command line may have a class of its own, which workers need not know
+    shared = dataclasses.asdict(options)  # the command line may pass a subclass, which workers need not import
     return {
         out if len(names) == 1 else out / name: SceneOptions(**shared | {"path": path})
         for name, path in zip(names, paths, strict=True)
@@ -103,14 +103,13 @@ def compare(
     """Train every strategy on every scene with every seed; finished runs are kept, interrupted ones continue.
 
     Args:
-        scenes: by folder of the comparison; run k of a strategy lives in ``<folder>/<strategy>/seed_<k>``.
+        scenes: by folder of the comparison; the run with seed k is in ``<folder>/<strategy>/seed_<k>``.
         configs: settings by name of the strategy.
         seeds: of the runs; they replace the seed of the settings.
-        running: where and how the runs are done.
+        running: where and how the runs are executed.
 
     Returns:
-        For every folder the results of the runs that finished, and why the others did not. Both are also written
-        there.
+        For every folder the results of the finished runs and the failures of the others; both are also written there.
 
     Raises:
         ValueError: if there is nothing to run, or a scene lacks what a term of the loss needs.
@@ -147,5 +146,5 @@ def compare(
 
 
 def _label(name: str, seed: int) -> str:
-    """Return what a run is called among those of its scene."""
+    """Return the label of a run among those of its scene."""
     return f"{name}, seed {seed}"

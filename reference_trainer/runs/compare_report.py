@@ -1,4 +1,4 @@
-"""What a comparison leaves: its results as JSON, a table with mean and spread, figures, and the list of failed runs."""
+"""The output of a comparison: results as JSON, a table with mean and spread, figures, and the list of failed runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Comparison:
 
 
 def save(comparison: Comparison, out: Path) -> None:
-    """Write the results as JSON, and the table if there is anything to put into it.
+    """Write the results as JSON, and the table if any run finished.
 
     Args:
         comparison: the results.

@@ -1,4 +1,4 @@
-"""Figures: an empty one; of a comparison, dynamics, and the same test view under every strategy."""
+"""Figures of a comparison: CA and PSNR during training, and one view under every strategy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["comparison_figure", "dynamics_figure", "new_figure"]
 
 @contextmanager
 def new_figure(path: Path) -> Iterator[Figure]:
-    """Give an empty figure to draw into, which becomes a PNG or what else the name of ``path`` ends in, such as SVG."""
+    """Yield an empty figure, and save it on exit in the format of the extension of ``path``, such as PNG or SVG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -46,15 +46,15 @@ def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
 
 
 def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split: str = "test") -> None:
-    """Lay the panels (photograph, render, error, CA map) of one view under several strategies below each other.
+    """Stack the panels (photograph, render, error, CA map) of one view under several strategies.
 
     Args:
         runs: folder of each run by label.
         path: the PNG to write.
-        view: what the files of the view are called, see `file_names`.
-        split: ``"train"`` or ``"test"``.
+        view: name of the view's files, see `file_names`.
+        split: of the view, such as ``"test"``.
     """
     panels = [read_image(folder / "views" / split / f"{view}{PANEL}.png")[0] for folder in runs.values()]
-    widest = max(panel.shape[2] for panel in panels)  # labels with more digits make narrow pictures' panels wider
+    widest = max(panel.shape[2] for panel in panels)  # long labels widen the panels of narrow pictures
     panels = [pad(panel, (0, widest - panel.shape[2]), value=1.0) for panel in panels]
     save_png(path, side_by_side(panels, list(runs), columns=1))

@@ -1,4 +1,4 @@
-"""The folder of a run: what its files are called, and which run it belongs to."""
+"""The folder of a run: the names of its files, and the settings that claim it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RESULTS = "results.json"
 
 
 def folder_name(text: str) -> str:
-    """Return a name of a folder for an expression, such as that of a regularizer.
+    """Return a folder name for an expression, such as that of a regularizer.
 
     Example:
         >>> folder_name("dropout(0.1) + noise(0.4)"), folder_name("")
@@ -38,17 +38,17 @@ def folder_name(text: str) -> str:
 
 
 def claim(options: SceneOptions, config: TrainConfig) -> dict[str, Any]:
-    """Return the content of ``config.json``: the run that a folder belongs to."""
+    """Return the content of ``config.json``, which claims a folder for one run."""
     return {"scene": dataclasses.asdict(options.absolute()), "config": dataclasses.asdict(config)}
 
 
 def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
     """Return the scene and the training of a run from its ``config.json``.
 
-    A setting that the file lacks is at its default: the version that wrote it did not have it yet.
+    Settings that the file lacks, because an older version wrote it, take their defaults.
 
     Raises:
-        ValueError: if the file is not such a file, or holds a setting that there is not or that is out of range.
+        ValueError: if the file is not a run's ``config.json``, or holds an unknown or invalid setting.
         OSError: if it cannot be read.
 
     Example:
@@ -69,17 +69,17 @@ def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
 def begun_with(
     out: Path, options: SceneOptions, config: TrainConfig, *, auto: bool, given: Collection[str]
 ) -> TrainConfig | None:
-    """Return the settings that a run in a folder began with, None if none has begun.
+    """Return the settings that the run in a folder began with, None if none has begun.
 
     Args:
         out: the folder.
-        options: the scene.
-        config: what is asked for.
-        auto: whether the plan that the run began with, if any, belongs to what is asked for.
+        options: the requested scene.
+        config: the requested training.
+        auto: whether to apply the plan that the run began with, if any, to ``config``.
         given: the settings that no plan changes.
 
     Raises:
-        ValueError: if the folder holds another run, or a damaged file.
+        ValueError: if the folder holds a run with other settings, or a damaged file.
     """
     if not (out / CONFIG).exists():
         return None

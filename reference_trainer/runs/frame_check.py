@@ -1,4 +1,4 @@
-"""Tell whether the cameras of a scene see a model that was trained elsewhere: both must be in one frame."""
+"""Check whether the cameras of a scene see a model trained elsewhere, that is, whether both share one frame."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from reference_trainer.scenes.scene import Scene
 __all__ = ["check_frame"]
 
 NEARLY_NONE = 0.01
-"""Share of the Gaussians, below which cameras are said not to see a model: stray ones are everywhere."""
+"""Share of the Gaussians below which a camera counts as blind to a model: stray ones may be anywhere."""
 
 
 def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[str]:
-    """Count the Gaussians in the pictures of a scene's cameras, before anything is rendered.
+    """Count, before anything is rendered, the Gaussians that the cameras of a scene see.
 
-    Gaussians count by their centers: at least 0.2 in front of the camera, where the renderer begins, and inside the
-    picture. Those of an opacity below 1/255 are never drawn and do not count.
+    A Gaussian counts if its center is beyond the near plane (0.2) and inside the picture, and its opacity is at least
+    1/255: fainter ones are never drawn.
 
     Args:
         gaussians: the model.
-        scene: its cameras, of both splits.
-        name: of the model, for the messages.
+        scene: with the cameras, of both splits.
+        name: of the model, for messages.
 
     Returns:
         Doubts: one line about the cameras that see less than 1 %, nothing if all see more.
 
     Raises:
-        ValueError: if all cameras together see less than 1 %; the message says where the model and the cameras are.
+        ValueError: if no Gaussian can be drawn, or all cameras together see less than 1 %.
     """
     drawn = gaussians[gaussians.opacities >= MIN_ALPHA]
     count, means = len(drawn), drawn.means
@@ -48,7 +48,7 @@ def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[st
     if seen < NEARLY_NONE * count:
         behind = int((~before).all(0).sum())
         center = means.double().median(0).values
-        reach = (means - center).norm(dim=1).kthvalue(-(-98 * count // 100)).values  # without the stray ones
+        reach = (means - center).norm(dim=1).kthvalue(-(-98 * count // 100)).values  # without stray ones
         rig = torch.stack([view.camera.position for view in views]).double()
         forward = torch.stack([view.camera.forward for view in views]).double().mean(0)
         raise ValueError(

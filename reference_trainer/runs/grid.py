@@ -1,4 +1,4 @@
-"""A grid of runs on an engine: finished runs are kept, interrupted ones continue, failing ones do not stop the rest."""
+"""Grids of runs on an engine: finished runs are kept, interrupted ones continue, failing ones do not stop the rest."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Run:
         label: what to call it.
         options: the scene.
         config: the training.
-        out: folder of the run, which no other run of the grid has.
+        out: folder of the run, unique within the grid.
     """
 
     label: str
@@ -39,14 +39,14 @@ class Run:
 
 @dataclass(frozen=True)
 class Running:
-    """How the runs of a grid are done, which changes none of their results.
+    """How the runs of a grid are executed; this does not affect what is trained.
 
     Args:
-        engine: where to.
+        engine: where to run.
         retries: how many dead workers of one run are replaced; each continues from the last checkpoint.
         device: where to train.
         monitor_every: steps between measurements of CA and PSNR; 0 for none.
-        checkpoint_every: steps between checkpoints: what a dead worker costs at most.
+        checkpoint_every: steps between checkpoints, the most that a dead worker costs.
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         say: receives a line about every run and every worker that died.
 
@@ -73,17 +73,17 @@ class Running:
 def run_grid(
     runs: Sequence[Run], running: Running, *, done: Callable[[Run, dict[str, Any]], None] = lambda run, results: None
 ) -> list[dict[str, Any] | Failure]:
-    """Do all runs; what is finished already is read here and not given to a worker.
+    """Execute all runs; finished ones are read in this process instead.
 
-    The folders of the runs are made here, so that a worker on another machine knows whether it sees the same ones.
+    The folders of the runs are made here, so that a worker on another machine can tell whether it shares them.
 
     Args:
-        runs: what to do.
+        runs: what to run.
         running: where and how.
-        done: is called here with each run that is finished and its results, before other runs begin.
+        done: called in this process with each finished run and its results, before another run takes its place.
 
     Returns:
-        For every run the content of ``results.json``, or why there is none.
+        For every run the content of ``results.json``, or its failure.
     """
     outcomes: dict[int, dict[str, Any] | Failure] = {}
 
@@ -106,7 +106,7 @@ def run_grid(
     numbers = list(tasks)
     for index, outcome in run_all(running.engine, list(tasks.values()), retries=running.retries, say=running.say):
         note(numbers[index], outcome, "now")
-    for number in numbers:  # a run that another sweep was at work on failed here, and may be finished by now
+    for number in numbers:  # a run that failed here because another sweep held its folder may be finished by now
         if isinstance(outcomes[number], Failure) and (runs[number].out / RESULTS).exists():
             note(number, _read(runs[number]), "meanwhile")
     return [outcomes[number] for number in range(len(runs))]
@@ -115,10 +115,10 @@ def run_grid(
 def train_run(
     options: SceneOptions, config: TrainConfig, out: Path, engine: str, how: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Do or continue one run, in a worker; see `run_experiment` for how, and `use_engine` for what draws.
+    """Start or continue one run in a worker; ``how`` is for `run_experiment`, ``engine`` for `use_engine`.
 
     Raises:
-        FileNotFoundError: if the folder of the run is not there, because this machine does not share it.
+        FileNotFoundError: if the folder of the run does not exist, because this machine does not share it.
     """
     if not out.is_dir():
         raise FileNotFoundError(
@@ -130,17 +130,17 @@ def train_run(
 
 
 def _read(run: Run) -> Value | Failure:
-    """Return the results of a finished run; one of other settings is refused."""
+    """Return the results of a finished run, or a failure if it has other settings."""
     return attempt(Task(run.label, run_experiment, _where(run)), torch.get_num_threads())
 
 
 def _where(run: Run) -> tuple[SceneOptions, TrainConfig, Path]:
-    """Return what a run is and where it lives; workers have other working directories."""
+    """Return scene, training and folder of a run with absolute paths: a worker's working directory may differ."""
     return run.options.absolute(), run.config, run.out.resolve()
 
 
 def _line(outcome: dict[str, Any] | Failure, when: str) -> str:
-    """Return an outcome in a few words."""
+    """Summarize an outcome in one line."""
     if isinstance(outcome, Failure):
         return f"FAILED, {outcome.error}"
     mean = outcome["mean"]

@@ -1,4 +1,4 @@
-"""One process at a time in the folder of a run."""
+"""A lock that admits one process at a time to the folder of a run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 __all__ = ["LOCK", "FolderInUseError", "run_lock"]
 
 LOCK = ".lock"
-_HOLDER = ".lock.holder"  # beside the lock, because Windows lets nobody read a file that is locked
+_HOLDER = ".lock.holder"  # a separate file, because on Windows a locked file cannot be read
 _KNOWN_HOLDER = re.compile(r"process \d+ on [\w.-]+")
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOLCK)
 
@@ -25,18 +25,17 @@ class FolderInUseError(RuntimeError):
 
 @contextmanager
 def run_lock(folder: Path) -> Iterator[None]:
-    """Keep every other process that asks for the same lock out of a folder; the folder is made if it is missing.
+    """Lock a folder, made if missing, against other processes that ask for the same lock.
 
-    The lock belongs to the operating system, which releases it when the process ends, however it ends: there are no
-    stale locks, although the empty file ``.lock`` stays. Whoever does not ask for the lock, such as a reader, is not
-    kept out. On a network file system that supports locks it holds for all machines. On one that does not, the folder
-    is used without, with a warning.
+    The operating system releases the lock when the process ends, however it ends: there are no stale locks, although
+    the empty file ``.lock`` stays. The lock is advisory: readers are not kept out. On a network file system that
+    supports locks it holds across machines; on one that does not, a warning is issued and the folder used unlocked.
 
     Args:
         folder: of the run.
 
     Raises:
-        FolderInUseError: if it is locked; nothing in the folder was touched. It does not wait.
+        FolderInUseError: at once, if the folder is locked; nothing in it was touched.
         OSError: if the lock file cannot be made.
 
     Example:
@@ -51,7 +50,7 @@ def run_lock(folder: Path) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     folder.mkdir(parents=True, exist_ok=True)
-    # Where the system has no locks, filelock would fall back to a marker file, which outlives a killed process.
+    # Without locks in the system, filelock would fall back to a marker file, which outlives a killed process.
     lock = FileLock(folder / LOCK, fallback_to_soft=False)
     try:
         lock.acquire(blocking=False)
@@ -81,13 +80,13 @@ def run_lock(folder: Path) -> Iterator[None]:
 
 
 def _note_holder(folder: Path) -> None:
-    """Leave word who holds the lock; a courtesy, for which no run must fail."""
+    """Record who holds the lock; best effort, because no run must fail over it."""
     with suppress(OSError):
         (folder / _HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
 
 
 def _holder(folder: Path) -> str:
-    """Return who holds the lock as far as known."""
+    """Return who holds the lock, as far as known."""
     with suppress(OSError, ValueError), (folder / _HOLDER).open(encoding="utf-8") as file:
         text = file.read(200)
         if _KNOWN_HOLDER.fullmatch(text):

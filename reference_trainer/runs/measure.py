@@ -1,4 +1,4 @@
-"""Measure a model on a scene, and draw what has been trained before."""
+"""Measure a trained model on a scene, and render it."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def of_run(run: Path, device: str = "cpu", *, regularizer: str | None = None) ->
     Args:
         run: folder of the run.
         device: where to render.
-        regularizer: render as if it had been trained with these, such as "noise(0.8, scale=True)" where the training
-            was the same with "noise(0.8)"; by default with what it was.
+        regularizer: treat the model as if it had been trained with these, such as "noise(0.8, scale=True)" for a run
+            with "noise(0.8)"; by default with those of the run.
 
     Raises:
         FileNotFoundError: if the folder holds no run.
-        ValueError: if the expression cannot be understood.
+        ValueError: if the expression cannot be parsed.
     """
     trainer = load_run(run, device)
     model = model_of(trainer)
@@ -63,13 +63,13 @@ def measure(
 ) -> Evaluation:
     """Measure a model at views; write ``evaluation.json``, ``evaluation.md`` and pictures, and print the table.
 
-    If it is interrupted, the same call continues with the next view.
+    After an interruption, the same call continues with the next view.
 
     Args:
         model: what to measure.
         views: by split, see `evaluate`.
         out: folder for the results.
-        about: what else is written to the JSON file, such as the name of the scene.
+        about: further entries of the JSON file, such as the name of the scene.
         samples: K of the CA score.
         seed: of its masks.
         perceptual: a perceptual metric.
@@ -108,8 +108,8 @@ def render_run(
     Args:
         run: folder of the run.
         what: ``"test"``, ``"train"``, or ``"flight"`` through the training cameras.
-        out: folder for PNG files, and a GIF of a flight; ``<run>/render_<what>`` by default.
-        frames: pictures of a flight.
+        out: folder for PNG files, and for a flight also a GIF; ``<run>/render_<what>`` by default.
+        frames: number of pictures of a flight.
         device: where to render.
         say: receives where the pictures are.
 

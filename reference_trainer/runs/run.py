@@ -1,4 +1,4 @@
-"""One run from photographs to scores: train, monitor, checkpoint, evaluate, write pictures. Resumable at any point."""
+"""One run from photographs to scores: train, monitor, checkpoint, evaluate, write pictures; resumable at any point."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ __all__ = ["load_run", "model_of", "run_experiment", "save_for_viewers"]
 
 
 def model_of(trainer: Trainer) -> TrainedModel:
-    """Return the trainer's model as it is to be used at test time."""
+    """Return the trainer's current model, for use at test time."""
     return TrainedModel(
         gaussians=trainer.gaussians.map(Tensor.detach),
         background=trainer.background,
@@ -67,13 +67,13 @@ def save_for_viewers(model: TrainedModel, path: Path, *, pad_to_degree: int | No
     Args:
         model: what to write.
         path: the file.
-        pad_to_degree: as of `save_ply`.
+        pad_to_degree: as in `save_ply`.
     """
     factor = model.factor
     trained_with: dict[str, Any] = {"regularizer": model.regularizer, "step": model.step}
     if factor is None:
         save_ply(model.gaussians, path, opacities=model.test_opacities, pad_to_degree=pad_to_degree, **trained_with)
-    else:  # which a reader can take out again
+    else:  # a uniform factor, which a reader can undo
         save_ply(model.gaussians, path, bake_p=1 - factor, pad_to_degree=pad_to_degree, **trained_with)
 
 
@@ -93,30 +93,30 @@ def run_experiment(
     watch: Callable[[Trainer], None] = lambda trainer: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Train on a scene and measure the result; what a former call has done already is not done again.
+    """Train on a scene and measure the result; continues where an earlier call stopped.
 
-    The folder receives ``config.json`` with the settings that are trained with, with ``auto`` also ``plan.json`` with
-    the reasons for those that were not asked for, ``checkpoint.pt``, ``ca.jsonl`` with TensorBoard events,
-    ``point_cloud.ply`` with the plain opacities (where those of the test are others, as after dropout,
-    also ``point_cloud_for_viewers.ply`` with them, marked), ``views/`` with pictures of every view,
-    and ``results.json``, which marks the run as complete. While it is written it is locked (`run_lock`).
+    The folder receives ``config.json`` with the settings of the training; with ``auto`` also ``plan.json`` with the
+    reasons for those that were not asked for; ``checkpoint.pt``; ``ca.jsonl`` and TensorBoard events;
+    ``point_cloud.ply`` with the plain opacities, and if the test-time ones differ, as after dropout, also
+    ``point_cloud_for_viewers.ply`` with those, marked; ``views/`` with pictures of every view; and ``results.json``,
+    which marks the run as complete. It is locked while it is written to (`run_lock`).
 
     Args:
         options: the scene; random initial points use the seed of ``config``.
         config: all settings of the training.
         out: folder of this run.
-        auto: leave out what the scene does not need (`make_plan`). A run that is continued keeps the plan it began
-            with, or goes on without one if it began without.
+        auto: leave out what the scene does not need (`make_plan`). A continued run keeps the plan it began with, or
+            none if it began without.
         given: with ``auto``, fields of ``config`` that the plan must not change although they are at their default.
         device: where to train.
         monitor_every: steps between measurements of CA and PSNR; 0 for none. A training of fewer steps is measured at
             its end.
-        monitor_pictures: whether each shows TensorBoard what `CAMonitor` calls details.
+        monitor_pictures: whether each measurement also logs the ``details`` of `CAMonitor` (see `glance`).
         checkpoint_every: steps between checkpoints.
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         progress: whether to show a progress bar.
-        watch: called after every step, and before every view is measured, with what must not be changed.
-        say: receives a line about what is happening.
+        watch: called with the trainer, which it must not change, after every step and before each view is measured.
+        say: receives lines about what is happening.
 
     Returns:
         The content of ``results.json``.
@@ -125,24 +125,24 @@ def run_experiment(
         ValueError: if the folder holds a run with other settings, or a damaged file.
         FolderInUseError: if another process is at work in the folder; nothing there was touched.
         TrainingStoppedError: if training cannot go on; the last checkpoint is kept, and the message names it.
-        TrainingInterrupted: on Ctrl-C, after a checkpoint has been saved; a second Ctrl-C does not wait for it. After
-            SIGTERM the checkpoint is saved, too, and the signal raised again, which ends the process.
-        OSError: if a file cannot be written, such as on a full disk; what was there before is kept.
+        TrainingInterrupted: on Ctrl-C, after a checkpoint has been saved; a second Ctrl-C does not wait for it. On
+            SIGTERM a checkpoint is saved as well, and the signal is raised again, which ends the process.
+        OSError: if a file cannot be written, such as on a full disk; its previous content is kept.
     """
     config.check()
     perceptual = load_lpips(lpips, device=device)
     begun_with(out, options, config, auto=auto, given=given)
     if (out / RESULTS).exists():
         return _complete(out, say)
-    scene = options.load(seed=config.seed)  # before the folder is made: a mistyped scene must not claim it
+    scene = options.load(seed=config.seed)  # before the folder is made, so that a mistyped scene does not claim it
     for note in scene.notes:
         say(note)
     with run_lock(out), threads_for(scene.pixels):
-        begun = begun_with(out, options, config, auto=auto, given=given)  # by another process since, perhaps to its end
+        begun = begun_with(out, options, config, auto=auto, given=given)  # perhaps since, by another process
         if (out / RESULTS).exists():
             return _complete(out, say)
         settings = _planned(scene, config, out, auto=auto, given=given, say=say) if begun is None else begun
-        remove_leftovers(out, below=False)  # below may be what an evaluation of the run writes at this moment
+        remove_leftovers(out, below=False)  # an evaluation of the run may be writing to a subfolder right now
         remove_leftovers(out / VIEWS)
         resumed = (out / CHECKPOINT).exists()
         trainer = Trainer.load(out / CHECKPOINT, scene, device) if resumed else Trainer(scene, settings, device)
@@ -155,7 +155,7 @@ def run_experiment(
             shared: dict[str, Any] = {"resumed": resumed, "progress": progress, "watch": watch, "say": say}
             _train(trainer, out, monitor_every, checkpoint_every, pictures=monitor_pictures, **shared)
 
-        def go_on(text: str) -> None:  # a page that is open is drawn between the views that are measured, too
+        def go_on(text: str) -> None:  # keeps an open viewer page drawn while views are measured
             say(text)
             watch(trainer)
 
@@ -176,7 +176,7 @@ def load_run(folder: Path, device: torch.device | str = "cpu") -> Trainer:
 
 
 def _complete(out: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return the results of a run that is complete."""
+    """Return the results of a complete run."""
     say(f"{out}: complete, nothing to do")
     return read_results(out)
 
@@ -184,9 +184,9 @@ def _complete(out: Path, say: Callable[[str], None]) -> dict[str, Any]:
 def _planned(
     scene: Scene, config: TrainConfig, out: Path, *, auto: bool, given: Collection[str], say: Callable[[str], None]
 ) -> TrainConfig:
-    """Return the settings that a run begins with, and write the plan that they come from, if they come from one."""
+    """Return the settings that a run begins with; with ``auto`` those of a plan, which is written."""
     if not auto:
-        (out / PLAN).unlink(missing_ok=True)  # of a run that ended before it had begun
+        (out / PLAN).unlink(missing_ok=True)  # left by a run that stopped before its config.json was written
         return config
     plan = make_plan(scene, config, given=given)
     write_json(out / PLAN, plan.as_dict())
@@ -199,14 +199,14 @@ def _planned(
 
 @contextmanager
 def _saved_at_the_end(trainer: Trainer, out: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """Save a training that is interrupted, and say what is left of one that cannot go on."""
+    """Save a training that is interrupted; if it cannot go on, add to the error where the last checkpoint is."""
     checkpoint = out / CHECKPOINT
     try:
         yield
     except TrainingInterrupted as stop:
         trainer.save(checkpoint)
         say(f"{out}: saved at step {trainer.step} of {trainer.config.iterations}; the same command continues there")
-        if stop.signal == signal.SIGTERM:  # who sent it expects the process to end by it
+        if stop.signal == signal.SIGTERM:  # its sender expects the process to die of it
             sys.stdout.flush()
             signal.raise_signal(signal.SIGTERM)
         raise
@@ -227,7 +227,7 @@ def _train(
     watch: Callable[[Trainer], None],
     say: Callable[[str], None],
 ) -> None:
-    """Train to the end with a monitor and checkpoints on the way."""
+    """Train to the end, with monitoring and checkpoints."""
     last = trainer.config.iterations
 
     def checkpoint(trainer: Trainer) -> None:
@@ -246,7 +246,7 @@ def _train(
     score = model_of(trainer).ca_score(render_fn=render_now)
     views = {"train": trainer.views, "test": [view.to(trainer.device) for view in trainer.scene.test]}
 
-    def quality(opacity: Tensor, view: View) -> float:  # the monitor's own scaling knows of dropout only
+    def quality(opacity: Tensor, view: View) -> float:  # the monitor's own test-time scaling knows only dropout
         return psnr(model_of(trainer).test_rendering(view).image.clamp(0, 1), view.image)
 
     def details(opacity: Tensor, view: View) -> dict[str, Tensor]:
@@ -263,7 +263,7 @@ def _train(
     ) as monitor:
         say(f"{out}: CA and PSNR go to {' and '.join(monitor.backends)} every {monitor_every} steps")
 
-        if trainer.step > 0:  # the last measurement may have been interrupted; one that is in the log is not repeated
+        if trainer.step > 0:  # the last measurement may be missing; one in the log is not repeated
             monitor(trainer.step, trainer.gaussians.opacities)
 
         def after_step(trainer: Trainer) -> None:
@@ -274,7 +274,7 @@ def _train(
 
 
 def _measure(trainer: Trainer, out: Path, perceptual: LPIPS | None, say: Callable[[str], None]) -> dict[str, Any]:
-    """Write the trained model, its pictures and its scores; return the results."""
+    """Evaluate the trained model; write it, its pictures and its scores, and return the results."""
     model = model_of(trainer)
     save_ply(model.gaussians, out / PLY, regularizer=model.regularizer, step=model.step)
     if model.depends_on_camera:
@@ -291,6 +291,6 @@ def _measure(trainer: Trainer, out: Path, perceptual: LPIPS | None, say: Callabl
         **evaluation.as_dict(),
         "machine": machine(),
     }
-    keep.unlink(missing_ok=True)  # first, because a complete run is not touched again
+    keep.unlink(missing_ok=True)  # before results.json, because a complete run is not touched again
     write_json(out / RESULTS, results)
     return read_results(out)

@@ -1,4 +1,4 @@
-"""Score anyone's 3DGS PLY, on the views of a scene or from cameras around it."""
+"""Score any 3DGS PLY at the views of a scene, or from cameras on an orbit around it."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from reference_trainer.scenes.scene import Scene, View, Viewpoint
 __all__ = ["Placed", "PlyFacts", "of_plain_ply", "of_ply", "place", "scaled", "score_ply"]
 
 SMALLEST_RADIUS = 0.25
-"""Smaller models are enlarged to this: the near plane of the renderer, at 0.2, would cut into them."""
+"""Smaller models are enlarged to this radius: the renderer's near plane, at 0.2, would cut into them."""
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class PlyFacts:
-    """What a PLY says of itself.
+    """What a PLY file says about its model.
 
     Args:
-        gaussians: their number.
+        gaussians: number of Gaussians.
         sh_degree: of the coefficients in the file.
-        sh_degree_used: highest band with a coefficient other than 0.
-        opacity_scale: the factor that is baked into the stored opacities, 1 if none is.
-        for_rendering: whether they are test-time opacities that the plain ones cannot be had from.
-        regularizer: what the model was trained with, from the file or as told.
+        sh_degree_used: highest band with a nonzero coefficient.
+        opacity_scale: the factor baked into the stored opacities, 1 if none is.
+        for_rendering: whether they are test-time opacities from which the plain ones cannot be recovered.
+        regularizer: what the model was trained with, from the file or the caller.
     """
 
     gaussians: int
@@ -70,22 +70,21 @@ class PlyFacts:
 def of_ply(
     ply: Path, *, background: Tensor, regularizer: str | None = None, device: str = "cpu"
 ) -> tuple[TrainedModel, PlyFacts]:
-    """Return the model of a standard 3DGS PLY, and what the file says of it.
+    """Return the model of a standard 3DGS PLY, and what the file says about it.
 
-    A PLY of this package says what the model was trained with, and with it what is to be rendered at test time. One
-    whose opacities are scaled by 1 - p already says so as well: the scaling is undone, because CA is measured on plain
-    opacities and the evaluation scales by itself. Opacities that were replaced by those of the test in another way are
-    used as they are, for CA too.
+    A PLY of this package records the regularizers of the training, which decide the test-time opacities, and whether
+    its opacities are scaled by 1 - p already: that is undone, because CA is measured on plain opacities and the
+    evaluation does its own scaling. Test-time opacities of any other kind are used as they are, for CA too.
 
     Args:
         ply: the model.
         background: color behind it, shape (3,).
-        regularizer: what the model was trained with, instead of what the PLY says.
+        regularizer: what the model was trained with, overriding the PLY.
         device: where to render.
 
     Raises:
-        ValueError: if the PLY is damaged or holds no Gaussian, has been scaled for another rate than ``regularizer``
-            says, or names regularizers that cannot be made.
+        ValueError: if the PLY is damaged or holds no Gaussian, was scaled for another rate than ``regularizer`` says,
+            or names unknown regularizers.
         FileNotFoundError: if the PLY is missing.
     """
     loaded = load_ply(ply)
@@ -116,7 +115,7 @@ def of_ply(
 
 
 def of_plain_ply(ply: Path, *, regularizer: str | None = None, device: str = "cpu") -> tuple[TrainedModel, PlyFacts]:
-    """Do the same over black; a ValueError if the opacities are those of the test, or scaled."""
+    """Do as `of_ply` over black, with a ValueError unless the opacities are plain."""
     model, facts = of_ply(ply, background=torch.zeros(3), regularizer=regularizer, device=device)
     if facts.for_rendering or facts.opacity_scale != 1:
         by = "those of the test" if facts.for_rendering else f"scaled by {facts.opacity_scale:g}"
@@ -126,14 +125,14 @@ def of_plain_ply(ply: Path, *, regularizer: str | None = None, device: str = "cp
 
 @dataclass(frozen=True)
 class Placed:
-    """A model and where it is looked at from.
+    """A model and the views that it is measured at.
 
     Args:
-        model: enlarged by a factor, if it is tiny and there is no scene.
-        enlarged: the factor.
+        model: the model, enlarged if it is tiny and there is no scene.
+        enlarged: the factor by which it is enlarged.
         views: by split; ``"orbit"`` without a scene.
         scene: None for an orbit.
-        about: what a file of results says of all this.
+        about: entries about all this for a file of results.
     """
 
     model: TrainedModel
@@ -181,14 +180,14 @@ def score_ply(
     device: str = "cpu",
     say: Say = print,
 ) -> Evaluation:
-    """Measure the model of a PLY at the views of a scene or from an orbit; writes and prints what `measure` does.
+    """Measure the model of a PLY at the views of a scene or on an orbit; writes and prints what `measure` does.
 
     Args:
         ply: the model, in the frame of the scene's cameras; for an orbit in any frame and of any size.
         where: the scene or the orbit.
         out: folder for the results; ``<ply>_evaluation`` by default.
-        background: of an orbit, ``"black"``, also by default, or ``"white"``; a scene has its own.
-        regularizer: as of `of_ply`.
+        background: of an orbit, ``"black"`` (the default) or ``"white"``; a scene has its own.
+        regularizer: as in `of_ply`.
         samples: K of the CA score.
         seed: of its masks.
         perceptual: a perceptual metric.
@@ -196,7 +195,7 @@ def score_ply(
         say: receives the progress, the table, and doubts whether the frames agree.
 
     Raises:
-        ValueError: as `of_ply`, `check_frame` and `OrbitOptions.views`, or if there is no such background.
+        ValueError: from `of_ply`, `check_frame` or `OrbitOptions.views`, or if the background is unknown.
         FileNotFoundError: if the PLY or the scene is missing.
     """
     placed = place(ply, where, background=background, regularizer=regularizer, device=device, say=say)
@@ -233,14 +232,14 @@ def _on_orbit(model: TrainedModel, orbit: OrbitOptions, about: dict[str, object]
 
 
 def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
-    """Return the model in a world that is larger by a factor; its pictures from larger orbits are the same."""
+    """Return the model scaled by a factor about the origin; pictures from cameras scaled alike are the same."""
     return replace(
         gaussians, means=gaussians.means * factor, log_scales=gaussians.log_scales + torch.tensor(factor).log().item()
     )
 
 
 def _worse_than_one_color(result: Evaluation, scene: Scene) -> bool:
-    """Whether no training view is nearer to its photograph than the photograph's mean color is."""
+    """Whether every training view has a lower PSNR than the mean color of its photograph."""
 
     def of_mean(view: View) -> float:
         return psnr(view.image.mean((1, 2), keepdim=True).expand_as(view.image), view.image)

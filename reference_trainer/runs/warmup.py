@@ -1,4 +1,4 @@
-"""Compile the renderer's loops in advance, with progress: once per machine instead of at the first step."""
+"""Compile the renderer's loops in advance, with a progress bar, instead of at the first training step."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ __all__ = ["warm_up"]
 
 @functools.cache
 def warm_up(say: Callable[[str], None] = lambda text: None) -> tuple[str, ...]:
-    """Use every loop once, if loops draw on a CPU; those that are on the disk are read from there.
+    """Use every loop once per process, if the CPU engine is the loops; those in the disk cache are loaded from it.
 
-    Done once in a process. One training step of each kind and one of every score is what makes sure that exactly those
-    variants of the loops are compiled that are needed.
+    A training step of each kind and a score of each kind compile exactly the variants of the loops that are needed.
 
     Args:
-        say: receives what is being done, if it takes time.
+        say: told what is being done, if anything has to be compiled.
 
     Returns:
         The names of the loops that had to be compiled.
@@ -50,7 +49,7 @@ def warm_up(say: Callable[[str], None] = lambda text: None) -> tuple[str, ...]:
 
 
 def _use_everything() -> None:
-    """Do one training step of each kind and one score of each on a scene of a few pixels."""
+    """Take one training step of each kind and compute each score on a scene of a few pixels."""
     from ca_reg.functional import Multiplier
     from reference_trainer.runs.run import model_of
     from reference_trainer.scenes import synthetic_scene

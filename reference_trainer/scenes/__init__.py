@@ -1,7 +1,7 @@
-"""Scenes: photographs with cameras and initial points, from the files of one of the `formats`, or built in.
+"""Scenes: photographs with cameras and initial points, read from one of the `formats` or built in.
 
-``load_scene`` is the way in; ``Scene`` is all that the rest of the program sees. What is asked for is imported then, so
-that the command line knows the options of a scene without torch.
+``load_scene`` is the entry point; ``Scene`` is all that the rest of the program sees. Names are imported on first
+access, so that the command line can list the options of a scene without importing torch.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""Scenes of one ``.npz``: what scripts around VGGT, DUSt3R, MapAnything or Depth Anything save of their predictions."""
+"""Scenes from a single ``.npz`` of predictions, as scripts around VGGT, DUSt3R, MapAnything or Depth Anything save."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ POINTS = ("points", "points3d", "pts3d", "world_points", "world_points_from_dept
 COLORS = ("colors", "rgb", "images", "image")
 CONFIDENCE = ("confidence", "conf", "world_points_conf", "depth_conf")
 NAMES = ("image_names", "names", "image_paths")
-LARGEST = 2**30  # bytes of an array
-MOST_POINTS = 50_000  # what networks predict is a point for each pixel
+LARGEST = 2**30  # bytes per array
+MOST_POINTS = 50_000  # networks predict one point per pixel
 
 Arrays = Mapping[str, NDArray[Any]]
 
 
 def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], PointCloud | None]:
-    """Read S cameras of an ``.npz`` file, pair them with the images of a folder, and read the points beside them.
+    """Read the S cameras of an ``.npz`` file, pair them with the images of a folder, and read the points, if any.
 
     Convention: OpenCV axes, half-integer pixel centers. ``extrinsic(s)``, ``world_to_camera``, ``w2c``,
     ``cam_from_world`` and ``viewmats`` are world to camera; ``camera_poses``, ``camera_to_world``, ``cam2world``,
     ``c2w`` and ``poses`` camera to world; both (S, 3, 4) or (S, 4, 4). ``intrinsic(s)``, ``K`` or ``Ks``, (S, 3, 3) or
-    (3, 3), are for pictures of the size of ``images``, ``depth`` or a map of points in the file, else of the image
-    files. Images belong to the cameras by ``image_names``, ``names`` or ``image_paths``, else in sorted order.
+    (3, 3), refer to pictures of the size of ``images``, ``depth`` or a map of points in the file, else of the image
+    files. Images are matched to cameras by ``image_names``, ``names`` or ``image_paths``, else in sorted order.
 
     Points are ``points``, ``points3d``, ``pts3d``, ``world_points`` or ``world_points_from_depth``, (..., 3), else
-    ``depth`` (S, H, W) lifted, in the colors of ``colors``, ``rgb`` or ``images``: bytes, or floats up to 1. Of points
-    with a ``confidence`` the better half counts, of more than 50,000 every so many-th, and none that is not finite.
+    ``depth`` (S, H, W) lifted; colors are ``colors``, ``rgb`` or ``images``, as bytes or floats up to 1. Points that
+    are not finite or whose ``confidence`` is below the median are left out; the rest is thinned to at most 50,000.
 
     Raises:
         FileNotFoundError: if the folder is missing.
-        ValueError: if there are no poses or intrinsics, or they make no cameras of the images.
+        ValueError: if there are no poses or intrinsics, or they do not make a valid camera for every image.
     """
     path, folder = Path(path), Path(folder)
     asked = (*TO_CAMERA, *TO_WORLD, *INTRINSICS, *POINTS, *COLORS, *CONFIDENCE, *NAMES, "depth")
@@ -83,12 +83,12 @@ def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], Poin
 
 
 def _first(arrays: Arrays, names: Sequence[str]) -> NDArray[Any] | None:
-    """Return the first of some arrays that is there."""
+    """Return the first array found under one of the names, None if there is none."""
     return next((arrays[name] for name in names if name in arrays), None)
 
 
 def _files(path: Path, folder: Path, names: NDArray[Any] | None, count: int) -> list[Path]:
-    """Return the image files of the cameras."""
+    """Return the image file of each camera."""
     if names is None:
         files = list_images(folder)
     else:
@@ -101,7 +101,7 @@ def _files(path: Path, folder: Path, names: NDArray[Any] | None, count: int) -> 
 
 
 def _map_size(arrays: Arrays) -> tuple[int, int] | None:
-    """Return width and height of the pictures that were predicted from, None if the file has no map of them."""
+    """Return width and height of the network's input pictures, None if no array of the file has their size."""
     maps = [arrays[name].shape for name in ("images", "image", "depth", *POINTS) if name in arrays]
     maps = [shape for shape in maps if len(shape) > 3 or (len(shape) == 3 and shape[2] != 3)]
     if not maps:
@@ -141,7 +141,7 @@ def _points(path: Path, arrays: Arrays, frames: Sequence[Frame]) -> PointCloud |
 
 
 def _lifted(depth: NDArray[Any], camera: Camera) -> NDArray[Any]:
-    """Return the world points (H, W, 3) of a map of depths along the camera's axis."""
+    """Lift a map of depths along the camera's z axis to world points (H, W, 3); nan where the depth is not positive."""
     rows, columns = (torch.arange(size) + 0.5 for size in depth.shape[:2])
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).double()
     depths = torch.from_numpy(depth.reshape(depth.shape[:2]).astype(np.float64))
@@ -149,7 +149,7 @@ def _lifted(depth: NDArray[Any], camera: Camera) -> NDArray[Any]:
 
 
 def _files_of(root: Path) -> list[Path]:
-    """Return the ``.npz`` files of a folder, if it is none of IDR's."""
+    """Return the ``.npz`` files of a folder, none if it is an IDR scene."""
     return [] if IDR.found(root) else sorted(root.glob("*.npz"))
 
 

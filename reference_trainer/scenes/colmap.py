@@ -1,4 +1,4 @@
-"""COLMAP reconstructions, binary or text."""
+"""Scenes from COLMAP reconstructions, binary or text."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ __all__ = ["COLMAP", "colmap_folders", "colmap_frames", "read_colmap"]
 
 
 def read_colmap(folder: str | Path) -> ColmapModel:
-    """Read a reconstruction: cameras, images and points, from ``.bin`` files, or ``.txt`` where there is no ``.bin``.
+    """Read a reconstruction, often ``sparse/0``: cameras, images and points, each ``.bin`` or, failing that, ``.txt``.
 
-    Its folder is often ``sparse/0``. It has no points if a ``points3D.ply`` stands in their place.
+    The points are empty if the folder has InstantSplat's ``points3D.ply`` instead.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -35,23 +35,23 @@ def read_colmap(folder: str | Path) -> ColmapModel:
 
 
 def colmap_folders(root: Path) -> list[Path]:
-    """Return the folders of a scene with a reconstruction; the first has the cameras.
+    """Return the folders of a scene that hold a reconstruction; cameras are read from the first.
 
-    They are ``sparse/0`` (COLMAP), ``sparse`` (VGGT), the scene folder itself, and every ``sparse_<name>/0``
-    (InstantSplat, and clouds from the training views alone).
+    Candidates, in order: ``sparse/0`` (COLMAP), ``sparse`` (VGGT), the scene folder itself, and every
+    ``sparse_<name>/0`` (InstantSplat, and clouds from the training views alone).
     """
     folders = [root / "sparse" / "0", root / "sparse", root, *sorted(root.glob("sparse_*/0"))]
     return [folder for folder in folders if _has(folder, "cameras") and _has(folder, "images")]
 
 
 def colmap_frames(model: ColmapModel, folder: str | Path) -> list[Frame]:
-    """Pair the images of a reconstruction with their files in a folder, maybe of resized copies; sorted by name.
+    """Pair the images of a reconstruction with their files in a folder, possibly of resized copies; sorted by name.
 
-    The frame has the pinhole part of the camera, and its distortion beside it.
+    Each frame holds the pinhole part of its camera and, separately, the distortion.
 
     Raises:
         FileNotFoundError: if there is no such folder.
-        ValueError: if images are missing there, or a camera is a fisheye.
+        ValueError: if images are missing there, or a camera model is a fisheye.
     """
     files = match_images(folder, [image.name for image in model.images])
     frames = []
@@ -63,7 +63,7 @@ def colmap_frames(model: ColmapModel, folder: str | Path) -> list[Frame]:
 
 
 def _read(folder: Path, stem: str) -> Any:
-    """Read one of the three files in whichever form is there."""
+    """Read one of the three files, binary or else text."""
     for suffix, reader in READERS[stem].items():
         path = folder / (stem + suffix)
         if path.is_file():
@@ -76,13 +76,13 @@ def _read(folder: Path, stem: str) -> Any:
 
 
 def _has(folder: Path, stem: str) -> bool:
-    """Whether one of the three files is there in either form."""
+    """Whether one of the three files exists in either form."""
     return any((folder / (stem + suffix)).is_file() for suffix in READERS[stem])
 
 
 def _read_scene(root: Path, options: SceneOptions) -> Capture:
     """Read a scene folder."""
-    folder = (colmap_folders(root) or [root / "sparse" / "0"])[0]  # to be told what is missing there
+    folder = (colmap_folders(root) or [root / "sparse" / "0"])[0]  # the fallback's error says what is missing
     return Capture(colmap_frames(read_colmap(folder), picture_folder(root, options.images)))
 
 

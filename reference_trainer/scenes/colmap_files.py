@@ -28,7 +28,7 @@ _TRACK = np.dtype([("image", "<i4"), ("feature", "<i4")])
 
 
 class _Cursor:
-    """Reads a file from front to end, and refuses what is not there before anything is allocated for it."""
+    """Reads a file front to back; a record beyond its end is refused before memory is allocated for it."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.data, self.at = path, path.read_bytes(), 0
@@ -47,13 +47,13 @@ class _Cursor:
         return struct.unpack_from("<" + layout, self.data, self.at - size)
 
     def count(self, smallest: int, what: str) -> int:
-        """Read a number of records of at least ``smallest`` bytes each."""
+        """Read how many records follow, each of at least ``smallest`` bytes."""
         count: int = self.take("Q", f"the number of {what}")[0]
         self.need(count * smallest, f"{count} {what}")
         return count
 
     def array(self, dtype: np.dtype[np.void], what: str) -> np.ndarray:
-        """Read a number of records, and them."""
+        """Read a count and that many records."""
         count = self.count(dtype.itemsize, what)
         self.at += count * dtype.itemsize
         return np.frombuffer(self.data, dtype, count, self.at - count * dtype.itemsize)
@@ -65,7 +65,7 @@ class _Cursor:
         return raw.decode("utf-8", errors="replace")
 
     def records(self, smallest: int, what: str) -> Iterator[None]:
-        """Go through the file's records, and refuse what is left after their number: it passes for a smaller scene."""
+        """Yield once per announced record; refuse trailing bytes: a damaged count would pass for a smaller scene."""
         for _ in range(self.count(smallest, what)):
             yield
         if self.at != len(self.data):
@@ -113,11 +113,10 @@ _ANNOUNCED = re.compile(r"#\s*Number of \w+:\s*(\d{1,18})\b")
 
 
 def _lines(path: Path, lines_each: int = 1) -> Iterator[tuple[int, str]]:
-    """Yield the numbered lines without comments; empty ones stay, since an image without features has one.
+    """Yield the lines that are no comments, numbered; empty ones too, since an image without features has one.
 
-    Text has no other sign of being complete than the number of records in COLMAP's comment, so where that is given it
-    is held against the lines at the end. Files made by hand need not have it, and a file without any lines may have no
-    comment.
+    The number of records in COLMAP's comment is the only sign that a text file is complete. Where present, it is
+    checked against the lines read; it may be absent, unless the file has comments or blank lines alone.
     """
     announced, number, found, line, blank = None, 0, 0, "\n", True
     with path.open(encoding="utf-8") as file:
@@ -146,13 +145,13 @@ def _records(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _numbers(text: str, kind: type[float] | type[int]) -> NDArray[Any]:
-    """Read words as numbers, one after the other: all words at once would take 30 times the text."""
+    """Read words as numbers, one at a time: a list of all words would take 30 times the memory of the text."""
     words = (kind(word[0]) for word in re.finditer(r"\S+", text))
     return np.fromiter(words, np.float64 if kind is float else np.int64)
 
 
 def _damaged(path: Path, number: int, error: Exception) -> ValueError:
-    """Say which line could not be read."""
+    """Return an error that names the line that could not be read."""
     return ValueError(f"{path}, line {number}, is truncated or not COLMAP text: {error}")
 
 
@@ -177,7 +176,7 @@ def read_images_text(path: Path) -> list[ColmapImage]:
         if not line and not images:  # blank lines at the beginning
             continue
         _, second = next(lines, (0, ""))
-        if not line:  # or at the end
+        if not line:  # and at the end
             continue
         try:
             words = line.split(maxsplit=9)  # a name may contain spaces
@@ -202,7 +201,7 @@ def read_points_text(path: Path) -> ColmapPoints:
             color = [int(word) for word in words[4:7]]
             if not all(0 <= x <= 255 for x in color):
                 raise ValueError(f"a color must be three numbers from 0 to 255, got {color}.")
-            float(words[7])  # the reprojection error, which nobody here uses, but which must be there
+            float(words[7])  # the reprojection error, unused but required
             track = _numbers(words[8] if len(words) > 8 else "", int).reshape(-1, 2)[:, 0]
             points.add(int(words[0]), [float(word) for word in words[1:4]], color, track)
         except (ValueError, IndexError, OverflowError) as error:
@@ -215,4 +214,4 @@ READERS: dict[str, dict[str, Callable[[Path], Any]]] = {
     "images": {".bin": read_images_binary, ".txt": read_images_text},
     "points3D": {".bin": read_points_binary, ".txt": read_points_text},
 }
-"""By file and form."""
+"""Readers by file stem and suffix."""

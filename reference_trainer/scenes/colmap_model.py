@@ -1,4 +1,4 @@
-"""What a COLMAP reconstruction holds, as plain data, and its camera models."""
+"""A COLMAP reconstruction as plain data, and COLMAP's camera models."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = [
 
 
 class CameraModel(NamedTuple):
-    """A camera model: its name, how many focal lengths it has, and how many distortion parameters.
+    """A camera model: its name and its numbers of focal lengths and distortion parameters.
 
-    A fisheye model is no pinhole even where its distortion parameters are 0, so it cannot be approximated by one.
+    A fisheye model is no pinhole even where its distortion parameters are 0, so no pinhole approximates it.
     """
 
     name: str
@@ -37,7 +37,8 @@ class CameraModel(NamedTuple):
         return self.focal_lengths + 2 + self.distortion
 
 
-# By number, COLMAP, src/colmap/sensor/models.h. The distortion is k1 k2 p1 p2 k3 k4 k5 k6 or a beginning of that list.
+# Indexed by model id: COLMAP, src/colmap/sensor/models.h. The distortion of the models that are no fisheyes is
+# k1 k2 p1 p2 k3 k4 k5 k6 or a prefix of it.
 CAMERA_MODELS = (
     CameraModel("SIMPLE_PINHOLE", 1, 0),
     CameraModel("PINHOLE", 2, 0),
@@ -55,7 +56,7 @@ _MODELS: dict[int | str, CameraModel] = {k: m for n, m in enumerate(CAMERA_MODEL
 
 
 class ColmapCamera(NamedTuple):
-    """Intrinsics of one camera: the pinhole part at the origin of the world, float64, and the distortion beside it.
+    """Intrinsics of one camera: its pinhole part, posed at the world origin, float64, and its distortion.
 
     Convention: half-pixel centers, as in the rest of the program; the distortion is in COLMAP's order, empty for the
     pinhole models.
@@ -66,7 +67,7 @@ class ColmapCamera(NamedTuple):
     distortion: tuple[float, ...]
 
     def at(self, world_to_camera: NDArray[np.float64]) -> Camera:
-        """Return the camera at a pose (4, 4) without its distortion.
+        """Return the pinhole part at a pose (4, 4).
 
         Raises:
             ValueError: if the model is a fisheye.
@@ -87,10 +88,10 @@ def add_camera(
     height: int,
     parameters: tuple[float, ...],
 ) -> None:
-    """Add a camera by its number: model number or name, size in pixels, parameters in COLMAP's order.
+    """Add a camera under its number; the model is a number or a name, the parameters are in COLMAP's order.
 
     Raises:
-        ValueError: if it is there already, its model is unknown, or the size or a parameter makes no sense.
+        ValueError: if the number is taken, the model is unknown, or the size or a parameter is invalid.
     """
     if number in cameras:
         raise ValueError(f"it has camera {number} twice.")
@@ -113,7 +114,7 @@ def view_matrix(qvec: Sequence[float], tvec: Sequence[float]) -> NDArray[np.floa
     Raises:
         ValueError: if they are not finite, or the quaternion is zero.
     """
-    with np.errstate(over="ignore"):  # becomes infinite, which is refused
+    with np.errstate(over="ignore"):  # overflow gives inf, which is refused
         norm = np.linalg.norm(qvec)
     if not (np.isfinite(tvec).all() and 0 < norm < np.inf):
         raise ValueError(f"the pose must be a finite non-zero quaternion and translation, got {qvec} and {tvec}.")
@@ -125,10 +126,10 @@ def view_matrix(qvec: Sequence[float], tvec: Sequence[float]) -> NDArray[np.floa
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """One registered image: its number, path within the image folder, camera's number and pose (4, 4), float64.
+    """One registered image: its number, path within the image folder, camera number and pose (4, 4), float64.
 
-    Its 2D features are at ``keypoints`` (K, 2), pixels, float64, and belong to the 3D points of the numbers
-    ``point_ids`` (K,), -1 for none. Raises ValueError if a feature has no finite position.
+    Its 2D features lie at ``keypoints`` (K, 2), pixels, float64, and observe the 3D points numbered ``point_ids``
+    (K,), -1 for none. Raises ValueError if a feature has no finite position.
     """
 
     id: int
@@ -147,8 +148,8 @@ class ColmapImage:
 class ColmapPoints:
     """The M triangulated points: numbers (M,), world coordinates (M, 3), float64, and RGB (M, 3), uint8.
 
-    ``tracks`` holds for each the numbers of the images that it was found in, each an int64 array; empty if the
-    reconstruction does not say. Raises ValueError if a position is not finite.
+    ``tracks`` holds, for each point, an int64 array of the numbers of the images that observe it; the array is empty
+    if the reconstruction does not say. Raises ValueError if a position is not finite.
     """
 
     ids: NDArray[np.int64]
@@ -163,18 +164,18 @@ class ColmapPoints:
 
 
 class PointRecords:
-    """The points of a file while it is read, in few bytes each: as Python objects they would take ten times as many."""
+    """Accumulates the points of a file in compact arrays: as Python objects they would take ten times the memory."""
 
     def __init__(self) -> None:
         self._ids, self._positions, self._colors = array("q"), array("d"), array("B")
         self._images, self._ends = array("q"), array("q")
 
     def add(self, number: int, position: Sequence[float], color: Sequence[int], images: NDArray[np.integer]) -> None:
-        """Take in a point, and the numbers of the images in its track.
+        """Add a point and the numbers of the images in its track.
 
         Raises:
-            ValueError: if it has not three coordinates and three colors.
-            OverflowError: if a number is beyond 64 bits, or a color no byte.
+            ValueError: if there are not three coordinates and three colors.
+            OverflowError: if a number does not fit 64 bits, or a color a byte.
         """
         if len(position) != 3 or len(color) != 3:
             raise ValueError(f"a point has three coordinates and three colors, got {[*position]} and {[*color]}.")
@@ -197,9 +198,9 @@ class PointRecords:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A reconstruction: cameras by number, images sorted by name, and points, of which there may be none.
+    """A reconstruction: cameras by number, images sorted by name, and points, possibly none.
 
-    Raises ValueError if an image has a camera that is not there, or two images have one name or number.
+    Raises ValueError if an image refers to a missing camera, or two images share a name or number.
     """
 
     cameras: dict[int, ColmapCamera]
@@ -218,10 +219,9 @@ class ColmapModel:
             raise ValueError("two images have the same number.")
 
     def seen_by(self) -> frozenset[str]:
-        """Return the names of the images that the points come from.
+        """Return the names of the images that the points come from: those in their tracks.
 
-        These are the images in the points' tracks. If any point has no track, it may come from any image, so these are
-        all the images of the reconstruction.
+        A point without a track may come from any image, so one such point makes it all images of the reconstruction.
         """
         if any(len(track) == 0 for track in self.points.tracks):
             return frozenset(image.name for image in self.images)

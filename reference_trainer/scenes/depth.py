@@ -1,4 +1,4 @@
-"""Depth of the training photographs: from files, a network's, a sensor's or a stereo method's, or from the points."""
+"""Depth priors of the training photographs: from files (of a network, a sensor, stereo) or from the initial points."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["point_prior", "read_depth", "true_priors", "with_prior"]
 
 
 def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> View:
-    """Return a view with the depth prior that belongs to its photograph, resized and undistorted as that is.
+    """Return a view with the depth prior of its photograph, resized and undistorted like it.
 
     Args:
         view: as loaded from the frame.
@@ -28,8 +28,8 @@ def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> V
         options: those of the scene; `depth` is not None.
 
     Raises:
-        FileNotFoundError: if there is no file for it.
-        ValueError: if the file is no picture of numbers, is constant, or has another aspect ratio than the photograph.
+        FileNotFoundError: if there is no depth file for the photograph.
+        ValueError: if the file is no depth map, is constant, or its aspect ratio is not the photograph's.
     """
     assert options.depth is not None
     folder = root / options.depth.removesuffix(":inverse")
@@ -53,12 +53,12 @@ def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> V
 
 
 def true_priors(scene: Scene, asked: str) -> Scene:
-    """Return the built-in scene with its true depth as prior of the training views, unknown where nothing is hit.
+    """Return the built-in scene with depth priors of its training views.
 
-    With ``"points"`` it is that of `point_prior`.
+    ``"true"`` asks for the true depth, unknown where nothing is hit; ``"points"`` for that of `point_prior`.
 
     Raises:
-        ValueError: if anything else but ``"true"`` was asked for.
+        ValueError: if anything else was asked for.
     """
     if asked == "points" and scene.points is not None:
         return replace(scene, train=tuple(point_prior(view, scene.points) for view in scene.train))
@@ -74,14 +74,14 @@ def true_priors(scene: Scene, asked: str) -> Scene:
 
 
 def point_prior(view: View, cloud: PointCloud) -> View:
-    """Return a view with a depth prior that needs no file: the depth of the initial points, and what lies between them.
+    """Return a view with a depth prior that needs no file: the depth of the initial points, interpolated.
 
-    Of the points of a pixel the nearest counts; between pixels with points the inverse depth is linear over Delaunay
-    triangles, which is exact on a plane. Outside their hull the prior is unknown. Points that are hidden from the view
-    count as well, for nobody says which those are.
+    Of several points in a pixel the nearest counts. Between them the inverse depth is linear over Delaunay triangles,
+    which is exact on a plane; outside their hull the prior is unknown. Occluded points count as well, because a point
+    cloud does not tell which those are.
 
     Raises:
-        ValueError: if there is no cloud that was reconstructed, or the view sees none of it.
+        ValueError: if the points are random, or fewer than 4 pixels of the view have one.
         ImportError: if SciPy is missing.
     """
     from scipy.interpolate import LinearNDInterpolator
@@ -103,10 +103,10 @@ def point_prior(view: View, cloud: PointCloud) -> View:
 
 
 def read_depth(path: str | Path) -> Tensor:
-    """Read a picture of depths as they are in the file, shape (H, W), float32; nan where they are not finite.
+    """Read a depth map with the values of the file, shape (H, W), float32; nan where they are not finite.
 
     Args:
-        path: an ``.npy`` file of (H, W) floats or integers, axes of length 1 aside, or a gray PNG of 8 or 16 bits.
+        path: an ``.npy`` file of floats or integers, (H, W) up to axes of length 1, or a gray PNG of 8 or 16 bits.
 
     Raises:
         ValueError: if it is neither.
@@ -115,12 +115,12 @@ def read_depth(path: str | Path) -> Tensor:
 
     try:
         if Path(path).suffix == ".npy":
-            # Mapped, a header that announces more than the file has is refused before anything is allocated.
+            # Memory mapping refuses a header that announces more than the file holds before anything is allocated.
             array = np.load(path, mmap_mode="r", allow_pickle=False)
         else:
             with Image.open(path, formats=("PNG",)) as file:
                 array = np.array(file if file.mode != "P" else file.convert("RGB"))
-    except Exception as error:  # each reader has its own
+    except Exception as error:  # each reader raises its own types
         raise ValueError(f"{path} is not a readable .npy file or PNG: {error}") from error
     picture = np.squeeze(array)
     if picture.ndim != 2 or picture.dtype.kind not in "fiu":

@@ -1,6 +1,7 @@
-"""The table of scene formats, and what a format hands over. A new one is a file with a reader, and a line in `load.py`.
+"""The table of scene formats and the `Capture` that their readers return.
 
-Formats outside of this package come by `register_format`, or by name: ``--format my_module:read_my_scene``.
+A new format is a module with a reader and an entry in `load.py`. Formats from outside this package are added by
+`register_format`, or named on the command line: ``--format my_module:read_my_scene``.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ __all__ = ["Capture", "Reader", "SceneFormat", "contents", "find_format", "only_
 
 @dataclass(frozen=True)
 class Capture:
-    """What the files of a scene say, before anything is split or loaded.
+    """What the files of a scene say, before views are split and pictures loaded.
 
     Args:
-        frames: the photographs with their cameras, in the order in which splits count them.
-        test: the held-out ones where the format itself keeps them apart; ``frames`` are then the training ones.
+        frames: the photographs with their cameras, in the order that split rules index.
+        test: the held-out frames if the format itself keeps them apart; ``frames`` are then the training ones.
         points: initial points that the files name.
         split: the rule where there is no split file: ``"llff"`` or ``"dtu"``.
-        views: the usual number of training views.
+        views: the default number of training views.
         background: ``"black"`` or ``"white"``, behind transparent pictures.
     """
 
@@ -40,7 +41,7 @@ class Capture:
 
 
 Reader = Callable[[Path, SceneOptions], Capture]
-"""From a scene folder and what was asked for (``images`` is a reader's business) to what the files say."""
+"""Reads a scene folder; of the options, ``images`` is for the reader to honor."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,8 @@ class SceneFormat:
 
     Args:
         name: what ``--format`` calls it.
-        sign: the file or folder by which it is known, for messages.
-        found: whether a folder is one.
+        sign: the file or folder that identifies it, for messages.
+        found: whether a folder holds a scene of this format.
         read: its reader.
     """
 
@@ -64,7 +65,7 @@ _FORMATS: dict[str, SceneFormat] = {}
 
 
 def register_format(format: SceneFormat) -> None:
-    """Add a format, after those that are there: of several that a folder fits, the first counts.
+    """Add a format after the existing ones; of several that fit a folder, the first counts.
 
     Example:
         >>> found = lambda root: (root / "toy.txt").exists()
@@ -81,11 +82,11 @@ def register_format(format: SceneFormat) -> None:
 
 
 def find_format(root: Path, name: str) -> tuple[str, Reader]:
-    """Return the name and reader of the format of this name, or of the first that a folder fits, for ``"auto"``.
+    """Return the name and reader of the named format, or for ``"auto"`` of the first that fits the folder.
 
     Raises:
         FileNotFoundError: if there is no such folder.
-        ValueError: if there is no such format, or the folder fits none; the message lists what it holds.
+        ValueError: if there is no such format, or none fits the folder.
     """
     if not root.is_dir():
         raise FileNotFoundError(f"there is no scene folder {root}; for the built-in scene, say 'synthetic'.")
@@ -108,7 +109,7 @@ def find_format(root: Path, name: str) -> tuple[str, Reader]:
 
 
 def _imported(name: str) -> Reader:
-    """Return a reader from a module of the user, which may lie in the working directory."""
+    """Import a reader from a user's module, which may lie in the working directory."""
     module, _, attribute = name.partition(":")
     try:
         reader: Reader = imported(module, attribute)
@@ -118,12 +119,12 @@ def _imported(name: str) -> Reader:
 
 
 def only_default(format: str, **options: object) -> None:
-    """Refuse options that a format has no use for."""
+    """Refuse options that a format ignores, unless they have their defaults."""
     given = {name: value for name, value in options.items() if value not in (None, "auto")}
     if given:
         raise ValueError(f"a {format} scene has no use for {given}; leave them out.")
 
 
 def contents(root: Path) -> list[str]:
-    """Names in a folder, for error messages."""
+    """Return the first 20 names in a folder, for error messages."""
     return sorted(entry.name for entry in root.iterdir())[:20]

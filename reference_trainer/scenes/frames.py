@@ -1,4 +1,4 @@
-"""A photograph on disk with its camera, and the step from there to a view in memory."""
+"""Frames, which are photographs on disk with their cameras, and loading them as views."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from reference_trainer.scenes.undistort import undistort
 
 __all__ = ["Frame", "load_view", "view_matrix"]
 
-# Resizing to whole pixels changes the aspect ratio by about 1 / height; a wrong picture folder changes it by more.
+# Rounding to whole pixels changes the aspect ratio by about 1 / height; a wrong picture folder changes it by more.
 ASPECT_TOLERANCE = 0.02
 
 
@@ -28,10 +28,10 @@ class Frame:
     Args:
         name: its name in the scene file, unique within the scene.
         path: the image file.
-        camera: its camera, for the picture size that the scene file was written for; the pose is float64.
+        camera: its camera, at the picture size that the scene file refers to; the pose is float64.
         distortion: coefficients of the lens, in the order of `reference_trainer.scenes.undistort.distort`.
-        bounds: nearest and farthest depth of the scene in this view, where the scene file has them.
-        mask: a picture that is white where the object is, where the scene has one.
+        bounds: nearest and farthest depth of the scene in this view, if the scene file has them.
+        mask: a picture that is white on the object, if the scene has one.
     """
 
     name: str
@@ -43,9 +43,9 @@ class Frame:
 
 
 def view_matrix(axes: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
-    """Return the view matrix (4, 4), float64, of a camera at a world position (3,), for its right, down and forward.
+    """Return the view matrix (4, 4), float64, of a camera at a world position (3,).
 
-    These axes are one a row, shape (3, 3); ValueError is raised if they are no rotation, to a thousandth.
+    The rows of ``axes`` (3, 3) are its right, down and forward; ValueError if they are no rotation to within 1e-3.
     """
     with np.errstate(all="ignore"):
         is_rotation = np.allclose(axes @ axes.T, np.eye(3), atol=1e-3) and np.linalg.det(axes) > 0
@@ -59,8 +59,8 @@ def view_matrix(axes: NDArray[np.float64], position: NDArray[np.float64]) -> Ten
 def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, straight: bool = True) -> View:
     """Read the photograph of a frame and fit its camera to the picture's size, float32.
 
-    A picture with an alpha channel is composited on the background (3,) first, then made smaller by the factor
-    ``downscale``, at least 1, and, if it is to be ``straight``, undistorted last.
+    A picture with an alpha channel is first composited on the background (3,). The picture is then shrunk by
+    ``downscale``, at least 1, and last, if it is to be ``straight``, undistorted.
 
     Raises:
         FileNotFoundError: if there is no such file.

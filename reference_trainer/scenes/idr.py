@@ -24,11 +24,11 @@ DTU_PICTURES = (49, 64)
 def read_idr(path: str | Path, folder: str | Path) -> list[Frame]:
     """Read the cameras of ``cameras_sphere.npz`` and pair them with the images of a folder, sorted by name.
 
-    Convention: ``world_mat_<i>`` is K [R | t], world to pixels of the pictures on the disk, with OpenCV axes; K has its
-    pixel centers where the pictures have them. ``scale_mat_<i>`` maps the unit sphere onto that around the object. The
-    world stays as it is, millimetres for DTU, as do COLMAP files beside it; the sphere gives the depth bounds.
-    If the folder holds fewer images than there are cameras, their names must be numbers, and these count; else they
-    belong together in sorted order. A folder ``mask`` beside the file holds the masks.
+    Convention: ``world_mat_<i>`` is K [R | t], world to pixels of the pictures on disk, with OpenCV axes and the
+    pictures' own pixel centers. ``scale_mat_<i>`` maps the unit sphere onto the one around the object. World
+    coordinates (millimeters for DTU) are kept, so that COLMAP files beside it still fit; the sphere gives the depth
+    bounds. Images are matched to cameras in sorted order if there are as many, else by their names, which must be
+    numbers. A folder ``mask`` beside the file holds the masks.
 
     Raises:
         FileNotFoundError: if the file or the folder is missing.
@@ -58,7 +58,7 @@ def read_idr(path: str | Path, folder: str | Path) -> list[Frame]:
 
 
 def _camera(world: NDArray[np.float64], width: int, height: int) -> Camera:
-    """Take K [R | t] apart: the RQ decomposition of its left part, from the QR decomposition of its inverse."""
+    """Decompose K [R | t]: the RQ decomposition of K R, by the QR decomposition of its inverse."""
     if world.shape not in ((4, 4), (3, 4)):
         raise ValueError(f"expected shape (4, 4), got {world.shape}.")
     projection = world[:3] * np.sign(np.linalg.det(world[:3, :3]))

@@ -1,4 +1,4 @@
-"""Image files: reading, compositing, resizing, and finding the file that a scene file names."""
+"""Image files: reading, compositing, resizing, and finding those that a scene file names."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ __all__ = [
 ]  # fmt: skip
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
-# Pillow would otherwise try all formats that it knows on a file, whatever its name, and hand PostScript to Ghostscript.
+# Otherwise Pillow tries every format it knows, whatever the file's name, and hands PostScript to Ghostscript.
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
-LARGEST_IMAGE = 100_000_000  # pixels: a few bytes can announce any number, and each takes 25 bytes of memory
-LARGE_PICTURE = 500_000  # pixels: what a processor trains in about a second a step; larger ones are reduced
-_BAND = 100_000  # pixels that are converted at a time
+LARGEST_IMAGE = 100_000_000  # pixels: a header can announce any number, and each takes 25 bytes of memory
+LARGE_PICTURE = 500_000  # pixels: about a second per training step on a CPU; larger pictures are reduced
+_BAND = 100_000  # pixels converted at a time
 
 
 def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
     """Read an 8-bit image file.
 
-    Convention: alpha is straight, as PNG defines it: the colors are not multiplied by it. An orientation tag is
-    ignored, as COLMAP does, because the cameras belong to the stored pixels.
+    Convention: alpha is straight, as PNG defines it: the colors are not premultiplied. An orientation tag is ignored,
+    as by COLMAP, because the cameras belong to the stored pixels.
 
     Args:
-        path: the file: PNG, JPEG, BMP, TIFF or WebP, which its content tells and not its name.
+        path: PNG, JPEG, BMP, TIFF or WebP, by content, not by name.
 
     Returns:
-        Colors in [0, 1], shape (3, H, W), float32, and the coverage in [0, 1], shape (H, W), or None if the file has
-        no transparency.
+        Colors in [0, 1], shape (3, H, W), float32, and alpha in [0, 1], shape (H, W), or None if the file has no
+        transparency.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -46,7 +46,7 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
     """
     with _opened(path) as file:
         mode, width, height = file.mode, file.width, file.height
-        file.verify()  # compares a PNG's checksums, which decoding does not
+        file.verify()  # checks a PNG's checksums, which decoding does not
     if mode.startswith(("I", "F")):
         raise ValueError(f"{path} has pixel mode {mode}; convert it to 8 bits per channel first.")
     if width * height > LARGEST_IMAGE:
@@ -56,7 +56,7 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
             _check_strips(file)
         has_alpha = mode in ("RGBA", "LA", "PA") or "transparency" in file.info
         picture = file.convert("RGBA" if has_alpha else "RGB")
-    del file  # and what its decoder holds, before the result is made
+    del file  # frees the decoder's buffers before the result is allocated
     image = torch.empty(3, height, width)
     alpha = torch.empty(height, width) if has_alpha else None
     rows = max(1, _BAND // width)
@@ -70,14 +70,14 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Return the width and height of an image file, pixels, without decoding it; errors are those of `read_image`."""
+    """Return the width and height of an image file, pixels, without decoding it; errors as for `read_image`."""
     with _opened(path) as file:
         return int(file.width), int(file.height)
 
 
 @contextmanager
 def _opened(path: str | Path) -> Iterator[Any]:
-    """Open an image with Pillow and turn its many errors into one."""
+    """Open an image with Pillow; whatever it raises becomes ValueError."""
     from PIL import Image, UnidentifiedImageError
 
     if not Path(path).is_file():
@@ -89,12 +89,12 @@ def _opened(path: str | Path) -> Iterator[Any]:
         raise ValueError(
             f"{path} is not a readable image: its content is none of PNG, JPEG, BMP, TIFF or WebP."
         ) from error
-    except Exception as error:  # each of Pillow's decoders has its own
+    except Exception as error:  # each of Pillow's decoders raises its own types
         raise ValueError(f"{path} is not a readable image: {error}") from error
 
 
 def _check_strips(file: Any) -> None:
-    """Refuse a TIFF whose strips do not fill it: it would come out black there."""
+    """Refuse a TIFF whose strips do not cover it: the rest would be black."""
     extents = [tile[1] or (0, 0, *file.size) for tile in file.tile]
     filled = sum((right - left) * (bottom - top) for left, top, right, bottom in extents)
     if filled < file.width * file.height:
@@ -102,14 +102,14 @@ def _check_strips(file: Any) -> None:
 
 
 def composite(image: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
-    """Lay a picture (3, H, W) with straight alpha (H, W) over a plain background (3,)."""
+    """Composite a picture (3, H, W) with straight alpha (H, W) on a plain background (3,)."""
     return image * alpha + background[:, None, None] * (1 - alpha)
 
 
 def resize_image(image: Tensor, width: int, height: int) -> Tensor:
-    """Resize a picture (C, H, W) in [0, 1] with the bicubic filter, widened when shrinking so that nothing aliases.
+    """Resize a picture (C, H, W) in [0, 1] with an antialiased bicubic filter.
 
-    This is Pillow's default filter, with which the published 3DGS loaders resize, without their rounding to 8 bits.
+    This is Pillow's default, which the published 3DGS loaders use, without their rounding to 8 bits.
     """
     resized = torch.nn.functional.interpolate(image[None], size=(height, width), mode="bicubic", antialias=True)[0]
     return resized.clamp(0, 1)
@@ -130,16 +130,15 @@ def list_images(folder: str | Path) -> list[Path]:
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file is a picture by its name; not so ``._a.jpg``, which macOS leaves on other file systems."""
+    """Whether a file is a picture by its name; ``._a.jpg``, which macOS leaves on other file systems, is not."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
-    """Find the file of each named image in a folder, also in one of resized copies.
+    """Find the file of each named image in a folder, possibly of resized copies.
 
-    Files are matched by their full name (``/`` between folders), else by their name without extension, else, if there
-    are as many files as names, by the order of both sorted lists, which is how the LLFF data set relates
-    ``images_8/image000.png`` to ``images/IMG_4026.JPG``.
+    Files are matched by relative path, else by name without extension, else, if there are as many files as names, by
+    sorted order, which is how the LLFF data set relates ``images_8/image000.png`` to ``images/IMG_4026.JPG``.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -163,9 +162,9 @@ def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
-    """Return ``root / relative``, where ``relative`` comes from a file and must not lead out of ``root``.
+    """Return ``root / relative`` for a path that comes from a file and must not lead out of ``root``.
 
-    Links are not followed for this check: a data set may link to pictures elsewhere, but must not name them.
+    Symbolic links are not resolved: a data set may link to pictures elsewhere, but must not name them.
 
     Raises:
         ValueError: if the path is absolute or leaves ``root``.
@@ -181,13 +180,13 @@ def path_inside(root: str | Path, relative: str) -> Path:
 
 
 def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
-    """Return the folder of a scene's photographs, the one that was asked for by name or the usual one.
+    """Return the folder of a scene's photographs: the named one, or a default.
 
-    Of that and the ``<usual>_<factor>`` beside it, it is the one with the largest pictures of at most half a megapixel,
-    or with the smallest if there are none. Without any, it is the scene folder itself, if pictures lie in it.
+    The default is the first of ``<usual>`` and the ``<usual>_<factor>`` beside it, by increasing factor, whose pictures
+    have at most half a megapixel, else the last of them; without any, the scene folder itself if it has pictures.
 
     Raises:
-        FileNotFoundError: if there is none; the message lists the folders with pictures.
+        FileNotFoundError: if there is none.
     """
     if name is not None:
         found = [root / name] if (root / name).is_dir() else []

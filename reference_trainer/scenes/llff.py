@@ -20,13 +20,13 @@ __all__ = ["LLFF", "read_llff"]
 def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
     """Read the cameras of ``poses_bounds.npy`` and pair them with the images of a folder in sorted order.
 
-    Convention: each row holds a (3, 5) matrix, row by row, and the nearest and farthest depth. The matrix is
+    Convention: each row holds a (3, 5) matrix, row-major, and the nearest and farthest depth. The matrix is
     [R | t | (height, width, focal length)], camera to world, with the camera's axes down, right, back. The principal
     point is the center of the picture. The frames' cameras are OpenCV and world to camera.
 
     Raises:
         FileNotFoundError: if the file or the folder is missing.
-        ValueError: if the file is not (N, 17) finite numbers with rotations in them, or there are not N images.
+        ValueError: if the file does not hold (N, 17) finite numbers with valid rotations, or there are not N images.
     """
     path = Path(path)
     if not path.is_file():

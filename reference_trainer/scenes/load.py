@@ -1,4 +1,4 @@
-"""One function that loads any scene: finds the format, the pictures, the split and honest initial points."""
+"""`load_scene`, which loads any scene: format, pictures, split, and initial points that have not seen test views."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from reference_trainer.scenes.undistort import corner_displacement
 
 __all__ = ["load_options", "load_scene"]
 
-# The table; of several that a folder fits, the first counts.
+# The order matters: of several formats that fit a folder, the first counts.
 for _format in (BLENDER, IDR, COLMAP, TRANSFORMS, LLFF, ARRAYS):
     register_format(_format)
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 RULES = {"llff": llff_split, "dtu": dtu_split}
 FEW = 8
-"""Below so many photographs all train, unless a split is asked for: a held-out one would be missed."""
+"""Below this many photographs all are trained on, unless a split is asked for: there are none to spare."""
 
 
 def load_scene(path: str | Path, *, seed: int = 0, **options: Any) -> Scene:
@@ -44,14 +44,14 @@ def load_scene(path: str | Path, *, seed: int = 0, **options: Any) -> Scene:
     Args:
         path: the scene folder, or ``"synthetic"`` for the built-in scene.
         seed: seed of random points, and of the points of the built-in scene.
-        options: the fields of `SceneOptions`, which says what each does.
+        options: the fields of `SceneOptions`.
 
     Returns:
-        The scene, float32 on the CPU; views are in the order of their names, for Blender scenes of their JSON file.
+        The scene, float32 on the CPU; views are sorted by name, those of Blender scenes in the order of the JSON file.
 
     Raises:
         FileNotFoundError: if a file or folder is missing.
-        ValueError: if an option or a file makes no sense, or the points have seen test views.
+        ValueError: if an option or a file is invalid, or the points have seen test views.
 
     Example:
         >>> scene = load_scene("synthetic", downscale=4)
@@ -62,7 +62,7 @@ def load_scene(path: str | Path, *, seed: int = 0, **options: Any) -> Scene:
 
 
 def load_options(options: SceneOptions, seed: int = 0) -> Scene:
-    """Load the scene that options describe; the same as `load_scene`."""
+    """Load the scene that options describe, as `load_scene` does."""
     if options.downscale is not None and options.downscale < 1:
         raise ValueError(f"downscale must be at least 1, got {options.downscale}.")
     if options.background not in ("auto", *BACKGROUNDS):
@@ -156,7 +156,7 @@ def _split(root: Path, capture: Capture, options: SceneOptions) -> tuple[list[Fr
 
 
 def _downscale(frames: list[Frame], asked: float | None) -> tuple[float, str]:
-    """Return by which factor pictures are made smaller, and a sentence if nobody asked for it."""
+    """Return the factor by which pictures are shrunk, and a note if it is not the user's choice."""
     if asked is not None:
         return asked, ""
     width, height = max((image_size(frame.path) for frame in frames), key=math.prod)
@@ -170,7 +170,7 @@ def _downscale(frames: list[Frame], asked: float | None) -> tuple[float, str]:
 
 
 def _about_lenses(frames: list[Frame], options: SceneOptions) -> str:
-    """Say how far lens distortion goes, if there is any."""
+    """Return a note on the size of the lens distortion, empty if there is none."""
     worst = max(
         (corner_displacement(frame.camera, frame.distortion) for frame in frames if frame.distortion), default=0.0
     )

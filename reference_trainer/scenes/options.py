@@ -1,4 +1,4 @@
-"""Which views are to be used, as one value: what the command line asks for and what workers receive."""
+"""The options that decide scenes and cameras: what the command line offers and what workers receive."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-if TYPE_CHECKING:  # torch takes seconds, and the help of a command needs none of it
+if TYPE_CHECKING:  # importing torch takes seconds, and --help needs none of it
     from torch import Tensor
 
     from reference_trainer.camera import Camera
@@ -65,7 +65,7 @@ class SceneOptions:
     """Accept initial points that were triangulated from test views; such results are not comparable with others."""
 
     def absolute(self) -> SceneOptions:
-        """Return the options with absolute paths, to be found again from another working directory."""
+        """Return the options with absolute paths, valid in any working directory."""
         path = self.path if self.path == "synthetic" else str(Path(self.path).resolve())
         return replace(self, path=path, init=None if self.init is None else str(Path(self.init).resolve()))
 
@@ -105,7 +105,7 @@ class OrbitOptions:
             count=self.cameras,
             width=self.size,
             height=self.size,
-            fill=0.8,  # what the quantiles of the bounding sphere leave out, such as a plant's highest leaf, shows too
+            fill=0.8,  # so that what lies outside the bounding sphere, such as a plant's highest leaf, shows too
             world=self.world,
             arc=math.radians(self.arc),
         )

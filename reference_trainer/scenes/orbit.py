@@ -16,21 +16,21 @@ from reference_trainer.scenes.options import World
 __all__ = ["BoundingSphere", "bounding_sphere", "look_at", "orbit_views"]
 
 ELEVATION = math.radians(20)
-"""Height of the cameras over the horizon of the center: objects are mostly looked at from a little above."""
+"""Elevation of the cameras above the center: objects are mostly looked at from a little above."""
 
 INSIDE = 0.98
-"""Share of the opacity that the picture must hold; stray Gaussians far away would make the object tiny otherwise."""
+"""Share of the opacity that the picture must hold; with all of it, stray Gaussians would make the object tiny."""
 
 SURROUNDINGS = 3.0
-"""Where `INSIDE` of the opacity reaches this many times further from the median point than half of it, the model is a
-place with surroundings and no object: objects have 1.6 to 1.9 (a plant, a mesh, lego), a capture of a room 5 (fern)."""
+"""A model is an object with surroundings if the radius around its median point that holds `INSIDE` of the opacity is
+more than this many times the radius that holds half: 1.6 to 1.9 for objects (a plant, a mesh, lego), 5 for fern."""
 
 
 @dataclass(frozen=True)
 class BoundingSphere:
-    """The part of a model that is to be looked at: its center (3,), float64, and radius, in world units.
+    """The part of a model to look at: center (3,), float64, and radius, world units.
 
-    It may be the middle of a place with surroundings, such as a room, and not an object as a whole.
+    With ``surroundings`` it is the middle of a place, such as a room, rather than a whole object.
     """
 
     center: Tensor
@@ -52,29 +52,29 @@ def orbit_views(
 ) -> list[Camera]:
     """Place cameras on a circle around a model, all looking at its center.
 
-    The `bounding_sphere` takes the share ``fill`` of the shorter side of the picture. In a y-down world the first
-    camera of a full circle looks along +z, the others follow at equal angles towards the side of +x; an arc is centered
-    on that first camera and has a camera at both ends.
+    The `bounding_sphere` spans the share ``fill`` of the shorter side of the picture. In a y-down world the first
+    camera of a full circle faces +z, looking slightly down, and the others follow at equal angles, moving towards +x;
+    an arc is centered on that first camera and has a camera at both ends.
 
-    Convention: the world is y down and z forward (OpenCV) unless told otherwise, as captures mostly have it: a PLY does
-    not say where up is, and the axes of inertia do not tell it either (a plant is longest along it, a table shortest).
-    Blender and nerfstudio have z up. The cameras are OpenCV.
-    The renderer does not draw what is nearer than 0.2: models with a radius below about 0.13 must be enlarged first.
+    Convention: the world is y down and z forward (OpenCV) unless told otherwise, as in most captures: a PLY file does
+    not say where up is, nor do the axes of inertia (a plant is longest along it, a table shortest). Blender and
+    nerfstudio have z up. The cameras are OpenCV.
+    The renderer clips at depth 0.2: models with a radius below about 0.13 must be enlarged first.
 
     Args:
         means: as for `bounding_sphere`.
-        opacities: likewise.
+        opacities: as for `bounding_sphere`.
         count: number of cameras.
-        width: of their pictures, pixels.
-        height: likewise.
+        width: of the pictures, pixels.
+        height: of the pictures, pixels.
         field_of_view: along the shorter side of the picture, radians, in (0, pi).
         fill: diameter of the sphere as a share of the shorter side, in (0, 1].
         world: the vertical axis.
-        arc: angle between the first and the last camera, radians, in (0, 2 pi]; a full circle has no camera twice. A
-            model that was captured from one side (LLFF scenes) looks sensible on a small arc only.
+        arc: angle between the first and the last camera, radians, in (0, 2 pi]; a full circle has no camera twice.
+            A model captured from one side (LLFF scenes) looks sensible on a small arc only.
 
     Raises:
-        ValueError: if an argument is out of range, or as `bounding_sphere` does.
+        ValueError: if an argument is out of range, or `bounding_sphere` raises it.
 
     Example:
         >>> corners = torch.tensor([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
@@ -106,16 +106,15 @@ def orbit_views(
 
 
 def bounding_sphere(means: Tensor, opacities: Tensor) -> BoundingSphere:
-    """Find where the Gaussians of a model are; a few stray ones do not matter.
+    """Find where the Gaussians of a model are, robust to a few stray ones.
 
-    Of an object, the center is that of the box between the quantiles 1 - `INSIDE` and `INSIDE` of each coordinate, and
-    the radius the quantile `INSIDE` of the distances from it. Of a place with `SURROUNDINGS`, where that sphere would
-    be the room, the center is the median and the radius twice that of half of the opacity. All is weighted by opacity,
-    activated, (N,) or (N, 1); the means (N, 3) are finite world coordinates.
+    For an object, the center is that of the box between the quantiles 1 - `INSIDE` and `INSIDE` of each coordinate, and
+    the radius is the quantile `INSIDE` of the distances from it. For a place with `SURROUNDINGS`, where that sphere
+    would be the room, the center is the median and the radius is twice the median distance from it. Quantiles are
+    weighted by the activated opacities, (N,) or (N, 1); the means (N, 3) are finite world coordinates.
 
     Raises:
-        ValueError: if the shapes do not match, or the Gaussians that are not transparent do not span a volume, because
-            there are none or they lie on one point.
+        ValueError: if the shapes do not match, or the opacity is all 0 or concentrated at one point.
 
     Example:
         >>> sphere = bounding_sphere(torch.tensor([[1.0, 0, 0], [3.0, 0, 0]]), torch.ones(2))
@@ -145,7 +144,7 @@ def bounding_sphere(means: Tensor, opacities: Tensor) -> BoundingSphere:
 
 
 def _axes(world: World) -> Tensor:
-    """Return the rotation whose columns are right, down and forward of the first camera in this world."""
+    """Return the rotation whose columns are the directions right, down and forward in this world."""
     vertical, sign = "xyz".index(world[0]), 1.0 if world.endswith("down") else -1.0
     down = torch.eye(3, dtype=torch.float64)[vertical] * sign
     right = torch.eye(3, dtype=torch.float64)[1 if vertical == 0 else 0]
@@ -153,7 +152,7 @@ def _axes(world: World) -> Tensor:
 
 
 def _quantile(values: Tensor, weights: Tensor, share: float) -> Tensor:
-    """Return the smallest value that, with all below it, holds this share of the weight."""
+    """Return the weighted quantile: the smallest value that, with all below it, holds this share of the weight."""
     ordered, order = values.sort()
     held = weights[order].cumsum(0)
     return ordered[torch.searchsorted(held, share * held[-1])]

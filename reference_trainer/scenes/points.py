@@ -1,4 +1,4 @@
-"""Initial points: from COLMAP, from a PLY file, or random; and the guard against test views among their sources."""
+"""Initial points: from COLMAP, a PLY file, or random; and the guard against points triangulated from test views."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ __all__ = ["check_no_leak", "choose_points", "colmap_points", "filled", "model_s
 
 RANDOM_POINTS = 10_000  # as DNGaussian for the Blender scenes
 THIN = 1_000
-"""A measured cloud of fewer points is filled with random ones, unless it was asked for."""
+"""A reconstructed cloud of fewer points is filled up with random ones, unless the user asked for it."""
 INSTANTSPLAT = "points3D.ply"
-OPAQUE = 13.0  # in place of an infinite logit, which cannot be trained
+OPAQUE = 13.0  # replaces an infinite logit, which cannot be trained
 
 
 def choose_points(
     root: Path, points: str, train: Sequence[Frame], generator: torch.Generator, *, own: PointCloud | None = None
 ) -> tuple[PointCloud, str]:
-    """Return the initial points that an option of a scene asks for, and a sentence about the choice.
+    """Return the initial points that the option ``points`` asks for, and a note on the choice.
 
-    ``points`` is ``"auto"``, ``"random"``, ``"random:<count>"``, or a ``.ply`` file or a COLMAP folder within the
-    scene; ``own`` are those that the scene file names.
+    It is ``"auto"``, ``"random"``, ``"random:<count>"``, or a ``.ply`` file or COLMAP folder within the scene; ``own``
+    are the points that the scene file names.
 
     Raises:
         FileNotFoundError: if the file or folder is missing.
-        ValueError: if the option or a file makes no sense.
+        ValueError: if the option or a file is invalid.
     """
     kind, _, count = points.partition(":")
     passed = ""
@@ -73,10 +73,10 @@ def choose_points(
 
 
 def filled(cloud: PointCloud, train: Sequence[Frame], generator: torch.Generator) -> tuple[PointCloud, str]:
-    """Add random points to a measured cloud that is too thin to grow a model from, and say so.
+    """Add random points to a reconstructed cloud of fewer than `THIN` points, and return it with a note.
 
-    They lie where the training cameras look, at depths between those of 98 % of the cloud: on fern from three views,
-    459 points alone end 1 dB below.
+    They lie in the frusta of the training cameras, between the 1st and 99th percentiles of the cloud's depths. On fern
+    from three views, training from 459 points alone ends 1 dB lower.
     """
     cameras = [frame.camera for frame in train]
     depths = torch.cat([camera.project(cloud.positions.double())[1] for camera in cameras])
@@ -93,9 +93,9 @@ def filled(cloud: PointCloud, train: Sequence[Frame], generator: torch.Generator
 
 
 def colmap_points(folder: Path) -> PointCloud | None:
-    """Read the points of a COLMAP reconstruction, or InstantSplat's ``points3D.ply`` in their place; None without any.
+    """Read the points of a COLMAP reconstruction, or else InstantSplat's ``points3D.ply``; None if there are none.
 
-    ``seen_by`` names the images in their tracks, or all of the reconstruction's if tracks are missing.
+    ``seen_by`` names the images in their tracks, or all images of the reconstruction if tracks are missing.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -112,16 +112,16 @@ def colmap_points(folder: Path) -> PointCloud | None:
 
 
 def ply_points(path: str | Path, *, seen_by: frozenset[str] | None = None) -> PointCloud:
-    """Read the vertices of a PLY file: a point cloud, or the centers and plain colors of a 3DGS model.
+    """Read the vertices of a PLY file: a point cloud, or the centers and base colors of a 3DGS model.
 
     Args:
         path: a PLY file, binary or ASCII, whose first element is ``vertex`` with at least ``x y z``. Its colors are
-            ``red green blue``: bytes, or floats up to 1 or up to 255; or ``f_dc_0`` to ``f_dc_2``; else gray.
-        seen_by: names of the images that it was made from, where that is known, for a PLY file does not say.
+            ``red green blue``, as bytes or as floats up to 1 or 255, else ``f_dc_0`` to ``f_dc_2``, else gray.
+        seen_by: names of the images that it was made from, if known: a PLY file does not say.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is truncated, not a PLY, or has no points with finite positions and fitting colors.
+        ValueError: if the file is truncated, not a PLY, has no points, or has invalid positions or colors.
     """
     path = Path(path)
     if not path.is_file():
@@ -141,7 +141,7 @@ def ply_points(path: str | Path, *, seen_by: frozenset[str] | None = None) -> Po
 
 
 def _colors(vertices: PlyVertices) -> Tensor:
-    """Return the colors, in [0, 1] if they are any, shape (N, 3)."""
+    """Return the colors (N, 3), in [0, 1] if the file's are valid."""
     rgb, band = ("red", "green", "blue"), ("f_dc_0", "f_dc_1", "f_dc_2")
     if vertices.kinds.keys() >= set(rgb):
         colors = vertices.columns(rgb)
@@ -152,11 +152,11 @@ def _colors(vertices: PlyVertices) -> Tensor:
 
 
 def model_start(path: str | Path) -> tuple[Gaussians, PointCloud, str]:
-    """Read a 3DGS PLY to start from; return its Gaussians, their centers as points, and a sentence about it.
+    """Read a 3DGS PLY to start from; return its Gaussians, their centers as points, and a note on it.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no 3DGS model, is empty, or its opacities are not the plain ones.
+        ValueError: if it is no 3DGS model, is empty, or was written with test-time opacities.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no model {path} to start from: --init takes a 3DGS .ply.")
@@ -175,10 +175,9 @@ def model_start(path: str | Path) -> tuple[Gaussians, PointCloud, str]:
 
 
 def check_no_leak(points: PointCloud, train_names: Iterable[str], *, allow: bool = False) -> None:
-    """Refuse points that were triangulated with the help of images outside the training split, unless they are allowed.
+    """Refuse points that were triangulated from images outside the training split, unless allowed.
 
-    A point found in a test view brings that view's geometry into training. A cloud whose origin is unknown
-    (``seen_by`` is None) passes: nothing is known against it.
+    Such points leak the geometry of test views into training. A cloud of unknown origin (``seen_by`` is None) passes.
 
     Raises:
         ValueError: if the points have seen other images and ``allow`` is False.

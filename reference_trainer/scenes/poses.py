@@ -1,4 +1,4 @@
-"""Cameras and points for photographs that have none: COLMAP's structure from motion, by pycolmap."""
+"""Cameras and points for photographs that have none, by COLMAP's structure from motion (pycolmap)."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from reference_trainer.scenes.images import image_size, list_images
 __all__ = ["FoundPoses", "find_poses"]
 
 FEW = 8
-"""Below so many photographs the settings are others than COLMAP's, which are for dozens."""
+"""Below this many photographs COLMAP's settings, made for dozens, are replaced."""
 LARGEST_SIDE = 1600
-"""Pixels of the longer side at which features are looked for: beyond, time grows and poses hardly improve."""
+"""Pixels of the longer side at which features are extracted: beyond, time grows and poses hardly improve."""
 
 
 @dataclass(frozen=True)
 class FoundPoses:
-    """What was found of some photographs.
+    """The outcome of `find_poses`.
 
     Args:
         folder: of the COLMAP model, ``sparse/0`` in the scene.
-        registered: names of the photographs that have a camera now.
+        registered: names of the photographs that now have a camera.
         left_out: names of the others.
         points: number of points.
         error: mean reprojection error of their features, pixels of the photographs.
@@ -47,7 +47,7 @@ class FoundPoses:
     focal: tuple[float, ...]
 
     def __str__(self) -> str:
-        """Say what was found, and what to do about the rest."""
+        """Describe what was found, and what to do about photographs left out."""
         lengths = " to ".join(f"{x:.0f}" for x in dict.fromkeys((self.focal[0], self.focal[-1])))
         every = len(self.registered) + len(self.left_out)
         lines = [
@@ -70,19 +70,19 @@ def find_poses(
     seed: int = 0,
     progress: bool = False,
 ) -> FoundPoses:
-    """Find cameras and points of a folder of photographs, and write them as the COLMAP model ``sparse/0``.
+    """Find cameras and points for a folder of photographs, and write them as the COLMAP model ``sparse/0``.
 
-    The photographs are those in ``images`` of the scene folder, or in the folder itself. Those of one size and focal
-    length are taken to be from one camera. Below `FEW` photographs, where COLMAP's own settings find little, features
-    are described over several scales and affine shapes, points need two photographs instead of three, and a focal
-    length that a photograph's EXIF data tell is kept, for so few photographs know it less well. The model appears as a
-    whole or not at all. A second call gives the same result.
+    The photographs are those in ``images`` of the scene folder, or in the folder itself. Those of equal size and focal
+    length are taken to share one camera. Below `FEW` photographs, where COLMAP's own settings find little, features use
+    domain-size pooling and affine shapes, points need two photographs instead of three, and the focal lengths are kept
+    if EXIF data give them for all photographs, since so few determine them less well. The model is written atomically,
+    and the result is deterministic.
 
     Args:
-        scene: folder of the photographs, sorted by name.
-        out: another scene folder to write, with copies of the photographs in ``images``; by default the same.
+        scene: the scene folder.
+        out: another scene folder to write to, with copies of the photographs in ``images``; by default ``scene``.
         camera: COLMAP's name of a camera model; by default SIMPLE_PINHOLE below `FEW` photographs, else SIMPLE_RADIAL.
-        seed: of all that is random.
+        seed: of all randomness.
         progress: whether to show progress bars.
 
     Raises:
@@ -124,7 +124,7 @@ def find_poses(
 
 
 def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, progress: bool) -> Any:
-    """Return the reconstruction with the most photographs, None if there is none."""
+    """Return the reconstruction that registers the most photographs, None if there is none."""
     try:
         import pycolmap
     except ImportError as error:
@@ -141,7 +141,7 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
         known = known and taken_with.has_prior_focal_length
         alike[(*image_size(photo), taken_with.mean_focal_length())].append(photo.name)
     pycolmap.Database.open(database).close()
-    for names in alike.values():  # in order: the numbers of the photographs are part of the result
+    for names in alike.values():  # in a fixed order: image numbers are part of the result
         pycolmap.import_images(
             database, folder, camera_mode=pycolmap.CameraMode.SINGLE, image_names=names, options=reader
         )
@@ -159,7 +159,7 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
     pairs = len(photos) * (len(photos) - 1) // 2
     _watched(extract, database, "keypoints", len(photos), desc="features", unit="photo", disable=not progress)
     _watched(match, database, "two_view_geometries", pairs, desc="matching", unit="pair", disable=not progress)
-    # One thread: the order of additions, and so the result, would depend on how many there are.
+    # One thread: with more, the order of summation, and so the result, would depend on their number.
     mapping = pycolmap.IncrementalPipelineOptions(min_model_size=2, num_threads=1, random_seed=seed)
     if few:
         mapping.triangulation.ignore_two_view_tracks = False
@@ -171,7 +171,7 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
 
 
 def _watched(job: Callable[..., None], database: Path, table: str, total: int, **bar: Any) -> None:
-    """Do a job of COLMAP's in another thread, with a bar of the rows that it has written; Ctrl-C ends it."""
+    """Run a COLMAP job in another thread, with a progress bar over the rows it has written; Ctrl-C cancels it."""
     import pycolmap
     from tqdm import tqdm
 
@@ -189,9 +189,9 @@ def _watched(job: Callable[..., None], database: Path, table: str, total: int, *
 
 
 def _write(model: Any, folder: Path) -> None:
-    """Write a model beside its place and move it there."""
+    """Write a model atomically: beside its place, then moved there."""
     part = folder.with_name(f".{folder.name}.part")
-    shutil.rmtree(part, ignore_errors=True)  # of a process that was killed
+    shutil.rmtree(part, ignore_errors=True)  # left by a process that was killed
     part.mkdir(parents=True)
     try:
         model.write_binary(part)

@@ -1,4 +1,4 @@
-"""Cameras between and around the training cameras, for losses that need no photograph."""
+"""Virtual cameras between and around the training cameras, for losses that need no photograph."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ CameraPath = Literal["line", "arc"]
 
 
 def pseudo_cameras(scene: Scene) -> Callable[[torch.Generator], Camera]:
-    """Return a function that draws cameras at random among the training cameras, as CoR-GS does on LLFF and DTU.
+    """Return a function that draws random cameras among the training cameras, as CoR-GS does on LLFF and DTU.
 
-    A camera stands anywhere in the box of the training cameras that is centered on their mean position, its edges along
-    the axes of their mean orientation, and looks at one point on the mean axis, at the depth
-    ``1 / (0.25 / (0.9 near) + 0.75 / (5 far))``. Size and focal lengths are those of the first training camera, the
-    principal point is the picture's middle. ``near`` and ``far`` are `depth_bounds` of the initial points; the sources
-    read them from ``poses_bounds.npy``.
+    Positions are uniform in the box that is centered on the mean training position, has its edges along the axes of the
+    mean orientation and just reaches every training camera. All cameras look at the point on the mean optical axis at
+    the depth ``1 / (0.25 / (0.9 near) + 0.75 / (5 far))``. Size and focal lengths are those of the first training
+    camera, the principal point is the picture's center. ``near`` and ``far`` are the `depth_bounds` of the initial
+    points; the sources read them from ``poses_bounds.npy``.
 
     Raises:
-        ValueError: if the scene has no points in its pictures, or the cameras look to too different sides, such as
-            from around an object: they have no mean direction.
+        ValueError: if no initial point lies in a training picture, or the viewing directions differ too much to have
+            a mean, as around an object.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
@@ -70,11 +70,11 @@ def cameras_between(
 
     Args:
         scene: with the training cameras.
-        path: the way from one to the other, see `camera_between`.
-        past: how far past either, as a share of the way; by default they stand at 0.15 to 0.85 of it.
+        path: the path from one to the other, see `camera_between`.
+        past: how far beyond either end a camera may stand, as a share of the path; by default 0.15 short of both.
 
     Raises:
-        ValueError: if the scene has less than two training cameras.
+        ValueError: if the scene has fewer than two training cameras.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
@@ -96,10 +96,10 @@ def cameras_between(
 
 @torch.no_grad()
 def camera_between(first: Camera, second: Camera, along: float, path: CameraPath = "line") -> Camera:
-    """Return the first camera moved and turned towards the second, 0 at the first and 1 at the second.
+    """Return the first camera moved and turned towards the second; ``along`` is 0 at the first and 1 at the second.
 
-    The orientation takes the great arc. The position takes the straight line, or the ``"arc"`` of the screw motion that
-    leads from one camera to the other: cameras that look at a common point from one distance go around it, facing it.
+    Orientations are interpolated along the great arc. Positions follow the straight line, or the ``"arc"`` of the screw
+    motion between the poses: cameras that look at a common point from one distance move around it, facing it.
 
     Example:
         >>> pose = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))  # half a turn around the origin, 2 in front of both
@@ -122,11 +122,11 @@ def camera_between(first: Camera, second: Camera, along: float, path: CameraPath
 
 VIRTUAL_VIEWS = {"box": pseudo_cameras} | {path: partial(cameras_between, path=path) for path in get_args(CameraPath)}
 VIRTUAL_VIEWS["beyond"] = partial(cameras_between, past=0.5)
-"""Where cameras without a photograph may stand, by name: functions of a scene that return one that draws them."""
+"""Where virtual cameras may stand, by name: functions from a scene to a function that draws such cameras."""
 
 
 def depth_bounds(scene: Scene) -> tuple[float, float]:
-    """Return the least and the largest depth of the scene, those of one point in a thousand in each picture apart.
+    """Return the smallest and the largest depth of the initial points, robust to one outlier in a thousand per end.
 
     Convention: LLFF's ``poses_bounds.npy`` holds these two percentiles, 0.1 and 99.9, for every photograph.
 

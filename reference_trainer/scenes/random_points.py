@@ -1,4 +1,4 @@
-"""Random initial points: in a box, or where the cameras look."""
+"""Random initial points: in a box, or in the cameras' frusta."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def random_points(train: Sequence[Frame], count: int, generator: torch.Generator
     """Draw gray points where the training cameras look.
 
     They fill the NeRF-synthetic box if its center lies in all training pictures and all training cameras stand outside
-    it, else the cameras' frusta, between the scene file's depth bounds where it has them.
+    it, else the cameras' frusta, between the scene file's depth bounds if it has any.
     """
     cameras = [frame.camera for frame in train]
     if all(_looks_at_box(frame) for frame in train):
@@ -40,7 +40,7 @@ def _looks_at_box(frame: Frame) -> bool:
 
 
 def random_points_in_box(count: int, half_size: float, *, generator: torch.Generator | None = None) -> PointCloud:
-    """Draw gray points uniformly in a cube around the origin whose edge is twice ``half_size``, world units."""
+    """Draw gray points uniformly in an origin-centered cube of edge ``2 * half_size``, world units."""
     positions = (2 * torch.rand(count, 3, generator=generator) - 1) * half_size
     return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
 
@@ -53,14 +53,14 @@ def random_points_in_frusta(
     far: float | None = None,
     generator: torch.Generator | None = None,
 ) -> PointCloud:
-    """Draw gray points that some camera sees: uniform over its picture, and in inverse depth between two bounds.
+    """Draw gray points in the cameras' frusta: uniform over the picture and in inverse depth between two bounds.
 
-    The bounds are in world units. Without them, the point closest to all optical axes is looked for; near and far are a
-    quarter of its median depth and four times that.
+    The bounds are in world units. Without them, near and far are a quarter and four times the median depth of the point
+    closest to all optical axes.
 
     Raises:
-        ValueError: if no depth can be found because the optical axes do not meet in front of the cameras, or the bounds
-            are not ``0 < near < far``.
+        ValueError: if the optical axes that must give the bounds do not meet in front of the cameras, or the bounds are
+            not ``0 < near < far``.
     """
     if near is None or far is None:
         focus = _focus_depth(cameras)

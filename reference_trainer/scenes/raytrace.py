@@ -1,4 +1,4 @@
-"""A small ray tracer for textured, matt surfaces with soft shadows; it knows the exact depth of every pixel."""
+"""A small ray tracer for textured Lambertian surfaces with soft shadows and exact depth."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from reference_trainer.scenes.textures import Texture
 __all__ = ["Box", "Round", "Solid", "nearest_hit", "render_solids"]
 
 SAMPLES = 3  # a side per pixel; odd, so that one ray passes through the pixel center and gives its depth
-SHADOW_OFFSET = 1e-3  # shadow rays start this far off the surface, lest rounding make it shadow itself
+SHADOW_OFFSET = 1e-3  # shadow rays start this far off the surface, so that rounding does not make it shadow itself
 AMBIENT = 0.3
 GAMMA = 2.2
 
 
 @dataclass(frozen=True)
 class Round:
-    """A sphere, or, where it has two heights, an upright cylinder without ends between them."""
+    """A sphere or, given two heights, the open upright cylinder between them."""
 
     center: tuple[float, float, float]
     radius: float
@@ -30,7 +30,7 @@ class Round:
     heights: tuple[float, float] | None = None
 
     def _across(self, points: Tensor) -> Tensor:
-        """Return vectors without what the shape does not see of them: the height, if it is a cylinder."""
+        """Return vectors without their vertical part for a cylinder, unchanged for a sphere."""
         return points if self.heights is None else points * points.new_tensor([1.0, 0.0, 1.0])
 
     def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ class Box:
     texture: Texture
 
     def _axes(self, like: Tensor) -> Tensor:
-        """Rows: the box's axes in world coordinates."""
+        """Return the box's axes in world coordinates, one per row."""
         c, s = math.cos(self.turn), math.sin(self.turn)
         return like.new_tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]])
 
@@ -98,11 +98,11 @@ def nearest_hit(solids: Sequence[Solid], origins: Tensor, directions: Tensor) ->
 
 
 def render_solids(camera: Camera, solids: Sequence[Solid], light: Tensor) -> tuple[Tensor, Tensor]:
-    """Render solids, 3x3 rays a pixel: the image (3, H, W) in [0, 1] and the depth (H, W) at pixel centers, float32.
+    """Render solids, 3x3 rays per pixel: the image (3, H, W) in [0, 1] and the depth (H, W) at pixel centers, float32.
 
-    Surfaces are matt, so their color does not depend on the view. The light is a small square of nine points (9, 3);
-    each of a pixel's nine rays sees another of them, which makes the shadows soft. Depth is along the camera's z axis;
-    image and depth are 0 where nothing is hit.
+    Surfaces are Lambertian, so their color does not depend on the view. The light is nine points (9, 3), one for each
+    of a pixel's nine rays, which makes the shadows soft. Depth is along the camera's z axis; image and depth are 0
+    where nothing is hit.
     """
     steps = (torch.arange(SAMPLES) + 0.5) / SAMPLES
     shape = (camera.height, camera.width, SAMPLES, SAMPLES)

@@ -1,4 +1,4 @@
-"""What a scene is to the rest of the program: photographs with cameras, and optional initial points."""
+"""Scenes as the rest of the program sees them: photographs with cameras, and optional initial points."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _NAMES_SHOWN = 12
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera that something can be looked at from; with its photograph it is a `View`.
+    """A named camera; with its photograph it is a `View`.
 
     Args:
-        name: a label, unique among its like.
+        name: a label, unique within its split.
         camera: the camera.
     """
 
@@ -45,12 +45,12 @@ class View(Viewpoint):
         name: the file name or another unique label.
         camera: its camera; ``camera.height`` and ``camera.width`` equal the image's.
         image: colors in [0, 1], shape (3, H, W), float32, already composited on the scene's background.
-        alpha: coverage in [0, 1], shape (H, W), where the source has one, else None.
-        depth: true depth along the camera's z axis, shape (H, W), where it is known, else None; 0 where nothing is hit.
-        mask: what an evaluation looks at, in [0, 1], shape (H, W), where the source has one: DTU's object. The
-            photograph itself is untouched by it.
+        alpha: coverage in [0, 1], shape (H, W), if the source has one.
+        depth: true depth along the camera's z axis, shape (H, W), if known; 0 where nothing is hit.
+        mask: the region that counts in an evaluation, in [0, 1], shape (H, W), if the source has one (DTU's object);
+            it is not applied to the image.
         depth_prior: what a loss may compare depth with, larger where farther, of unknown scale and shift, shape (H, W):
-            a depth, or the negative of an inverse depth; nan where unknown.
+            a depth, or a negated inverse depth; nan where unknown.
     """
 
     image: Tensor
@@ -64,8 +64,8 @@ class View(Viewpoint):
 class PointCloud:
     """Points to initialize Gaussians from: world coordinates and RGB in [0, 1], both (M, 3), float32.
 
-    ``source`` says for the log where they come from; ``seen_by`` names all the images that the points were triangulated
-    from, where that is known.
+    ``source`` says for the log where they come from; ``seen_by`` names all images that they were triangulated from, if
+    that is known.
     """
 
     positions: Tensor
@@ -85,8 +85,8 @@ class Scene:
         points: initial points, or None to let the trainer draw random ones.
         background: the color (3,) behind everything, in [0, 1].
         source: where the photographs come from.
-        notes: what a user should know of how it was loaded, a sentence each.
-        start: a model to start from instead; ``points`` are then its centers.
+        notes: what a user should know about how it was loaded, one note each.
+        start: a model to start from instead of points; ``points`` are then its centers.
     """
 
     name: str
@@ -99,7 +99,7 @@ class Scene:
     start: Gaussians | None = None
 
     def __str__(self) -> str:
-        """Say what a user looks at first: which photographs, their size, the names of the views, and the notes."""
+        """Summarize the scene: source and size of the photographs, names of the views, and the notes."""
         sizes = sorted({(view.camera.width, view.camera.height) for view in (*self.train, *self.test)})
         size = " to ".join(f"{width}x{height}" for width, height in dict.fromkeys((sizes[0], sizes[-1])))
         lines = [f"photographs: {self.source}, used at {size} pixels"]
@@ -124,7 +124,7 @@ class Scene:
         """Radius of the training rig: 1.1 x the largest distance of a training camera from their mean position.
 
         Convention: the INRIA code scales its position learning rate and its densification thresholds by this number.
-        A rig of one camera has no radius; then the result is 1.
+        A rig without a radius, such as a single camera, gives 1.
         """
         positions = torch.stack([view.camera.position for view in self.train])
         radius = (positions - positions.mean(0)).norm(dim=1).max().item()

@@ -1,4 +1,4 @@
-"""Which photographs are trained on and which are held out: the published sparse-view protocols."""
+"""Splits into training and held-out photographs: the published sparse-view protocols."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from reference_trainer.json_files import read_json
 
 __all__ = ["blender_split", "dtu_split", "evenly_spaced", "file_split", "llff_split"]
 
-BLENDER_TRAIN = (2, 16, 26, 55, 73, 76, 86, 93)  # the 8 views of DietNeRF, which every later paper takes
+BLENDER_TRAIN = (2, 16, 26, 55, 73, 76, 86, 93)  # the 8 views of DietNeRF, adopted by every later paper
 BLENDER_TEST_FRAMES = 200  # the size of a full NeRF-synthetic test set
 TEST_EVERY = 8
-DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)  # PixelNeRF's, of which a protocol of 3 views takes the first 3
+DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)  # PixelNeRF's; a protocol of n views takes the first n
 DTU_TEST = (1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, *range(29, 36), 41, 42, 43, 45, 46, 47)
 
 
 def evenly_spaced(count: int, views: int) -> list[int]:
-    """Choose ``views`` of ``count`` items, evenly, first and last included.
+    """Choose ``views`` of ``count`` items, evenly spaced, first and last included; a single one is the first.
 
-    Convention: Python's ``round``, half to even, of ``np.linspace(0, count - 1, views)``, as RegNeRF and its followers.
+    Convention: ``np.linspace(0, count - 1, views)`` rounded half to even by ``round``, as in RegNeRF and its followers.
 
     Raises:
         ValueError: if not ``1 <= views <= count``.
@@ -36,7 +36,7 @@ def evenly_spaced(count: int, views: int) -> list[int]:
 
 
 def llff_split(count: int, views: int) -> tuple[list[int], list[int]]:
-    """Split so many images of a forward-facing scene, sorted by name: indices of the training and of the test views.
+    """Split the ``count`` images of a forward-facing scene, sorted by name, into training and test indices.
 
     Every eighth image is a test view, beginning with the first; the training views are spread evenly over the rest.
     Raises ValueError if there are not enough images.
@@ -50,9 +50,9 @@ def llff_split(count: int, views: int) -> tuple[list[int], list[int]]:
 
 
 def dtu_split(count: int, views: int) -> tuple[list[int], list[int]]:
-    """Split a DTU scan of 49 or 64 pictures, sorted by name, as PixelNeRF and RegNeRF do: training and 25 test indices.
+    """Split a DTU scan of 49 or 64 pictures, sorted by name, into training and 25 test indices, as PixelNeRF, RegNeRF.
 
-    Raises ValueError if there are too few images, or not 1 to 9 training views.
+    Raises ValueError if there are fewer than 49 images, or ``views`` is not 1 to 9.
 
     Example:
         >>> train, test = dtu_split(49, 3)
@@ -67,8 +67,8 @@ def dtu_split(count: int, views: int) -> tuple[list[int], list[int]]:
 def blender_split(train_count: int, test_count: int, views: int) -> tuple[list[int], list[int]]:
     """Choose training and test views of a Blender (NeRF-synthetic) scene: indices into its two JSON files.
 
-    From the full data set the 8-view protocol takes eight fixed training views and every eighth of the 200 test views.
-    A scene that lists no more than ``views`` training frames is subsampled already: all are taken. Other numbers of
+    On the full data set the 8-view protocol takes eight fixed training views and every eighth of the 200 test views.
+    A scene that lists no more than ``views`` training frames is already subsampled: all are taken. Other numbers of
     views are spread evenly. A test list shorter than 200 is taken whole.
 
     Raises:
@@ -89,13 +89,13 @@ def blender_split(train_count: int, test_count: int, views: int) -> tuple[list[i
 def file_split(path: str | Path, names: Sequence[str], views: int | None) -> tuple[list[int], list[int]]:
     """Read a split from a JSON file with a list ``test`` and one or more lists of training images.
 
-    With ``views`` given, the list is ``train_<views>``, else ``train`` if it has that length, else ``views`` images
+    With ``views``, the training list is ``train_<views>``, else ``train`` if it has that length, else ``views`` images
     spread evenly over ``train_all``. Without, it is ``train``, else ``train_3``. Images are named with or without
-    extension. Returned are indices into ``names``, all images of the scene, each list in increasing order.
+    extension. Returns training and test indices into ``names``, all images of the scene, in increasing order.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file has no fitting list, names unknown images, or trains on test images.
+        ValueError: if a list is missing or repeats an image, names unknown images, or trains on test images.
     """
     path = Path(path)
     if not path.is_file():

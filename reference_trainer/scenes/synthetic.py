@@ -1,4 +1,4 @@
-"""The built-in scene: a small courtyard that needs no file, seen by a forward-facing rig."""
+"""The built-in scene: a small ray-traced courtyard seen by a forward-facing rig; it needs no files."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ __all__ = ["synthetic_scene"]
 FIELD_OF_VIEW = math.radians(52)  # horizontal
 TARGET = (0.0, 0.15, 5.0)  # the point that all cameras look at
 RIG_HALF_WIDTH = 1.1
-OUTSIDE = 1.35  # place of the extrapolated test camera, in half widths of the training rig
-DEPTH_NOISE = 0.005  # standard deviation of the initial points along the ray, as a share of their depth
+OUTSIDE = 1.35  # position of the extrapolating test camera, in half widths of the training rig
+DEPTH_NOISE = 0.005  # standard deviation of the initial points along the ray, relative to their depth
 GROUND = 1.0
 TEXTURE_SEED = 0
 
@@ -34,14 +34,13 @@ def synthetic_scene(
     points: int = 3000,
     seed: int = 0,
 ) -> Scene:
-    """Ray-trace the built-in scene: columns, spheres and a box on a tiled floor before a painted wall.
+    """Ray-trace the built-in scene: columns, spheres and a box on a tiled floor in front of a painted wall.
 
-    Training cameras, at least 2, stand side by side on a slightly bent row and look at one point, like the LLFF
-    captures. All test cameras but the last stand between and above or below them (interpolation), the last one beyond
-    the end of the row (extrapolation, the hardest). Every view has its exact depth. The initial points lie on surfaces
-    that training views see, with a depth error of 0.5 %, as if they had been triangulated. ``seed`` is that of the
-    points: the photographs are the same for every seed, so that runs can be compared. No ray reaches the background,
-    which is black.
+    The training cameras, at least 2, stand side by side in a slightly bent row and look at one point, as in LLFF
+    captures. All test cameras but the last stand between them (interpolation), the last one beyond the end of the row
+    (extrapolation, the hardest). Every view has its exact depth. The initial points lie on surfaces seen by training
+    views, with a depth error of 0.5 %, as if triangulated. ``seed`` affects the points alone: the photographs are the
+    same for every seed, so that runs can be compared. No ray reaches the background, which is black.
 
     Convention: OpenCV world: x right, y down, z forward; the floor is at y = 1.
 
@@ -78,7 +77,7 @@ def synthetic_scene(
 
 
 def _between(places: list[float], count: int) -> list[float]:
-    """Choose places in the gaps between the training cameras, as many gaps as possible, none of them twice."""
+    """Choose distinct places in the gaps between the training cameras, spread over as many gaps as possible."""
     gaps = list(itertools.pairwise(places))
     rounds = max(1, math.ceil(count / len(gaps)))
     chosen = []
@@ -97,7 +96,7 @@ def _camera(place: float, lift: float, width: int, height: int) -> Camera:
 
 
 def _surface_points(views: list[View], count: int, generator: torch.Generator) -> PointCloud:
-    """Draw pixels of the training views and lift them to the surface, with an error along the ray."""
+    """Draw pixels of the training views and lift them to the surface, with noise along the ray."""
     height, width = views[0].image.shape[1:]
     chosen = torch.randint(len(views) * height * width, (count,), generator=generator)
     error = 1 + DEPTH_NOISE * torch.randn(count, generator=generator)
@@ -113,7 +112,7 @@ def _surface_points(views: list[View], count: int, generator: torch.Generator) -
 
 
 def _courtyard(noise: Noise) -> list[Solid]:
-    """The surfaces of the scene. Reflectances are linear; the renderer applies the display gamma."""
+    """Return the surfaces of the scene. Reflectances are linear; the renderer applies the display gamma."""
 
     def floor(p: Tensor) -> Tensor:
         which, joint = checker(p[:, 0] / 0.8 + 0.35, p[:, 2] / 0.8, joint=0.05)

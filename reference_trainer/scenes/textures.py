@@ -11,7 +11,7 @@ from torch.nn.functional import grid_sample, pad
 __all__ = ["Noise", "Texture", "checker", "color_ramp"]
 
 Texture = Callable[[Tensor], Tensor]
-"""From points (R, 3) to RGB reflectances (R, 3) in [0, 1]."""
+"""Maps points (R, 3) to linear RGB reflectances (R, 3), nominally in [0, 1]."""
 
 
 class Noise:
@@ -30,7 +30,7 @@ class Noise:
         self._wrapped = pad(self.lattice[None, None], (0, 1) * 3, mode="circular")
 
     def __call__(self, points: Tensor, octaves: int = 1) -> Tensor:
-        """Return the noise at points (R, 3): values in [0, 1], shape (R,), with a feature size of 1 and below."""
+        """Return the noise at points (R, 3): values in [0, 1], shape (R,), with features of size 1 and smaller."""
         total, weight = points.new_zeros(points.shape[0]), 0.0
         for octave in range(octaves):
             # The shift keeps the lattice planes of the octaves apart.
@@ -61,6 +61,6 @@ def color_ramp(values: Tensor, colors: Sequence[tuple[float, float, float]]) -> 
 
 
 def checker(u: Tensor, v: Tensor, joint: float) -> tuple[Tensor, Tensor]:
-    """Return which color of a unit checkerboard (u, v) falls on, 0 or 1, and whether on a joint between tiles."""
+    """Return the color of a unit checkerboard at (u, v), 0 or 1, and whether the point is on a joint between tiles."""
     edge = torch.minimum((u - u.round()).abs(), (v - v.round()).abs())
     return (u.floor() + v.floor()).long() % 2, edge < joint / 2

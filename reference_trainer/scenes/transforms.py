@@ -1,4 +1,4 @@
-"""``transforms.json`` of nerfstudio and instant-ngp, and Blender's (NeRF-synthetic) pair of train and test."""
+"""Scenes with ``transforms.json`` (nerfstudio, instant-ngp) or Blender's pair of train and test (NeRF-synthetic)."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
     """Read the frames of one ``transforms*.json``, in the order of the file.
 
     Convention: ``transform_matrix`` is camera to world with OpenGL axes (x right, y up, z back); the frames' cameras
-    are OpenCV and world to camera. nerfstudio's ``applied_transform`` is taken back, so that the world is that of the
+    are OpenCV and world to camera. nerfstudio's ``applied_transform`` is undone, so that the world is that of the
     COLMAP files it came from. The focal length is ``fl_x`` and ``fl_y``, pixels, for a picture of ``w`` x ``h``, else
     it follows from the horizontal field of view ``camera_angle_x``, radians. The principal point ``cx``, ``cy`` is the
-    center of the picture unless given; ``k1 k2 p1 p2 k3`` are OpenCV's distortion. A frame may have its own of each.
-    ``file_path`` is relative to the JSON file; without an extension it means a PNG file. Pictures of the same names are
-    taken from another folder beside the file if one is given. The frames' names are the file paths without a leading
-    ``./`` and without extension.
+    center of the picture unless given; ``k1 k2 p1 p2 k3`` are OpenCV's distortion. A frame may override each of these.
+    ``file_path`` is relative to the JSON file; without an extension it means a PNG file. With ``images``, pictures of
+    the same names are taken from that folder beside the file. Frames are named by the relative path of their picture,
+    without extension.
 
     Raises:
         FileNotFoundError: if the file or images are missing.
-        ValueError: if the file is not what is described above, has a fisheye camera, or a path leads out of the scene
+        ValueError: if the file is not as described above, has a fisheye camera, or a path leads out of the scene
             folder.
     """
     path = Path(path)
@@ -74,7 +74,7 @@ def _file(root: Path, file_path: str, images: str | None) -> Path:
 
 
 def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float64]) -> Frame:
-    """Build one frame from its entry, which has the file's own values where it has none itself."""
+    """Build one frame from its entry, to which the file's shared values have been added."""
     width, height = (int(entry["w"]), int(entry["h"])) if "w" in entry else image_size(file)
     if "fl_x" in entry:
         fx = float(entry["fl_x"])
@@ -104,7 +104,7 @@ def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float
 
 
 def _applied(content: dict[str, Any]) -> NDArray[np.float64]:
-    """Return what nerfstudio has applied to the world, (4, 4)."""
+    """Return the transform that nerfstudio has applied to the world, (4, 4)."""
     matrix = np.eye(4)
     matrix[:3] = np.array(content.get("applied_transform", matrix[:3]), np.float64)[:3]
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
@@ -127,7 +127,7 @@ def _world_to_camera(entry: dict[str, Any], back: NDArray[np.float64]) -> torch.
 
 
 def _points(path: Path, frames: list[Frame]) -> PointCloud | None:
-    """Read the points that the file names: they lie in the world of its matrices, and may come from any image."""
+    """Read the points that the file names, if any: in the world of its matrices, and possibly from any image."""
     content = read_json(path)
     if "ply_file_path" not in content:
         return None

@@ -1,4 +1,4 @@
-"""Photographs through a real lens, resampled to what a pinhole camera would have taken."""
+"""Lens distortion, and resampling a photograph to what a pinhole camera would have taken."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from reference_trainer.camera import Camera
 __all__ = ["corner_displacement", "distort", "undistort"]
 
 LARGEST_ZOOM = 4.0
-"""Beyond this a lens shows so little of a straight picture that the file is more likely wrong."""
+"""Beyond this zoom the lens covers so little of the undistorted picture that the coefficients are more likely wrong."""
 
 
 def distort(points: Tensor, camera: Camera, distortion: Sequence[float]) -> Tensor:
     """Return where the lens puts pixels (..., N, 2), float64, of a pinhole camera without distortion.
 
-    Convention: OpenCV's rational model; the coefficients are k1 k2 p1 p2 k3 k4 k5 k6 or a beginning of that list, which
-    is also the order of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV. Pixel centers are half-integer.
+    Convention: OpenCV's rational model; the coefficients are k1 k2 p1 p2 k3 k4 k5 k6 or a prefix of that list, which is
+    also the order of COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV. Pixel centers are half-integer.
 
     Example:
         >>> camera = Camera(torch.eye(4), 100.0, 100.0, 50.0, 40.0, 100, 80)
@@ -36,21 +36,21 @@ def distort(points: Tensor, camera: Camera, distortion: Sequence[float]) -> Tens
 
 
 def corner_displacement(camera: Camera, distortion: Sequence[float]) -> float:
-    """Return how far the distortion moves a corner of the picture, at most over the four, in pixels."""
+    """Return the largest distance, in pixels, by which the distortion moves one of the four corners of the picture."""
     w, h = float(camera.width), float(camera.height)
     corners = torch.tensor([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]], dtype=torch.float64)
     return float((distort(corners, camera, distortion) - corners).norm(dim=1).max())
 
 
 def undistort(pixels: Tensor, camera: Camera, distortion: Sequence[float]) -> tuple[Tensor, Camera]:
-    """Resample a picture (C, H, W), bicubically and once, so that straight lines are straight; return its camera, too.
+    """Undistort a picture (C, H, W) by one bicubic resampling; return it with its new camera.
 
-    The picture keeps its size. Where the lens saw less than the straight picture would show, the focal length grows
-    until no pixel is empty, as COLMAP's undistorter does by default. ``camera`` is that of the picture without its
-    distortion, which is given as for `distort`.
+    The picture keeps its size. Where the lens saw less than the undistorted picture would show, the focal length grows
+    until no pixel is empty, as with COLMAP's undistorter by default. ``camera`` and ``distortion`` are as for
+    `distort`.
 
     Raises:
-        ValueError: if the lens folds the picture over itself, or shows less than a quarter of it.
+        ValueError: if the lens folds the picture over itself, or the zoom would exceed `LARGEST_ZOOM`.
     """
     zoom = _zoom(camera, distortion)
     straight = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
@@ -70,13 +70,13 @@ def undistort(pixels: Tensor, camera: Camera, distortion: Sequence[float]) -> tu
 
 
 def _distort_zoomed(points: Tensor, camera: Camera, distortion: Sequence[float], zoom: float) -> Tensor:
-    """Distort pixels of a picture whose focal length is larger by a factor."""
+    """Distort pixels of a camera whose focal length is ``zoom`` times larger."""
     center = torch.tensor([camera.cx, camera.cy], dtype=points.dtype)
     return distort(center + (points - center) / zoom, camera, distortion)
 
 
 def _zoom(camera: Camera, distortion: Sequence[float]) -> float:
-    """Find the smallest factor on the focal length, at least 1, with which the lens has seen all of the picture."""
+    """Find the smallest factor on the focal length, at least 1, at which the lens has seen all of the picture."""
     x, y = (torch.linspace(0.5, size - 0.5, 65, dtype=torch.float64) for size in (camera.width, camera.height))
     border = [torch.stack([x, torch.full_like(x, edge)], 1) for edge in (0.5, camera.height - 0.5)]
     border += [torch.stack([torch.full_like(y, edge), y], 1) for edge in (0.5, camera.width - 0.5)]

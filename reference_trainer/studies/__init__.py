@@ -1,1 +1,1 @@
-"""Studies of the method and of the program, with their reports."""
+"""Studies of the method and of this package, with their reports."""

@@ -1,4 +1,4 @@
-"""Clocks, and timing in turns."""
+"""Clocks, and interleaved timing."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Clock = Callable[[], float]
 
 
 def in_turns(calls: Mapping[str, Callable[[], object]], repeats: int, clock: Clock) -> dict[str, list[float]]:
-    """Time several calls in turns, so that a change of the machine's load meets all of them.
+    """Time several calls in turns, so that a change in the machine's load affects all of them alike.
 
     Args:
         calls: by name.
-        repeats: number of timed rounds; one round before them is not timed.
-        clock: seconds; `now` of a device, or `processor_clock`.
+        repeats: number of timed rounds, after one untimed round.
+        clock: returns seconds: `now` of a device, or `processor_clock`.
 
     Returns:
         Seconds of every round, by name.
@@ -40,12 +40,12 @@ def in_turns(calls: Mapping[str, Callable[[], object]], repeats: int, clock: Clo
 
 
 def now(device: torch.device) -> float:
-    """Return the time at which all work given to a device is done, seconds."""
+    """Wait until all work queued on a device is done; return the wall-clock time in seconds."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return perf_counter()
 
 
 def processor_clock(device: torch.device) -> Clock:
-    """Return a clock that other programs disturb less: the time of this process's processors; `now` on a GPU."""
+    """Return a clock less disturbed by other programs: CPU time of this process; on a GPU, `now`."""
     return process_time if device.type == "cpu" else partial(now, device)

@@ -1,4 +1,4 @@
-"""Work and precision of the estimators of co-adaptation: their error against the wall-clock time."""
+"""Work-precision study of the estimators of co-adaptation: error against wall-clock time."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ ERRORS = ("score", "map")
 DROP_RATE = 0.5
 THRESHOLD = 0.8  # of the expected alpha
 ROUNDS = 7  # how often everything but Monte Carlo is timed
-FIT_FROM = 8  # smallest K of the fitted lines: at smaller ones the error is not yet a power of K
-PICTURE = 256  # side of the picture of a PLY, pixels
+FIT_FROM = 8  # smallest K of the fitted lines: below, the error does not yet follow a power law in K
+PICTURE = 256  # side length of the picture of a PLY, pixels
 
 
 def error_runtime_study(
     sources: Sequence[Path], *, max_samples: int = 1024, seeds: int = 3, device: str = "cpu"
 ) -> Study:
-    """Declare the study of runs of this program and anyone's PLY files.
+    """Declare the study for runs of this package and for any PLY files.
 
     A run is measured at its first test view, or training view if there is none; a PLY at the first camera of an orbit,
-    over black. Both with the plain opacities: the test-time scaling is no part of co-adaptation.
+    over black. Both use the plain opacities: CA is defined without the test-time scaling.
 
     Args:
         sources: folders of runs, and ``.ply`` files.
@@ -55,7 +55,7 @@ def error_runtime_study(
         device: where to render.
 
     Raises:
-        FileNotFoundError: if a source is missing, or is no run.
+        FileNotFoundError: if a folder holds no run.
         ValueError: if there is no source, two have the same name, or a number is out of range.
     """
     if max_samples < 2 * FIT_FROM or max_samples & (max_samples - 1) or seeds < 1:
@@ -74,7 +74,7 @@ def error_runtime_study(
 
 
 def _measure(source: Path, max_samples: int, seeds: int, device: str) -> Record:
-    """Measure one checkpoint of a run, or PLY."""
+    """Measure one source: the checkpoint of a run, or a PLY."""
     if source.suffix == ".ply":
         return error_runtime(*_of_ply(source, device), max_samples=max_samples, seeds=seeds)
     model, scene, _ = of_run(source.parent, device)
@@ -83,16 +83,16 @@ def _measure(source: Path, max_samples: int, seeds: int, device: str) -> Record:
 
 @torch.no_grad()
 def error_runtime(model: TrainedModel, view: View, *, max_samples: int = 1024, seeds: int = 3) -> Record:
-    """Measure error and wall-clock time of all estimators of the co-adaptation of one view at a drop rate of 1/2.
+    """Measure error and wall-clock time of all estimators of one view's co-adaptation at drop rate 1/2.
 
     - Monte Carlo with K = 2, 4, 8, ... renders: the unbiased variance (ddof = 1), accumulated in float64 in one running
       pass per seed. Its time includes drawing the masks.
     - The paper's first-order form, and the exact moments in float32, drawn by every engine, and in float64.
 
-    All share one region, the pixels whose expected alpha exceeds 0.8 in the exact float64 result, and every time starts
-    at the parameters of the model: projection and tile lists are included. Each call is made once before it is timed;
-    on a GPU the clock waits for the work to be done. What takes one call is timed in turns with the plain render, so
-    that a change of the machine's load meets all of them. Plain renders are drawn by the engine that is chosen.
+    All share one region, the pixels whose expected alpha exceeds 0.8 in the exact float64 result. Times start from the
+    parameters of the model, so they include projection and tile lists; on a GPU the clock waits for the work to be
+    done. Everything but Monte Carlo is called once untimed and then timed in turns with the plain render (`in_turns`),
+    which is drawn by the engine in use, as are the Monte Carlo renders.
 
     Args:
         model: what to measure, float32; its dropout rate does not matter.
@@ -102,9 +102,9 @@ def error_runtime(model: TrainedModel, view: View, *, max_samples: int = 1024, s
 
     Returns:
         The exact float64 ``score``, the mean over RGB and the region, which covers the share ``covered`` of the pixels;
-        ``render_seconds`` of a plain render; under ``estimators`` one entry for each and each K: ``seconds``,
-        ``scores``, ``score`` and ``map``, with a value for each seed or repetition. ``score`` is the relative error of
-        the score, ``map`` the root mean square error of the variance map, divided by the mean of the reference.
+        ``render_seconds`` of a plain render; under ``estimators`` one entry per estimator and K with ``seconds``,
+        ``scores``, ``score`` and ``map``, a value for each seed or repetition. ``score`` is the relative error of the
+        score, ``map`` the root mean square error of the variance map, divided by the mean of the reference.
 
     Raises:
         ValueError: if no pixel is covered, or nothing in the region varies.
@@ -173,7 +173,7 @@ def error_runtime(model: TrainedModel, view: View, *, max_samples: int = 1024, s
 
 
 def _monte_carlo(model: TrainedModel, view: View, max_samples: int, seed: int) -> Iterator[tuple[int, float, Tensor]]:
-    """Yield K = 2, 4, 8, ..., the seconds spent up to there, and the unbiased variance (3, H, W)."""
+    """Yield K = 2, 4, 8, ..., the seconds spent so far, and the unbiased variance (3, H, W)."""
     opacities = model.gaussians.opacities
     device = opacities.device
     generator = torch.Generator().manual_seed(seed)
@@ -194,7 +194,7 @@ def _monte_carlo(model: TrainedModel, view: View, max_samples: int, seed: int) -
 
 
 def rms(estimate: Record, error: str) -> float:
-    """Return the root mean square of an error (of `ERRORS`) of an estimate over the seeds."""
+    """Return the root mean square over the seeds of an estimate's error, one of `ERRORS`."""
     return math.sqrt(statistics.fmean(x * x for x in estimate[error]))
 
 
@@ -204,26 +204,26 @@ def entries_of(record: Record, name: str) -> list[Record]:
 
 
 def single(record: Record) -> Record:
-    """Return the exact float32 estimate of the loops, or of torch where there are none."""
+    """Return the exact float32 estimate of the loops, or of the torch engine if there is none."""
     return (entries_of(record, LOOPS) or entries_of(record, TORCH))[0]
 
 
 def slope(record: Record, error: str) -> float:
     """Return the slope of ln error against ln K, fitted to Monte Carlo from K = 8 on; expected is -1/2.
 
-    The error at one K is the root mean square over the seeds. A map has the errors of many pixels, the score one error
-    per seed: the slope of the latter scatters, with a deviation of 0.14 for 3 seeds and K up to 1024.
+    The error at one K is the root mean square over the seeds. A map averages the errors of many pixels, but the score
+    has one error per seed, so its slope scatters: by 0.14 (standard deviation) for 3 seeds and K up to 1024.
     """
     ks, errors = _convergence(record, error)
     return float(np.polyfit(np.log(ks), np.log(errors), 1)[0])
 
 
 def samples_to_match(record: Record, error: str) -> float | None:
-    """Return the K at which Monte Carlo would have the error of the first exact float32 estimate.
+    """Return the K at which Monte Carlo would reach the error of the exact float32 estimate, see `single`.
 
-    Extrapolated from the measured errors by the law K^(-1/2) and not by the fitted slope, whose uncertainty would be
-    multiplied by many decades. The renders' own rounding and early stop may keep the average from getting there. None
-    if the exact estimate has no error at all.
+    Extrapolated from the measured errors by the law K^(-1/2), not by the fitted slope, whose uncertainty would be
+    magnified over many decades. Rounding and early termination in the renders may keep the average from getting there.
+    None if the exact estimate has no error at all.
     """
     ks, errors = _convergence(record, error)
     target = rms(single(record), error)
@@ -231,7 +231,7 @@ def samples_to_match(record: Record, error: str) -> float | None:
 
 
 def _convergence(record: Record, error: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return K and the error of Monte Carlo at each."""
+    """Return the K of the fit and the Monte Carlo error at each."""
     points = [(m["K"], rms(m, error)) for m in entries_of(record, MONTE_CARLO) if m["K"] >= FIT_FROM]
     ks, errors = np.array(points, dtype=np.float64).T
     return ks, errors
@@ -242,7 +242,7 @@ def _report(records: Records) -> str:
 
 
 def _table(record: Record) -> str:
-    """Return one row per estimator, and what follows; times are medians, errors root mean squares over the seeds."""
+    """Return one row per estimator, and conclusions; times are medians, errors root mean squares over the seeds."""
     render = statistics.median(record["render_seconds"])
     rows: list[dict[str, object]] = []
     for m in record["estimators"]:
@@ -260,7 +260,7 @@ def _table(record: Record) -> str:
 
 
 def _conclusion(record: Record, error: str) -> str:
-    """Say how the Monte Carlo error falls, and when it would be that of the exact estimate."""
+    """Say how the Monte Carlo error falls, and when it would reach that of the exact estimate."""
     needed, name, last = samples_to_match(record, error), single(record)["name"], entries_of(record, MONTE_CARLO)[-1]
     text = f"{error}: the error of {MONTE_CARLO} falls as K^{slope(record, error):.2f}"
     if needed is None:
@@ -270,7 +270,7 @@ def _conclusion(record: Record, error: str) -> str:
 
 
 def _draw(records: Records, figure: Any) -> None:
-    """Draw error against time, one panel per model; bars reach from the smallest to the largest error of a seed."""
+    """Draw error against time, one panel per model; bars span the smallest to the largest error of a seed."""
     figure.set_size_inches(5.2 * len(records), 5.2)
     panels = figure.subplots(1, len(records), squeeze=False, sharey=True)[0]
     for axes, (name, record) in zip(panels, records.items(), strict=True):
@@ -319,7 +319,7 @@ def _panel(axes: Any, record: Record) -> None:
 
 
 def _of_ply(ply: Path, device: str) -> tuple[TrainedModel, View]:
-    """Return the model of a PLY over black, and a view from an orbit; it has a camera but no photograph."""
+    """Return the model of a PLY over black, and a view on an orbit, whose image is a black placeholder."""
     model, _ = of_plain_ply(ply, device=device)
     means, opacities = model.gaussians.means, model.gaussians.opacities
     camera = orbit_views(means, opacities, count=1, width=PICTURE, height=PICTURE)[0]

@@ -25,8 +25,8 @@ from reference_trainer.scenes.scene import View, Viewpoint
 
 __all__ = ["study_attribution"]
 
-# Ends of the color scale in units of the mean. Shares grow with the size of a Gaussian, so that a picture of them
-# shows the large ones; per blend weight they show what the CA map shows, Gaussian by Gaussian.
+# Ends of the color scale of shares, in units of the mean. Shares grow with the size of a Gaussian, so a picture of
+# them highlights the large ones; per blend weight they show what the CA map shows, Gaussian by Gaussian.
 _SHARE_SCALE = (1.0, 100.0)
 
 _README = """\
@@ -57,12 +57,12 @@ def study_attribution(
     device: str = "cpu",
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
-    """Attribute the exact score of a run; write the shares, a colored PLY, pictures and a table, and print that.
+    """Attribute the exact score of a run; write the shares, colored PLYs, pictures and a table, and print the table.
 
     Args:
         run: folder of the run; its last checkpoint is measured.
-        out: folder for the results; by default ``attribution`` in that of the run.
-        split: ``"train"`` or ``"test"``: which views.
+        out: folder for the results; by default ``attribution`` in the run's folder.
+        split: the views to use, ``"train"`` or ``"test"``.
         drop_rate: of the score.
         device: where to render.
         say: receives the table.
@@ -71,7 +71,7 @@ def study_attribution(
         The content of ``attribution.json``.
 
     Raises:
-        ValueError: if no view of the split has a score, or all scores are 0.
+        ValueError: if the split is unknown or empty, none of its views has a score, or all scores are 0.
         FileNotFoundError: if the folder holds no run.
     """
     if split not in ("train", "test"):
@@ -110,7 +110,7 @@ def study_attribution(
         "attribution": colored_by(model.gaussians, shares, *scales["share"]),
         "attribution_per_weight": colored_by(model.gaussians, heat.values, *scales["share_per_weight"]),
     }
-    for name, gaussians in colored.items():  # with the scaling baked in, as in a run's PLY for viewers
+    for name, gaussians in colored.items():  # with test-time opacities, as in a run's PLY for viewers
         save_for_viewers(
             dataclasses.replace(model.without_camera, gaussians=gaussians), out / f"{name}.ply", pad_to_degree=3
         )
@@ -127,7 +127,7 @@ def study_attribution(
 def _correlations(
     model: TrainedModel, views: Sequence[Viewpoint], shares: Tensor, weights: Tensor
 ) -> dict[str, float | None]:
-    """Spearman's rank correlation of the share with what else is known of a Gaussian; None where all are equal."""
+    """Return Spearman's rank correlation of the share with other properties; None where all values are equal."""
     from scipy.stats import spearmanr  # a second to import
 
     gaussians = model.gaussians
@@ -141,7 +141,7 @@ def _correlations(
 
 @torch.no_grad()
 def _picture(model: TrainedModel, colored: Iterable[Gaussians], view: View, result: CAResult) -> Tensor:
-    """Lay the render, the CA map and the render in other colors side by side."""
+    """Arrange the render, the CA map and the renders in other colors side by side."""
     models = [model, *(dataclasses.replace(model, gaussians=gaussians) for gaussians in colored)]
     plain, *others = [each.test_rendering(view).image for each in models]
     texts = [f"{low:g} to {high:g} x mean" for low, high in (_SHARE_SCALE, PER_WEIGHT_SCALE)]

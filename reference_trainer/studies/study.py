@@ -1,4 +1,4 @@
-"""What a study is, a declaration, and the one function that runs every study."""
+"""`Study`, a declaration of what to measure and show, and `run_study`, which runs it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ __all__ = ["Record", "Records", "Study", "checkpoints", "run_study"]
 
 Say = Callable[[str], None]
 Record = dict[str, Any]
-"""What was measured of a case: strings, numbers, nan and infinity among them, None, lists and dictionaries."""
+"""The measurement of one case: strings, numbers including nan and infinity, None, lists and dictionaries."""
 Records = Mapping[str, Record]
-"""Records by the name of the case, in the order of the declaration."""
+"""Records by name of the case, in the order of declaration."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class Study:
 
     Args:
         name: of its files, ``NAME.json``, ``NAME.md`` and ``NAME.png``.
-        measure: measures one case, given its settings as keyword arguments. A function of a module, so that a worker
-            in another process finds it.
-        cases: the settings by the name of the case: strings, numbers, None, paths of files that are there and count
-            with their size and time, and lists and dataclasses of these. A place to write to is a string.
+        measure: measures one case, given its settings as keyword arguments. A module-level function, so that a worker
+            in another process can import it.
+        cases: the settings by name of the case: strings, numbers, None, paths of existing files, which count with size
+            and modification time, and lists and dataclasses of these. A place to write to is a string.
         report: returns the tables of all records in Markdown.
         draw: draws all records into an empty figure; None for no figure.
         check: whether the study checks the program itself: once it is finished, the next call measures all again.
@@ -53,15 +53,15 @@ class Study:
 
 
 def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say = print) -> Records:
-    """Measure the cases that are not measured yet; write all records, the tables and the figure, and print the tables.
+    """Measure the cases not measured yet; write all records, the tables and the figure, and print the tables.
 
-    Every record is on the disk, in ``NAME.records.json``, before the next case begins. It is kept for later calls as
-    long as the settings, the files among them and what `machine` says are the same; other cases may come and go.
+    Every record is on disk, in ``NAME.records.json``, as soon as its case is measured. Later calls reuse it as long as
+    the settings, the files among them and the result of `machine` are the same; other cases may come and go.
 
     Args:
         study: the declaration.
         out: folder for the results.
-        engine: where to measure, several cases at a time; None for here, one after the other.
+        engine: where to measure, several cases at a time; None for this process, one after the other.
         say: receives the progress and the tables.
 
     Returns:
@@ -69,7 +69,7 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
 
     Raises:
         ValueError: if there is no case, or what ``study.measure`` raises.
-        RuntimeError: if cases failed on the engine, after the others are written; the same call tries them again.
+        RuntimeError: after the others are written, if cases failed on the engine; the same call tries them again.
     """
     if not study.cases:
         raise ValueError(f"expected at least 1 case of {study.name}, got none.")
@@ -82,7 +82,7 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
         if isinstance(outcome, Failure):
             failed[name] = outcome.error
         else:
-            kept.add(keys[name], json.loads(json.dumps(outcome)))  # now what it will be when it is read
+            kept.add(keys[name], json.loads(json.dumps(outcome)))  # as it will be when read back
     records = {name: record for name, key in keys.items() if (record := kept.get(key)) is not None}
     write_json(out / f"{study.name}.json", {"study": study.name, "machine": here, "cases": records, "failed": failed})
     if records:
@@ -102,7 +102,7 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
 
 
 def checkpoints(runs: Sequence[Path]) -> dict[str, Path]:
-    """Return the checkpoints of runs by name: so many parts of their paths, from three on, as tell all of them apart.
+    """Return the checkpoints of runs, named by the last three parts of their paths, or more if needed for uniqueness.
 
     Raises:
         ValueError: if there is no run.
@@ -122,7 +122,7 @@ def checkpoints(runs: Sequence[Path]) -> dict[str, Path]:
 def _measured(
     study: Study, names: Sequence[str], engine: Engine | None, say: Say
 ) -> Iterator[tuple[str, Record | Failure]]:
-    """Measure cases; yield each as it is finished. Here an error ends the study, on an engine the others go on."""
+    """Measure cases; yield each when it is finished. Without an engine an error ends the study."""
     calls = {name: partial(study.measure, **study.cases[name]) for name in names}
     if engine is None:
         for number, (name, call) in enumerate(calls.items(), start=1):
@@ -137,7 +137,7 @@ def _measured(
 
 
 def _decisive(settings: Any) -> Any:
-    """Return settings as `fingerprint` takes them: a path is its file, of that size and from that time."""
+    """Return settings for `fingerprint`, with the size and modification time of files."""
     if isinstance(settings, Path):
         state = settings.stat()
         return [str(settings.resolve()), state.st_size, state.st_mtime_ns]

@@ -1,1 +1,1 @@
-"""A model to turn in a browser, drawn by the renderer of this package; ``window.py`` needs viser."""
+"""Interactive viewing of a model in a browser, drawn by this package's renderer; ``window.py`` needs viser."""

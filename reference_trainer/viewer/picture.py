@@ -1,4 +1,4 @@
-"""What the viewer draws: a model as somebody has chosen to look at it. It knows of no browser."""
+"""What the viewer draws: a model in the chosen display mode, independent of any browser."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ Mode = Literal["render", "co-adaptation", "depth", "heat"]
 
 @dataclass(frozen=True)
 class Look:
-    """How a model is looked at.
+    """How a model is shown.
 
     Args:
-        mode: the render of the test, the exact CA map, depth, or the Gaussians in the colors of their `Heat`.
+        mode: the test-time render, the exact CA map, depth, or the Gaussians in the colors of their `Heat`.
         drop_rate: of the CA map and of the mask, in [0, 1).
-        noise: standard deviation of the opacity noise, at least 0: the CA map is that of dropout and noise, all other
-            pictures are of one draw of it.
-        mask: whether the other pictures leave out the Gaussians of one random mask.
-        hidden: the part of the Gaussians that is left out, those with the highest heat first, in [0, 1).
+        noise: standard deviation of the opacity noise, at least 0: the CA map is that of dropout and noise together,
+            all other pictures show one draw of it.
+        mask: whether pictures other than the CA map drop the Gaussians of one random mask.
+        hidden: fraction of the Gaussians to leave out, those of highest heat first, in [0, 1).
     """
 
     mode: Mode = "render"
@@ -44,11 +44,11 @@ class Look:
 
 
 class Subject:
-    """A model that is looked at; what one look after the other needs of it is computed once.
+    """A model to show; what successive pictures share is computed once.
 
     Args:
         model: what to draw.
-        views: that its heat is measured from, on the model's device.
+        views: that its heat is measured at, on the model's device.
 
     Example:
         >>> from reference_trainer.model.gaussians import Gaussians
@@ -66,15 +66,15 @@ class Subject:
 
     @cached_property
     def heat(self) -> Heat:
-        """The heat at drop rate 1/2; a ValueError if no view has a score, or all scores are 0."""
+        """The heat at drop rate 1/2; ValueError if no view has a score, or all scores are 0."""
         return Heat.of(self.model, self._views)
 
     @torch.no_grad()
     def draw(self, look: Look, camera: Camera) -> tuple[Tensor, str]:
-        """Return a picture (3, H, W) in [0, 1], and what is to be said of it.
+        """Return a picture (3, H, W) in [0, 1] and a note on it.
 
         Raises:
-            ValueError: if heat is asked for and cannot be measured, see `heat`.
+            ValueError: if heat is needed (for its colors or to hide Gaussians) and cannot be measured, see `heat`.
         """
         if look != self._drawn[0]:
             self._drawn = look, self._chosen(look)
@@ -95,7 +95,7 @@ class Subject:
         return colors.T.view_as(out.image), f"depth {1 / high:.3g} (bright) to {1 / low:.3g}"
 
     def _said_of_heat(self, look: Look) -> str:
-        """Say what the colors mean, and how much co-adaptation is hidden."""
+        """Return a note on what the colors mean and how much co-adaptation is hidden."""
         said = []
         if look.mode == "heat":
             said.append(
@@ -123,6 +123,6 @@ class Subject:
 
 
 def _draws(look: Look) -> Chain:
-    """Return the regularizers that a look draws with, or whose exact variance it shows."""
+    """Return the regularizers whose draw or whose exact variance is shown."""
     dropped = look.mask or look.mode == "co-adaptation"
     return Chain(GaussianDropout(look.drop_rate if dropped else 0.0), OpacityNoise(look.noise))

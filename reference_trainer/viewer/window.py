@@ -1,4 +1,4 @@
-"""The page in the browser: viser shows the pictures of a model, and says where somebody has turned to."""
+"""The viewer in the browser, by viser: it shows the pictures of a model and reports the user's camera."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ HOST = "127.0.0.1"
 STILL = 0.2
 """Seconds without a change after which a picture is drawn at full resolution."""
 ROUGH_SECONDS = 0.1
-"""What a picture may take while something moves; the resolution follows."""
+"""Target time of a picture while the camera moves; the resolution adapts to it."""
 FEWEST, MOST = 10_000, 1_000_000
-"""Pixels of a picture."""
+"""Limits on the pixels of a picture."""
 TRAINING_SHARE = 0.1
-"""The part of the time of a training that goes into following it, as long as nobody moves."""
+"""Fraction of a training's time that showing its new states may take; moving the camera takes more."""
 
 
 @dataclass
 class _Window:
-    """One page: whether something is to be drawn, how, and since when nothing has moved."""
+    """One page: when it last moved, whether a picture is due, and whether the last one was at reduced resolution."""
 
     client: Any
     moved: float
@@ -54,17 +54,17 @@ class _Window:
 
 
 class Viewer(contextlib.AbstractContextManager["Viewer", None]):
-    """A server of pages on this machine that show a model, in whatever way is chosen there; a context.
+    """A context manager that serves pages on this machine which show a model.
 
-    Everything is drawn in the thread that calls `serve` or `follow`: a training is looked at between two of its steps.
+    Everything is drawn in the thread that calls `serve` or `follow`: a training is drawn between its steps.
 
     Args:
-        port: to listen at; 0 for any.
+        port: to listen at; 0 for any free one.
 
     Raises:
         ImportError: if viser is missing.
-        OSError: if the port is not free.
-        ValueError: if it is no port.
+        OSError: if the port cannot be used.
+        ValueError: if it is no port number.
     """
 
     def __init__(self, port: int) -> None:
@@ -91,7 +91,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
 
     @property
     def address(self) -> str:
-        """Of the page."""
+        """URL of the page."""
         return f"http://{HOST}:{self._server.get_port()}"
 
     def __str__(self) -> str:
@@ -103,7 +103,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             self._server.stop()
 
     def show(self, model: TrainedModel, views: Mapping[str, Sequence[Viewpoint]]) -> None:
-        """Show a model from now on. The views of the first one are those to jump to, by split."""
+        """Show a model from now on. The first call's views, by split, become the cameras to jump to."""
         flat = [view.to(model.gaussians.means.device) for group in views.values() for view in group]
         if self._subject is None:
             self._add_cameras(views, model.gaussians)
@@ -113,14 +113,14 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         self._changed.set()
 
     def serve(self) -> None:
-        """Draw what is asked for until Ctrl-C."""
+        """Draw whatever pages need until Ctrl-C."""
         with contextlib.suppress(KeyboardInterrupt):
             while True:
                 self._changed.wait(self.draw())
                 self._changed.clear()
 
     def follow(self, trainer: Trainer) -> None:
-        """Draw what is asked for of a model in training, between two steps; does nothing while no page is open."""
+        """Draw the model of a training between two of its steps; does nothing while no page is open."""
         if not self._windows:
             return
         start = time.perf_counter()
@@ -131,14 +131,14 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
                 model.gaussians.map(torch.clone), model.background, model.regularizer, model.step, model.sh_degree
             )
             self.show(model, measured_views(trainer.scene, lambda text: None))
-        with contextlib.suppress(NotFiniteError):  # the training says so itself
+        with contextlib.suppress(NotFiniteError):  # the training reports it itself
             self.draw()
         if new:
             end = time.perf_counter()
             self._next_model = end + (end - start) * (1 / TRAINING_SHARE - 1)
 
     def draw(self) -> float | None:
-        """Draw every page that is due; return in how many seconds the next is, None if a change must come first."""
+        """Draw every page that is due; return the seconds until the next one is, None if that takes a change."""
         waits = []
         for window in list(self._windows.values()):
             still = time.monotonic() - window.moved
@@ -150,7 +150,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         return min(waits, default=None)
 
     def _send(self, window: _Window) -> None:
-        """Draw a page once."""
+        """Draw one picture and send it to a page."""
         subject, view = self._subject, window.client.camera
         if subject is None:
             return
@@ -161,7 +161,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
                 image, note = subject.draw(self._look, camera)
             except ValueError as error:
                 (image, _), note = subject.draw(Look(), camera), str(error)
-        if window.client.client_id not in self._windows:  # it has been closed meanwhile
+        if window.client.client_id not in self._windows:  # closed in the meantime
             return
         window.client.scene.set_background_image(np.asarray(as_pillow(image)), format="jpeg", jpeg_quality=90)
         took, model = max(1e-3, time.perf_counter() - start), subject.model
@@ -193,7 +193,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         self._status = gui.add_markdown("")
 
     def _add_cameras(self, views: Mapping[str, Sequence[Viewpoint]], gaussians: Gaussians) -> None:
-        """Put the cameras into the page, to jump to, and begin at the first one."""
+        """Add the cameras to the page, to jump to, and start at the first one."""
         from kornia.geometry.quaternion import Quaternion
 
         gui, scene = self._server.gui, self._server.scene
@@ -223,20 +223,20 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             frustum.on_click(lambda event, pose=pose: self._jump(event.client, pose))
 
     def _jump(self, client: Any, pose: Mapping[str, Any]) -> None:
-        """Take a page to a camera."""
-        if client is not None:  # None where the server has set the value
+        """Move a page to a camera."""
+        if client is not None:  # None if the server has set the value
             with client.atomic():
                 for name, value in pose.items():
                     setattr(client.camera, name, value)
 
     def _connected(self, client: Any) -> None:
-        """Draw for a page from now on."""
+        """Register a new page."""
         self._windows[client.client_id] = _Window(client, time.monotonic())
         client.camera.on_update(lambda camera: self._moved(client.client_id))
         self._changed.set()
 
     def _moved(self, *clients: int) -> None:
-        """Draw these pages, or all, anew."""
+        """Mark these pages, or all, as due for a new picture."""
         for client in clients or list(self._windows):
             if window := self._windows.get(client):
                 window.moved, window.due = time.monotonic(), True
@@ -244,8 +244,8 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
 
 
 def _camera(view: Any, most: int) -> Camera:
-    """Return viser's camera as ours, with at most so many pixels."""
-    scale = min(1.0, math.sqrt(most / max(1, view.image_width * view.image_height)))  # a page can be closed up
+    """Convert viser's camera to ours, with at most ``most`` pixels."""
+    scale = min(1.0, math.sqrt(most / max(1, view.image_width * view.image_height)))  # a page may have no area
     width, height = (max(1, round(scale * side)) for side in (view.image_width, view.image_height))
     focal = 0.5 * height / math.tan(0.5 * view.fov)
     from_camera = torch.eye(4, dtype=torch.float64)
@@ -255,7 +255,7 @@ def _camera(view: Any, most: int) -> Camera:
 
 
 def _pose(camera: Camera, distance: float) -> dict[str, Any]:
-    """Return a camera as the properties of viser's; the model turns around the point at a distance in front of it."""
+    """Convert a camera to properties of viser's, which orbits around the point at ``distance`` in front of it."""
     position, axes = camera.position.cpu(), camera.world_to_camera[:3, :3].cpu()
     return {
         "position": position.numpy(),
@@ -266,6 +266,6 @@ def _pose(camera: Camera, distance: float) -> dict[str, Any]:
 
 
 def _distance(gaussians: Gaussians, camera: Camera) -> float:
-    """Return how far away the middle of what a camera sees is; 1 if it sees nothing."""
+    """Return the median depth of the Gaussians that a camera sees; 1 if it sees none."""
     depth = camera.project(gaussians.means)[1][pixels_of(gaussians.means, camera)[2]]
     return depth.median().item() if len(depth) else 1.0

@@ -1,1 +1,1 @@
-"""Where the runs of a sweep are done: processes of this machine or a Ray cluster, behind one protocol."""
+"""Where the runs of a sweep execute: processes on this machine or a Ray cluster, behind one protocol."""

@@ -1,4 +1,4 @@
-"""Which engine a sweep uses."""
+"""The choice of a sweep's engine."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ EngineName: TypeAlias = Literal["auto", "processes", "ray"]
 
 
 def choose_engine(name: EngineName, *, jobs: int, address: str | None = None, device: str = "cpu") -> Engine:
-    """Return the engine of a name.
+    """Return the engine of the given name.
 
     Args:
-        name: ``"auto"`` is Ray if there is the address of a cluster, in ``address`` or ``$RAY_ADDRESS``, and else the
-            processes of this machine: on a single machine Ray does nothing that they do not.
+        name: ``"auto"`` is Ray if ``address`` or ``$RAY_ADDRESS`` names a cluster, else local processes: on a single
+            machine Ray has no advantage over them.
         jobs: tasks at a time.
         address: of a Ray cluster; see `RayCluster`.
         device: where the tasks compute; on a Ray cluster a task on ``"cuda"`` reserves one GPU.
 
     Raises:
-        ValueError: if an address is given to the processes of this machine, or ``jobs`` is not positive.
-        ImportError: if Ray is asked for and not installed.
+        ValueError: if ``"processes"`` is given an address, or ``jobs`` is not positive.
+        ImportError: if Ray is needed and not installed.
 
     Example:
         >>> choose_engine("processes", jobs=2).jobs

@@ -1,4 +1,4 @@
-"""What a sweep asks of the place where it runs: a task, what may come of it, and the protocol of an engine."""
+"""The interface between a sweep and where it runs: tasks, their outcomes, and the protocol of an engine."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Task:
 
     Args:
         label: what to call it in messages.
-        function: found there by its module and name.
-        arguments: its arguments, which can be pickled.
+        function: importable there by module and name.
+        arguments: its arguments, picklable.
     """
 
     label: str
@@ -34,11 +34,11 @@ class Value:
 
 @dataclass(frozen=True)
 class Failure:
-    """The call raised, or none of its workers lived to answer.
+    """The call raised, or all its workers died.
 
     Args:
-        error: type and message in one line.
-        traceback: where it was raised; empty if no worker lived to say.
+        error: type and message of the exception, or how the last worker died.
+        traceback: where it was raised; empty if the workers died.
     """
 
     error: str
@@ -47,7 +47,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Death:
-    """The worker ended without an answer, which says nothing about the call itself.
+    """The worker died without an answer; the call itself may be fine.
 
     Args:
         reason: what is known, such as the signal.
@@ -60,10 +60,9 @@ Answer: TypeAlias = Value | Failure | Death
 
 
 class Engine(Protocol):
-    """Starts calls elsewhere and tells how they ended. It neither queues nor retries: `run_all` does, for every engine.
+    """Starts calls in other processes and reports how they ended; `run_all` queues and retries, for every engine.
 
-    An engine is good for one sweep. Nothing is started before the first task: a sweep with nothing left to do costs
-    nothing.
+    An engine serves one sweep. It starts nothing before the first task, so a sweep with nothing left to do is free.
     """
 
     @property
@@ -71,17 +70,17 @@ class Engine(Protocol):
         """How many tasks may run at a time; each gets its share of the processors."""
 
     def start(self, number: int, task: Task) -> None:
-        """Begin a task under a number of the caller's choice."""
+        """Start a task under a number of the caller's choice."""
 
     def wait(self) -> Sequence[tuple[int, Answer]]:
-        """Wait until at least one of the tasks that were started ends; return those that did, by number."""
+        """Wait until at least one started task ends; return the ended ones by number."""
 
     def close(self) -> None:
-        """Ask tasks that still run to save what they have, wait for them, and release everything."""
+        """Interrupt running tasks, which save what they have; wait for them, and release everything."""
 
 
 def attempt(task: Task, threads: int) -> Value | Failure:
-    """Make the call of a task, in the worker; an error becomes data.
+    """Execute a task in the worker, and return an exception as a `Failure`.
 
     Args:
         task: what to call.
@@ -94,10 +93,10 @@ def attempt(task: Task, threads: int) -> Value | Failure:
         >>> attempt(Task("many", int, ("many",)), torch.get_num_threads()).error
         "ValueError: invalid literal for int() with base 10: 'many'"
     """
-    import torch  # which the options of the command line, that name the engines, do without
+    import torch  # not at the top: the command line imports this module for its options alone
 
     torch.set_num_threads(threads)
     try:
         return Value(task.function(*task.arguments))
-    except Exception as error:  # one failing run must not stop the others; it is reported
+    except Exception as error:  # one failing run must not stop the others
         return Failure(f"{type(error).__name__}: {error}", traceback.format_exc())

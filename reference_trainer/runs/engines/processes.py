@@ -1,4 +1,4 @@
-"""The processes of this machine as an engine: one process per task, so that a death is the death of one task."""
+"""Local processes as an engine: one process per task, so that a death affects one task only."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from reference_trainer.threads import thread_count
 
 __all__ = ["Processes"]
 
-# Forked copies of a process that has used threads, as torch has, can hang.
+# A process forked after threads have been used, as by torch, can hang.
 _CONTEXT = get_context("spawn")
 
 
 class Processes:
-    """Every task in a new process of this machine, which ends with the task.
+    """Runs every task in a new local process, which ends with the task.
 
     A worker that loses its parent, however the parent ended, is interrupted as by Ctrl-C: the training saves a
-    checkpoint and ends. Ctrl-C itself reaches the parent alone, which tells the workers once; a second one kills them.
+    checkpoint and ends. Ctrl-C itself reaches only the parent, which interrupts its workers; a second one kills them.
 
     Args:
         jobs: tasks at a time; each may use its share of the processors, or ``OMP_NUM_THREADS`` if that is set.
@@ -38,14 +38,14 @@ class Processes:
             raise ValueError(f"expected at least 1 job, got {jobs}.")
         self.jobs = jobs
         self._threads = thread_count(jobs=jobs)
-        self._running: dict[Any, tuple[int, SpawnProcess]] = {}  # by the end of a pipe, whose class the system decides
+        self._running: dict[Any, tuple[int, SpawnProcess]] = {}  # by pipe end, whose class depends on the platform
 
     def start(self, number: int, task: Task) -> None:
-        """Begin a task; see `Engine`."""
+        """Start a task; see `Engine`."""
         here, there = _CONTEXT.Pipe()
         process = _CONTEXT.Process(target=_work, args=(there, task, self._threads), name=task.label)
         process.start()
-        there.close()  # the worker's copy must be the last one: its death is the end of the pipe
+        there.close()  # so that the worker holds the only copy, and its death closes the pipe
         self._running[here] = number, process
 
     def wait(self) -> list[tuple[int, Answer]]:
@@ -64,7 +64,7 @@ class Processes:
         return ended
 
     def close(self) -> None:
-        """Interrupt what still runs and wait for it; a second interruption kills it."""
+        """Interrupt running tasks and wait for them; a second interruption kills them."""
         for here in self._running:
             here.close()
         processes = [process for _, process in self._running.values()]
@@ -79,10 +79,10 @@ class Processes:
 
 
 def _work(there: Connection, task: Task, threads: int) -> None:
-    """Do one task in a process of its own and send the answer."""
+    """Execute one task in the worker process and send the answer."""
     if hasattr(os, "setpgid"):
-        os.setpgid(0, 0)  # out of the terminal's group: a Ctrl-C that came twice would not wait for the checkpoint
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a parent in the background may ignore
+        os.setpgid(0, 0)  # out of the terminal's group: a second interrupt from there would cut off the checkpoint
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background parent may ignore it
     answered = threading.Event()
     threading.Thread(target=_end_with_parent, args=(there, answered), daemon=True).start()
     try:
@@ -90,7 +90,7 @@ def _work(there: Connection, task: Task, threads: int) -> None:
         answered.set()
         there.send(answer)
     except (KeyboardInterrupt, BrokenPipeError):
-        pass  # nobody waits for the answer any more
+        pass  # nobody is waiting for the answer anymore
 
 
 def _end_with_parent(there: Connection, answered: threading.Event) -> None:
@@ -100,7 +100,7 @@ def _end_with_parent(there: Connection, answered: threading.Event) -> None:
     except (EOFError, OSError):
         if not answered.is_set():
             if os.name == "posix":
-                os.kill(os.getpid(), signal.SIGINT)  # unlike interrupt_main, it also ends a wait in the system
+                os.kill(os.getpid(), signal.SIGINT)  # unlike interrupt_main, also ends a blocking system call
             else:
                 _thread.interrupt_main()
 

@@ -1,4 +1,4 @@
-"""A Ray cluster as an engine: one on this machine that ends with the sweep, or a real one at an address."""
+"""A Ray cluster as an engine: a temporary one on this machine, or a running one at an address."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from reference_trainer.threads import chosen_threads
 
 __all__ = ["RayCluster"]
 
-_OBJECT_STORE = 128 * 2**20  # bytes; the answers are small, and Ray would take a third of the memory
+_OBJECT_STORE = 128 * 2**20  # bytes; answers are small, and by default Ray takes a third of the memory
 _PATIENCE = 60.0  # seconds for the runs to save their checkpoints
 
 
 class RayCluster:
-    """Every task as a Ray task with processors of its own.
+    """Runs every task as a Ray task with reserved processors.
 
-    Needs Ray (``ca_reg[ray]``). On a real cluster every machine needs the same installation, and a file system that
-    all of them and this machine share under the same path.
+    Needs Ray (``ca_reg[ray]``). On a cluster of several machines all need the same installation, and a file system that
+    they share with this machine under the same path.
 
     Args:
         jobs: tasks at a time; each reserves its share of the cluster's processors, at most those of one machine.
-        address: of a running cluster, as `ray.init` takes it: ``"host:6379"``, ``"ray://host:10001"``, or ``"auto"``
-            for the one that this machine belongs to. None for ``$RAY_ADDRESS``, and without it for a cluster on this
+        address: of a running cluster, as for `ray.init`: ``"host:6379"``, ``"ray://host:10001"``, or ``"auto"`` for the
+            one that this machine belongs to. None for ``$RAY_ADDRESS``, or if that is unset for a cluster on this
             machine that ends with the sweep.
         gpus: GPUs that a task reserves; fractions share one.
 
@@ -51,7 +51,7 @@ class RayCluster:
         self._running: dict[Any, int] = {}
 
     def start(self, number: int, task: Task) -> None:
-        """Begin a task; see `Engine`."""
+        """Start a task; see `Engine`."""
         if self._attempt is None:
             self._connect()
         self._running[self._attempt.options(name=task.label).remote(task, self._threads)] = number
@@ -62,7 +62,7 @@ class RayCluster:
         return [(self._running.pop(reference), self._answer(reference)) for reference in ended]
 
     def close(self) -> None:
-        """Interrupt what still runs, wait for it, and leave the cluster; one that was started for the sweep ends."""
+        """Interrupt running tasks, wait up to a minute for them, and leave the cluster; a temporary one ends."""
         for reference in self._running:
             self._ray.cancel(reference)
         if self._running:
@@ -73,13 +73,13 @@ class RayCluster:
             self._mine = False
 
     def _connect(self) -> None:
-        """Join the cluster or start one, and find out how many processors a task gets."""
+        """Join the cluster or start one, and compute how many processors a task gets."""
         ray = self._ray
-        if not ray.is_initialized():  # else the caller has chosen a cluster, which stays the caller's
+        if not ray.is_initialized():  # else the caller has connected already, and also disconnects
             local: dict[str, Any] = {}
             if self._address == "local":
-                os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a sweep on one machine reports to nobody
-                # More jobs than processors is the user's wish, and Ray would wait for the processors for ever.
+                os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no telemetry from a local sweep
+                # The user may ask for more jobs than processors; Ray would wait for the missing ones forever.
                 local = {"num_cpus": max(self.jobs, os.cpu_count() or 1), "object_store_memory": _OBJECT_STORE,
                          "include_dashboard": False}  # fmt: skip
             ray.init(address=self._address, log_to_driver=False, logging_level="warning", **local)
@@ -88,15 +88,15 @@ class RayCluster:
         share = min(sum(machines) // self.jobs, max(machines, default=1.0))
         processors = max(1, int(share))
         self._threads = chosen_threads() or processors
-        # Ray's own retries are off: `run_all` retries, counts and reports the same way for every engine.
+        # Ray's own retries are off: `run_all` retries, counts and reports alike for every engine.
         self._attempt = ray.remote(num_cpus=processors, num_gpus=self._gpus, max_retries=0)(attempt)
 
     def _answer(self, reference: Any) -> Answer:
-        """Return what a task that has ended says, or why it says nothing."""
+        """Return the answer of an ended task, or how its worker died."""
         exceptions = self._ray.exceptions
         try:
             answer: Answer = self._ray.get(reference)
-        except exceptions.RayTaskError as error:  # raised outside of the call, as by a machine without this package
+        except exceptions.RayTaskError as error:  # raised outside the call, such as on a machine without this package
             first, *_ = str(error.cause).splitlines() or [""]
             return Failure(f"{type(error.cause).__name__}: {first}", str(error))
         except exceptions.RayError as error:

@@ -1,4 +1,4 @@
-"""The queue of a sweep: so many tasks at a time, and another worker for a task whose worker died."""
+"""The queue of a sweep: a limited number of tasks at a time, and a new worker for a task whose worker died."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ __all__ = ["run_all"]
 def run_all(
     engine: Engine, tasks: Sequence[Task], *, retries: int = 3, say: Callable[[str], None] = lambda text: None
 ) -> Iterator[tuple[int, Value | Failure]]:
-    """Do tasks on an engine and close it; yield how each ended, in the order in which they end.
+    """Run tasks on an engine; yield the outcomes in the order in which they end, and close the engine.
 
-    A task that raises is not tried again: it would raise again. One whose worker died goes to the end of the queue, so
-    that a task that kills its workers does not keep the others waiting.
+    A task that raises is not retried: it would raise again. One whose worker died goes to the end of the queue, so that
+    a task that kills its workers does not delay the others.
 
     Args:
-        engine: where to; it is closed at the end, also when the caller stops asking or is interrupted.
-        tasks: what to do.
+        engine: where to run; closed at the end, also if the caller stops iterating or is interrupted.
+        tasks: what to run.
         retries: how many dead workers of one task are replaced.
         say: receives a line about every worker that is replaced.
 

@@ -1,4 +1,4 @@
-"""The grid: which trainings there are, in which order, what of them is missing, and how it is done."""
+"""The grid of trainings that the claims need: which they are, what is missing, and running and measuring it."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ __all__ = ["Cell", "Grid", "declared", "estimate", "is_done", "listing", "rows_o
 SIXTHS = 6
 OPAQUE = 0.8
 DENSER = 2
-"""How many times the iterations, for the model of all photographs that depths are compared with."""
+"""Factor on the iterations for the model of all photographs, whose depth serves as the truth."""
 _FIGURES = ("psnr", "ssim", "lpips", "ca", "ca_half", "ca_exact", "ca_exact_half", "cv",
             "depth_abs_rel", "depth_rmse")  # fmt: skip
 _STEP = 0.07
-"""About how many processor seconds a step takes of which nothing is known."""
+"""Assumed processor seconds per step of a training without kept ones like it."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The trainings that are asked for.
+    """The requested trainings.
 
     Args:
         claims: by name.
         scenes: by name, with the paths of their folders.
         recipe: of all trainings that do not name another.
         iterations: of every training.
-        seeds: how many.
-        out: folder for what is trained, ``NAME/LABEL/seed_K``, removed once its row is kept.
+        seeds: number of seeds.
+        out: folder for the trainings, ``NAME/LABEL/seed_K``, each removed once its row is kept.
         rows: folder of the kept rows, ``NAME.json``.
     """
 
@@ -66,7 +66,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Cell:
-    """One training, and what is measured of it beside the usual."""
+    """One training, and what is measured beyond the usual."""
 
     scene: str
     setting: Setting
@@ -75,12 +75,12 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """What it is called in lines."""
+        """Its name in messages."""
         return f"{self.scene}, {label(self.setting, {'iterations': self.setting['iterations']})}, seed {self.seed}"
 
 
 def declared(grid: Grid) -> list[Cell]:
-    """Return the trainings of a grid, each once: first all of one seed, in the order of the claims."""
+    """Return the trainings of a grid, each once, ordered by seed, then by claim."""
     found: dict[str, Cell] = {}
     for seed in range(grid.seeds):
         for claim in grid.claims.values():
@@ -95,14 +95,14 @@ def declared(grid: Grid) -> list[Cell]:
 
 
 def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
-    """Do what is missing of a grid; each training is kept before the next but ``running.engine.jobs`` begins.
+    """Run what is missing of a grid; every finished training is measured and kept before another one starts.
 
     Args:
-        grid: what to do.
-        running: where and how; its monitor is set here.
+        grid: what to run.
+        running: where and how; its ``monitor_every`` is replaced.
 
     Returns:
-        Why trainings failed, by name. The same call tries them again.
+        Failures by the name of the training. The same call tries them again.
 
     Raises:
         ValueError: if a scene has no test views.
@@ -141,7 +141,7 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
     photographed = {name: scene for name in against if (scene := grid.scenes[name]).options.path != "synthetic"}
     do([Run(f"{name}, dense", x.dense, denser, grid.out / name / "dense") for name, x in photographed.items()], 0)
     for seed in range(grid.seeds):
-        for path in (True, False):  # which of them are monitored
+        for path in (True, False):  # whether CA is monitored
             of = [cell for cell in left if cell.seed == seed and ("path" in cell.needs) == path]
             do([_run(grid, cell) for cell in of], max(1, grid.iterations // SIXTHS) if path else 0)
     return failed
@@ -162,12 +162,12 @@ def rows_of(grid: Grid) -> dict[str, Rows]:
 
 
 def is_done(cell: Cell, rows: Mapping[str, Rows]) -> bool:
-    """Return whether all that is asked of a training is kept."""
+    """Return whether everything that is needed from a training is kept."""
     return (row := rows[cell.scene].of(cell.setting).get(cell.seed)) is not None and cell.needs <= row.keys()
 
 
 def estimate(cell: Cell, rows: Mapping[str, Rows]) -> float:
-    """Return about how many processor seconds a training takes: as many a step as those of its like that are kept."""
+    """Estimate the processor seconds of a training from the kept ones of the same scene, recipe and loss."""
     setting = cell.setting
     like = [
         value(row, "seconds") / row["setting"]["iterations"]
@@ -178,7 +178,7 @@ def estimate(cell: Cell, rows: Mapping[str, Rows]) -> float:
 
 
 def listing(grid: Grid) -> str:
-    """Return a line for each training: kept, or the processor minutes it may take; and the hours of claims and all."""
+    """Return a line per training, "kept" or its estimated minutes, then the estimated hours per claim and in total."""
     rows, cells = rows_of(grid), declared(grid)
     left = {cell.name: estimate(cell, rows) / 3600 for cell in cells if not is_done(cell, rows)}
     lines = [f"{cell.name}: " + (f"{60 * left[cell.name]:.0f} min" if cell.name in left else "kept") for cell in cells]
@@ -217,10 +217,10 @@ def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, dev
 
 
 def renders(model: TrainedModel, view: View, seed: int, draws: int = 5) -> dict[str, float]:
-    """Return the PSNR of a model of dropout or noise by how it is rendered.
+    """Return the PSNR of a model trained with dropout or noise, by how it is rendered.
 
-    "one" is a render under one draw, in mean over the draws; "five" the mean of the draws; "mean" the exact mean;
-    "scaled" a render with the mean opacities, which after dropout is that of the test.
+    "one" is the mean PSNR of renders under one draw each, "five" the PSNR of the mean of these renders, "mean" that of
+    the exact mean, "scaled" that of a render with the mean opacities, which after dropout is the test-time render.
     """
     x = model.gaussians.params(view.camera, step=model.step)
     generator = torch.Generator(x.opacities.device).manual_seed(seed)
@@ -235,7 +235,7 @@ def renders(model: TrainedModel, view: View, seed: int, draws: int = 5) -> dict[
 
 
 def depths(model: TrainedModel, view: View, truth: TrainedModel | None) -> dict[str, float]:
-    """Return the errors of the depth at a view, against the true one, or that of another model where it is opaque."""
+    """Return the depth errors at a view, against the true depth or that of another model where it is opaque."""
 
     def depth(of: TrainedModel) -> tuple[Tensor, Tensor]:
         out = of.test_rendering(view, depth=True)
@@ -252,34 +252,34 @@ def depths(model: TrainedModel, view: View, truth: TrainedModel | None) -> dict[
 
 
 def _folder(grid: Grid, cell: Cell) -> Path:
-    """Return where a training lives."""
+    """Return the folder of a training."""
     hidden = {"iterations": cell.setting["iterations"]}
     return grid.out / cell.scene / folder_name(label(cell.setting, hidden)) / f"seed_{cell.seed}"
 
 
 def _run(grid: Grid, cell: Cell) -> Run:
-    """Return a training as the engine of sweeps takes it."""
+    """Return a training as a run of `run_grid`."""
     config = config_of(cell.setting, cell.seed)
     options = grid.scenes[cell.scene].options_for(cell.setting, config.loss)
     return Run(cell.name, options, config, _folder(grid, cell))
 
 
 def _mean(of: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return the means of figures over the views that have them."""
+    """Return the means of figures over the views where they are finite."""
     return {name: mean_std(each[name] for each in of)[0] for name in of[0]}
 
 
 def _rounded(data: Any) -> Any:
-    """Return nested figures with six digits, None for what is not finite."""
+    """Round nested figures to six digits; None replaces what is not finite."""
     if isinstance(data, dict):
         return {name: _rounded(x) for name, x in data.items()}
     return (float(f"{data:.6g}") if math.isfinite(data) else None) if isinstance(data, float) else data
 
 
 def _commit() -> str | None:
-    """Return the commit of this checkout, with "-dirty" if files differ from it; None if it is none."""
+    """Return the commit of this checkout, with "-dirty" if files differ from it; None outside a checkout."""
     root = Path(__file__).parents[3]
-    if not (root / ".git").exists():  # an installed package may lie within the repository of something else
+    if not (root / ".git").exists():  # an installed package may lie within another project's repository
         return None
     command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:

@@ -1,4 +1,4 @@
-"""The claims of the paper, and the comparisons that go with them: which trainings, which table, which checks."""
+"""The claims of the paper and further comparisons as data: their trainings, tables and checks."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from reference_trainer.studies.paper.scenes import SCENES
 __all__ = ["CLAIMS", "GAINS", "QUALITY", "TIMED", "Check", "Claim", "Setting", "chosen"]
 
 Setting = Mapping[str, Any]
-"""What a training changes of its recipe: fields of `TrainConfig`, ``recipe`` if it is another than that of the study,
-and ``views``. Steps in expressions are those of 10,000 iterations, with which they scale."""
+"""What a training changes relative to its recipe: fields of `TrainConfig`, ``recipe`` if it differs from the study's,
+and ``views``. Steps in expressions refer to 10,000 iterations and are scaled to those of the study."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """Something that must hold in mean over the seeds: ``low < a - b < high``, of figures of the same seed.
+    """A condition on the mean over seeds of paired differences: ``low < a - b < high``.
 
     Args:
         of: a figure of a row, such as "test psnr".
-        a: the setting that it is of.
-        b: the setting that it is compared with.
-        low: lower end of what is claimed.
-        high: upper end.
+        a: the setting whose figure it is.
+        b: the setting it is compared with.
+        low: lower end of the claimed interval.
+        high: upper end of the claimed interval.
         to: the figure of ``b``; by default the same.
         relative: whether the difference is divided by the figure of ``b``.
     """
@@ -43,11 +43,11 @@ class Check:
 _PSNR, _CA = "test psnr", "test ca"
 QUALITY = (_PSNR, "test ssim", "test lpips", _CA, "test ca_exact_half", "test depth_abs_rel", "test depth_rmse",
            "gaussians")  # fmt: skip
-"""The columns of a table of models, those of them that were measured."""
+"""The columns of a table of models, as far as they were measured."""
 TIMED = (*QUALITY, "seconds", "pace")
-"""The same of models that were trained on one machine."""
+"""The same for models that were trained on one machine."""
 _FEW = ("synthetic", "herz-jesu", "lego")
-_WITH_MORE = ("synthetic", "fern")  # than nine photographs to train on
+_WITH_MORE = ("synthetic", "fern")  # scenes with more than nine photographs to train on
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,11 @@ class Claim:
     Args:
         says: the claim.
         paper: the paper's figures; CA in units of 1e-3.
-        settings: what is trained: the rows of its table.
-        checks: all of which must hold; none for a comparison.
+        settings: the trainings, which are the rows of its table.
+        checks: conditions that must all hold; none for a comparison.
         shows: the columns of its table.
-        scenes: on which of the declared scenes; on a scene of one's own every claim can be tested.
-        needs: what is measured for it alone: "path", "renders" or "depth".
+        scenes: the declared scenes it is tested on; on a user's own scene every claim can be tested.
+        needs: extra measurements: "path", "renders" or "depth".
     """
 
     says: str
@@ -212,7 +212,7 @@ CLAIMS = {
     "guided": Claim("rates by depth and density are better than one for all (D2GS)", "", (_DROPOUT, _TIERS),
                     (_higher(_PSNR, _TIERS, _DROPOUT),)),
 }  # fmt: skip
-"""The seventeen claims by their number, then what the field asks beside them."""
+"""The seventeen claims by their number, then further questions of the field by name."""
 
 GAINS: Mapping[str, Mapping[str, Mapping[float, tuple[Setting, Setting]]]] = {
     "dropout rate": {"": {p: (each, _PLAIN) for p, each in _RATE.items()}},
@@ -222,11 +222,11 @@ GAINS: Mapping[str, Mapping[str, Mapping[float, tuple[Setting, Setting]]]] = {
         for name, of in (("dropout 0.1", _BY_VIEWS[0.1]), ("dropout 0.2", _BY_VIEWS[0.2]))
     },
 }
-"""What changes along an axis, by the name of a line: a setting at each place, and what it is compared with there."""
+"""The axes of the figure: for every line, by name, a pair of settings to compare at each position on the axis."""
 
 
 def chosen(names: Sequence[str], scenes: Sequence[str] | None = None) -> dict[str, Claim]:
-    """Return claims by name, none for all; with ``scenes`` they are tested on these, whatever is declared.
+    """Return the named claims, or all if none is named; with ``scenes`` they are tested on these instead of their own.
 
     Raises ValueError if there is no such claim.
     """

@@ -1,4 +1,4 @@
-"""The picture of the claims: what a regularizer changes, by its strength and by the number of views."""
+"""The figure of the claims: the effect of a regularizer against its strength and the number of views."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _FIGURES = ("test psnr", "PSNR, dB more than without", 1.0), ("test ca_exact_hal
 
 
 def gains_figure(kept: Kept, path: Path) -> None:
-    """Draw what is kept of `GAINS`: differences of PSNR and of the exact score, with two standard errors, by scene.
+    """Draw what is kept of `GAINS`: differences in PSNR and in the exact score, with two standard errors, by scene.
 
-    A line needs three places, a panel a line; at strength 0 there is no difference. A single seed has no error bar.
+    A line needs at least three points, a column of panels at least one line. A single seed has no error bar.
 
     Args:
         kept: the rows.
         path: the PNG or SVG to write.
 
     Raises:
-        ValueError: if there is no line.
+        ValueError: if there is no line to draw.
         ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
     """
     panels = {axis: [_lines(axis, of, unit, kept) for of, _, unit in _FIGURES] for axis in GAINS}
@@ -55,7 +55,7 @@ def gains_figure(kept: Kept, path: Path) -> None:
 
 
 def _lines(axis: str, of: str, unit: float, kept: Kept) -> dict[str, dict[float, tuple[float, float]]]:
-    """Return the lines of a panel by label: mean and two standard errors in units, at each place that is kept."""
+    """Return the lines of a panel by label: mean and two standard errors in ``unit``, at each kept position."""
     lines = {}
     for name, pairs in GAINS[axis].items():
         for scene in kept.scenes:

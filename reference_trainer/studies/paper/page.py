@@ -1,4 +1,4 @@
-"""Tables and verdicts of the kept rows, and the pages of the docs that show them between marks."""
+"""Tables and verdicts from the kept rows, and their insertion between marks in pages of the docs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MARKS = re.compile(r"(<!-- paper (\w+)(?: ([\w-]+))?(?: (\d+))? -->\n).*?(<!-- 
 
 
 class Kept:
-    """The rows of all scenes of a folder, of one recipe and number of iterations."""
+    """The kept rows of all scenes in a folder, looked up for one recipe and number of iterations."""
 
     def __init__(self, folder: Path, recipe: str = "3dgs", iterations: int = 3_000) -> None:
         self.folder, self.recipe, self.iterations = folder, recipe, iterations
@@ -45,7 +45,7 @@ class Kept:
 
 
 def differences(check: Check, scene: str, kept: Kept) -> list[float]:
-    """Return the differences that a check is about, of every seed that has both figures."""
+    """Return the finite differences that a check is about, one per seed that has both figures."""
     a, b = kept.of(scene, check.a), kept.of(scene, check.b)
     pairs = [(value(a[seed], check.of), value(b[seed], check.to or check.of)) for seed in sorted(a.keys() & b.keys())]
     found = [(x - y) / (y if check.relative else 1.0) for x, y in pairs]
@@ -53,7 +53,7 @@ def differences(check: Check, scene: str, kept: Kept) -> list[float]:
 
 
 def judged(claim: Claim, kept: Kept) -> dict[str, tuple[int, Verdict]]:
-    """Return for every scene on which all checks of a claim are measured with how many seeds, and the verdict."""
+    """Return, for every scene with measurements for all checks of a claim, the number of seeds and the verdict."""
     found = {}
     for scene in kept.scenes:
         of = [(check, differences(check, scene, kept)) for check in claim.checks]
@@ -64,7 +64,7 @@ def judged(claim: Claim, kept: Kept) -> dict[str, tuple[int, Verdict]]:
 
 
 def claims_table(kept: Kept) -> str:
-    """Return one row for each claim: the verdict, and on which scenes."""
+    """Return one row per claim with its verdict, overall and by scene."""
     rows: list[dict[str, object]] = []
     columns = ["", "claim", "the paper", "verdict", "scenes (seeds)"]
     for name, claim in CLAIMS.items():
@@ -82,7 +82,7 @@ def claims_table(kept: Kept) -> str:
 
 
 def details(name: str, kept: Kept) -> str:
-    """Return what is measured of a claim: on every scene the table of its settings, and the checks; else ""."""
+    """Return, for every scene, the table of a claim's settings and its checks; "" if nothing is measured."""
     claim, parts = CLAIMS[name], []
     for scene in kept.scenes:
         found = {}
@@ -98,10 +98,10 @@ def details(name: str, kept: Kept) -> str:
 
 
 def gains(name: str, kept: Kept) -> str:
-    """Return what every setting of a claim changes against the plain training with the same views and recipe; else "".
+    """Return how every setting of a claim differs from the plain training of the same views and recipe; "" if unknown.
 
-    In decibels of PSNR with two standard errors, and in percent of the exact score, on every scene where two seeds or
-    more are kept; in the order of the mean over the scenes, and those that lack one last.
+    Differences are in dB of PSNR with two standard errors, and in percent of the exact score, on every scene with at
+    least two kept seeds. Settings are sorted by the mean over scenes; those that lack a scene come last.
     """
     claim, rows, scenes = CLAIMS[name], list[tuple[int, float, dict[str, object]]](), dict[str, None]()
     for setting in claim.settings:
@@ -127,12 +127,12 @@ def gains(name: str, kept: Kept) -> str:
 
 
 def page(text: str, kept: Kept) -> str:
-    """Return the text of a page with everything between its marks made again.
+    """Return the text of a page with everything between its marks regenerated.
 
-    The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``; WHAT is ``claims`` for the verdicts,
-    ``details`` or ``gains`` of a claim by its name, ``details`` of all without, or ``rows`` for all rows of the file
-    NAME beside the folder, which says in ``usual`` what of a setting needs no name; iterations are by default those of
-    ``kept``.
+    The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``. WHAT is ``claims`` for the verdicts,
+    ``details`` or ``gains`` for the claim NAME, ``details`` without a name for all claims, or ``rows`` for all rows of
+    ``NAME.json`` beside the folder, whose entry ``usual`` holds the parts of a setting that labels omit. ITERATIONS are
+    by default those of ``kept``.
     """
 
     def made(match: re.Match[str]) -> str:
@@ -155,13 +155,13 @@ def page(text: str, kept: Kept) -> str:
 
 
 def _heading(name: str) -> str:
-    """Return a claim with its number, another comparison without its name."""
+    """Return the heading of a claim, with its number, or of another comparison, without its name."""
     says = CLAIMS[name].says
     return f"{name}. {says}" if name.isdigit() else says[0].upper() + says[1:]
 
 
 def _rows(rows: Rows) -> str:
-    """Return one row for each setting, named by what differs from what is usual in the file."""
+    """Return one row per setting, labeled by how it differs from the file's ``usual``."""
     found: dict[str, list[Row]] = {}
     for row in rows.rows:
         found.setdefault(label(row["setting"], rows.content["usual"]), []).append(row)
@@ -169,7 +169,7 @@ def _rows(rows: Rows) -> str:
 
 
 def _table(rows: Mapping[str, Sequence[Row]], figures: Sequence[str]) -> str:
-    """Return one row for each setting: means and sample deviations over the seeds, of the figures that one has."""
+    """Return one row per setting: means and sample standard deviations over seeds, of figures that any setting has."""
     lines: list[dict[str, object]] = []
     titles: dict[str, None] = {}
     for name, of in rows.items():
@@ -202,5 +202,5 @@ def _line(check: Check, of: Sequence[float], kept: Kept) -> str:
 
 
 def _name(setting: Mapping[str, object], kept: Kept) -> str:
-    """Return what a setting is called among those of the same recipe."""
+    """Return the label of a setting among those of the same recipe."""
     return label(setting, {"recipe": kept.recipe})

@@ -1,4 +1,4 @@
-"""What is kept of a training: one row of a small JSON file for each scene, which can be committed."""
+"""What is kept of a training: one row in a small JSON file per scene, which can be committed."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ __all__ = ["Row", "Rows", "config_of", "label", "resolved", "value"]
 
 Row = dict[str, Any]
 """``setting`` and ``seed``, ``commit``, ``version``, ``cpu`` and the kind of ``lpips``, and the figures: ``test`` and
-``train`` as of `evaluate`, means over the views, ``gaussians``, ``seconds`` of the processor, and ``path``, ``renders``
+``train`` from `evaluate`, as means over views, ``gaussians``, ``seconds`` of processor time, and ``path``, ``renders``
 and ``depth`` where measured."""
 
 
 def resolved(setting: Setting, recipe: str, iterations: int) -> dict[str, Any]:
-    """Return a setting with its recipe and iterations, to which its steps are scaled: what identifies a training.
+    """Return a setting with recipe and iterations, its steps scaled to these: what identifies a training.
 
     Example:
         >>> resolved({"regularizer": "d2gs(ramp(0.05, 0.3, 0, 10_000))"}, "3dgs", 3_000)
@@ -36,13 +36,13 @@ def resolved(setting: Setting, recipe: str, iterations: int) -> dict[str, Any]:
 
 
 def config_of(setting: Setting, seed: int) -> TrainConfig:
-    """Return the training of a resolved setting."""
+    """Return the training settings of a resolved setting."""
     changes = {name: x for name, x in setting.items() if name not in ("recipe", "views")}
     return with_recipe(setting["recipe"], seed=seed, **changes)
 
 
 def label(setting: Setting, hidden: Mapping[str, Any] | None = None) -> str:
-    """Return a setting in words, but for what is hidden because it is that of all.
+    """Return a setting in words, without entries that equal those of ``hidden``.
 
     Example:
         >>> label({"recipe": "3dgs", "regularizer": "density", "views": 6}, {"recipe": "3dgs"})
@@ -54,7 +54,7 @@ def label(setting: Setting, hidden: Mapping[str, Any] | None = None) -> str:
 
 
 def value(row: Row, figure: str) -> float:
-    """Return a figure of a row, such as "test psnr" or "gaussians"; nan where it was not measured."""
+    """Return a figure of a row, such as "test psnr" or "gaussians"; nan if it was not measured."""
     found: Any = row
     for key in figure.split():
         found = (found or {}).get(key)
@@ -62,12 +62,12 @@ def value(row: Row, figure: str) -> float:
 
 
 class Rows:
-    """The rows of one scene, in a file with a line for each; several processes may add to it.
+    """The rows of one scene, in a file with one line each; several processes may add to it.
 
     Args:
-        file: the JSON file, which need not be there.
-        about: what else stands in a new one.
-        lock: a file to lock while it is written, on the same machine.
+        file: the JSON file, which need not exist.
+        about: further entries of a new file.
+        lock: a file on the same machine to lock while it is written.
     """
 
     def __init__(self, file: Path, about: Mapping[str, Any] | None = None, lock: Path | None = None) -> None:
@@ -76,7 +76,7 @@ class Rows:
 
     @property
     def rows(self) -> Sequence[Row]:
-        """All rows, in the order in which they were measured."""
+        """All rows, in the order in which they were added."""
         rows: list[Row] = self.content["rows"]
         return rows
 
@@ -85,7 +85,7 @@ class Rows:
         return {row["seed"]: row for row in self.rows if row["setting"] == setting}
 
     def add(self, row: Row) -> None:
-        """Add a row, in the place of one of the same training, and write the file."""
+        """Add a row, replacing that of the same training if there is one, and write the file."""
         self.lock.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(self.lock):
             if self.file.is_file():

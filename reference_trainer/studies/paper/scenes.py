@@ -1,4 +1,4 @@
-"""The scenes of the study with their protocols: pictures 252 to 267 pixels wide, points that saw no test view."""
+"""The declared scenes of the study with their protocols; no initial points have seen test views."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ __all__ = ["SCENES", "PaperScene", "chosen_scenes"]
 
 @dataclass(frozen=True)
 class PaperScene:
-    """A scene, and what of the grid goes with it.
+    """A scene and how the grid uses it.
 
     Args:
-        options: which views; the path of a declared one is its folder below that of the data.
+        options: the scene; the path of a declared one is relative to the data folder.
         about: its protocol in words.
-        recipes: what can be trained on it; None for all.
-        depth: the depth that recipes with a depth prior are given.
+        recipes: those that can be trained on it; None for all.
+        depth: the depth option for losses with a depth prior.
     """
 
     options: SceneOptions
@@ -31,14 +31,14 @@ class PaperScene:
     depth: str = "points"
 
     def below(self, data: Path) -> PaperScene:
-        """Return the scene with the path of its folder."""
+        """Return the scene with its folder below that of the data."""
         path = self.options.path
         return self if path == "synthetic" else replace(self, options=replace(self.options, path=str(data / path)))
 
     def options_for(self, setting: Mapping[str, Any], loss: str) -> SceneOptions:
-        """Return the scene of a training: with so many views, and with depths if a term of its loss compares them.
+        """Return the scene for a training: with the setting's number of views, and with depth if its loss needs one.
 
-        With other views the initial points stay, which saw the scene's own training views and none of the test.
+        With another number of views the initial points stay those of the scene's own training views.
         """
         options = self.options
         if "views" in setting:
@@ -49,7 +49,7 @@ class PaperScene:
 
     @property
     def dense(self) -> SceneOptions:
-        """All photographs, the test views among them: what the depth of a sparse training is compared with."""
+        """The scene with all photographs, including test views: its model is the reference for depth."""
         return replace(self.options, test="none", views=None, allow_test_points=True)
 
 
@@ -94,10 +94,10 @@ def chosen_scenes(names: Sequence[str], data: Path, own: SceneOptions) -> dict[s
     Args:
         names: of the declared scenes; none for all.
         data: where their folders are.
-        own: a scene of one's own instead, if it has a path.
+        own: the user's own scene instead, if it has a path.
 
     Raises:
-        ValueError: if a scene is not declared, or declared scenes and one's own are asked for.
+        ValueError: if a scene is not declared, or both declared scenes and an own one are given.
     """
     if own.path:
         if names:

@@ -1,4 +1,4 @@
-"""When a claim holds: the rule, for differences of one scene and over scenes."""
+"""The rule by which a claim holds, on one scene and over several."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ERRORS = 2.0
 
 
 def interval(differences: Sequence[float]) -> tuple[float, float]:
-    """Return the mean of differences over the seeds and two standard errors of it, infinite for a single seed.
+    """Return the mean of differences over seeds and two standard errors of it, infinite for a single seed.
 
     Example:
         >>> interval([1.0, 2.0, 3.0])
@@ -26,10 +26,10 @@ def interval(differences: Sequence[float]) -> tuple[float, float]:
 
 
 def verdict(differences: Sequence[float], low: float, high: float) -> Verdict:
-    """Return whether the mean lies in (low, high): if two standard errors to both sides do, or all of them outside.
+    """Judge a claimed interval: "holds" if mean ± two standard errors lies inside (low, high), "fails" if outside.
 
-    Where the truth is at an end of the claimed interval, "holds" is a false alarm: 9 of 100 with three seeds (Student's
-    t with two degrees of freedom beyond 2), 2.7 with twenty.
+    If the true mean is at an end of the claimed interval, "holds" is a false positive: with three seeds in 9 of 100
+    cases (Student's t with two degrees of freedom, beyond 2), with twenty in 2.7.
 
     Example:
         >>> verdict([0.9, 1.0, 1.2], 0, math.inf), verdict([0.9, 1.0, 1.2], 2, math.inf), verdict([1.0], 0, math.inf)
@@ -44,9 +44,9 @@ def verdict(differences: Sequence[float], low: float, high: float) -> Verdict:
 
 
 def overall(verdicts: Iterable[Verdict], *, needs_all: bool = False) -> Verdict:
-    """Return the verdict of several: "holds" if most hold and none fails, "fails" if most fail and none holds.
+    """Combine verdicts: "holds" if more than half hold and none fails, "fails" if more than half fail and none holds.
 
-    With ``needs_all``, for the checks of one claim, all must hold, and one that fails is enough.
+    With ``needs_all``, for the checks of one claim, all must hold, and a single failure makes it "fails".
 
     Example:
         >>> overall(["holds", "holds", "undecided"]), overall(["holds", "holds", "fails"]), overall(["fails"])

@@ -1,1 +1,1 @@
-"""The stability study: extreme cases against float64 and exact arithmetic, and where each starts to fail."""
+"""The stability study: extreme inputs compared with float64 and exact arithmetic, to find where each starts to fail."""

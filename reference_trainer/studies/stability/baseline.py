@@ -1,7 +1,7 @@
-"""A simple renderer, frozen: the unit in which speed is told, and in float64 the reference for errors.
+"""A simple, frozen renderer: the unit of speed measurements and, in float64, the reference for errors.
 
-It is never made faster: a ratio to it must mean the same in every later measurement. For the same reason it shares no
-code and no constant with the renderer.
+It is never optimized, so that a ratio to its speed means the same in every later measurement. For the same reason it
+shares no code and no constants with the renderer.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _TILE = 16
 def render_simply(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, camera: Camera
 ) -> Tensor:
-    """Render Gaussians over black as the formulas say, tile after tile, with autograd's own backward pass.
+    """Render Gaussians over black by the textbook formulas, tile by tile, with autograd's own backward pass.
 
-    A tile of 16 x 16 pixels considers every Gaussian whose bounding box at alpha = 1/255 meets it, so nothing that the
-    definition draws is left out: in float64 this is brute force.
+    A tile of 16 x 16 pixels considers every Gaussian whose bounding box at alpha = 1/255 overlaps it, so nothing that
+    the definition draws is left out: in float64 the result is that of brute force.
 
     Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA rasterizer; the gradient
     passes through the clamp at 0.99.
@@ -97,7 +97,7 @@ def _project(means: Tensor, quaternions: Tensor, scales: Tensor, view: Tensor, c
 
 
 def _blend(pixels: Tensor, centers: Tensor, inverses: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
-    """Composite Gaussians, nearest first, at pixels (P, 2); return the colors (P, 3)."""
+    """Composite Gaussians, nearest first, at pixels (P, 2); return colors (P, C)."""
     dx, dy = (pixels[:, None] - centers).unbind(2)
     power = inverses[:, 0, 0] * dx * dx + 2 * inverses[:, 0, 1] * dx * dy + inverses[:, 1, 1] * dy * dy
     raw = opacities * torch.exp(-0.5 * power)

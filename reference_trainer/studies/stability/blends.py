@@ -1,4 +1,4 @@
-"""Cases of opacity, depth order, masks, noise, colors and precision of the inputs."""
+"""Stability cases on opacity, depth order, masks, noise, colors and input precision."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SQUARES = "variances are squares, which overflow float32: the score says NOT_FI
 
 
 def blend_cases() -> list[Case]:
-    """Return the cases: magnitudes are numbers of Gaussians or of renders, standard deviations or colors."""
+    """Return the cases; magnitudes are logits, counts of Gaussians or renders, inverse gaps, sigmas or colors."""
     return [
         *(single(_OPACITY, f"opacities {name}", partial(_opacities, x)) for name, x in _OPACITIES.items()),
         Case(
@@ -77,7 +77,7 @@ def _opacities(value: float) -> Probe:
 
 
 def _logits(value: float) -> Probe:
-    """Compare opacities and their gradient with the closed forms: float64 itself rounds the latter to 0."""
+    """Compare opacities and their gradient with closed forms, because even float64 autograd rounds the latter to 0."""
 
     def measured() -> Quantities:
         points, logits = torch.zeros(1, 3), torch.tensor([value], requires_grad=True)
@@ -97,14 +97,14 @@ def _stacked(opacity: float, count: float) -> Probe:
 
 
 def _one_plane() -> Probe:
-    """Put all Gaussians at one depth: they are drawn in their own order."""
+    """Put all Gaussians at one depth: they must be drawn in storage order."""
     camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 38.0, 15.0, 12.7, 32, 24)
     scene = base_scene(camera=camera)
     return of_scene(scene.with_(means=torch.cat([scene.means[:, :2], torch.full((24, 1), 3.0).double()], dim=1)))
 
 
 def _copies(count: float) -> Probe:
-    """Draw one Gaussian many times, in many colors: rounding must not change the order of equal depths."""
+    """Draw copies of one Gaussian in different colors: rounding must not change the order of equal depths."""
     n = int(count)
     scene = base_scene(n)
     same = {name: getattr(scene, name)[:1].expand(n, -1) for name in ("means", "quaternions", "scales")}
@@ -132,7 +132,7 @@ def _masked(keep: Tensor) -> Probe:
 
 
 def _rate(rate: float) -> Probe:
-    """Vary the drop rate of the draw, of the moments and of the score."""
+    """Set the drop rate of the draw, the moments and the score."""
     scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
     return Probe(
         lambda: scene_quantities(scene, torch.float32, rate=rate),
@@ -141,7 +141,7 @@ def _rate(rate: float) -> Probe:
 
 
 def _noise(sigma: float) -> Probe:
-    """Vary sigma of the draw; moments and mean opacities of the clamped noise, of faint to opaque Gaussians, too."""
+    """Set sigma of the draw, and of the clamped noise's moments and mean opacity for faint to opaque Gaussians."""
     scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
     grid = torch.cat([torch.logspace(-8, -1, 8), torch.linspace(0.2, 1.0, 9), 1 - torch.logspace(-7, -2, 6)])
 
@@ -158,7 +158,7 @@ def _noise(sigma: float) -> Probe:
 
 
 def _renders(count: float) -> Probe:
-    """Score a bright wall of ten layers: the variance of K renders is small beside their squares."""
+    """Score a bright wall of ten layers: the variance of K renders is small compared with their squares."""
     opacity = torch.linspace(0.3, 0.9, 10)
 
     def score(dtype: torch.dtype) -> Quantities:
@@ -178,7 +178,7 @@ def _renders(count: float) -> Probe:
 
 
 def _colored(share: float, background: float) -> Probe:
-    """Vary the background, and with a share of 1 the colors with it."""
+    """Set the background and, with a share other than 0, scale the colors by it."""
     scene = base_scene()
     behind = torch.full_like(scene.background, background)
     return of_scene(scene.with_(background=behind, colors=scene.colors * (background if share else 1.0)))
@@ -195,7 +195,7 @@ def _short_lists() -> Probe:
 
 
 def _autocast() -> Probe:
-    """Run everything as inside a mixed-precision training step."""
+    """Compute everything under autocast, as in a mixed-precision training step."""
     probe = of_scene(base_scene())
 
     def measured() -> Quantities:

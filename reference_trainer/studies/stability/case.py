@@ -1,4 +1,4 @@
-"""What a case of the stability study is."""
+"""Cases of the stability study: what to push to an extreme, what to compare with, and how it may end."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Case", "Probe", "decades", "of_scene", "single"]
 
 
 class Probe(NamedTuple):
-    """What to compare: a computation as users run it, and what it should give."""
+    """A comparison: a computation as users run it, and its reference result."""
 
     measured: Callable[[], Quantities]
     reference: Callable[[], Quantities]
@@ -29,13 +29,13 @@ class Case:
     Args:
         family: heading of the table.
         name: what is extreme.
-        probe: the comparison at a magnitude.
-        magnitudes: from harmless to extreme, increasing, positive; one for a case that has no scale.
+        probe: returns the comparison at a magnitude.
+        magnitudes: from harmless to extreme, increasing, positive; a single one for a case without a scale.
         until: the largest magnitude at which all quantities must be right.
-        beyond: what is allowed after it: an error that names the mistake; a documented limit, finite but less exact; or
+        beyond: what is allowed above it: an error that names the mistake; a documented limit, finite but less exact; or
             an infinity where the dtype has no larger number.
         note: the documented limit, or what refuses.
-        draws: whether float32 is drawn, by an engine of the renderer; what is not is judged once for all engines.
+        draws: whether it uses an engine of the renderer; if not, it is judged once for all engines.
     """
 
     family: str
@@ -49,7 +49,7 @@ class Case:
 
 
 def single(family: str, name: str, probe: Callable[[], Probe], *, refused: str = "", draws: bool = True) -> Case:
-    """Return a case without a scale, which must be right, or refused if it is said by what."""
+    """Return a case without a scale, which must be right, or may be refused if ``refused`` names by what."""
     until = 0.0 if refused else math.inf
     return Case(family, name, lambda _: probe(), until=until, beyond="refused", note=refused, draws=draws)
 
@@ -65,12 +65,12 @@ def decades(first: int, last: int, step: int = 1) -> tuple[float, ...]:
 
 
 def of_scene(scene: StressScene, *, dtype: torch.dtype = torch.float32, independent: bool = True) -> Probe:
-    """Compare everything that is computed of a scene with float64, at inputs that both can hold.
+    """Compare everything computed from a scene with float64, at inputs that both precisions represent exactly.
 
     Args:
-        scene: what to render; it is rounded to ``dtype`` for both.
+        scene: what to render; it is first rounded to ``dtype``, except for the pose.
         dtype: of the computation.
-        independent: compare image, alpha and gradients with the renderer of another kind, not with the same in float64.
+        independent: compare image, alpha and gradients with the independent renderer, not with the same one in float64.
     """
     scene = scene.to(dtype, camera=torch.float64).to(torch.float64)
     return Probe(

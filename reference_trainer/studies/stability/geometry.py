@@ -1,4 +1,4 @@
-"""Cases of shape, size and place of the Gaussians, and of the camera."""
+"""Stability cases on the shape, size and position of Gaussians, and on the camera."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _SIZES = ((1, 1), (1, 64), (64, 1), (4096, 4), (4, 4096))
 
 
 def geometry_cases() -> list[Case]:
-    """Return the cases: magnitudes are axis ratios, factors, pixels or focal lengths, as the names say."""
+    """Return the cases; magnitudes are axis ratios, factors, distances, pixels or focal lengths, as the names say."""
     return [
         Case(_SHAPE, "needles, axis ratio, thin axes shrink", lambda x: _axes(0.3, 0.3 / x, 0.3 / x), _RATIOS),
         Case(_SHAPE, "pancakes, axis ratio, thin axis shrinks", lambda x: _axes(0.3, 0.3, 0.3 / x), _RATIOS),
         Case(
             _SHAPE, "needles, axis ratio, long axis grows",
-            # Against the renderer itself, which the tests in decimal arithmetic find exact where the reference is not.
+            # Against the renderer itself in float64: tests in decimal arithmetic find the other reference inexact here.
             lambda x: _axes(0.02 * x, 0.02, 0.02, independent=False), _RATIOS,
         ),
         Case(_SHAPE, "pancakes, axis ratio, long axes grow", lambda x: _axes(0.02 * x, 0.02 * x, 0.02), _RATIOS),
@@ -61,7 +61,7 @@ def geometry_cases() -> list[Case]:
 
 
 def _axes(a: float, b: float, c: float, *, independent: bool = True) -> Probe:
-    """Give all Gaussians the same axes; their orientations are random."""
+    """Give all Gaussians the same axis lengths; their orientations are random."""
     axes = torch.tensor([[a, b, c]], dtype=torch.float64)
     return of_scene(base_scene().with_(scales=axes.expand(24, 3)), independent=independent)
 
@@ -77,7 +77,7 @@ def _quaternions(norm: float) -> Probe:
 
 
 def _no_rotation() -> Probe:
-    """Compare with the identity; there the gradient of what has no direction is defined as 0."""
+    """Compare zero quaternions with the identity; their gradient is defined as 0."""
     scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
     zero = torch.zeros_like(scene.quaternions)
     identity = scene.with_(quaternions=zero + torch.tensor([1.0, 0, 0, 0], dtype=torch.float64))
@@ -88,7 +88,7 @@ def _no_rotation() -> Probe:
 
 
 def _replaced(point: Tensor, scale: float, scene: StressScene) -> Probe:
-    """Put the first Gaussian of a scene at a point of the camera's frame, round, of a given width."""
+    """Move the first Gaussian of a scene to a point in camera coordinates and make it isotropic, of a given scale."""
     pose = scene.camera.world_to_camera
     means, scales = scene.means.clone(), scene.scales.clone()
     means[0] = pose[:3, :3].T @ (point - pose[:3, 3])
@@ -97,7 +97,7 @@ def _replaced(point: Tensor, scale: float, scene: StressScene) -> Probe:
 
 
 def _at_depth(depth: float) -> Probe:
-    """Put a Gaussian near the axis; the camera looks along z, so that its depth is a number that float32 holds."""
+    """Put a Gaussian near the optical axis; the camera looks along world z, so that no rotation rounds its depth."""
     camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 38.0, 15.0, 12.7, 32, 24)
     scene = base_scene(camera=camera)
     ahead = scene.means + torch.tensor([0.0, 0, 3], dtype=torch.float64)
@@ -115,7 +115,7 @@ def _on_border() -> Probe:
 
 
 def _beside(pixels: float, sigma: float | None = None) -> Probe:
-    """Put a Gaussian beside the image, by default so wide that it still reaches in."""
+    """Put a Gaussian outside the image, by default so wide that it still reaches in."""
     camera = camera_of()
     width = pixels if sigma is None else sigma
     slope = (pixels + camera.width - camera.cx) / camera.fx
@@ -123,7 +123,7 @@ def _beside(pixels: float, sigma: float | None = None) -> Probe:
 
 
 def _far(factor: float) -> Probe:
-    """Move the scene away and make it larger: the same picture, at large depths."""
+    """Scale the scene and its distance: the same picture, at large depths."""
     scene = base_scene()
     pose = scene.camera.world_to_camera.clone()
     pose[:3, 3] *= factor
@@ -132,7 +132,7 @@ def _far(factor: float) -> Probe:
 
 
 def _offset(offset: float) -> Probe:
-    """Move scene and camera in the world; the reference is not rounded, because that is what float32 cannot hold."""
+    """Shift scene and camera in the world; the reference stays unrounded, because float32's rounding is the subject."""
     scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
     shift = offset * torch.tensor([1.0, -0.7, 0.4], dtype=torch.float64)
     pose = scene.camera.world_to_camera.clone()
@@ -142,7 +142,7 @@ def _offset(offset: float) -> Probe:
 
 
 def _telephoto(focal: float) -> Probe:
-    """Shrink the scene across the axis as the focal length grows, so that it fills the image."""
+    """Shrink the scene across the optical axis as the focal length grows, so that it fills the image."""
     scene = base_scene(camera=Camera(torch.eye(4, dtype=torch.float64), focal, focal, 15.0, 12.7, 32, 24))
     across = torch.tensor([40.0 / focal, 40.0 / focal, 1.0], dtype=torch.float64)
     means = scene.means * across + torch.tensor([0.0, 0, 3], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Judge a case: finite or not, how far off, and from which magnitude on."""
+"""Judge a stability case: whether it is finite, how large its errors are, and from which magnitude on it fails."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ VALUE_TOLERANCE = 1e-3
 GRADIENT_TOLERANCE = 1e-2
 """Largest error of a gradient that counts as right: a hundredth of a training step."""
 
-_HALVINGS = 5  # of the decade in which a case starts to fail: the onset is then known to 7 %
+_HALVINGS = 5  # bisections of the interval in which a case starts to fail; of a decade, they leave 7 %
 _ALLOWED = {
     "refused": {"ok", "refused"},
     "limit": {"ok", "refused", "inexact"},
@@ -33,10 +33,10 @@ def judge(case: Case) -> Record:
         case: what to judge.
 
     Returns:
-        What the case is; under "ending" how it ends: "ok"; "refused" or "limit" as it foresees; "defect" for all else;
-        under "onset" the smallest magnitude that failed, None if none did; under "points" for every magnitude, those of
-        the search included, the "status" ("ok", "inexact", "not finite", "refused" or "crash"), the relative "errors"
-        of the quantities, which of them are "wrong", and the "message" of an exception.
+        The description of the case; under "ending" how it ends: "ok"; "refused" or "limit" as declared; "defect" for
+        anything else; under "onset" the smallest magnitude that failed, None if none did; under "points" for every
+        magnitude, including those of the search, the "status" ("ok", "inexact", "not finite", "refused" or "crash"),
+        the relative "errors" of the quantities, which of them are "wrong", and the "message" of an exception.
     """
     points = [_point(case, magnitude) for magnitude in case.magnitudes]
     failed = next((i for i, point in enumerate(points) if point["status"] != "ok"), None)
@@ -65,9 +65,9 @@ def judge(case: Case) -> Record:
 
 
 def relative_error(measured: Tensor, reference: Tensor) -> float:
-    """Return the norm of the difference over that of the reference, absolute if the latter is 0.
+    """Return the norm of the difference divided by that of the reference; undivided if the reference is 0.
 
-    Both may be undefined (nan) in the same places. Infinite if anything else is not finite in what was measured.
+    Positions where both are nan are ignored; any other value of ``measured`` that is not finite gives infinity.
 
     Raises:
         ValueError: if the shapes differ.

@@ -1,4 +1,4 @@
-"""Everything that the package computes of a scene, in a precision of choice."""
+"""Everything that the package computes from a scene, in a chosen precision."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def scene_quantities(
         scene: what to render; its tensors are converted.
         dtype: the precision of the Gaussians. The pose stays in float64, as a careful caller would keep it.
         rate: of dropout, in the draw, the moments and the score.
-        sigma: of the opacity noise.
-        keep: the mask of the dropout, shape (N,); drawn by default.
+        sigma: standard deviation of the opacity noise.
+        keep: the dropout mask, shape (N,); drawn by default.
 
     Returns:
         `SCENE_QUANTITIES`.
@@ -76,16 +76,16 @@ def scene_quantities(
 
 
 def reference_quantities(scene: StressScene) -> Quantities:
-    """Compute the same in float64; image, alpha and gradients by a renderer of another kind, which shares no code.
+    """Compute the same in float64, with image, alpha and gradients by the independent renderer `render_simply`.
 
     Returns:
-        `SCENE_QUANTITIES`. Moments, score and draws are those of the renderer itself in float64.
+        `SCENE_QUANTITIES`. Moments, score and draws are those of the package's renderer in float64.
     """
     return {**scene_quantities(scene, torch.float64), **independent_images(scene)}
 
 
 def independent_images(scene: StressScene) -> Quantities:
-    """Compute `IMAGES` in float64 with the frozen simple renderer; white as a fourth color gives the alpha."""
+    """Compute `IMAGES` in float64 with `render_simply`; a fourth color channel of ones gives alpha."""
     scene = scene.to(torch.float64)
     parameters = _leaves(scene)
     means, quaternions, scales, opacities, colors = parameters.values()
@@ -100,14 +100,14 @@ def loss_weights(camera: Camera) -> Tensor:
     """Return the weights of red, green, blue and alpha in the loss: random, so that nothing cancels by symmetry.
 
     Returns:
-        Multiples of 1/64, which every precision holds, shape (4, H, W), float64.
+        Multiples of 1/64, exact in every precision, shape (4, H, W), float64.
     """
     generator = torch.Generator().manual_seed(_SEED)
     return torch.randint(-20, 45, (4, camera.height, camera.width), generator=generator).double() / 64
 
 
 def splats_of(scene: StressScene, parameters: Mapping[str, Tensor] | None = None) -> Splats:
-    """Project a scene, or other Gaussians in its place."""
+    """Project the Gaussians of a scene, or other ones in their place."""
     means, quaternions, scales, opacities, colors = (
         getattr(scene, name) if parameters is None else parameters[name] for name in PARAMETERS
     )
@@ -115,7 +115,7 @@ def splats_of(scene: StressScene, parameters: Mapping[str, Tensor] | None = None
 
 
 def _leaves(scene: StressScene) -> dict[str, Tensor]:
-    """Return the parameters of a scene, asking for gradients."""
+    """Return copies of a scene's parameters that require gradients."""
     return {name: getattr(scene, name).clone().requires_grad_() for name in PARAMETERS}
 
 
@@ -129,6 +129,6 @@ def _gradients(loss: Tensor, parameters: Mapping[str, Tensor], names: Sequence[s
     leaves = [*parameters.values()]
     if not loss.requires_grad:
         return dict(zip(names, map(torch.zeros_like, leaves), strict=True))
-    with torch.autocast("cpu", enabled=False):  # as PyTorch asks of backward passes
+    with torch.autocast("cpu", enabled=False):  # as PyTorch recommends for backward passes
         gradients = torch.autograd.grad(loss, leaves, allow_unused=True, materialize_grads=True)
     return dict(zip(names, gradients, strict=True))

@@ -1,4 +1,4 @@
-"""The small scene that every case of the stability study pushes to an extreme."""
+"""The small scenes that the cases of the stability study push to an extreme."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from reference_trainer.camera import Camera
 __all__ = ["PARAMETERS", "StressScene", "base_scene", "camera_of", "stack"]
 
 PARAMETERS = ("means", "quaternions", "scales", "opacities", "colors")
-"""The tensors of the Gaussians, by the names that the renderer gives them."""
+"""Names of the Gaussians' tensors, in the order of the renderer's arguments."""
 
 _SEED = 20
 _DISTANCE = 3.0  # from the camera to the center of the scene, whose half width is 1
@@ -45,13 +45,13 @@ class StressScene:
         return replace(self, **changes)  # type: ignore[arg-type]
 
     def to(self, dtype: torch.dtype, *, camera: torch.dtype | None = None) -> StressScene:
-        """Return the scene in another dtype, the pose of the camera in a dtype of its own if one is given."""
+        """Return the scene in another dtype; ``camera`` is that of the camera's pose, if it differs."""
         tensors = {x.name: getattr(self, x.name).to(dtype) for x in fields(self) if x.name != "camera"}
         return StressScene(**tensors, camera=self.camera.to(dtype=camera or dtype))
 
 
 def camera_of(width: int = 32, height: int = 24, *, focal: float = 40.0, distance: float = _DISTANCE) -> Camera:
-    """Return a turned camera that looks at the origin from a distance, float64."""
+    """Return a rotated camera at a distance from the origin, which lies on its optical axis; float64."""
     skew = torch.tensor([[0, -0.1, 0.2], [0.1, 0, -0.3], [-0.2, 0.3, 0]], dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.linalg.matrix_exp(skew)
@@ -63,7 +63,7 @@ def base_scene(n: int = 24, *, camera: Camera | None = None, seed: int = _SEED) 
     """Draw n ordinary Gaussians around the origin, float64.
 
     Args:
-        n: number of them.
+        n: number of Gaussians.
         camera: the view, by default 32 x 24 pixels from a distance of 3.
         seed: of the draw.
 
@@ -88,7 +88,7 @@ def base_scene(n: int = 24, *, camera: Camera | None = None, seed: int = _SEED) 
 
 
 def stack(n: int, opacity: float, *, spacing: float = 1e-3) -> StressScene:
-    """Put n Gaussians behind each other on the axis of an 8 x 8 camera: all of them reach all pixels."""
+    """Put n Gaussians one behind the other on the optical axis of an 8 x 8 camera: all of them reach all pixels."""
     scene = base_scene(n, camera=Camera(torch.eye(4, dtype=torch.float64), 20.0, 20.0, 4.0, 4.0, 8, 8))
     means = torch.zeros(n, 3, dtype=torch.float64)
     means[:, 2] = 2.0 + spacing * torch.arange(n, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The stability study: every case with every engine, where it ends and how; the command fails if nobody foresaw it."""
+"""The stability study: runs every case with every engine; the command fails if one ends other than declared."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from reference_trainer.studies.study import Record, Records, Study, run_study
 
 __all__ = ["all_cases", "judge_with", "stability_study", "study_stability"]
 
-_FLOOR = 1e-9  # of the colors of the figure
+_FLOOR = 1e-9  # lower end of the figure's color scale
 
 
 @cache
@@ -35,13 +35,13 @@ def all_cases() -> tuple[Case, ...]:
 
 
 def study_stability(out: Path) -> Records:
-    """Push both engines of the renderer and the functions of `ca_reg` to extremes, and say where they end and how.
+    """Push both engines of the renderer and the functions of `ca_reg` to extremes, and report where and how they fail.
 
     Args:
         out: folder for the results.
 
     Raises:
-        RuntimeError: if a case ends in another way than it should; lists them, after everything is written.
+        RuntimeError: after everything is written, if cases end other than declared; lists them.
     """
     records = run_study(stability_study(), out)
     if defects := [name for name, record in records.items() if record["ending"] == "defect"]:
@@ -50,9 +50,9 @@ def study_stability(out: Path) -> Records:
 
 
 def stability_study() -> Study:
-    """Declare the study: every case once for each engine, or once if it draws nothing; no loops where numba is missing.
+    """Declare the study: every case once per available engine, or once in total if it draws nothing.
 
-    What was measured is not kept once it is finished: the next study checks the program as it is then.
+    Records are not kept once the study is finished: the next call checks the program as it is then.
     """
     cases = {}
     for number, case in enumerate(all_cases()):
@@ -63,7 +63,7 @@ def stability_study() -> Study:
 
 
 def judge_with(number: int, engine: str | None) -> Record:
-    """Judge a case, by its number in `all_cases`, with an engine; None for one that draws nothing."""
+    """Judge a case, by its index in `all_cases`, with an engine; None for a case that draws nothing."""
     start, case = perf_counter(), _with_one_reference(all_cases()[number])
     if engine is None:
         record = judge(case)
@@ -75,7 +75,7 @@ def judge_with(number: int, engine: str | None) -> Record:
 
 @lru_cache(maxsize=1)
 def _with_one_reference(case: Case) -> Case:
-    """Return the case with references that are computed once: they are in float64, whatever the engine."""
+    """Return the case with cached references: these are in float64 and do not depend on the engine."""
 
     @cache
     def probe(magnitude: float) -> Probe:
@@ -86,7 +86,7 @@ def _with_one_reference(case: Case) -> Case:
 
 
 def _worst_errors(record: Record) -> dict[str, float]:
-    """Return the largest error of every quantity over the magnitudes at which all were right."""
+    """Return the largest error of every quantity over the magnitudes at which all quantities are right."""
     worst: dict[str, float] = {}
     for point in record["points"]:
         if point["status"] == "ok":
@@ -100,12 +100,12 @@ def _engines(records: Records) -> list[str]:
 
 
 def _of_engine(records: Sequence[Record], engine: str) -> list[Record]:
-    """Return the records of an engine, and those that are of no engine."""
+    """Return the records of an engine and those without one."""
     return [record for record in records if record["engine"] in (engine, None)]
 
 
 def _report(records: Records) -> str:
-    """Return counts, errors by case and quantity, and how what ends does so."""
+    """Return the counts, the errors by case and quantity, and the cases that end."""
     cases, about = [*records.values()], machine()
     endings = {engine: Counter(case["ending"] for case in _of_engine(cases, engine)) for engine in _engines(records)}
     columns = ["engine", "cases", "ok", "refused", "limit", "defect"]
@@ -135,7 +135,7 @@ def _report(records: Records) -> str:
 
 
 def _error_row(case: Record) -> dict[str, object]:
-    """Return the row of a case, its errors with one digit."""
+    """Return the row of a case, with errors to one digit."""
     right = [point["magnitude"] for point in case["points"] if point["status"] == "ok"]
     up_to = f"{max(right):.2g}" if case["magnitudes"] else "one"
     row: dict[str, object] = {"case": case["name"], "engine": case["engine"] or "", "up to": up_to}
@@ -143,7 +143,7 @@ def _error_row(case: Record) -> dict[str, object]:
 
 
 def _ending_row(case: Record) -> dict[str, object]:
-    """Return the row of a case that does not stay right: from where on, what goes wrong first, and what it says."""
+    """Return the row of a case that ends: from which magnitude on, what goes wrong first, and the message or note."""
     first = next(point for point in case["points"] if point["status"] != "ok")
     wrong = ", ".join(first["wrong"])
     return {
@@ -167,7 +167,7 @@ def _draw(records: Records, figure: Any) -> None:
 
 
 def _heat(figure: Any, engine: str, cases: Sequence[Record]) -> None:
-    """Draw the largest error of every quantity over the magnitudes at which all are right."""
+    """Draw the heat map of `_worst_errors` for one engine."""
     table = np.full((len(cases), len(SCENE_QUANTITIES)), math.nan)
     for i, case in enumerate(cases):
         for name, error in _worst_errors(case).items():
@@ -186,7 +186,7 @@ def _heat(figure: Any, engine: str, cases: Sequence[Record]) -> None:
 
 
 def _label(case: Record) -> str:
-    """Return the name of a case, to where it was pushed, and from where on it ends."""
+    """Return the name of a case with the magnitude up to which it was pushed, or from which on it fails."""
     if not case["magnitudes"]:
         return str(case["name"])
     end = f"; ends at {case['onset']:.2g}" if case["onset"] is not None else f" (to {case['magnitudes'][1]:.0e})"
