@@ -81,10 +81,11 @@ def point_prior(view: View, cloud: PointCloud) -> View:
     cloud does not tell which those are.
 
     Raises:
-        ValueError: if the points are random, or fewer than 4 pixels of the view have one.
+        ValueError: if the points are random, or those that the view sees span no triangle.
         ImportError: if SciPy is missing.
     """
     from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import QhullError
 
     if cloud.source == "random":
         raise ValueError('depth "points" needs points of the scene, and these are random: name a cloud with --points.')
@@ -95,11 +96,17 @@ def point_prior(view: View, cloud: PointCloud) -> View:
     from_near = depths[seen].argsort()
     places, inverse = pixels[seen][from_near].numpy(), 1 / depths[seen][from_near].numpy()
     first = np.unique(places.astype(int), axis=0, return_index=True)[1]
-    if len(first) < 4:
-        raise ValueError(f'depth "points" needs points in every training view, and {view.name} sees {len(first)}.')
-    between = LinearNDInterpolator(places[first], inverse[first])
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    return replace(view, depth_prior=torch.from_numpy(1 / between(columns, rows)).float())
+    try:
+        between = LinearNDInterpolator(places[first], inverse[first])(columns, rows)
+    except (QhullError, ValueError):  # on one line; none
+        between = np.full_like(columns, np.nan)
+    if not np.isfinite(between).any():
+        raise ValueError(
+            f'depth "points" needs points in every training view, and the {len(first)} pixels of {view.name} that see '
+            "one span no triangle: give depth maps with --depth FOLDER, or a denser cloud with --points."
+        )
+    return replace(view, depth_prior=torch.from_numpy(1 / between).float())
 
 
 def read_depth(path: str | Path) -> Tensor:

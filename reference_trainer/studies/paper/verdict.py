@@ -29,7 +29,7 @@ def verdict(differences: Sequence[float], low: float, high: float) -> Verdict:
     """Judge a claimed interval: "holds" if mean ± two standard errors lies inside (low, high), "fails" if outside.
 
     If the true mean is at an end of the claimed interval, "holds" is a false positive: with three seeds in 9 of 100
-    cases (Student's t with two degrees of freedom, beyond 2), with twenty in 2.7.
+    cases (Student's t with two degrees of freedom, beyond 2), with twenty in 3.
 
     Example:
         >>> verdict([0.9, 1.0, 1.2], 0, math.inf), verdict([0.9, 1.0, 1.2], 2, math.inf), verdict([1.0], 0, math.inf)

@@ -139,8 +139,11 @@ def test_between_points_on_a_plane_the_prior_is_the_plane_and_what_is_behind_it_
     torch.testing.assert_close(prior[inside], (1 / inverse_depth(centers))[inside].float(), rtol=1e-5, atol=0)
     with pytest.raises(ValueError, match="these are random"):
         point_prior(view, PointCloud(points.float(), torch.zeros(60, 3), source="random"))
-    with pytest.raises(ValueError, match="v sees 0"):
-        point_prior(view, PointCloud(behind.float(), torch.zeros(60, 3), source="a model"))
+    row = torch.arange(4, 20, dtype=torch.float64)
+    in_line = camera.lift(torch.stack([row, row + 0.25], 1), torch.ones_like(row))  # beside the centers of the pixels
+    for few, number in ((behind, 0), (points[:2], 2), (in_line, 16)):
+        with pytest.raises(ValueError, match=f"the {number} pixels of v that see one span no triangle"):
+            point_prior(view, PointCloud(few.float(), torch.zeros(len(few), 3), source="a model"))
 
 
 def test_the_built_in_scene_has_points_to_make_a_prior_of():
