@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "Rate", "check_count", "check_finite", "check_opacity", "check_opacity_range", "check_per_gaussian", "check_rate",
-    "is_zero", "rate_like",
+    "Rate", "check_callable", "check_count", "check_finite", "check_opacity", "check_opacity_range",
+    "check_per_gaussian", "check_rate", "is_zero", "rate_like",
 ]  # fmt: skip
 
 Rate = float | Tensor
@@ -77,23 +77,33 @@ def check_rate(p: Any, name: str = "p") -> None:
         raise ValueError(f"{name} must be in [0, 1), got {p}; it is the fraction of Gaussians that is dropped.")
 
 
-def check_finite(x: Any, name: str, *, minimum: float = -math.inf) -> None:
-    """Raise unless ``x`` is a finite real number of at least ``minimum``."""
+def check_finite(x: Any, name: str, *, minimum: float = -math.inf, hint: str = "") -> None:
+    """Raise unless ``x`` is a finite real number of at least ``minimum``; the ``hint`` ends the message."""
     if _is_in_a_graph(x):
         return
     if not isinstance(x, Real):
         raise TypeError(f"{name} must be a real number, got {type(x).__name__}.")
-    if not math.isfinite(x) or x < minimum:
+    try:
+        finite = math.isfinite(x)
+    except OverflowError:  # an integer above all floats
+        finite = False
+    if not finite or x < minimum:
         at_least = "" if minimum == -math.inf else f" and at least {minimum:g}"
-        raise ValueError(f"{name} must be finite{at_least}, got {x}.")
+        raise ValueError(f"{name} must be finite{at_least}, got {x}{hint}.")
 
 
-def check_count(x: Any, name: str, *, minimum: int) -> None:
-    """Raise unless ``x`` is an integer of at least ``minimum``."""
+def check_callable(x: Any, name: str, arguments: str = "opacity, view") -> None:
+    """Raise unless ``x`` can be called; ``arguments`` are those that it takes, for the message."""
+    if not callable(x):
+        raise TypeError(f"{name} must be callable as {name}({arguments}), got {type(x).__name__}.")
+
+
+def check_count(x: Any, name: str, *, minimum: int, hint: str = "") -> None:
+    """Raise unless ``x`` is an integer of at least ``minimum``; the ``hint`` ends the message."""
     if not isinstance(x, Integral) or isinstance(x, bool):
         raise TypeError(f"{name} must be an integer, got {type(x).__name__}.")
     if x < minimum:
-        raise ValueError(f"{name} must be at least {minimum}, got {x}.")
+        raise ValueError(f"{name} must be at least {minimum}, got {x}{hint}.")
 
 
 def rate_like(p: Rate, opacity: Tensor) -> Rate:

@@ -16,7 +16,21 @@ def draw_numbers(
 ) -> Tensor:
     """Return n float32 numbers of ``torch.rand`` or ``torch.randn``, drawn on the generator's device if one is given.
 
-    Raises a RuntimeError if a generator is used during a backward pass, where a recomputed draw would differ.
+    The draws of a regularizer take them: a generator need not be on the device of the Gaussians. That of a score is on
+    the CPU, so that its masks are the same on every device.
+
+    Args:
+        sample: ``torch.rand`` or ``torch.randn``.
+        n: number of Gaussians.
+        generator: source of the draw; None for the global one of ``device``.
+        device: device of the returned numbers, shape (n,); None for where they were drawn.
+
+    Raises:
+        RuntimeError: if a generator is used during a backward pass, where a recomputed draw would differ.
+
+    Example:
+        >>> draw_numbers(torch.rand, 3, torch.Generator().manual_seed(0), "cpu")
+        tensor([0.4963, 0.7682, 0.0885])
     """
     if generator is not None and torch._C._current_graph_task_id() != -1:
         raise RuntimeError(

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from ca_reg._check import Rate, check_count, check_opacity, check_opacity_range
+from ca_reg._check import Rate, check_count, check_finite, check_opacity, check_opacity_range
 from ca_reg.schedules import Constant, Schedule, as_schedule
 
 __all__ = ["Scheduled"]
@@ -29,8 +29,9 @@ class Scheduled(nn.Module):
 
     def __init__(self, rate: float | Schedule | None = None) -> None:
         super().__init__()
-        if not (rate is None or callable(rate)):
-            self._check_rate(rate, self.rate_name)
+        value = rate.value if isinstance(rate, Constant) else rate
+        if not (value is None or callable(value)):
+            self._check_rate(value, self.rate_name)
         self._schedule = as_schedule(0.0 if rate is None else rate)
         self._opacity_seen = False
         self._rate: Tensor | None = None
@@ -53,7 +54,8 @@ class Scheduled(nn.Module):
             self._rate = torch.tensor(self._present_rate(), dtype=torch.float64, device="cpu")
 
     def _check_rate(self, rate: float, name: str) -> None:
-        """Raise unless the rate is in range."""
+        """Raise unless the rate is in range: finite and at least 0, unless overridden."""
+        check_finite(rate, name, minimum=0.0)
 
     def _present_rate(self, step: int | None = None) -> float:
         """Return the rate at a step, by default the current one, after a check."""
@@ -77,9 +79,6 @@ class Scheduled(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         step = state_dict.pop(prefix + "step", None)
-        former = state_dict.pop(prefix + "_extra_state", None)  # of versions up to 0.1.0
-        if former is not None:
-            step = former["step"]
         if step is not None:
             self.set_step(round(float(step)))
         super()._load_from_state_dict(state_dict, prefix, *args)

@@ -22,17 +22,14 @@ LEAST = 16
 small biases it downward, the more so the less certain it is: with 8 renders it is known to 27 %."""
 
 _GIVEN = ("samples", "ddof", "relative_error", "max_samples")
-_APPLIES = {
-    "sampling": ("samples", "ddof"),
-    "adaptive": ("relative_error", "max_samples"),
-    "exact": (),
-    "exact_neutral": (),
-}
-_REMEDY = {
-    "sampling": "give relative_error as well for adaptive sampling",
-    "adaptive": "with relative_error the number of renders is found (up to max_samples), and ddof is 1",
-    "exact": "an exact score samples nothing",
-    "exact_neutral": "an exact score samples nothing",
+_METHODS: dict[Method, tuple[tuple[str, ...], str]] = {  # which of these apply, and what to say of the others
+    "sampling": (("samples", "ddof"), "give relative_error as well for adaptive sampling"),
+    "adaptive": (
+        ("relative_error", "max_samples"),
+        "with relative_error the number of renders is found (up to max_samples), and ddof is 1",
+    ),
+    "exact": ((), "an exact score samples nothing"),
+    "exact_neutral": ((), "an exact score samples nothing"),
 }
 
 
@@ -57,9 +54,10 @@ def make_settings(
     check_count(seed, "seed", minimum=0)
     samples, ddof, relative_error, max_samples = (given[name] for name in _GIVEN)
     method = _method(exact, neutral, relative_error)
+    applies, remedy = _METHODS[method]
     for name, value in given.items():
-        if value is not None and name not in _APPLIES[method]:
-            raise ValueError(f"{name} does not apply to the method {method!r}: {_REMEDY[method]}.")
+        if value is not None and name not in applies:
+            raise ValueError(f"{name} does not apply to the method {method!r}: {remedy}.")
     drop_rate = None if drop_rate is None else float(drop_rate)
     settings = CASettings(method=method, drop_rate=drop_rate, regularizer=regularizer, threshold=float(threshold))
     if method == "sampling":

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ca_reg._check import check_count, check_opacity
+from ca_reg._check import check_callable, check_count, check_opacity
 from ca_reg.functional import Multiplier, contributions, pixel_moments
 from ca_reg.types import ExactMoments
 
@@ -86,8 +86,7 @@ class ListMoments:
     """
 
     def __init__(self, lists_fn: Callable[[Tensor, Any], PixelLists], *, elements: int = 1 << 20) -> None:
-        if not callable(lists_fn):
-            raise TypeError(f"lists_fn must be callable as lists_fn(opacity, view), got {type(lists_fn).__name__}.")
+        check_callable(lists_fn, "lists_fn")
         check_count(elements, "elements", minimum=1)
         self.lists_fn = lists_fn
         self.elements = int(elements)

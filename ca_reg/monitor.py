@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ca_reg._check import check_count, check_opacity
+from ca_reg._check import check_callable, check_count, check_opacity
 from ca_reg._log import read_log
 from ca_reg.functional import scale_opacity
 from ca_reg.result import summarize
@@ -92,6 +92,9 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         check_count(every, "every", minimum=1)
         if resume_step is not None:
             check_count(resume_step, "resume_step", minimum=0)
+        for name, fn in (("psnr", psnr), ("details", details)):
+            if fn is not None:
+                check_callable(fn, name)
         if not isinstance(views, Mapping):
             raise TypeError(f"views must be a mapping from names to sequences of views, got {type(views).__name__}.")
         if not views or any(len(group) == 0 for group in views.values()):
@@ -215,23 +218,18 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
 
 def _keep_lines(path: Path, resume_step: int | None) -> int:
     """Drop the lines after ``resume_step``, all if it is None; return the last step that is kept, -1 if none is."""
-    kept: list[str] = []
-    last = -1
-    if resume_step is not None and path.exists():
-        for line, record in read_log(path):
-            if record["step"] <= resume_step:
-                kept.append(line + "\n")
-                last = max(last, record["step"])
+    read = () if resume_step is None or not path.exists() else read_log(path)
+    kept = [(line, record["step"]) for line, record in read if record["step"] <= resume_step]
     partial = path.with_suffix(".tmp")
     try:
         with partial.open("w", encoding="utf-8") as file:
-            file.writelines(kept)
+            file.writelines(f"{line}\n" for line, _ in kept)
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)  # atomic: the log never vanishes from disk
     finally:
         partial.unlink(missing_ok=True)
-    return last
+    return max((step for _, step in kept), default=-1)
 
 
 def _summary_writer(folder: Path, resume_step: int | None) -> SummaryWriter | None:

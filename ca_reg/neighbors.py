@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["mean_neighbor_distance", "nearest_distance", "nearest_neighbors"]
+__all__ = ["nearest_distance", "nearest_neighbors", "rms_neighbor_distance"]
 
 SMALLEST_SQUARED_DISTANCE = 1e-7  # INRIA's clamp: coinciding points still get a Gaussian of some size
 TREE_FROM = 4_000  # points; below that the other search takes less time than importing SciPy
@@ -122,7 +122,7 @@ def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
     return torch.cat([torch.cdist(x, others, compute_mode="donot_use_mm_for_euclid_dist").amin(1) for x in rows])
 
 
-def mean_neighbor_distance(positions: Tensor) -> Tensor:
+def rms_neighbor_distance(positions: Tensor) -> Tensor:
     """Return the root mean squared distance of each point to its three nearest others.
 
     Convention: the INRIA code takes the logarithm of this as the initial scale of a Gaussian. Coinciding points get
@@ -132,11 +132,8 @@ def mean_neighbor_distance(positions: Tensor) -> Tensor:
         ValueError: if the shape is not (N, 3) or N is less than 2.
 
     Example:
-        >>> mean_neighbor_distance(torch.tensor([[0.0, 0, 0], [0, 0, 2]])).tolist()
+        >>> rms_neighbor_distance(torch.tensor([[0.0, 0, 0], [0, 0, 2]])).tolist()
         [2.0, 2.0]
     """
-    n = positions.shape[0]
-    if positions.ndim != 2 or positions.shape[1] != 3 or n < 2:
-        raise ValueError(f"positions must have shape (N, 3) with N >= 2, got {tuple(positions.shape)}.")
-    squares, _ = nearest_neighbors(positions, min(3, n - 1))
+    squares, _ = nearest_neighbors(positions, max(1, min(3, len(positions) - 1)))
     return squares.mean(1).clamp_min(SMALLEST_SQUARED_DISTANCE).sqrt()

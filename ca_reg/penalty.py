@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from ca_reg._check import check_finite
+from ca_reg._check import check_callable
 from ca_reg._scheduled import Scheduled
 from ca_reg.functional import Multiplier
 from ca_reg.schedules import Schedule
@@ -104,11 +104,7 @@ class CAPenalty(Scheduled):
         weight: float | Schedule = 1.0,
         layout: Layout = "CHW",
     ) -> None:
-        if not callable(moments_fn):
-            raise TypeError(
-                "moments_fn must be callable as moments_fn(opacity, view, multiplier, background), got "
-                f"{type(moments_fn).__name__}."
-            )
+        check_callable(moments_fn, "moments_fn", "opacity, view, multiplier, background")
         if not isinstance(multiplier, Multiplier) and not callable(multiplier):
             raise TypeError(
                 "multiplier must be a Multiplier, such as Multiplier.dropout(0.2), or a callable that makes one from "
@@ -124,9 +120,6 @@ class CAPenalty(Scheduled):
     def weight(self) -> float:
         """The factor of the penalty at the current step."""
         return self._present_rate()
-
-    def _check_rate(self, rate: float, name: str) -> None:
-        check_finite(rate, name, minimum=0.0)
 
     def forward(self, opacity: Tensor, view: Any, background: Tensor | None = None) -> PenalizedRender:
         """Render the moments of one view, with gradients.

@@ -81,7 +81,7 @@ class Registry(Generic[T]):
         module_name, _, class_name = name.rpartition(".")
         try:
             found = imported(module_name, class_name)
-        except (ImportError, AttributeError) as error:
+        except (ImportError, AttributeError, RecursionError) as error:
             raise ValueError(f"the {self.kind} {module_name}:{class_name} cannot be had: {error}.") from error
         if not (isinstance(found, type) and issubclass(found, self.base)):
             raise ValueError(f"{module_name}:{class_name} is no subclass of {self.base.__name__}: {found!r:.80}.")
@@ -97,10 +97,11 @@ class Registry(Generic[T]):
         Raises:
             ValueError: if the text does not parse, a name is unknown, or an argument is rejected.
         """
-        if not text.strip():
+        text = text.strip()
+        if not text:
             return []
         # Turn module:Class into module.Class, which Python can parse, outside string literals.
-        source = re.sub(r"('[^']*'|\"[^\"]*\")|(?<=\w):(?=[A-Za-z_])", lambda found: found[1] or ".", text.strip())
+        source = re.sub(r"('[^']*'|\"[^\"]*\")|(?<=\w):(?=[A-Za-z_])", lambda found: found[1] or ".", text)
         try:
             node: ast.expr = ast.parse(source, mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
@@ -125,32 +126,42 @@ class Registry(Generic[T]):
     def _make(self, node: ast.expr, text: str, imports: bool) -> T:
         """Make one object."""
         call = node if isinstance(node, ast.Call) else ast.Call(node, [], [])
-        if not re.fullmatch(r"[A-Za-z_][\w.]*", name := ast.unparse(call.func)):
-            raise ValueError(f"{ast.unparse(node)!r:.80} in {text!r:.200} is no {self.kind}; {self._form()}")
+        if not re.fullmatch(r"[A-Za-z_][\w.:]*", name := _written(call.func, text)):
+            raise ValueError(f"{_written(node, text)!r:.80} in {text!r:.200} is no {self.kind}; {self._form()}")
+        name = name.replace(":", ".")
         if "." in name and not imports:
             raise ValueError(f"{name} in {text!r:.200} is not imported because a file says so: give it yourself.")
         factory = self[name]
         try:
-            arguments, named = self._arguments(call)
+            arguments, named = self._arguments(call, text)
             return factory(*arguments, **named)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{ast.unparse(node)!r:.200}: {error}") from error
+            raise ValueError(f"{_written(node, text)!r:.200}: {error}") from error
 
-    def _arguments(self, call: ast.Call) -> tuple[list[Any], dict[Any, Any]]:
+    def _arguments(self, call: ast.Call, text: str) -> tuple[list[Any], dict[Any, Any]]:
         """Evaluate arguments: literals, and calls of the registry's values."""
-        named = {keyword.arg: self._value(keyword.value) for keyword in call.keywords}
-        return [self._value(argument) for argument in call.args], named
+        named: dict[Any, Any] = {}
+        for keyword in call.keywords:
+            if keyword.arg in named:
+                raise ValueError(f"{keyword.arg} is given twice.")
+            named[keyword.arg] = self._value(keyword.value, text)
+        return [self._value(argument, text) for argument in call.args], named
 
-    def _value(self, node: ast.expr) -> Any:
+    def _value(self, node: ast.expr, text: str) -> Any:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in self._values:
-            arguments, named = self._arguments(node)
+            arguments, named = self._arguments(node, text)
             return self._values[node.func.id](*arguments, **named)
         try:
             return ast.literal_eval(node)
         except ValueError as error:
             known = ", ".join([*self._values, "Python's literals"])
-            raise ValueError(f"{ast.unparse(node)!r:.80} is none of {known}.") from error
+            raise ValueError(f"{_written(node, text)!r:.80} is none of {known}.") from error
 
     def _form(self) -> str:
         example = f"{next(iter(self._factories), 'name')}(...)"
         return f"write {example}, or several with + between them."
+
+
+def _written(node: ast.expr, text: str) -> str:
+    """Return an expression as it is written in the text; unlike `ast.unparse`, however deep it is."""
+    return ast.get_source_segment(text, node) or ""

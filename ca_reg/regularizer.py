@@ -50,13 +50,15 @@ class Regularizer(Scheduled):
     Example:
         Dim every second Gaussian at random:
 
+        >>> from ca_reg.functional import draw_numbers
         >>> class Flicker(Regularizer):
         ...     drops = False
         ...     def draw(self, x, generator=None):
-        ...         return Draw(torch.rand(len(x.opacities), generator=generator))
+        ...         factor = draw_numbers(torch.rand, len(x.opacities), generator, x.opacities.device)
+        ...         factor[::2] = 1.0
+        ...         return Draw(factor)
         ...     def replay(self, x, draw):
-        ...         factor = torch.where(torch.arange(len(draw.value)) % 2 == 0, 1.0, draw.value)
-        ...         return x._replace(opacities=x.opacities * factor)
+        ...         return x._replace(opacities=x.opacities * draw.value)
         >>> flicker = Flicker()
         >>> flicker(torch.full((4,), 0.5))[::2]
         tensor([0.5000, 0.5000])
@@ -71,7 +73,11 @@ class Regularizer(Scheduled):
     last: Draw | None = None
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
-        """Draw for one training step, for which ``x`` is what the rasterizer would receive without a regularizer."""
+        """Draw for one training step, for which ``x`` is what the rasterizer would receive without a regularizer.
+
+        The generator may be on another device than ``x``: :func:`~ca_reg.functional.draw_numbers` draws on the one and
+        returns on the other.
+        """
         raise NotImplementedError
 
     def replay(self, x: Params, draw: Draw) -> Params:

@@ -191,49 +191,42 @@ def summarize(results: Iterable[CAResult]) -> CASummary:
         >>> summarize(score(torch.ones(10), view=None, index=i) for i in range(2)).views
         2
     """
-    tally = ViewTally()
-    settings = set()
+    sums, settings = torch.zeros(5, dtype=torch.float64), set()
     for result in results:
-        tally.add(result)
+        sums += row_of(result)
         settings.add(result.settings)
     if len(settings) != 1:
         raise ValueError(f"expected results of one score, with one set of settings, got {len(settings)} of them.")
-    return tally.summary(settings.pop())
+    return summary_of(sums, settings.pop())
 
 
-class ViewTally:
-    """Sums over views, in one tensor that ranks can all-reduce."""
+def row_of(result: CAResult) -> Tensor:
+    """Return value, squared standard error, 1, whether empty, whether not finite, (5,) float64, to be summed."""
+    ok = result.reason is Reason.OK
+    row = [result.value, result.std_error**2] if ok else [0.0, 0.0]
+    row += [1.0, float(result.reason is Reason.EMPTY), float(result.reason is Reason.NOT_FINITE)]
+    return torch.tensor(row, dtype=torch.float64)
 
-    def __init__(self) -> None:
-        # sum of values, sum of squared standard errors, views, empty views, views that are not finite
-        self.sums = torch.zeros(5, dtype=torch.float64)
 
-    def add(self, result: CAResult) -> None:
-        """Count one view."""
-        ok = result.reason is Reason.OK
-        row = [result.value, result.std_error**2] if ok else [0.0, 0.0]
-        row += [1.0, float(result.reason is Reason.EMPTY), float(result.reason is Reason.NOT_FINITE)]
-        self.sums += torch.tensor(row, dtype=torch.float64)
-
-    def summary(self, settings: CASettings) -> CASummary:
-        """Return the mean over the views counted."""
-        total, squared_error, views, empty, not_finite = self.sums.tolist()
-        counted = views - empty
-        if views == 0:
-            reason = Reason.NO_VIEWS
-        elif not_finite > 0:
-            reason = Reason.NOT_FINITE
-        else:
-            reason = Reason.OK if counted > 0 else Reason.EMPTY
-        ok = reason is Reason.OK
-        return CASummary(
-            value=total / counted if ok else math.nan,
-            std_error=math.sqrt(squared_error) / counted if ok else math.nan,
-            reason=reason,
-            views=int(views),
-            empty_views=int(empty),
-            **asdict(settings),
-        )
+def summary_of(sums: Tensor, settings: CASettings) -> CASummary:
+    """Return the mean over views, given the sum of their rows, (5,)."""
+    total, squared_error, views, empty, not_finite = sums.tolist()
+    counted = views - empty
+    if views == 0:
+        reason = Reason.NO_VIEWS
+    elif not_finite > 0:
+        reason = Reason.NOT_FINITE
+    else:
+        reason = Reason.OK if counted > 0 else Reason.EMPTY
+    ok = reason is Reason.OK
+    return CASummary(
+        value=total / counted if ok else math.nan,
+        std_error=math.sqrt(squared_error) / counted if ok else math.nan,
+        reason=reason,
+        views=int(views),
+        empty_views=int(empty),
+        **asdict(settings),
+    )
 
 
 def new_axes(count: int = 1) -> Any:

@@ -72,7 +72,8 @@ class LinearRamp:
 
     def __call__(self, step: int) -> float:
         """Return the rate at ``step``."""
-        done = min(max((step - self.start_step) / (self.end_step - self.start_step), 0.0), 1.0)
+        within = min(max(step, self.start_step), self.end_step)
+        done = (within - self.start_step) / (self.end_step - self.start_step)
         # This form, not start + done * (end - start), is exact at both ends.
         return (1.0 - done) * self.start_value + done * self.end_value
 
@@ -138,6 +139,7 @@ class ExponentialDecay:
     stop: int
 
     def __post_init__(self) -> None:
+        check_count(self.stop, "stop", minimum=0)  # None, which StartStop takes, has no decay
         StartStop(self.start_value, self.start, self.stop)  # checks
         check_finite(self.end_value, "end_value")
         if not (self.start_value > 0 and self.end_value > 0):

@@ -13,7 +13,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ca_reg._accumulate import Deviations, RenderMoments
-from ca_reg._check import check_count, check_finite, check_opacity, check_opacity_range, check_rate
+from ca_reg._check import check_callable, check_count, check_finite, check_opacity, check_opacity_range, check_rate
 from ca_reg._random import seeded
 from ca_reg._settings import GROUPS, LEAST, ROUND, make_settings
 from ca_reg.functional import Multiplier
@@ -21,7 +21,7 @@ from ca_reg.params import Params
 from ca_reg.reason import Reason
 from ca_reg.regularizer import Regularizer
 from ca_reg.regularizers import GaussianDropout
-from ca_reg.result import CAResult, CASummary, ViewTally
+from ca_reg.result import CAResult, CASummary, row_of, summary_of
 from ca_reg.types import (
     ExactMoments,
     Layout,
@@ -147,13 +147,10 @@ class CAScore:
         max_samples: int | None = None,
     ) -> None:
         for name, fn in (("render_fn", render_fn), ("alpha_fn", alpha_fn)):
-            if fn is not None and not callable(fn):
-                raise TypeError(f"{name} must be callable as {name}(opacity, view), got {type(fn).__name__}.")
-        if exact is not None and not callable(exact):
-            raise TypeError(
-                f"exact must be callable as exact(opacity, view, multiplier, background), got {type(exact).__name__}; "
-                "it is the renderer's moments function, not a switch."
-            )
+            if fn is not None:
+                check_callable(fn, name)
+        if exact is not None:
+            check_callable(exact, "exact", "opacity, view, multiplier, background")
         if render_fn is None and exact is None:
             raise ValueError("give render_fn, or exact if the renderer offers moments; without both nothing renders.")
         if exact is not None and alpha_fn is not None:
@@ -238,7 +235,7 @@ class CAScore:
             TypeError, ValueError: as for a call of the score.
         """
         result = self(opacity, view, index=view_position(self._updates) if index is None else index)
-        self._tally.add(result)
+        self._sums += row_of(result)
         self._updates += 1
         return result
 
@@ -248,18 +245,16 @@ class CAScore:
         Views without visible pixels are left out of the mean; ``empty_views`` counts them. The standard error is over
         the choice of masks, with the views held fixed. On several ranks every rank must call this.
         """
-        tally = ViewTally()
-        tally.sums = self._tally.sums.clone()
+        sums = self._sums.clone()
         if dist.is_available() and dist.is_initialized():
             on_gpu = dist.get_backend() == "nccl"
-            sums = tally.sums.to(torch.device("cuda", torch.cuda.current_device()) if on_gpu else "cpu")
+            sums = sums.to(torch.device("cuda", torch.cuda.current_device()) if on_gpu else "cpu")
             dist.all_reduce(sums)
-            tally.sums = sums.cpu()
-        return tally.summary(self.settings)
+        return summary_of(sums, self.settings)
 
     def reset(self) -> None:
         """Forget all views."""
-        self._tally = ViewTally()
+        self._sums = torch.zeros(5, dtype=torch.float64)
         self._updates = 0
 
     def _exact(self, moments_fn: MomentsFn, x: Params, view: Any) -> ExactView:

@@ -17,7 +17,7 @@ from ._call import Call
 
 __all__ = [
     "MODULES", "RASTERIZERS", "ForwardCall", "check_installed", "class_in", "forward_signature", "hide_dropped",
-    "is_of_the_family", "rasterizer_classes", "white_alpha",
+    "rasterizer_classes", "white_alpha",
 ]  # fmt: skip
 
 MODULES = ("diff_gaussian_rasterization", "diff_gaussian_rasterization_abs")
@@ -87,21 +87,11 @@ def rasterizer_classes() -> list[type]:
     return list(dict.fromkeys(cls for cls in found if cls is not None))
 
 
-def is_of_the_family(rasterizer: type) -> bool:
-    """Whether the forward of a class takes the family's arguments."""
-    return not _signature(rasterizer)[1]
-
-
-def _signature(rasterizer: type) -> tuple[inspect.Signature, list[str]]:
-    """Return the signature of a forward, and which arguments of the family it lacks."""
-    forward = getattr(rasterizer, "forward", None)
-    signature = inspect.signature(forward) if callable(forward) else inspect.Signature()
-    return signature, [name for name in ("means3D", "opacities") if name not in signature.parameters]
-
-
 def forward_signature(rasterizer: type) -> inspect.Signature:
     """Return the signature of a rasterizer's forward; raise TypeError if it lacks the family's arguments."""
-    signature, missing = _signature(rasterizer)
+    forward = getattr(rasterizer, "forward", None)
+    signature = inspect.signature(forward) if callable(forward) else inspect.Signature()
+    missing = [name for name in ("means3D", "opacities") if name not in signature.parameters]
     if missing:
         raise TypeError(
             f"{rasterizer.__qualname__}.forward{signature} has no argument {' or '.join(missing)}, so it is no "

@@ -11,7 +11,7 @@ import torch
 
 from ._after_import import AfterImport
 from ._patch import ClassPatch
-from ._rasterizer import ForwardCall, class_in, forward_signature, is_of_the_family
+from ._rasterizer import ForwardCall, class_in, forward_signature
 
 __all__ = ["Wrapped"]
 
@@ -81,8 +81,11 @@ class Wrapped:
                 wrap(found)
 
     def _wrap_candidate(self, rasterizer: type) -> None:
-        if is_of_the_family(rasterizer):
-            self._wrap_rasterizer(rasterizer)
+        try:
+            forward_signature(rasterizer)
+        except TypeError:  # not of the family
+            return
+        self._wrap_rasterizer(rasterizer)
 
     def _wrap_rasterizer(self, rasterizer: type) -> None:
         """Wrap the forward of a rasterizer."""

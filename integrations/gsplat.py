@@ -223,7 +223,9 @@ class Installation(Hook):
             (holder, name): function
             for holder in _HOLDERS
             for name, function in vars(importlib.import_module(holder)).items()
-            if name.startswith("rasterization") and _takes_opacities(function)
+            if name.startswith("rasterization")
+            and callable(function)
+            and "opacities" in inspect.signature(function).parameters
         }
         made = {id(x): Regularized(x, self._regularizer, self._generator, hook=self) for x in found.values()}
         for (holder, name), function in found.items():
@@ -282,11 +284,6 @@ def install(regularizer: nn.Module, *, generator: torch.Generator | None = None,
         30000
     """
     return Installation(regularizer, generator=generator, patience=patience).install()
-
-
-def _takes_opacities(function: Any) -> bool:
-    """Whether this is a callable with an argument ``opacities``."""
-    return callable(function) and "opacities" in inspect.signature(function).parameters
 
 
 def load_gsplat(device: torch.device | None = None) -> Any:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAScore, CASummary, Params, RenderFn
-from ca_reg.result import ViewTally
+from ca_reg.result import row_of, summary_of
 from ca_reg.score import view_position
 
 __all__ = ["CAScoreMetric"]
@@ -84,7 +84,7 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
     def __init__(self, score: CAScore | RenderFn, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.score = score if isinstance(score, CAScore) else CAScore(score)
-        self.add_state("sums", default=ViewTally().sums, dist_reduce_fx="sum")
+        self.add_state("sums", default=torch.zeros(5, dtype=torch.float64), dist_reduce_fx="sum")
         # A collection lets metrics of equal state share their updates, and scores are small enough to look equal in
         # its allclose, or all empty at first. Two digits in base 4096, because it compares with a relative tolerance.
         digits = torch.tensor(divmod(next(_numbers), 4096), dtype=torch.float64)
@@ -103,18 +103,17 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
         Raises:
             TypeError, ValueError: as for a call of the score.
         """
-        tally = ViewTally()
-        tally.add(self.score(opacity, view, index=self._position(self.update_count - 1) if index is None else index))
-        self.sums = self.sums + tally.sums.to(self.sums)
+        index = self._position(self.update_count - 1) if index is None else index
+        self.sums = self.sums + row_of(self.score(opacity, view, index=index)).to(self.sums)
 
     def compute(self) -> Tensor:
         """Return the mean over the views of all ranks, a scalar; on several ranks every rank must call this."""
-        return torch.tensor(self._summarize().value, dtype=self.sums.dtype, device=self.sums.device)
+        return self.sums.new_tensor(summary_of(self.sums, self.score.settings).value)
 
     def summary(self) -> CASummary:
         """Return the mean with its standard error, reason and counts; on several ranks every rank must call this."""
         with self.sync_context(dist_sync_fn=self.dist_sync_fn, should_sync=self.sync_on_compute):
-            return self._summarize()
+            return summary_of(self.sums, self.score.settings)
 
     def plot(self, val: Tensor | Sequence[Tensor] | None = None, ax: Any = None) -> Any:
         """Draw one value or a sequence of them, by default the present mean; return the figure and its axes.
@@ -135,9 +134,3 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
     def _position(self, before: int) -> int:
         """Return the position of the view that follows ``before`` others on this rank."""
         return view_position(before, self.process_group)
-
-    def _summarize(self) -> CASummary:
-        """Summarize the state."""
-        tally = ViewTally()
-        tally.sums = self.sums.cpu()
-        return tally.summary(self.score.settings)

@@ -94,13 +94,9 @@ class Page:
             raise RuntimeError(f"{script}: {result['exceptionDetails']}")
         return result["result"].get("value")
 
-    def screenshot(self, *, whole: bool = False) -> bytes:
-        """Return the window, or the whole page, as a PNG."""
-        return base64.b64decode(self("Page.captureScreenshot", captureBeyondViewport=whole)["data"])
-
     def picture(self) -> torch.Tensor:
         """Return the window as colors (3, H, W) in [0, 1]."""
-        with Image.open(BytesIO(self.screenshot())) as file:
+        with Image.open(BytesIO(base64.b64decode(self("Page.captureScreenshot")["data"]))) as file:
             return torch.from_numpy(np.array(file.convert("RGB"))).permute(2, 0, 1) / 255
 
     def _read(self) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """The engines that the renderer is tested with, and the one table of how exact each is."""
 
-import os
 from typing import NamedTuple
 
 import torch
@@ -53,9 +52,3 @@ ON_CARDS = {
     for device in (CARD, "cuda")
     for name in ("float64", "float32")
 }
-
-
-def subprocess_environment(**changes: str) -> dict[str, str]:
-    """The environment for a process of its own, with the package found where this one has found it."""
-    root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": root, **changes}

@@ -3,6 +3,7 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -98,33 +99,18 @@ def brute_force(
     return image.permute(2, 0, 1), 1 - light
 
 
-def associated_legendre_sh(direction: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics up to a degree from scipy-free associated Legendre polynomials, order m = -l .. l."""
-    x, y, z = direction.tolist()
-    phi, cosine = math.atan2(y, x), z
-    sine = math.sqrt(max(0.0, 1 - cosine * cosine))
+def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
+    """SciPy's real spherical harmonics of unit vectors (N, 3), order m = -l .. l within a band, (N, (degree + 1)^2).
+
+    SciPy has the complex ones, with the Condon-Shortley phase; m < 0 are their imaginary parts.
+    """
+    from scipy.special import sph_harm_y  # SciPy 1.15 or newer
+
+    x, y, z = directions.numpy().T
+    polar, azimuth = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
     values = []
     for band in range(degree + 1):
         for m in range(-band, band + 1):
-            k = abs(m)
-            legendre = _legendre(band, k, cosine, sine)
-            norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - k) / math.factorial(band + k))
-            if m == 0:
-                values.append(norm * legendre)
-            else:
-                angle = math.cos(k * phi) if m > 0 else math.sin(k * phi)
-                values.append(math.sqrt(2) * norm * legendre * angle)
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def _legendre(band: int, m: int, cosine: float, sine: float) -> float:
-    """Associated Legendre polynomial with the Condon-Shortley phase, by the standard recurrences."""
-    value = 1.0
-    for i in range(1, m + 1):
-        value *= -(2 * i - 1) * sine
-    if band == m:
-        return value
-    previous, value = value, cosine * (2 * m + 1) * value
-    for n in range(m + 2, band + 1):
-        previous, value = value, ((2 * n - 1) * cosine * value - (n + m - 1) * previous) / (n - m)
-    return value
+            value = sph_harm_y(band, abs(m), polar, azimuth)
+            values.append((value.imag if m < 0 else value.real) * (1 if m == 0 else math.sqrt(2)))
+    return torch.from_numpy(np.stack(values, 1))

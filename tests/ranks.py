@@ -1,14 +1,11 @@
 """Run a function of a test file in several processes of torch.distributed (gloo)."""
 
 import json
-import os
 import subprocess
 import sys
-from pathlib import Path
 
+from subprocesses import subprocess_environment
 from waiting import PATIENCE
-
-import ca_reg
 
 WORKER = """
 import importlib.util, json, sys
@@ -26,12 +23,10 @@ print(json.dumps(answer))
 
 def on_ranks(path, name, folder, ranks=2):
     """Return what ``name(rank)`` of the file returns, by rank; it must go through JSON."""
-    root = str(Path(ca_reg.__file__).parents[1])
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}  # after the root, which -c puts first
     processes = []
     for rank in range(ranks):
         command = [sys.executable, "-c", WORKER, str(path), name, str(folder / name), str(rank), str(ranks)]
-        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, cwd=root, env=environment))
+        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, env=subprocess_environment()))
     outputs = [process.communicate(timeout=PATIENCE)[0] for process in processes]
     assert all(process.returncode == 0 for process in processes)
     return [json.loads(output.splitlines()[-1]) for output in outputs]

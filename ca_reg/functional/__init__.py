@@ -1,5 +1,6 @@
 """The pure functions behind the modules: they hold no state, change no argument and draw only when asked to."""
 
+from ca_reg._random import draw_numbers
 from ca_reg.functional.dropout import apply_dropout, draw_keep_mask, gaussian_dropout
 from ca_reg.functional.expected_losses import expected_absolute_error, expected_squared_error
 from ca_reg.functional.moments import (
@@ -25,6 +26,7 @@ __all__ = [
     "color_variance",
     "contributions",
     "draw_keep_mask",
+    "draw_numbers",
     "draw_opacity_noise",
     "expected_absolute_error",
     "expected_opacity",

@@ -159,11 +159,9 @@ def relative_ranks(values: Tensor) -> Tensor:
     """
     if len(values) < 2:
         return torch.full_like(values, 0.5)
-    ordered, order = values.sort()
-    _, places, counts = ordered.unique_consecutive(return_inverse=True, return_counts=True)  # type: ignore[no-untyped-call]
-    ranks = torch.empty_like(values)
-    ranks[order] = ((2 * counts.cumsum(0) - counts - 1).to(values.dtype) / (2 * len(values) - 2))[places]
-    return ranks
+    _, places, counts = values.unique(return_inverse=True, return_counts=True)  # type: ignore[no-untyped-call]
+    ranks: Tensor = (2 * counts.cumsum(0) - counts - 1).to(values.dtype) / (2 * len(values) - 2)
+    return ranks[places]
 
 
 def camera_depths(x: Params) -> Tensor:

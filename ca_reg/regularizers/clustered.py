@@ -79,7 +79,7 @@ class ClusteredDropout(Regularizer):
         rate = self.anchor_rate(rate, neighbors)
         keep = functional.draw_keep_mask(count, rate, generator=generator, device=x.opacities.device)
         keep = keep.index_fill(0, neighbors[~keep].flatten(), False)
-        return Draw(keep, keep)
+        return Draw(keep=keep)
 
     def replay(self, x: Params, draw: Draw) -> Params:
         """Set the opacities of dropped Gaussians to 0."""

@@ -57,16 +57,16 @@ class SHDropout(Regularizer):
         """Draw which Gaussians keep all degrees, (N,) bool, and note how many coefficients the others keep."""
         assert x.sh is not None
         rate, degree = self._rate_at(x.step), bisect_right(self.until, x.step)
-        bands = (degree + 1) ** 2
-        if is_zero(rate) or degree == len(self.until) or bands >= x.sh.shape[1]:
+        count = (degree + 1) ** 2
+        if is_zero(rate) or degree == len(self.until) or count >= x.sh.shape[1]:
             return Draw()
-        return Draw((functional.draw_keep_mask(len(x.sh), rate, generator=generator, device=x.sh.device), bands))
+        return Draw((functional.draw_keep_mask(len(x.sh), rate, generator=generator, device=x.sh.device), count))
 
     def replay(self, x: Params, draw: Draw) -> Params:
         """Set the higher coefficients of the other Gaussians to 0."""
         if draw.value is None:
             return x
         assert x.sh is not None
-        whole, bands = draw.value
-        low, high = x.sh[:, :bands], x.sh[:, bands:]
+        whole, count = draw.value
+        low, high = x.sh[:, :count], x.sh[:, count:]
         return x._replace(sh=torch.cat([low, high.masked_fill(~whole[:, None, None], 0.0)], dim=1))

@@ -75,7 +75,7 @@ class GaussianDropout(IndependentDropout):
         As :meth:`Regularizer.forward <ca_reg.Regularizer.forward>`; ``keep``, (N,) bool, is an earlier mask to replay
         instead of drawing one, in training only.
         """
-        return super().forward(opacity, drawn=None if keep is None else Draw(keep, keep), generator=generator)
+        return super().forward(opacity, drawn=None if keep is None else Draw(keep=keep), generator=generator)
 
     def rates(self, x: Params) -> Rate:
         """Return the rate at the step."""

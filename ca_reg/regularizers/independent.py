@@ -56,7 +56,7 @@ class IndependentDropout(Regularizer):
             return Draw()
         count, device = x.opacities.shape[0], x.opacities.device
         keep = functional.draw_keep_mask(count, rates, generator=generator, device=device)
-        return Draw(keep, keep)
+        return Draw(keep=keep)
 
     def replay(self, x: Params, draw: Draw) -> Params:
         """Set the opacities of dropped Gaussians to 0, and compensate the others if asked to."""

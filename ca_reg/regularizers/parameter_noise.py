@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ca_reg import functional
-from ca_reg._check import check_finite, is_zero
+from ca_reg._check import is_zero
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Regularizer
 from ca_reg.schedules import Schedule
@@ -61,9 +61,6 @@ class ParameterNoise(Regularizer):
     def noise(self) -> Tensor | None:
         """The last draw, float32, the shape of the parameter; None if there was none."""
         return None if self.last is None else self.last.value
-
-    def _check_rate(self, rate: float, name: str) -> None:
-        check_finite(rate, name, minimum=0.0)
 
     def perturb(self, values: Tensor, noise: Tensor) -> Tensor:
         """Return the parameter with the noise, in its own dtype."""

@@ -57,6 +57,7 @@ FUNCTIONAL = {
     "expected_opacity",
     "contributions",
     "draw_keep_mask",
+    "draw_numbers",
     "draw_opacity_noise",
     "expected_absolute_error",
     "expected_squared_error",

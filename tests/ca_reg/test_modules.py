@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from ca_reg import GaussianDropout, LinearRamp, OpacityNoise, StartStop, functional
+from ca_reg import Constant, GaussianDropout, LinearRamp, OpacityNoise, StartStop, functional
 
 OPACITY = torch.linspace(0.05, 0.95, 40)
 
@@ -104,7 +104,14 @@ def test_a_draw_cannot_be_replayed_in_eval_nor_on_another_number_of_gaussians():
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: GaussianDropout(1.0), lambda: GaussianDropout(-0.1), lambda: OpacityNoise(-1)]
+    "make",
+    [
+        lambda: GaussianDropout(1.0),
+        lambda: GaussianDropout(-0.1),
+        lambda: OpacityNoise(-1),
+        lambda: GaussianDropout(Constant(1.0)),
+        lambda: OpacityNoise(Constant(-1.0)),
+    ],
 )
 def test_rates_are_checked_at_construction(make):
     with pytest.raises(ValueError, match="must be"):

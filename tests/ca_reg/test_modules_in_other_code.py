@@ -63,15 +63,6 @@ def test_the_step_of_a_schedule_survives_a_checkpoint_on_disk(make):
 
 @each_kind
 @pytest.mark.parametrize("rate", [0.2, RAMP], ids=["constant", "schedule"])
-def test_checkpoints_of_version_0_1_0_load(make, rate):
-    """They held the step of every module as extra state."""
-    module = nn.ModuleDict({"inner": make(rate)})
-    module.load_state_dict({"inner._extra_state": {"step": 70}}, strict=True)
-    assert module["inner"].step == 70
-
-
-@each_kind
-@pytest.mark.parametrize("rate", [0.2, RAMP], ids=["constant", "schedule"])
 def test_a_moving_average_over_the_values_of_a_state(make, rate):
     present = model(make(rate))
     average = copy.deepcopy(present)

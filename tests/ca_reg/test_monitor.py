@@ -182,6 +182,8 @@ def test_closing_twice_is_fine_and_using_it_then_is_an_error(tmp_path):
         ({"views": [1.0]}, TypeError),
         ({"every": 0}, ValueError),
         ({"resume_step": -1}, ValueError),
+        ({"psnr": 30.0}, TypeError),
+        ({"details": True}, TypeError),
     ],
 )
 def test_wrong_arguments_are_refused_before_a_file_is_touched(tmp_path, arguments, error):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ca_reg import neighbors
-from ca_reg.neighbors import mean_neighbor_distance, nearest_distance, nearest_neighbors
+from ca_reg.neighbors import nearest_distance, nearest_neighbors, rms_neighbor_distance
 
 
 def _points(kind: str, n: int) -> torch.Tensor:
@@ -93,7 +93,7 @@ def brute_force(positions):
 @pytest.mark.parametrize("n", [2, 3, 4, 200])
 def test_neighbor_distance_equals_brute_force(n):
     positions = torch.randn(n, 3, generator=torch.Generator().manual_seed(n))
-    torch.testing.assert_close(mean_neighbor_distance(positions).double(), brute_force(positions), rtol=1e-5, atol=0)
+    torch.testing.assert_close(rms_neighbor_distance(positions).double(), brute_force(positions), rtol=1e-5, atol=0)
 
 
 def test_neighbor_distance_of_near_duplicates_far_from_the_origin():
@@ -101,18 +101,18 @@ def test_neighbor_distance_of_near_duplicates_far_from_the_origin():
     base = torch.rand(40, 3, generator=generator) + 3
     shifts = 1e-3 * torch.randn(3, 40, 3, generator=generator)
     positions = torch.cat([base, *(base + shift for shift in shifts)])
-    got = mean_neighbor_distance(positions)
+    got = rms_neighbor_distance(positions)
     torch.testing.assert_close(got.double(), brute_force(positions), rtol=1e-4, atol=0)
 
 
 def test_duplicates_get_the_floor():
-    assert torch.equal(mean_neighbor_distance(torch.ones(5, 3)), torch.full((5,), 1e-7).sqrt())
+    assert torch.equal(rms_neighbor_distance(torch.ones(5, 3)), torch.full((5,), 1e-7).sqrt())
 
 
 @pytest.mark.parametrize("shape", [(1, 3), (0, 3), (4, 2), (12,)])
 def test_neighbor_distance_refuses_other_shapes(shape):
     with pytest.raises(ValueError, match="shape"):
-        mean_neighbor_distance(torch.zeros(shape))
+        rms_neighbor_distance(torch.zeros(shape))
 
 
 @pytest.mark.parametrize("tree", [True, False])

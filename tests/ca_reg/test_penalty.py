@@ -8,7 +8,7 @@ import torch
 from oracles import random_scene
 from torch.nn.functional import mse_loss
 
-from ca_reg import CAPenalty, LinearRamp
+from ca_reg import CAPenalty, Constant, LinearRamp
 from ca_reg.functional import Multiplier, alpha_moments, expected_squared_error, pixel_moments, scale_opacity
 from reference_trainer.render import render, splat
 from reference_trainer.render.moments import render_moments
@@ -212,6 +212,7 @@ def test_printing_shows_the_arguments():
         ({"moments_fn": None}, TypeError, "moments_fn must be callable"),
         ({"multiplier": 0.2}, TypeError, "Multiplier.dropout"),
         ({"weight": -1.0}, ValueError, "weight must be finite and at least 0"),
+        ({"weight": Constant(-1.0)}, ValueError, "weight must be finite and at least 0"),
         ({"weight": "1"}, TypeError, "weight must be a real number"),
         ({"layout": "WHC"}, ValueError, "layout must be one of"),
     ],

@@ -51,6 +51,15 @@ def test_a_class_in_a_file_of_the_working_directory(tmp_path, monkeypatch):
         ("ca_reg:NoSuchClass", "cannot be had"),
         ("+".join(["dropout(0.1)"] * 9) + "+(", "cannot be read"),
         ("(lambda: 0)()", "is no regularizer"),
+        ("dropout(1" + "0" * 309 + ")", "p must be finite, got 1000"),
+        ("segs(stop=None)", "stop must be an integer"),
+        ("noise(sigma=0.8, sigma=0.1)", "sigma is given twice"),
+        ("dropout(ramp(0, 0.2, 0, end_step=5, end_step=9))", "end_step is given twice"),
+        # Deeper than Python's limit for recursion:
+        ("noise(" + "-" * 500 + "1)", "-- is none of ramp"),
+        ("noise(" + "*".join("1" * 400) + ")", r"1\*1.* is none of ramp"),
+        ("noise" + "(1)" * 600, "is no regularizer"),
+        ("noise" + ".a" * 600, "cannot be had"),
     ],
 )
 def test_what_cannot_be_made_is_refused_by_name(text, message):

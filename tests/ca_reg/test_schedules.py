@@ -20,6 +20,11 @@ def test_a_ramp_may_fall():
     assert LinearRamp(0.4, 0.0, 0, 10)(5) == pytest.approx(0.2)
 
 
+def test_a_ramp_may_lie_beyond_all_floats():
+    ramp = LinearRamp(0.1, 0.3, 10**400, 10**400 + 1)
+    assert [ramp(step) for step in (0, 10**400 + 1)] == [0.1, 0.3]
+
+
 def test_start_stop_is_half_open():
     schedule = StartStop(0.2, start=10, stop=20)
     assert [schedule(step) for step in (0, 9, 10, 19, 20, 100)] == [0.0, 0.0, 0.2, 0.2, 0.0, 0.0]
@@ -45,6 +50,7 @@ def test_numbers_become_constants_and_callables_stay():
         (lambda: LinearRamp(0.0, 0.2, 10, 10), "must come after"),
         (lambda: ExponentialDecay(0.2, 0.1, 10, 10), "must come after"),
         (lambda: ExponentialDecay(0.2, 0.0, 0, 10), "above 0"),
+        (lambda: ExponentialDecay(10**400, 0.1, 0, 10), "value must be finite, got 1000"),
         (lambda: LinearRamp(0.0, 0.2, -1, 10), "at least 0"),
         (lambda: StartStop(0.2, start=5, stop=5), "must come after"),
     ],
@@ -52,3 +58,8 @@ def test_numbers_become_constants_and_callables_stay():
 def test_schedules_that_make_no_sense_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_decay_without_an_end_is_refused():
+    with pytest.raises(TypeError, match="stop must be an integer, got NoneType"):
+        ExponentialDecay(0.2, 0.1, 0, None)

@@ -8,7 +8,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 import torch
-from stand_ins.gsplat_of_nerfstudio import rasterization
+from stand_ins.gsplat import rasterization_1_4 as rasterization
 from torch import nn
 
 from ca_reg import CAScore, integrations
@@ -90,7 +90,8 @@ def test_training_drops_gaussians_from_image_gradients_and_radii():
     removed = plain.get_outputs(CAMERA)
     assert torch.equal(outputs["rgb"], removed["rgb"])
     assert torch.equal(outputs["accumulation"], removed["accumulation"])
-    for out in (outputs, removed):
+    for out, info in ((outputs, model.info), (removed, plain.info)):
+        info["means2d"].retain_grad()
         (out["rgb"] - 0.3).square().sum().backward()
     for name, parameter in model.named_parameters():
         assert torch.equal(parameter.grad[keep], plain.get_parameter(name).grad[keep])
@@ -113,7 +114,7 @@ def test_evaluation_scales_the_opacities_and_masks_nothing():
     with torch.no_grad():
         plain.opacities.copy_(logits_of(0.6 * activated(model)))
     torch.testing.assert_close(outputs["rgb"], plain.get_outputs(CAMERA)["rgb"])
-    assert (model.info["radii"] == 5).all()
+    assert (model.info["radii"] > 0).all()
 
 
 def test_noise_is_added_in_training_and_scaled_on_request():

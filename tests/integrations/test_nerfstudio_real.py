@@ -6,7 +6,7 @@ from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
 import torch
-from stand_ins.gsplat_of_nerfstudio import rasterization
+from stand_ins.gsplat import rasterization_1_4 as rasterization
 from torch import nn
 
 from ca_reg.integrations import nerfstudio

@@ -8,7 +8,7 @@ from oracles import random_scene
 from stand_ins.gsplat import intrinsics, rasterization
 from stand_ins.inria import PIPE, Model, make_render, settings_of
 
-from ca_reg import Chain, Draw, IndependentDropout, Learned, Regularizer
+from ca_reg import Chain, Draw, IndependentDropout, Learned, Params, Regularizer
 from ca_reg.integrations._rasterizer import ForwardCall, forward_signature
 from ca_reg.integrations.gsplat import regularized
 from ca_reg.integrations.inria import RasterizerHook
@@ -108,6 +108,15 @@ def test_scales_in_the_inria_hook(rasterizer, my_module):
     torch.testing.assert_close(trained["render"], expected["render"], rtol=1e-5, atol=1e-6)
     assert torch.equal(trained["radii"], expected["radii"])
     assert torch.equal(tested["render"], render(model.camera, model, PIPE, BLACK)["render"])
+
+
+def test_draws_from_a_generator_of_another_device(card, my_module):
+    """As in a score, whose generator is on the processor."""
+    found = []
+    for device in ("cpu", card):
+        x = Params(torch.full((5,), 0.5, device=device), scales=torch.ones(5, 3, device=device))
+        found.append(my_module.MyScaleNoise().regularize(x, torch.Generator().manual_seed(0)).scales.cpu())
+    assert torch.equal(*found)
 
 
 def test_moved_positions_leave_the_gradients_on_the_screen_where_they_belong(rasterizer):
