@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-__all__ = ["Camera", "pixels_of"]
+__all__ = ["Camera"]
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,11 @@ class Camera:
         across = local[..., :2] / depth[..., None]
         return across * depth.new_tensor([self.fx, self.fy]) + depth.new_tensor([self.cx, self.cy]), depth
 
+    def inside(self, pixels: Tensor, depth: Tensor) -> Tensor:
+        """Return which pixels (..., 2) at depths (...) are in the picture and in front of the camera, (...) bool."""
+        x, y = pixels.unbind(-1)
+        return (depth > 0) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
     def resized(self, width: int, height: int) -> Camera:
         """Return the camera of the same picture resized to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height
@@ -96,15 +101,3 @@ class Camera:
         """Return the camera with its view matrix on another device or in another dtype."""
         pose = self.world_to_camera.to(device=device, dtype=dtype)
         return self if pose is self.world_to_camera else replace(self, world_to_camera=pose)
-
-
-def pixels_of(positions: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the column and row of every point's pixel, clamped to the picture, and whether the point is in view."""
-    pixels, depth = camera.project(positions)
-    column, row = pixels.unbind(1)
-    within = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    return (
-        column.nan_to_num().clamp(0, camera.width - 1).long(),
-        row.nan_to_num().clamp(0, camera.height - 1).long(),
-        within,
-    )

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from ca_reg._check import check_count
 from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.density.operations import is_large, reset_opacity
 from reference_trainer.model.optimizer import GaussianOptimizer
@@ -35,10 +35,11 @@ class AbsGradDensity(AdaptiveDensity):
         ceiling_every: number of steps between these, until densification ends; 0 never lowers.
 
     Raises:
+        TypeError: if ``ceiling_every`` is no integer.
         ValueError: if one is out of range.
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset({"absgrad"})
+    needs = frozenset({"absgrad"})
 
     def __init__(
         self,
@@ -52,8 +53,7 @@ class AbsGradDensity(AdaptiveDensity):
         for name, value in given.items():
             if not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}.")
-        if ceiling_every < 0:
-            raise ValueError(f"ceiling_every must not be negative, got {ceiling_every}: 0 turns it off.")
+        check_count(ceiling_every, "ceiling_every", minimum=0, hint=": 0 turns it off")
         if not 0 < opacity_ceiling < 1:
             raise ValueError(f"opacity_ceiling must be in (0, 1), got {opacity_ceiling}: ceiling_every=0 turns it off.")
         self.settings = {"densify_gradient": clone_gradient, "dense_fraction": dense_fraction}

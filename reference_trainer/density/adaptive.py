@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.density.operations import decay_opacity, densify, prune, refuse_not_finite, reset_opacity
+from reference_trainer.density.operations import (
+    clone,
+    decay_opacity,
+    is_large,
+    prune,
+    refuse_not_finite,
+    reset_opacity,
+    split,
+)
 from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.density.strategy import DensityStrategy
 from reference_trainer.model.optimizer import GaussianOptimizer
@@ -28,7 +35,7 @@ class AdaptiveDensity(DensityStrategy):
     dropped in a step are not counted in it; like all others they are pruned, reset and decayed by plain opacity.
     """
 
-    resets: ClassVar[bool] = True
+    resets = True
 
     def reset(self, count: int) -> None:
         """Forget the gradients."""
@@ -58,18 +65,14 @@ class AdaptiveDensity(DensityStrategy):
         config = self.config
         if config.max_gaussians is None or len(optimizer.gaussians) < config.max_gaussians:
             self.grow(optimizer, step)
-        large = config.prune_size is not None and step > config.prune_size_from
-        max_scale = config.prune_size * self.extent if large and config.prune_size is not None else None
-        prune(optimizer, min_opacity=config.prune_opacity, max_scale=max_scale)
+        size = config.prune_size if step > config.prune_size_from else None
+        prune(optimizer, min_opacity=config.prune_opacity, max_scale=None if size is None else size * self.extent)
 
     def grow(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Clone and split once."""
-        densify(
-            optimizer,
-            self.selected(optimizer),
-            size_threshold=self.large,
-            generator=self.split_generator(step),
-        )
+        selected, large = self.selected(optimizer), is_large(optimizer, self.large)
+        clone(optimizer, selected & ~large)
+        split(optimizer, selected & large, generator=self.split_generator(step))
 
     def selected(self, optimizer: GaussianOptimizer) -> Tensor:
         """Return which Gaussians are to be cloned if they are small, and split if they are large, shape (N,) bool."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
 
 import torch
 
+from ca_reg._check import check_count
 from ca_reg.neighbors import nearest_distance
 from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.training.errors import TrainingStoppedError
@@ -29,16 +29,16 @@ class CoPruning(AdaptiveDensity):
         every: positive number of steps.
 
     Raises:
+        TypeError: if ``every`` is no integer.
         ValueError: if one is out of range.
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset({"fields"})
+    needs = frozenset({"fields"})
 
     def __init__(self, distance: float = 5.0, every: int = 500) -> None:
         if not distance > 0:
             raise ValueError(f"distance must be positive, got {distance}.")
-        if every < 1:
-            raise ValueError(f"every must be at least 1, got {every}: density control without it is 'adaptive'.")
+        check_count(every, "every", minimum=1, hint=": density control without it is 'adaptive'")
         self.distance, self.every = distance, every
 
     def together(self, fields: Sequence[Field], step: int) -> None:

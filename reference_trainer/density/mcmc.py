@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ca_reg._check import check_finite
 from reference_trainer.density.operations import refuse_not_finite
 from reference_trainer.density.strategy import DensityStrategy
 from reference_trainer.model.gaussians import Gaussians
@@ -46,14 +47,12 @@ class MCMCDensity(DensityStrategy):
         growth: factor on the number of Gaussians, at least 1.
 
     Raises:
-        ValueError: if one is out of range.
+        ValueError: if one is out of range or not finite.
     """
 
     def __init__(self, noise: float = 5e5, growth: float = 1.05) -> None:
-        if not noise >= 0:
-            raise ValueError(f"noise must not be negative, got {noise}: 0 turns it off.")
-        if not growth >= 1:
-            raise ValueError(f"growth must be at least 1, which adds nothing, got {growth}.")
+        check_finite(noise, "noise", minimum=0, hint=": 0 turns it off")
+        check_finite(growth, "growth", minimum=1, hint=": 1 adds nothing")
         self.noise, self.growth = noise, growth
 
     @torch.no_grad()

@@ -12,16 +12,7 @@ from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.rotations import rotation_matrices
 from reference_trainer.training.errors import TrainingStoppedError
 
-__all__ = [
-    "clone",
-    "decay_opacity",
-    "densify",
-    "is_large",
-    "prune",
-    "refuse_not_finite",
-    "reset_opacity",
-    "split",
-]
+__all__ = ["clone", "decay_opacity", "is_large", "prune", "refuse_not_finite", "reset_opacity", "split"]
 
 _SPLIT_INTO = 2
 _SPLIT_SHRINK = 0.8 * _SPLIT_INTO  # children of a split are smaller by this factor, as in the INRIA code
@@ -48,26 +39,6 @@ def split(optimizer: GaussianOptimizer, selected: Tensor, *, generator: torch.Ge
     smaller = parents.log_scales - math.log(_SPLIT_SHRINK)
     optimizer.select(~selected)
     optimizer.append(replace(parents, means=parents.means + offsets, log_scales=smaller))
-
-
-def densify(
-    optimizer: GaussianOptimizer,
-    selected: Tensor,
-    *,
-    size_threshold: float,
-    generator: torch.Generator | None = None,
-) -> None:
-    """Clone the small and split the large ones of the selected Gaussians (Kerbl et al. 2023, Sec. 5.2).
-
-    Args:
-        optimizer: holds the Gaussians; changed.
-        selected: which Gaussians are to become two, shape (N,) bool.
-        size_threshold: Gaussians whose largest standard deviation exceeds it are split, others cloned; world units.
-        generator: for the positions of the children.
-    """
-    large = is_large(optimizer, size_threshold)
-    clone(optimizer, selected & ~large)
-    split(optimizer, selected & large, generator=generator)
 
 
 def is_large(optimizer: GaussianOptimizer, size: float) -> Tensor:
@@ -102,11 +73,12 @@ def prune(optimizer: GaussianOptimizer, *, min_opacity: float, max_scale: float 
 def reset_opacity(optimizer: GaussianOptimizer, ceiling: float) -> None:
     """Lower every opacity to at most ``ceiling`` and forget its optimizer state (Kerbl et al. 2023, Sec. 5.2)."""
     logits = optimizer.gaussians.opacity_logits.detach().clamp(max=math.log(ceiling / (1 - ceiling)))
-    optimizer.set_opacity_logits(logits, forget=True)
+    optimizer.set_opacity_logits(logits)
+    optimizer.forget(slice(None), "opacity_logits")
 
 
 def decay_opacity(optimizer: GaussianOptimizer, factor: float) -> None:
     """Multiply every opacity by ``factor`` (Binocular3DGS's opacity decay); the optimizer state stays."""
     opacities = optimizer.gaussians.opacities.detach() * factor
     # The floor keeps the logit finite; a Gaussian this faint is pruned long before.
-    optimizer.set_opacity_logits(torch.logit(opacities.clamp(min=1e-7)), forget=False)
+    optimizer.set_opacity_logits(torch.logit(opacities.clamp(min=1e-7)))

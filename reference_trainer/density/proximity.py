@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ca_reg._check import check_count
 from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.density.operations import clone, is_large, split
@@ -37,12 +38,12 @@ class ProximityDensity(AdaptiveDensity):
         split_distance: multiple of the extent beyond which they are split; positive.
 
     Raises:
+        TypeError: if ``until`` is no integer.
         ValueError: if one is out of range.
     """
 
     def __init__(self, until: int = 2_000, distance: float = 5.0, split_distance: float = 10.0) -> None:
-        if until < 0:
-            raise ValueError(f"until must not be negative, got {until}: 0 unpools nothing.")
+        check_count(until, "until", minimum=0, hint=": 0 unpools nothing")
         if not (distance > 0 and split_distance > 0):
             raise ValueError(f"distance and split_distance must be positive, got {distance}, {split_distance}.")
         self.unpool_until, self.distance, self.split_distance = until, distance, split_distance

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize, pdist
 
+from ca_reg._check import check_count
 from reference_trainer.camera import Camera
 from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.density.operations import clone, is_large, split
@@ -37,14 +38,14 @@ class RayBoxDensity(AdaptiveDensity):
         width: of a region, pixels, positive.
 
     Raises:
+        TypeError: if one is no integer.
         ValueError: if one is out of range.
     """
 
     def __init__(self, views: int = 3, height: int = 20, width: int = 40) -> None:
-        if views < 2:
-            raise ValueError(f"views must be at least 2, whose rays can meet, got {views}.")
-        if height < 1 or width < 1:
-            raise ValueError(f"height and width must be positive pixels, got {height} and {width}.")
+        check_count(views, "views", minimum=2, hint=": the rays of one do not meet")
+        check_count(height, "height", minimum=1)
+        check_count(width, "width", minimum=1)
         self.views, self.height, self.width = views, height, width
 
     @torch.no_grad()

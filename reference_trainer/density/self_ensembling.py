@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from ca_reg._check import check_count
 from ca_reg.neighbors import nearest_distance
 from ca_reg.regularizers.segs import SEGSNoise
 from reference_trainer.density.co_pruning import CoPruning
@@ -51,6 +52,7 @@ class SelfEnsembling(CoPruning):
         least: smallest standard deviation of an uncertain pixel, in colors of [0, 1].
 
     Raises:
+        TypeError: if ``every`` or ``views`` is no integer.
         ValueError: if one is out of range, or the scene has no `pseudo_cameras`.
     """
 
@@ -68,8 +70,9 @@ class SelfEnsembling(CoPruning):
     ) -> None:
         super().__init__(distance, every)
         self.noise = SEGSNoise(first, last, start, stop)
-        if views < 1 or not 0 < share < 1 or not least >= 0:
-            raise ValueError(f"expected views >= 1, share in (0, 1) and least >= 0, got {views}, {share} and {least}.")
+        check_count(views, "views", minimum=1)
+        if not 0 < share < 1 or not least >= 0:
+            raise ValueError(f"expected share in (0, 1) and least >= 0, got {share} and {least}.")
         self.start = max(start, 2 * every)  # for three pictures
         self.stop, self.views, self.share, self.least = stop, views, share, least
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ca_reg import attribute
+from ca_reg._check import check_count
 from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.evaluation.shares import all_but_highest, blend_weights, share_per_weight
 from reference_trainer.evaluation.trained_model import TrainedModel
@@ -32,12 +33,12 @@ class SharePruning(AdaptiveDensity):
         drop_rate: of the score, in (0, 1).
 
     Raises:
+        TypeError: if ``every`` is no integer.
         ValueError: if one is out of range.
     """
 
     def __init__(self, every: int = 500, fraction: float = 0.02, drop_rate: float = 0.5) -> None:
-        if every < 1:
-            raise ValueError(f"every must be at least 1, got {every}: density control without it is 'adaptive'.")
+        check_count(every, "every", minimum=1, hint=": density control without it is 'adaptive'")
         for name, value in (("fraction", fraction), ("drop_rate", drop_rate)):
             if not 0 < value < 1:
                 raise ValueError(f"{name} must be in (0, 1), got {value}.")

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
-
 from torch import Tensor
 
+from ca_reg._check import check_count
 from ca_reg.functional import Multiplier
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import WeightedTerm
 from reference_trainer.scenes.pseudo import VIRTUAL_VIEWS
-
-if TYPE_CHECKING:
-    from reference_trainer.scenes.scene import Scene
-    from reference_trainer.training.step import Step
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.step import Step
 
 __all__ = ["CoAdaptation"]
 
@@ -34,6 +31,7 @@ class CoAdaptation(WeightedTerm):
         every: the term acts once in so many steps, multiplied by their number, so that ``weight`` is the mean per step.
 
     Raises:
+        TypeError: if ``every`` is no integer.
         ValueError: if one is out of range, or the scene has no such cameras.
 
     Example:
@@ -44,15 +42,14 @@ class CoAdaptation(WeightedTerm):
     """
 
     needs = frozenset({"moments"})
-    analytic: ClassVar[bool] = True
+    analytic = True
 
     def __init__(self, weight: float | Schedule = 1.0, p: float = 0.5, where: str = "training", every: int = 1) -> None:
         super().__init__(weight)
         self.multiplier = Multiplier.dropout(p)
         if where not in ("training", *VIRTUAL_VIEWS):
             raise ValueError(f"where must be training, {', '.join(VIRTUAL_VIEWS)}, got {where!r}.")
-        if every < 1:
-            raise ValueError(f"every must be at least 1, got {every}: a term without steps is left out.")
+        check_count(every, "every", minimum=1, hint=": a term without steps is left out")
         self.where, self.every = where, every
 
     def begin(self, scene: Scene) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from itertools import permutations
-from typing import ClassVar
 
 from torch import Tensor
 
 from ca_reg.schedules import Schedule
-from reference_trainer.losses.photometric import _check_lambda, photometric_loss
+from reference_trainer.losses.photometric import check_lambda, photometric_loss
 from reference_trainer.losses.term import WeightedTerm
 from reference_trainer.scenes.pseudo import pseudo_cameras
 from reference_trainer.scenes.scene import Scene
@@ -34,11 +33,11 @@ class CoRegularization(WeightedTerm):
     """
 
     needs = frozenset({"fields"})
-    analytic: ClassVar[bool] = True
+    analytic = True
 
     def __init__(self, weight: float | Schedule = 1.0, lambda_dssim: float = 0.2) -> None:
         super().__init__(weight)
-        _check_lambda(lambda_dssim)
+        check_lambda(lambda_dssim)
         self.lambda_dssim = lambda_dssim
 
     def begin(self, scene: Scene) -> None:

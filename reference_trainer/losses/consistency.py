@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from torch import Tensor
 
 from ca_reg import GaussianDropout
 from ca_reg.functional import Multiplier, expected_squared_error
 from ca_reg.schedules import Schedule
-from reference_trainer.losses.photometric import _check_lambda, photometric_loss
+from reference_trainer.losses.photometric import check_lambda, photometric_loss
 from reference_trainer.losses.term import WeightedTerm
 from reference_trainer.training.step import Step
 
@@ -40,7 +38,7 @@ class Consistency(WeightedTerm):
         (0.3, 0.5, True)
     """
 
-    analytic: ClassVar[bool] = True
+    analytic = True
 
     def __init__(
         self,
@@ -52,7 +50,7 @@ class Consistency(WeightedTerm):
     ) -> None:
         super().__init__(weight)
         self.dropout = GaussianDropout(p)
-        _check_lambda(lambda_dssim)
+        check_lambda(lambda_dssim)
         self.p, self.lambda_dssim, self.exact = p, lambda_dssim, exact
         self.needs = frozenset({"moments"} if exact else ())
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from torch import Tensor
 
+from ca_reg._check import check_finite
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import WeightedTerm
 from reference_trainer.training.step import Step
@@ -21,15 +20,14 @@ class Flat(WeightedTerm):
         limit: ratio up to which nothing is penalized, at least 1; 1 gives DNGaussian's term but for a constant.
 
     Raises:
-        ValueError: if one is out of range.
+        ValueError: if one is out of range, or ``limit`` not finite.
     """
 
-    analytic: ClassVar[bool] = True
+    analytic = True
 
     def __init__(self, weight: float | Schedule = 0.002, limit: float = 1.0) -> None:
         super().__init__(weight)
-        if not limit >= 1:
-            raise ValueError(f"limit must be at least 1, the ratio of a sphere, got {limit}.")
+        check_finite(limit, "limit", minimum=1, hint=": 1 is the ratio of a sphere")
         self.limit = limit
 
     def value(self, step: Step) -> Tensor:

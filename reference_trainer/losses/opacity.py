@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from torch import Tensor
 
 from ca_reg.schedules import Schedule
@@ -25,7 +23,7 @@ class Opacity(WeightedTerm):
         ValueError: if one is out of range.
     """
 
-    analytic: ClassVar[bool] = True
+    analytic = True
 
     def __init__(self, weight: float | Schedule = 0.01, split: float | None = None) -> None:
         super().__init__(weight)

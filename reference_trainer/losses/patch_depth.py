@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import unfold
 
+from ca_reg._check import check_count, check_finite
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import PriorTerm
 from reference_trainer.training.step import Step
@@ -37,7 +38,8 @@ class PatchDepth(PriorTerm):
             the soft pass at step 1,000.
 
     Raises:
-        ValueError: if one is out of range.
+        TypeError: if ``smallest`` or ``largest`` is no integer.
+        ValueError: if one is out of range or not finite.
     """
 
     def __init__(
@@ -52,10 +54,9 @@ class PatchDepth(PriorTerm):
     ) -> None:
         super().__init__(weight)
         for name, value in (("near", near), ("far", far), ("tolerance", tolerance)):
-            if not value >= 0:
-                raise ValueError(f"{name} must not be negative, got {value}.")
-        if not 2 <= smallest <= largest:
-            raise ValueError(f"patches need 2 <= smallest <= largest, got {smallest} and {largest}.")
+            check_finite(value, name, minimum=0)
+        check_count(smallest, "smallest", minimum=2)
+        check_count(largest, "largest", minimum=smallest, hint=", less than smallest")
         if which not in ("plain", "hard", "soft"):
             raise ValueError(f"which must be plain, hard or soft, got {which!r}.")
         self.near, self.far, self.tolerance, self.which = near, far, tolerance, which

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from reference_trainer.losses.term import WeightedTerm
 from reference_trainer.render.engine import engine_for
 from reference_trainer.training.step import Step
 
-__all__ = ["Photometric", "expected_photometric_loss", "photometric_loss", "ssim_map"]
+__all__ = ["Photometric", "check_lambda", "expected_photometric_loss", "photometric_loss", "ssim_map"]
 
 _RADIUS = 5
 _SIGMA = 1.5
@@ -35,11 +35,11 @@ class Photometric(WeightedTerm):
         ValueError: if one is out of range.
     """
 
-    analytic: ClassVar[bool] = True
+    analytic = True
 
     def __init__(self, lambda_dssim: float = 0.2, *, weight: float | Schedule = 1.0) -> None:
         super().__init__(weight)
-        _check_lambda(lambda_dssim)
+        check_lambda(lambda_dssim)
         self.lambda_dssim = lambda_dssim
 
     def value(self, step: Step) -> Tensor:
@@ -74,7 +74,7 @@ def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -
         >>> image.grad.shape
         torch.Size([3, 16, 16])
     """
-    _check_lambda(lambda_dssim)
+    check_lambda(lambda_dssim)
     _check_pair(image, target)
     return _with_ssim(torch.nn.functional.l1_loss(image, target), image, target, None, lambda_dssim)
 
@@ -105,7 +105,7 @@ def expected_photometric_loss(mean: Tensor, variance: Tensor, target: Tensor, la
         >>> losses[0] < losses[1]
         True
     """
-    _check_lambda(lambda_dssim)
+    check_lambda(lambda_dssim)
     _check_pair(mean, target)
     return _with_ssim(expected_absolute_error(mean, variance, target).mean(), mean, target, variance, lambda_dssim)
 
@@ -160,7 +160,7 @@ def _check_pair(image: Tensor, target: Tensor) -> None:
         raise ValueError("target is a constant here, but it requires a gradient: pass target.detach().")
 
 
-def _check_lambda(lambda_dssim: float) -> None:
+def check_lambda(lambda_dssim: float) -> None:
     """Raise unless it is a weight in [0, 1]."""
     if not 0 <= lambda_dssim <= 1:
         raise ValueError(f"lambda_dssim must lie in [0, 1], got {lambda_dssim}.")

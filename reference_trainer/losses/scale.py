@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from torch import Tensor
 
+from ca_reg._check import check_finite
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import WeightedTerm
 from reference_trainer.training.step import Step
@@ -21,15 +20,14 @@ class Scale(WeightedTerm):
         limit: standard deviation up to which nothing is penalized, at least 0, world units; DNGaussian has none.
 
     Raises:
-        ValueError: if one is out of range.
+        ValueError: if one is out of range, or ``limit`` not finite.
     """
 
-    analytic: ClassVar[bool] = True
+    analytic = True
 
     def __init__(self, weight: float | Schedule = 0.001, limit: float = 0.0) -> None:
         super().__init__(weight)
-        if not limit >= 0:
-            raise ValueError(f"limit must not be negative, got {limit}.")
+        check_finite(limit, "limit", minimum=0)
         self.limit = limit
 
     def value(self, step: Step) -> Tensor:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
+from ca_reg._check import check_count
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.photometric import Photometric
 from reference_trainer.losses.term import WeightedTerm
@@ -27,15 +26,15 @@ class Views(WeightedTerm):
         lambda_dssim: of `photometric_loss`.
 
     Raises:
+        TypeError: if ``n`` is no integer.
         ValueError: if one is out of range.
     """
 
-    analytic: ClassVar[bool] = True
+    analytic = True
 
     def __init__(self, n: int = 3, weight: float | Schedule = 1.0, lambda_dssim: float = 0.2) -> None:
         super().__init__(weight)
-        if n < 2:
-            raise ValueError(f"n must be at least 2, got {n}: one view is what photometric has.")
+        check_count(n, "n", minimum=2, hint=": one view is what photometric has")
         self.n, self.photometric = n, Photometric(lambda_dssim)
 
     def value(self, step: Step) -> Tensor:

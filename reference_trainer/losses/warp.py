@@ -9,6 +9,7 @@ from kornia.filters import spatial_gradient
 from kornia.geometry import create_meshgrid, remap
 from torch import Tensor
 
+from ca_reg._check import check_finite
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import WeightedTerm
 from reference_trainer.training.step import Step
@@ -28,7 +29,7 @@ class Warp(WeightedTerm):
         smooth: weight of the smoothness, at least 0.
 
     Raises:
-        ValueError: if one is out of range.
+        ValueError: if one is out of range, or ``smooth`` not finite.
     """
 
     needs = frozenset({"depth"})
@@ -37,8 +38,7 @@ class Warp(WeightedTerm):
         super().__init__(weight)
         if not shift > 0:
             raise ValueError(f"shift must be positive, got {shift}.")
-        if not smooth >= 0:
-            raise ValueError(f"smooth must not be negative, got {smooth}.")
+        check_finite(smooth, "smooth", minimum=0)
         self.shift, self.smooth = shift, smooth
 
     def value(self, step: Step) -> Tensor:

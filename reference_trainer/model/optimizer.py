@@ -57,13 +57,10 @@ class GaussianOptimizer:
             lambda moment: torch.cat([moment, moment.new_zeros(count, *moment.shape[1:])]),
         )
 
-    def set_opacity_logits(self, logits: Tensor, *, forget: bool) -> None:
-        """Overwrite the opacity logits, shape (N,); ``forget`` also clears their optimizer state."""
-        parameter = self.gaussians.opacity_logits
+    def set_opacity_logits(self, logits: Tensor) -> None:
+        """Overwrite the opacity logits, shape (N,); their optimizer state stays."""
         with torch.no_grad():
-            parameter.copy_(logits)
-        if forget:
-            self._forget(parameter, slice(None))
+            self.gaussians.opacity_logits.copy_(logits)
 
     def relocate(self, index: Tensor, new: Gaussians) -> None:
         """Overwrite the Gaussians at ``index`` (positions) with as many new ones; their optimizer state stays."""
@@ -75,7 +72,9 @@ class GaussianOptimizer:
         """Clear the optimizer state of the Gaussians at ``index`` (bool mask or positions), for all or some names."""
         for name, x in self.gaussians.named():
             if not names or name in names:
-                self._forget(x, index)
+                for key, value in self._adam.state[x].items():
+                    if key != "step":
+                        value[index] = 0
 
     def state_dict(self) -> dict[str, Any]:
         """Return parameters and moments as plain tensors, for a checkpoint."""
@@ -90,11 +89,6 @@ class GaussianOptimizer:
         self._replace({name: x.detach().clone().requires_grad_() for name, x in state["gaussians"].items()})
         for name, x in self.gaussians.named():
             self._adam.state[x] = {key: value.clone() for key, value in state["moments"][name].items()}
-
-    def _forget(self, parameter: Tensor, index: Tensor | slice) -> None:
-        for name, value in self._adam.state[parameter].items():
-            if name != "step":
-                value[index] = 0
 
     def _group(self, name: str) -> dict[str, Any]:
         return next(group for group in self._adam.param_groups if group["name"] == name)

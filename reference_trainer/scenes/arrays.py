@@ -131,7 +131,8 @@ def _points(path: Path, arrays: Arrays, frames: Sequence[Frame]) -> PointCloud |
             colors = given.reshape(-1, 3) / (255 if given.dtype.kind in "iu" or given.max(initial=0) > 1 else 1)
     keep, confidence = np.isfinite(positions).all(1), _first(arrays, CONFIDENCE)
     if confidence is not None and confidence.size == len(positions):
-        keep &= confidence.ravel() >= np.median(confidence)
+        known = confidence[~np.isnan(confidence)]
+        keep &= confidence.ravel() >= (np.median(known) if len(known) else np.inf)
     chosen = np.flatnonzero(keep)
     chosen = chosen[:: -(-len(chosen) // MOST_POINTS) or 1]
     if len(chosen) == 0:
@@ -142,9 +143,11 @@ def _points(path: Path, arrays: Arrays, frames: Sequence[Frame]) -> PointCloud |
 
 def _lifted(depth: NDArray[Any], camera: Camera) -> NDArray[Any]:
     """Lift a map of depths along the camera's z axis to world points (H, W, 3); nan where the depth is not positive."""
-    rows, columns = (torch.arange(size) + 0.5 for size in depth.shape[:2])
-    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).double()
-    depths = torch.from_numpy(depth.reshape(depth.shape[:2]).astype(np.float64))
+    from kornia.geometry import create_meshgrid
+
+    height, width = depth.shape[:2]
+    pixels = create_meshgrid(height, width, normalized_coordinates=False, dtype=torch.float64)[0] + 0.5
+    depths = torch.from_numpy(depth.reshape(height, width).astype(np.float64))
     return camera.lift(pixels, depths.where(depths > 0, torch.nan)).numpy()
 
 

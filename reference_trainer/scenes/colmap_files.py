@@ -18,7 +18,7 @@ from reference_trainer.scenes.colmap_model import (
     ColmapPoints,
     PointRecords,
     add_camera,
-    view_matrix,
+    view_matrix_from_quaternion,
 )
 
 __all__ = ["READERS"]
@@ -95,7 +95,7 @@ def read_images_binary(path: Path) -> list[ColmapImage]:
         number, *pose, camera = cursor.take("i7di", "an image")
         name, keypoints = cursor.text("the name of an image"), cursor.array(_KEYPOINT, "features")
         xy, points = keypoints["xy"].astype(np.float64), keypoints["point"].astype(np.int64)
-        images.append(ColmapImage(number, name, camera, view_matrix(pose[:4], pose[4:]), xy, points))
+        images.append(ColmapImage(number, name, camera, view_matrix_from_quaternion(pose[:4], pose[4:]), xy, points))
     return images
 
 
@@ -180,7 +180,7 @@ def read_images_text(path: Path) -> list[ColmapImage]:
             continue
         try:
             words = line.split(maxsplit=9)  # a name may contain spaces
-            matrix = view_matrix([*map(float, words[1:5])], [*map(float, words[5:8])])
+            matrix = view_matrix_from_quaternion([*map(float, words[1:5])], [*map(float, words[5:8])])
             features = _numbers(second, float).reshape(-1, 3)
             if not (np.abs(features[:, 2]) <= 2**53).all():  # also refuses nan
                 raise ValueError("a feature has no number of a point.")

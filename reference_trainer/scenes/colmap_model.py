@@ -16,7 +16,7 @@ from reference_trainer.rotations import rotation_matrices
 
 __all__ = [
     "CAMERA_MODELS", "ColmapCamera", "ColmapImage", "ColmapModel", "ColmapPoints", "PointRecords", "add_camera",
-    "view_matrix",
+    "view_matrix_from_quaternion",
 ]  # fmt: skip
 
 
@@ -108,7 +108,7 @@ def add_camera(
     cameras[number] = ColmapCamera(known, pinhole, parameters[known.focal_lengths + 2 :])
 
 
-def view_matrix(qvec: Sequence[float], tvec: Sequence[float]) -> NDArray[np.float64]:
+def view_matrix_from_quaternion(qvec: Sequence[float], tvec: Sequence[float]) -> NDArray[np.float64]:
     """Build the view matrix (4, 4) from COLMAP's quaternion, wxyz, and translation.
 
     Raises:

@@ -9,17 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.scenes.frames import ASPECT_TOLERANCE, Frame
-from reference_trainer.scenes.images import path_inside, resize_image
+from reference_trainer.scenes.frames import ASPECT_TOLERANCE, Frame, fitted
+from reference_trainer.scenes.images import path_inside
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud, Scene, View
-from reference_trainer.scenes.undistort import undistort
 
 __all__ = ["point_prior", "read_depth", "true_priors", "with_prior"]
 
 
 def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> View:
     """Return a view with the depth prior of its photograph, resized and undistorted like it.
+
+    Where some of the map is unknown, a pixel gets the bilinearly weighted mean of the known values, if there is one
+    within the pixel or, in a coarser map, where the pixel is.
 
     Args:
         view: as loaded from the frame.
@@ -29,26 +31,29 @@ def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> V
 
     Raises:
         FileNotFoundError: if there is no depth file for the photograph.
-        ValueError: if the file is no depth map, is constant, or its aspect ratio is not the photograph's.
+        ValueError: if the file is no depth map, is constant or unknown everywhere, or its aspect ratio is not the
+            photograph's.
     """
     assert options.depth is not None
     folder = root / options.depth.removesuffix(":inverse")
     path = _find(frame, folder)
     prior = read_depth(path)
-    (rows, columns), camera = prior.shape, view.camera
+    (rows, columns), camera = prior.shape, frame.camera.resized(view.camera.width, view.camera.height)
     if abs(columns / rows * camera.height / camera.width - 1) > ASPECT_TOLERANCE:
         raise ValueError(
             f"{path} is {columns}x{rows}, which is not the shape of its photograph {frame.path} at {camera.width}x"
             f"{camera.height}: the aspect ratios must agree."
         )
-    known = prior[prior.isfinite()]
-    low, high = (known.min(), known.max()) if len(known) else (0.0, 0.0)
-    if low == high:
+    known = prior.isfinite()
+    low, high = (prior[known].min(), prior[known].max()) if bool(known.any()) else (0.0, 0.0)
+    layers = torch.stack([((prior - low) / (high - low)).where(known, 0), known.to(prior)])
+    mode = "bicubic" if bool(known.all()) else "bilinear"  # some bicubic weights are negative: no mean of a part
+    (unit, weight), _ = fitted(layers, camera, frame.distortion if options.undistort else (), mode)
+    # A known value has at least a quarter of its share of the pixel that it lies in: just that if at a corner.
+    enough = weight > 0.24 * min(1, camera.width * camera.height / prior.numel())
+    if low == high or not bool(enough.any()):
         raise ValueError(f"{path} holds no depth: it is constant, or unknown everywhere.")
-    unit = resize_image(((prior - low) / (high - low))[None], camera.width, camera.height)
-    if options.undistort and any(frame.distortion):
-        unit, _ = undistort(unit, frame.camera.resized(camera.width, camera.height), frame.distortion)
-    resized = unit[0] * (high - low) + low
+    resized = (unit / weight * (high - low) + low).where(enough, torch.nan)
     return replace(view, depth_prior=-resized if options.depth.endswith(":inverse") else resized)
 
 
@@ -60,7 +65,7 @@ def true_priors(scene: Scene, asked: str) -> Scene:
     Raises:
         ValueError: if anything else was asked for.
     """
-    if asked == "points" and scene.points is not None:
+    if asked == "points":
         return replace(scene, train=tuple(point_prior(view, scene.points) for view in scene.train))
     if asked != "true":
         raise ValueError(
@@ -91,8 +96,7 @@ def point_prior(view: View, cloud: PointCloud) -> View:
         raise ValueError('depth "points" needs points of the scene, and these are random: name a cloud with --points.')
     camera = view.camera
     pixels, depths = camera.project(cloud.positions.double())
-    size = pixels.new_tensor([camera.width, camera.height])
-    seen = (depths > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+    seen = camera.inside(pixels, depths)
     from_near = depths[seen].argsort()
     places, inverse = pixels[seen][from_near].numpy(), 1 / depths[seen][from_near].numpy()
     first = np.unique(places.astype(int), axis=0, return_index=True)[1]

@@ -16,7 +16,7 @@ from reference_trainer.scenes.images import is_image
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["Capture", "Reader", "SceneFormat", "contents", "find_format", "only_default", "register_format"]
+__all__ = ["Capture", "Reader", "SceneFormat", "find_format", "only_default", "register_format"]
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,8 @@ def find_format(root: Path, name: str) -> tuple[str, Reader]:
             "'ca_reg[colmap]'), as do COLMAP, VGGT and InstantSplat."
         )
     raise ValueError(
-        f"{root} has none of {', '.join(format.sign for format in _FORMATS.values())}; it has {contents(root)}."
+        f"{root} has none of {', '.join(format.sign for format in _FORMATS.values())}; it has "
+        f"{sorted(entry.name for entry in root.iterdir())[:20]}."
     )
 
 
@@ -123,8 +124,3 @@ def only_default(format: str, **options: object) -> None:
     given = {name: value for name, value in options.items() if value not in (None, "auto")}
     if given:
         raise ValueError(f"a {format} scene has no use for {given}; leave them out.")
-
-
-def contents(root: Path) -> list[str]:
-    """Return the first 20 names in a folder, for error messages."""
-    return sorted(entry.name for entry in root.iterdir())[:20]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from reference_trainer.scenes.images import composite, read_image, resize_image
 from reference_trainer.scenes.scene import View
 from reference_trainer.scenes.undistort import undistort
 
-__all__ = ["Frame", "load_view", "view_matrix"]
+__all__ = ["Frame", "fitted", "load_view", "view_matrix"]
 
 # Rounding to whole pixels changes the aspect ratio by about 1 / height; a wrong picture folder changes it by more.
 ASPECT_TOLERANCE = 0.02
@@ -56,11 +57,21 @@ def view_matrix(axes: NDArray[np.float64], position: NDArray[np.float64]) -> Ten
     return torch.from_numpy(pose)
 
 
-def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, straight: bool = True) -> View:
+def fitted(layer: Tensor, camera: Camera, distortion: Sequence[float], mode: str = "bicubic") -> tuple[Tensor, Camera]:
+    """Resize a picture (C, H, W) to the size of its camera, then undo the distortion, if any; return both.
+
+    The modes are those of `resize_image`, errors those of `undistort`.
+    """
+    if layer.shape[1:] != (camera.height, camera.width):
+        layer = resize_image(layer, camera.width, camera.height, mode)
+    return undistort(layer, camera, distortion, mode) if any(distortion) else (layer, camera)
+
+
+def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, undistort: bool = True) -> View:
     """Read the photograph of a frame and fit its camera to the picture's size, float32.
 
     A picture with an alpha channel is first composited on the background (3,). The picture is then shrunk by
-    ``downscale``, at least 1, and last, if it is to be ``straight``, undistorted.
+    ``downscale``, at least 1, and last undistorted, if asked for.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -77,13 +88,8 @@ def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, strai
     layers = {"image": image if alpha is None else composite(image, alpha, background)}
     layers |= {} if alpha is None else {"alpha": alpha[None]}
     layers |= {} if frame.mask is None else {"mask": read_image(frame.mask)[0].mean(0, keepdim=True)}
-    width, height = max(1, round(width / downscale)), max(1, round(height / downscale))
-    for name, layer in layers.items():
-        layers[name] = layer if layer.shape[1:] == (height, width) else resize_image(layer, width, height)
-    camera = frame.camera.resized(width, height)
-    if straight and any(frame.distortion):
-        names, sizes = list(layers), [len(layer) for layer in layers.values()]
-        pixels, camera = undistort(torch.cat(list(layers.values())), camera, frame.distortion)
-        layers = dict(zip(names, torch.split(pixels, sizes), strict=True))
-    flat = {name: layer[0] for name, layer in layers.items() if name != "image"}
-    return View(frame.name, camera.to(dtype=torch.float32), layers["image"], flat.get("alpha"), mask=flat.get("mask"))
+    camera = frame.camera.resized(max(1, round(width / downscale)), max(1, round(height / downscale)))
+    fits = {name: fitted(layer, camera, frame.distortion if undistort else ()) for name, layer in layers.items()}
+    image, camera = fits.pop("image")
+    flat = {name: layer[0] for name, (layer, _) in fits.items()}
+    return View(frame.name, camera.to(dtype=torch.float32), image, flat.get("alpha"), mask=flat.get("mask"))

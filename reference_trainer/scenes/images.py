@@ -106,12 +106,12 @@ def composite(image: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
     return image * alpha + background[:, None, None] * (1 - alpha)
 
 
-def resize_image(image: Tensor, width: int, height: int) -> Tensor:
-    """Resize a picture (C, H, W) in [0, 1] with an antialiased bicubic filter.
+def resize_image(image: Tensor, width: int, height: int, mode: str = "bicubic") -> Tensor:
+    """Resize a picture (C, H, W) in [0, 1] with an antialiased filter, ``"bicubic"`` or ``"bilinear"``.
 
-    This is Pillow's default, which the published 3DGS loaders use, without their rounding to 8 bits.
+    Bicubic is Pillow's default, which the published 3DGS loaders use, without their rounding to 8 bits.
     """
-    resized = torch.nn.functional.interpolate(image[None], size=(height, width), mode="bicubic", antialias=True)[0]
+    resized = torch.nn.functional.interpolate(image[None], size=(height, width), mode=mode, antialias=True)[0]
     return resized.clamp(0, 1)
 
 
@@ -183,7 +183,8 @@ def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
     """Return the folder of a scene's photographs: the named one, or a default.
 
     The default is the first of ``<usual>`` and the ``<usual>_<factor>`` beside it, by increasing factor, whose pictures
-    have at most half a megapixel, else the last of them; without any, the scene folder itself if it has pictures.
+    have at most half a megapixel, else the last of them, folders without pictures left out; without any, the scene
+    folder itself if it has pictures.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -195,6 +196,7 @@ def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
         reduced = [path for path, factor in factors.items() if factor.isdecimal()]
         found = [root / usual] if (root / usual).is_dir() else []
         found += sorted(reduced, key=lambda path: int(factors[path]))
+        found = [path for path in found if any(map(is_image, path.iterdir()))] or found[:1]
         found = found or ([root] if any(map(is_image, root.iterdir())) else [])
     if not found:
         others = sorted(each.name for each in root.iterdir() if each.is_dir() and any(map(is_image, each.iterdir())))
@@ -204,5 +206,4 @@ def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
         )
     if len(found) == 1:
         return found[0]
-    sizes = {path: image_size(list_images(path)[0]) for path in found}
-    return next((path for path in found if math.prod(sizes[path]) <= LARGE_PICTURE), found[-1])
+    return next((path for path in found if math.prod(image_size(list_images(path)[0])) <= LARGE_PICTURE), found[-1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -89,12 +90,8 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
     chosen = capture.background if options.background == "auto" else options.background
     color: Tensor = torch.tensor(BACKGROUNDS[chosen])
     downscale, about_size = _downscale([*train, *test], options.downscale)
-    views = {
-        kind: tuple(
-            load_view(frame, background=color, downscale=downscale, straight=options.undistort) for frame in frames
-        )
-        for kind, frames in (("train", train), ("test", test))
-    }
+    load = partial(load_view, background=color, downscale=downscale, undistort=options.undistort)
+    views = {"train": tuple(map(load, train)), "test": tuple(map(load, test))}
     if options.depth == "points":
         views["train"] = tuple(point_prior(view, cloud) for view in views["train"])
     elif options.depth is not None:

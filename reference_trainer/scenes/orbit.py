@@ -18,6 +18,9 @@ __all__ = ["BoundingSphere", "bounding_sphere", "look_at", "orbit_views"]
 ELEVATION = math.radians(20)
 """Elevation of the cameras above the center: objects are mostly looked at from a little above."""
 
+FIELD_OF_VIEW = math.radians(45)
+"""Along the shorter side of the picture."""
+
 INSIDE = 0.98
 """Share of the opacity that the picture must hold; with all of it, stray Gaussians would make the object tiny."""
 
@@ -45,7 +48,6 @@ def orbit_views(
     count: int,
     width: int,
     height: int,
-    field_of_view: float = math.radians(45),
     fill: float = 1.0,
     world: World = "y-down",
     arc: float = 2 * math.pi,
@@ -67,7 +69,6 @@ def orbit_views(
         count: number of cameras.
         width: of the pictures, pixels.
         height: of the pictures, pixels.
-        field_of_view: along the shorter side of the picture, radians, in (0, pi).
         fill: diameter of the sphere as a share of the shorter side, in (0, 1].
         world: the vertical axis.
         arc: angle between the first and the last camera, radians, in (0, 2 pi]; a full circle has no camera twice.
@@ -82,17 +83,15 @@ def orbit_views(
         >>> len(cameras), [round(x, 2) for x in cameras[0].forward.tolist()]  # 20 degrees downwards
         (4, [0.0, 0.34, 0.94])
     """
-    if count < 1 or not 0 < field_of_view < math.pi:
-        raise ValueError(f"expected count >= 1 and field_of_view in (0, pi) radians, got {count} and {field_of_view}.")
-    if not 0 < fill <= 1 or not 0 < arc <= 2 * math.pi or world not in get_args(World):
+    if count < 1 or not 0 < fill <= 1 or not 0 < arc <= 2 * math.pi or world not in get_args(World):
         raise ValueError(
-            f"expected fill in (0, 1], arc in (0, 2 pi] and world one of {', '.join(get_args(World))}; got {fill}, "
-            f"{arc} and {world!r}."
+            f"expected count >= 1, fill in (0, 1], arc in (0, 2 pi] and world one of {', '.join(get_args(World))}; got "
+            f"{count}, {fill}, {arc} and {world!r}."
         )
     sphere = bounding_sphere(means, opacities)
-    center, half_angle = sphere.center, math.atan(fill * math.tan(0.5 * field_of_view))
+    center, half_angle = sphere.center, math.atan(fill * math.tan(0.5 * FIELD_OF_VIEW))
     distance = sphere.radius / math.sin(half_angle)
-    focal = 0.5 * min(width, height) / math.tan(0.5 * field_of_view)
+    focal = 0.5 * min(width, height) / math.tan(0.5 * FIELD_OF_VIEW)
     level, lift = distance * math.cos(ELEVATION), distance * math.sin(ELEVATION)
     full = arc > 2 * math.pi * (1 - 1e-9)
     start, step = (0.0, arc / count) if full else (-0.5 * arc if count > 1 else 0.0, arc / max(1, count - 1))

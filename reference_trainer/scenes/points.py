@@ -78,10 +78,12 @@ def filled(cloud: PointCloud, train: Sequence[Frame], generator: torch.Generator
     They lie in the frusta of the training cameras, between the 1st and 99th percentiles of the cloud's depths. On fern
     from three views, training from 459 points alone ends 1 dB lower.
     """
+    if len(cloud.positions) >= THIN or cloud.source == "random":
+        return cloud, ""
     cameras = [frame.camera for frame in train]
     depths = torch.cat([camera.project(cloud.positions.double())[1] for camera in cameras])
     depths = depths[depths > 0]
-    if len(cloud.positions) >= THIN or cloud.source == "random" or len(depths) < 2:
+    if len(depths) < 2:
         return cloud, ""
     near, far = depths.quantile(torch.tensor([0.01, 0.99], dtype=depths.dtype)).tolist()
     if near == far:

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import torch
 from torch.nn.functional import normalize
 
-from reference_trainer.camera import Camera, pixels_of
+from reference_trainer.camera import Camera
 from reference_trainer.scenes.orbit import look_at
 from reference_trainer.scenes.scene import Scene
 
@@ -133,11 +133,10 @@ def depth_bounds(scene: Scene) -> tuple[float, float]:
     Raises:
         ValueError: if no initial point lies within a training picture.
     """
-    positions = torch.empty(0, 3) if scene.points is None else scene.points.positions
     bounds = []
     for view in scene.train:
-        pose = view.camera.world_to_camera
-        depths = (positions @ pose[2, :3] + pose[2, 3])[pixels_of(positions, view.camera)[2]]
+        pixels, depths = view.camera.project(scene.points.positions)
+        depths = depths[view.camera.inside(pixels, depths)]
         if len(depths):
             bounds.append(depths.quantile(depths.new_tensor([0.001, 0.999])).tolist())
     if not bounds:

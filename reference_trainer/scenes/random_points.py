@@ -10,7 +10,7 @@ from reference_trainer.camera import Camera
 from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["random_points", "random_points_in_box", "random_points_in_frusta"]
+__all__ = ["random_points", "random_points_in_frusta"]
 
 BLENDER_BOX = 1.3  # half the edge of the box that holds every NeRF-synthetic object, as in the INRIA code
 
@@ -19,52 +19,39 @@ def random_points(train: Sequence[Frame], count: int, generator: torch.Generator
     """Draw gray points where the training cameras look.
 
     They fill the NeRF-synthetic box if its center lies in all training pictures and all training cameras stand outside
-    it, else the cameras' frusta, between the scene file's depth bounds if it has any.
-    """
-    cameras = [frame.camera for frame in train]
-    if all(_looks_at_box(frame) for frame in train):
-        return random_points_in_box(count, BLENDER_BOX, generator=generator)
-    bounds = [frame.bounds for frame in train if frame.bounds is not None]
-    if bounds:
-        near, far = min(near for near, _ in bounds), max(far for _, far in bounds)
-        return random_points_in_frusta(cameras, count, near=near, far=far, generator=generator)
-    return random_points_in_frusta(cameras, count, generator=generator)
-
-
-def _looks_at_box(frame: Frame) -> bool:
-    """Whether the camera stands outside the NeRF-synthetic box and has its center, the origin, in the picture."""
-    camera = frame.camera
-    (u, v), depth = camera.project(torch.zeros(3))
-    outside = float(camera.position.abs().max()) > BLENDER_BOX and depth > 0
-    return bool(outside and 0 <= u <= camera.width and 0 <= v <= camera.height)
-
-
-def random_points_in_box(count: int, half_size: float, *, generator: torch.Generator | None = None) -> PointCloud:
-    """Draw gray points uniformly in an origin-centered cube of edge ``2 * half_size``, world units."""
-    positions = (2 * torch.rand(count, 3, generator=generator) - 1) * half_size
-    return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
-
-
-def random_points_in_frusta(
-    cameras: Sequence[Camera],
-    count: int,
-    *,
-    near: float | None = None,
-    far: float | None = None,
-    generator: torch.Generator | None = None,
-) -> PointCloud:
-    """Draw gray points in the cameras' frusta: uniform over the picture and in inverse depth between two bounds.
-
-    The bounds are in world units. Without them, near and far are a quarter and four times the median depth of the point
-    closest to all optical axes.
+    it, else the cameras' frusta, between the scene file's depth bounds if it has any, else between a quarter and four
+    times the median depth of the point closest to all optical axes.
 
     Raises:
         ValueError: if the optical axes that must give the bounds do not meet in front of the cameras, or the bounds are
             not ``0 < near < far``.
     """
-    if near is None or far is None:
+    cameras = [frame.camera for frame in train]
+    if all(map(_looks_at_box, cameras)):
+        positions = (2 * torch.rand(count, 3, generator=generator) - 1) * BLENDER_BOX
+        return PointCloud(positions, torch.full((count, 3), 0.5), source="random", seen_by=frozenset())
+    bounds = [frame.bounds for frame in train if frame.bounds is not None]
+    if bounds:
+        near, far = min(near for near, _ in bounds), max(far for _, far in bounds)
+    else:
         focus = _focus_depth(cameras)
         near, far = focus / 4, focus * 4
+    return random_points_in_frusta(cameras, count, near=near, far=far, generator=generator)
+
+
+def _looks_at_box(camera: Camera) -> bool:
+    """Whether the camera stands outside the NeRF-synthetic box and has its center, the origin, in the picture."""
+    outside = float(camera.position.abs().max()) > BLENDER_BOX
+    return outside and bool(camera.inside(*camera.project(torch.zeros(3))))
+
+
+def random_points_in_frusta(
+    cameras: Sequence[Camera], count: int, *, near: float, far: float, generator: torch.Generator
+) -> PointCloud:
+    """Draw gray points in the cameras' frusta: uniform over the picture and in inverse depth between two bounds.
+
+    The bounds are in world units. Raises ValueError if they are not ``0 < near < far``.
+    """
     if not 0 < near < far:
         raise ValueError(f"the depth bounds must satisfy 0 < near < far, got {near} and {far}.")
     chosen = torch.randint(len(cameras), (count,), generator=generator)

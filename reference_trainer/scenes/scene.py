@@ -1,4 +1,4 @@
-"""Scenes as the rest of the program sees them: photographs with cameras, and optional initial points."""
+"""Scenes as the rest of the program sees them: photographs with cameras, and initial points."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Scene:
         name: short label for reports.
         train: views to fit.
         test: held-out views, never used in training.
-        points: initial points, or None to let the trainer draw random ones.
+        points: initial points.
         background: the color (3,) behind everything, in [0, 1].
         source: where the photographs come from.
         notes: what a user should know about how it was loaded, one note each.
@@ -92,7 +92,7 @@ class Scene:
     name: str
     train: tuple[View, ...]
     test: tuple[View, ...]
-    points: PointCloud | None
+    points: PointCloud
     background: Tensor
     source: str = "built in"
     notes: tuple[str, ...] = ()

@@ -42,8 +42,10 @@ def corner_displacement(camera: Camera, distortion: Sequence[float]) -> float:
     return float((distort(corners, camera, distortion) - corners).norm(dim=1).max())
 
 
-def undistort(pixels: Tensor, camera: Camera, distortion: Sequence[float]) -> tuple[Tensor, Camera]:
-    """Undistort a picture (C, H, W) by one bicubic resampling; return it with its new camera.
+def undistort(
+    pixels: Tensor, camera: Camera, distortion: Sequence[float], mode: str = "bicubic"
+) -> tuple[Tensor, Camera]:
+    """Undistort a picture (C, H, W) by one resampling, bicubic or ``"bilinear"``; return it with its new camera.
 
     The picture keeps its size. Where the lens saw less than the undistorted picture would show, the focal length grows
     until no pixel is empty, as with COLMAP's undistorter by default. ``camera`` and ``distortion`` are as for
@@ -52,19 +54,17 @@ def undistort(pixels: Tensor, camera: Camera, distortion: Sequence[float]) -> tu
     Raises:
         ValueError: if the lens folds the picture over itself, or the zoom would exceed `LARGEST_ZOOM`.
     """
+    from kornia.geometry import create_meshgrid
+
     zoom = _zoom(camera, distortion)
     straight = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
-    y, x = torch.meshgrid(
-        torch.arange(camera.height, dtype=torch.float64) + 0.5,
-        torch.arange(camera.width, dtype=torch.float64) + 0.5,
-        indexing="ij",
-    )
-    source = _distort_zoomed(torch.stack([x, y], -1).flatten(0, 1), camera, distortion, zoom)
+    centers = create_meshgrid(camera.height, camera.width, normalized_coordinates=False, dtype=torch.float64)[0] + 0.5
+    source = _distort_zoomed(centers.flatten(0, 1), camera, distortion, zoom)
     grid = 2 * source / torch.tensor([camera.width, camera.height], dtype=torch.float64) - 1
     grid = grid.to(pixels.dtype).reshape(1, camera.height, camera.width, 2)
     # Without align_corners, -1 and 1 are the outer edges of the picture: the same half-pixel centers as the camera's.
     resampled = torch.nn.functional.grid_sample(
-        pixels[None], grid, mode="bicubic", padding_mode="border", align_corners=False
+        pixels[None], grid, mode=mode, padding_mode="border", align_corners=False
     )
     return resampled[0].clamp(0, 1), straight
 

@@ -179,18 +179,16 @@ class TrainConfig:
         renderer, terms = self.make_renderer(), self.make_losses()
         if not terms:
             raise ValueError("loss needs at least one term, such as photometric.")
-        if self.fields < 2 and "fields" in density.needs.union(*(term.needs for term in terms)):
+        of_terms = frozenset[str]().union(*(term.needs for term in terms))
+        if self.fields < 2 and "fields" in density.needs | of_terms:
             raise ValueError(f"{self.loss} with {self.density} compares fields, of which there is one: set fields=2.")
         if self.analytic and "moments" not in renderer.capabilities:
             raise ValueError("analytic training needs the moments of the torch renderer: leave out renderer.")
         if self.analytic and "absgrad" in density.needs:
             raise ValueError(f"analytic training has no absolute gradients, which {self.density} needs: leave it out.")
-        capabilities = renderer.capabilities | {"fields"}
-        if density.needs - capabilities:
-            needs = ", ".join(sorted(density.needs))
-            raise ValueError(f"{self.density} needs {needs}, which the renderer {self.renderer} lacks.")
-        if lacking := set().union(*(term.needs for term in terms)) - capabilities:
-            raise ValueError(f"the loss needs {', '.join(sorted(lacking))}, which the renderer {self.renderer} lacks.")
+        for what, needs in ((self.density, density.needs), ("the loss", of_terms)):
+            if lacking := ", ".join(sorted(needs - renderer.capabilities - {"fields"})):
+                raise ValueError(f"{what} needs {lacking}, which the renderer {self.renderer} lacks.")
         if self.analytic and (drawn := [type(term).__name__ for term in terms if not term.analytic]):
             raise ValueError(
                 f"analytic training has no draw, which {', '.join(drawn)} needs: leave out analytic, or the term."
@@ -201,10 +199,10 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("iterations", "fields"), lambda x: x >= 1, "at least 1", ""),
     (("dropout",), lambda x: 0 <= x < 1, "in [0, 1)", ": 0 turns it off"),
     (("noise",), lambda x: x >= 0, "at least 0", ": 0 turns it off"),
-    (("seed", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_every", "prune_size_from",
-      "densify_gradient", "dense_fraction", "prune_opacity", "scales_rate", "quaternions_rate", "opacity_rate",
-      "color_rate"), lambda x: x >= 0, "at least 0", ""),
-    (("max_gaussians", "densify_until", "opacity_reset_from"), lambda x: x is None or x >= 0, "None or at least 0", ""),
+    (("seed", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_from",
+      "opacity_reset_every", "prune_size_from", "densify_gradient", "dense_fraction", "prune_opacity", "scales_rate",
+      "quaternions_rate", "opacity_rate", "color_rate"), lambda x: x >= 0, "at least 0", ""),
+    (("max_gaussians", "densify_until"), lambda x: x is None or x >= 0, "None or at least 0", ""),
     (("sh_degree",), lambda x: x in (0, 1, 2, 3), "0, 1, 2 or 3", ""),
     (("initial_points",), lambda x: x in ("all", "seen"), "all or seen", ""),
     (("prune_size",), lambda x: x is None or x > 0, "positive, or None to keep what is large", ""),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ca_reg.neighbors import mean_neighbor_distance
+from ca_reg.neighbors import rms_neighbor_distance
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import arguments
 from reference_trainer.render import splat
@@ -29,7 +29,7 @@ def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
         config: says which points to take and how large and how opaque the Gaussians are.
 
     Raises:
-        ValueError: if the scene has no points, or only seen ones are to be taken and there are none.
+        ValueError: if only seen points are to be taken and there are none.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
@@ -37,8 +37,6 @@ def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
         >>> len(initial_gaussians(scene, TrainConfig()))
         50
     """
-    if scene.points is None:
-        raise ValueError(f"scene {scene.name!r} has no initial points: load it with points='random'.")
     if scene.start is not None:
         bands = (config.sh_degree + 1) ** 2 - 1
         rest = scene.start.sh_rest[:, :bands]
@@ -47,7 +45,7 @@ def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
         start = Gaussians.from_points(
             scene.points.positions,
             scene.points.colors,
-            mean_neighbor_distance(scene.points.positions) * config.initial_scale,
+            rms_neighbor_distance(scene.points.positions) * config.initial_scale,
             sh_degree=config.sh_degree,
             opacity=config.initial_opacity,
         )

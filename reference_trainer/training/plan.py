@@ -75,7 +75,7 @@ def make_plan(scene: Scene, config: TrainConfig, *, given: Collection[str] = ())
         given: names of fields that were asked for explicitly, even if at their default.
 
     Raises:
-        ValueError: if ``given`` names something that is not a field of `TrainConfig`, or the scene has no points.
+        ValueError: if ``given`` names something that is not a field of `TrainConfig`.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
@@ -86,8 +86,6 @@ def make_plan(scene: Scene, config: TrainConfig, *, given: Collection[str] = ())
     unknown = set(given) - {f.name for f in dataclasses.fields(TrainConfig)}
     if unknown:
         raise ValueError(f"given must name fields of TrainConfig, got {sorted(unknown)}.")
-    if scene.points is None:
-        raise ValueError(f"scene {scene.name!r} has no initial points: load it with points='random'.")
     config.check()
     kept = _kept(config, given)
     return Plan(tuple(_item(rule(scene, config), config, kept) for rule in RULES))

@@ -9,9 +9,8 @@ from typing import Any, Literal
 
 import torch
 
-from reference_trainer.camera import pixels_of
 from reference_trainer.losses import Photometric
-from reference_trainer.scenes.scene import PointCloud, Scene
+from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.initial import drawn_by_any, initial_gaussians
 
@@ -51,8 +50,8 @@ def sh_bands(scene: Scene, config: TrainConfig) -> PlanItem:
     if reached < config.sh_degree:
         reason = f"bands above degree {reached} would begin after the last step, {config.iterations}, and stay 0"
         return PlanItem(name, "reduced" if reached else "left out", reason, {"sh_degree": reached})
-    positions = _points(scene).positions
-    seen = int(torch.stack([pixels_of(positions, view.camera)[2] for view in scene.train]).sum(0).median())
+    positions, cameras = scene.points.positions, [view.camera for view in scene.train]
+    seen = int(torch.stack([camera.inside(*camera.project(positions)) for camera in cameras]).sum(0).median())
     sees = f"the median point is seen by {seen} of {len(scene.train)} training views"
     return PlanItem(name, "used", f"{sees}; lower degrees are not known to end as well")
 
@@ -89,7 +88,7 @@ def distortion(scene: Scene, config: TrainConfig) -> PlanItem:
 
 def densification(scene: Scene, config: TrainConfig) -> PlanItem:
     """Clones and splits."""
-    name, points = "densification", _points(scene)
+    name, points = "densification", scene.points
     until = config.densify_end
     if config.densify_every == 0:
         return PlanItem(name, "left out", "asked for (densify_every=0)")
@@ -183,7 +182,7 @@ def moments(scene: Scene, config: TrainConfig) -> PlanItem:
 
 def initial_size(scene: Scene, config: TrainConfig) -> PlanItem:
     """The size of initial points. Distances between random points say nothing about a surface: Gaussians pile up."""
-    name, points = "size of initial points", _points(scene)
+    name, points = "size of initial points", scene.points
     count = len(points.positions)
     if scene.start is not None:
         return PlanItem(name, "used", f"by construction: {count} Gaussians have sizes of their own")
@@ -214,14 +213,8 @@ RULES: tuple[Callable[[Scene, TrainConfig], PlanItem], ...] = (
 """All rules, in the order of the table."""
 
 
-def _points(scene: Scene) -> PointCloud:
-    """The initial points, whose presence `make_plan` has checked."""
-    assert scene.points is not None
-    return scene.points
-
-
 def _degrees_apart(scene: Scene) -> float:
     """The median over the training views of the angle to the nearest other one, seen from the middle of the points."""
-    middle = _points(scene).positions.median(0).values
+    middle = scene.points.positions.median(0).values
     to = torch.nn.functional.normalize(torch.stack([view.camera.position for view in scene.train]) - middle, dim=1)
     return float((to @ to.T).fill_diagonal_(-1.0).amax(1).clamp(-1, 1).arccos().rad2deg().median())

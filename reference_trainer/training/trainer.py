@@ -46,9 +46,8 @@ class Trainer:
         regularizer: likewise.
 
     Raises:
-        ValueError: if the scene has no initial points, its photographs lack what a term of the loss compares with, or
-            show a background where it is to be random, or the training is to be analytic and a regularizer has no
-            exact expectation.
+        ValueError: if the photographs lack what a term of the loss compares with, or show a background where it is to
+            be random, or the training is to be analytic and a regularizer has no exact expectation.
         ImportError: if gsplat is to draw, and is missing.
         RuntimeError: if gsplat is to draw on something else than a CUDA device.
 

@@ -2,8 +2,9 @@ import math
 
 import pytest
 import torch
+from strategies import begun
 
-from reference_trainer.density.operations import decay_opacity, densify, prune, reset_opacity
+from reference_trainer.density.operations import clone, decay_opacity, prune, reset_opacity, split
 from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
@@ -40,12 +41,13 @@ def sizes(*largest: float) -> torch.Tensor:
 # Which Gaussians are selected, and what becomes of them
 
 
-def test_small_ones_are_cloned_large_ones_split_and_quiet_ones_stay():
+def test_small_ones_are_cloned_large_ones_split_and_quiet_ones_stay(tiny_scene):
     start = some(5, log_scales=sizes(0.05, 0.5, 0.05, 0.5, 0.1))
     optimizer = optimizer_of(start)
     # The threshold itself selects; a Gaussian of just the size threshold (the last) is cloned.
-    statistics = seen([0.5, 0.5, 0.49, 0.49, 0.9])
-    densify(optimizer, statistics.mean_gradient >= 0.5, size_threshold=float(start.scales[4].max()))
+    strategy = begun("adaptive", tiny_scene, 5, densify_gradient=0.5)
+    strategy.statistics, strategy.large = seen([0.5, 0.5, 0.49, 0.49, 0.9]), float(start.scales[4].max())
+    strategy.grow(optimizer, 100)
     new = optimizer.gaussians
     assert len(new) == 5 - 1 + 2 + 2
     stayed, clones, children = torch.arange(4), torch.tensor([4, 5]), torch.tensor([6, 7])
@@ -63,7 +65,9 @@ def test_small_ones_are_cloned_large_ones_split_and_quiet_ones_stay():
 def test_nothing_to_do_changes_nothing():
     start = some(3)
     optimizer = optimizer_of(start)
-    densify(optimizer, torch.zeros(3, dtype=torch.bool), size_threshold=0.1)
+    nobody = torch.zeros(3, dtype=torch.bool)
+    clone(optimizer, nobody)
+    split(optimizer, nobody)
     assert torch.equal(optimizer.gaussians.means, start.means)
 
 
@@ -74,7 +78,7 @@ def test_children_are_where_the_generator_puts_them():
         optimizer = optimizer_of(start)
         state = torch.get_rng_state()
         g = torch.Generator().manual_seed(4)
-        densify(optimizer, torch.ones(2, dtype=torch.bool), size_threshold=0.1, generator=g)
+        split(optimizer, torch.ones(2, dtype=torch.bool), generator=g)
         assert torch.equal(torch.get_rng_state(), state)
         results.append(optimizer.gaussians.means.detach())
     assert torch.equal(*results)
@@ -104,7 +108,7 @@ def test_children_scatter_like_their_parent():
     start = some(n, quaternions=turn.repeat(n, 1), log_scales=log_scales.repeat(n, 1), means=torch.zeros(n, 3))
     optimizer = optimizer_of(start)
     everyone = torch.ones(n, dtype=torch.bool)
-    densify(optimizer, everyone, size_threshold=0.1, generator=torch.Generator().manual_seed(0))
+    split(optimizer, everyone, generator=torch.Generator().manual_seed(0))
     offsets = optimizer.gaussians.means.detach().double()
     assert len(offsets) == 2 * n
     w, x, y, z = torch.nn.functional.normalize(turn[0].double(), dim=0).tolist()

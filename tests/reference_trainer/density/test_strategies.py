@@ -1,5 +1,7 @@
 """What every strategy must keep, whatever its rule."""
 
+import re
+
 import pytest
 import torch
 from devices import CARD, DEVICES
@@ -59,20 +61,20 @@ def test_all_work_on_a_device(tiny_scene, busy, expression, device):
         ("absgrad(split_gradient=-1.0)", "split_gradient must be positive"),
         ("absgrad(dense_fraction=0)", "dense_fraction must be positive"),
         ("absgrad(opacity_ceiling=1.0)", "opacity_ceiling must be in"),
-        ("absgrad(ceiling_every=-1)", "ceiling_every must not be negative"),
-        ("proximity(until=-1)", "until must not be negative"),
+        ("absgrad(ceiling_every=-1)", "ceiling_every must be at least 0, got -1: 0 turns it off"),
+        ("proximity(until=-1)", "until must be at least 0, got -1: 0 unpools nothing"),
         ("proximity(distance=0.0)", "distance and split_distance must be positive"),
-        ("mcmc(noise=-1)", "noise must not be negative"),
-        ("mcmc(growth=0.9)", "growth must be at least 1"),
-        ("ray_boxes(views=1)", "views must be at least 2"),
-        ("ray_boxes(height=0)", "height and width must be positive"),
-        ("share_pruning(every=0)", "every must be at least 1"),
+        ("mcmc(noise=-1)", "noise must be finite and at least 0, got -1: 0 turns it off"),
+        ("mcmc(growth=0.9)", "growth must be finite and at least 1, got 0.9: 1 adds nothing"),
+        ("ray_boxes(views=1)", "views must be at least 2, got 1: the rays of one do not meet"),
+        ("ray_boxes(height=0)", "height must be at least 1, got 0"),
+        ("share_pruning(every=0)", "every must be at least 1, got 0: density control without it is 'adaptive'"),
         ("share_pruning(fraction=1.0)", "fraction must be in"),
         ("share_pruning(drop_rate=0.0)", "drop_rate must be in"),
         ("co_pruning(0)", "distance must be positive"),
-        ("co_pruning(every=0)", "every must be at least 1"),
+        ("co_pruning(every=0)", "every must be at least 1, got 0: density control without it is 'adaptive'"),
         ("self_ensembling(first=0.0)", "above 0|positive"),
-        ("self_ensembling(views=0)", "views >= 1"),
+        ("self_ensembling(views=0)", "views must be at least 1, got 0"),
         ("self_ensembling(share=1.0)", "share in"),
         ("self_ensembling(least=-0.1)", "least >= 0"),
         ("co_pruning", "compares fields, of which there is one: set fields=2"),
@@ -80,4 +82,22 @@ def test_all_work_on_a_device(tiny_scene, busy, expression, device):
 )
 def test_bad_arguments_are_refused(expression, message):
     with pytest.raises(ValueError, match=message):
+        TrainConfig(density=expression).check()
+
+
+@pytest.mark.parametrize(
+    ("expression", "name"),
+    [
+        ("absgrad(ceiling_every=0.5)", "ceiling_every"),
+        ("proximity(until=2e3)", "until"),
+        ("ray_boxes(views=2.5)", "views"),
+        ("ray_boxes(height=20.5)", "height"),
+        ("ray_boxes(width=40.5)", "width"),
+        ("share_pruning(every=500.5)", "every"),
+        ("co_pruning(every=500.5)", "every"),
+        ("self_ensembling(views=2.5)", "views"),
+    ],
+)
+def test_counts_are_integers(expression, name):
+    with pytest.raises(ValueError, match=rf"^{re.escape(repr(expression))}: {name} must be an integer, got float"):
         TrainConfig(density=expression).check()

@@ -17,6 +17,6 @@ def test_gradients(assert_gradients_of_differences):
 
 
 def test_arguments():
-    for text, message in (("flat(-1.0)", "weight must"), ("flat(1.0, 0.5)", "limit must be at least 1")):
+    for text, message in (("flat(-1.0)", "weight must"), ("flat(1.0, 0.5)", "limit must be finite and at least 1")):
         with pytest.raises(ValueError, match=message):
             LOSSES.make(text)

@@ -119,10 +119,12 @@ def test_nothing_to_compare_is_no_error(take_step):
 
 def test_arguments():
     for text, message in (
-        ("patch_depth(near=-1.0)", "near must not be negative"),
-        ("patch_depth(tolerance=-1.0)", "tolerance must not be negative"),
-        ("patch_depth(smallest=1)", "2 <= smallest <= largest, got 1 and 17"),
-        ("patch_depth(smallest=9, largest=8)", "2 <= smallest <= largest, got 9 and 8"),
+        ("patch_depth(near=-1.0)", "near must be finite and at least 0, got -1.0"),
+        ("patch_depth(tolerance=-1.0)", "tolerance must be finite and at least 0, got -1.0"),
+        ("patch_depth(smallest=1)", "smallest must be at least 2, got 1"),
+        ("patch_depth(smallest=9, largest=8)", "largest must be at least 9, got 8, less than smallest"),
+        ("patch_depth(smallest=4.5)", r"'patch_depth\(smallest=4\.5\)': smallest must be an integer, got float"),
+        ("patch_depth(largest=17.5)", r"'patch_depth\(largest=17\.5\)': largest must be an integer, got float"),
         ("patch_depth(which='both')", "which must be plain, hard or soft, got 'both'"),
     ):
         with pytest.raises(ValueError, match=message):

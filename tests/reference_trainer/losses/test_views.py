@@ -59,7 +59,8 @@ def test_gradients(assert_gradients_of_differences):
 
 def test_arguments():
     for text, message in (
-        ("views(1)", "n must be at least 2, got 1"),
+        ("views(1)", "n must be at least 2, got 1: one view is what photometric has"),
+        ("views(2.5)", r"'views\(2\.5\)': n must be an integer, got float"),
         ("views(2, -1.0)", "weight must"),
         ("views(2, 1.0, 2.0)", "lambda_dssim"),
     ):

@@ -120,7 +120,7 @@ def test_gradients(assert_gradients_of_differences):
 def test_arguments():
     for text, message in (
         ("warp(shift=0.0)", "shift must be positive"),
-        ("warp(smooth=-1.0)", "smooth must not be negative"),
+        ("warp(smooth=-1.0)", "smooth must be finite and at least 0, got -1.0"),
         ("warp(-1.0)", "weight must"),
     ):
         with pytest.raises(ValueError, match=message):

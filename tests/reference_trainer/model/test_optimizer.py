@@ -146,25 +146,27 @@ def test_the_rate_of_the_means_alone_changes():
     torch.testing.assert_close(moved, torch.full_like(moved, RATES["sh_rest"]), rtol=2e-2, atol=0)
 
 
-@pytest.mark.parametrize("forget", [True, False])
-def test_overwritten_opacities(forget):
+@pytest.mark.parametrize("names", [(), ("opacity_logits",), ("means", "sh_dc")])
+def test_what_is_overwritten_keeps_its_state_until_it_is_forgotten(names):
     optimizer = GaussianOptimizer(some(4), RATES)
     run(optimizer, torch.arange(4.0), range(3))
     old = optimizer.state_dict()
-    optimizer.set_opacity_logits(torch.tensor([0.0, 1.0, 2.0, 3.0]), forget=forget)
+    optimizer.set_opacity_logits(torch.tensor([0.0, 1.0, 2.0, 3.0]))
+    if names:
+        optimizer.forget(slice(None), *names)
     new = optimizer.state_dict()
     assert new["gaussians"]["opacity_logits"].tolist() == [0.0, 1.0, 2.0, 3.0]
     assert optimizer.gaussians.opacity_logits.requires_grad
     for name, moments in new["moments"].items():
-        cleared = forget and name == "opacity_logits"
         for moment in ("exp_avg", "exp_avg_sq"):
-            expected = torch.zeros_like(moments[moment]) if cleared else old["moments"][name][moment]
+            expected = torch.zeros_like(moments[moment]) if name in names else old["moments"][name][moment]
             assert torch.equal(moments[moment], expected), name
 
 
 def test_overwriting_before_the_first_step_needs_no_state():
     optimizer = GaussianOptimizer(some(2), RATES)
-    optimizer.set_opacity_logits(torch.zeros(2), forget=True)
+    optimizer.set_opacity_logits(torch.zeros(2))
+    optimizer.forget(slice(None), "opacity_logits")
     assert optimizer.gaussians.opacity_logits.tolist() == [0.0, 0.0]
 
 

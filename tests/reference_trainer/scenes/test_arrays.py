@@ -110,6 +110,15 @@ def test_a_map_of_points_takes_the_colors_of_the_pictures_and_the_surer_half(sce
     assert cloud.colors.numpy() == pytest.approx(expected)
 
 
+@pytest.mark.parametrize(("unknown", "kept"), [([0, 7], [5, 6, 8, 9]), (range(10), [])])
+def test_points_of_unknown_confidence_are_left_out(scene, unknown, kept):
+    points, sure = np.arange(30.0).reshape(10, 3), np.arange(10.0)  # of 1 to 6, 8 and 9 the median is 4.5
+    sure[list(unknown)] = np.nan
+    root = scene(extrinsic=to_camera(), intrinsic=INTRINSICS, points=points, confidence=sure)
+    cloud = read_arrays(root / "predictions.npz", root / "images")[1]
+    assert (cloud.positions[:, 0].tolist() if cloud else []) == [3 * i for i in kept]
+
+
 def test_depth_is_lifted_along_the_axis_of_the_camera(scene):
     depth = np.full((3, 6, 8), 5.0)
     depth[:, 0, 0] = 0  # unknown

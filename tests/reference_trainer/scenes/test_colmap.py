@@ -9,7 +9,7 @@ import torch
 
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
 from reference_trainer.scenes.colmap_files import READERS
-from reference_trainer.scenes.colmap_model import CAMERA_MODELS, view_matrix
+from reference_trainer.scenes.colmap_model import CAMERA_MODELS, view_matrix_from_quaternion
 
 
 def test_text_and_binary_hold_the_same_model(tmp_path, colmap_binary, colmap_text):
@@ -60,7 +60,7 @@ def test_quaternion_is_the_axis_angle_rotation():
         v = rng.normal(size=3)
         # Rodrigues
         turned = v * math.cos(angle) + np.cross(axis, v) * math.sin(angle) + axis * (axis @ v) * (1 - math.cos(angle))
-        assert np.allclose(view_matrix(q, (0, 0, 0))[:3, :3] @ v, turned, atol=1e-12)
+        assert np.allclose(view_matrix_from_quaternion(q, (0, 0, 0))[:3, :3] @ v, turned, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", READERS)

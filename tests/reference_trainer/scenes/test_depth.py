@@ -29,6 +29,7 @@ def scene(tmp_path, colmap_text, save_image):
 
 
 RAMP = np.add.outer(np.arange(96), 2 * np.arange(128)) / 8 - 5  # twice the photograph's size, every value a float16
+SMOOTH = np.round((RAMP[::2, ::2] - RAMP.min()) * 255 / np.ptp(RAMP[::2, ::2])).astype(np.uint8)  # of its size
 
 
 def load(root, **options):
@@ -52,21 +53,57 @@ def test_an_inverse_depth_is_turned_so_that_more_is_farther(scene):
     assert torch.equal(load(scene, depth=str(scene / "mono")).train[0].depth_prior, plain)
 
 
-def test_the_depth_is_undistorted_as_the_photograph_is(scene):
-    """The photograph's red is made the depth: after both went through the lens they still agree."""
-    smooth = RAMP[::2, ::2] - RAMP.min()
-    smooth = np.round(smooth * 255 / smooth.max()).astype(np.uint8)
+@pytest.fixture
+def bent_scene(scene):
+    """The scene through a lens; all photographs and depth maps are `SMOOTH`."""
     for name in ("a b", "b", "c"):
-        Image.fromarray(np.stack([smooth] * 3, -1)).save(scene / "images" / f"{name}.png")
+        Image.fromarray(np.stack([SMOOTH] * 3, -1)).save(scene / "images" / f"{name}.png")
     cameras = (scene / "sparse" / "0" / "cameras.txt").read_text()
     (scene / "sparse" / "0" / "cameras.txt").write_text(
-        cameras.replace("1 PINHOLE 64 48 50.5 51.25 32 24", "1 SIMPLE_RADIAL 64 48 50.5 32 24 0.2")
+        cameras.replace("1 PINHOLE 64 48 50.5 51.25 32 24", "1 SIMPLE_RADIAL 64 48 50.5 32 24 0.4")
     )
     for name in ("b", "c"):
-        np.save(scene / "mono" / f"{name}.npy", smooth.astype(np.float32))
-    straight, bent = (load_scene(scene, points="random:5", depth="mono", undistort=on).train[0] for on in (True, False))
+        np.save(scene / "mono" / f"{name}.npy", SMOOTH.astype(np.float32))
+    return scene
+
+
+def test_the_depth_is_undistorted_as_the_photograph_is(bent_scene):
+    """The photograph's red is made the depth: after both went through the lens they still agree."""
+    straight, bent = (
+        load_scene(bent_scene, points="random:5", depth="mono", undistort=on).train[0] for on in (True, False)
+    )
     assert (straight.image - bent.image).abs().max() > 0.01
     torch.testing.assert_close(straight.depth_prior / 255, straight.image[0], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.95])
+@pytest.mark.parametrize("scale", [1, 2])
+def test_of_a_map_with_holes_the_known_values_count(scene, share, scale):
+    """A pixel is known if a value within it is known, and then near what it is without holes."""
+    ramp = RAMP[:: 3 - scale, :: 3 - scale]
+    whole, step = ramp.reshape(48, scale, 64, scale).mean((1, 3)), ramp[1, 1] - ramp[0, 0]
+    holes = np.where(np.random.default_rng(0).random(ramp.shape) < share, ramp, np.nan)
+    np.save(scene / "mono" / "b.npy", holes)
+    found = load(scene, depth="mono").train[0].depth_prior.double().numpy()
+    known, within = np.isfinite(found), np.isfinite(holes).reshape(48, scale, 64, scale).any((1, 3))
+    assert known[within].all()
+    assert (known == within).mean() > (0.9 if scale > 1 else 0.999)  # some have several known values just outside
+    assert np.abs(found - whole)[known].max() < (1e-5 if scale == 1 else 1.501 * step)  # values up to 1.5 away count
+
+
+def test_holes_go_through_the_lens(bent_scene):
+    holes = np.where(np.random.default_rng(0).random((48, 64)) < 0.95, SMOOTH, np.nan)
+    np.save(bent_scene / "mono" / "b.npy", holes)
+    found, whole = (view.depth_prior for view in load_scene(bent_scene, points="random:5", depth="mono").train)
+    known = found.isfinite()
+    assert 0.95 < known.float().mean() < 1
+    step = SMOOTH[1, 1] - SMOOTH[0, 0]
+    assert (found - whole)[known].abs().max() < step
+    edge = np.full((48, 64), np.nan)
+    edge[23:25, 0] = 1.0, 2.0  # which the undistorted photograph no longer shows
+    np.save(bent_scene / "mono" / "b.npy", edge)
+    with pytest.raises(ValueError, match=r"b\.npy holds no depth: .* unknown everywhere"):
+        load_scene(bent_scene, points="random:5", depth="mono")
 
 
 def test_kinds_of_files(tmp_path):
@@ -102,7 +139,11 @@ def test_missing_and_mismatched_files_are_named(scene):
         load(scene, depth="mono")
     with pytest.raises(FileNotFoundError, match="no such folder"):
         load(scene, depth="nothing")
-    for array, message in ((RAMP.T, "96x128, which is not the shape"), (np.ones((48, 64)), "holds no depth")):
+    for array, message in (
+        (RAMP.T, "96x128, which is not the shape"),
+        (np.ones((48, 64)), "holds no depth"),
+        (np.full((48, 64), np.nan), "holds no depth"),
+    ):
         np.save(scene / "mono" / "c.npy", array)
         with pytest.raises(ValueError, match=rf"c\.npy.*{message}"):
             load(scene, depth="mono")

@@ -14,7 +14,7 @@ from reference_trainer.scenes.points import (
     colmap_points,
     filled,
 )
-from reference_trainer.scenes.random_points import random_points_in_box, random_points_in_frusta
+from reference_trainer.scenes.random_points import random_points
 from reference_trainer.scenes.scene import PointCloud
 
 
@@ -67,11 +67,15 @@ CAMERAS = [
 ]
 
 
-@pytest.mark.parametrize("bounds", [{}, {"near": 0.5, "far": 30.0}])
+def frames(cameras, bounds=None):
+    return [Frame(str(i), Path(str(i)), camera, bounds=bounds) for i, camera in enumerate(cameras)]
+
+
+@pytest.mark.parametrize("bounds", [None, (0.5, 30.0)])
 def test_random_points_lie_in_the_frusta(bounds):
-    points = random_points_in_frusta(CAMERAS, 500, generator=torch.Generator().manual_seed(0), **bounds)
+    points = random_points(frames(CAMERAS, bounds), 500, torch.Generator().manual_seed(0))
     depths = sorted((torch.tensor([1.0, 2.0, 3.0]) - camera.position).norm().item() for camera in CAMERAS)
-    near, far = bounds.get("near", depths[1] / 4), bounds.get("far", depths[1] * 4)
+    near, far = bounds or (depths[1] / 4, depths[1] * 4)
     seen = torch.zeros(500, dtype=torch.bool)
     for camera in CAMERAS:
         x, y, z = (points.positions @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
@@ -84,7 +88,7 @@ def test_random_points_lie_in_the_frusta(bounds):
 
 def test_random_points_are_uniform_in_inverse_depth():
     camera = Camera(torch.eye(4), 60.0, 50.0, 35.0, 22.0, 64, 48)
-    points = random_points_in_frusta([camera], 4000, near=1.0, far=10.0, generator=torch.Generator().manual_seed(1))
+    points = random_points(frames([camera], (1.0, 10.0)), 4000, torch.Generator().manual_seed(1))
     share = (1 / points.positions[:, 2] - 0.1) / 0.9
     ordered = share.sort().values
     distance = (ordered - (torch.arange(4000) + 0.5) / 4000).abs().max()
@@ -95,48 +99,53 @@ def test_random_points_are_uniform_in_inverse_depth():
 def test_frusta_without_a_meeting_point_are_refused():
     parallel = [Camera(torch.eye(4), 60.0, 50.0, 35.0, 22.0, 64, 48)] * 2
     with pytest.raises(ValueError, match=r"optical axes .*--points .*a COLMAP folder or a \.ply file"):
-        random_points_in_frusta(parallel, 10)
+        random_points(frames(parallel), 10, torch.Generator())
     apart = [looking([3.0, 0.0, 0.0], [6.0, 0.0, 1.0]), looking([-3.0, 0.0, 0.0], [-6.0, 0.0, 1.0])]
     with pytest.raises(ValueError, match="optical axes"):
-        random_points_in_frusta(apart, 10)
+        random_points(frames(apart), 10, torch.Generator())
     with pytest.raises(ValueError, match="0 < near < far"):
-        random_points_in_frusta(parallel, 10, near=2.0, far=1.0)
+        random_points(frames(parallel, (2.0, 1.0)), 10, torch.Generator())
 
 
-@pytest.mark.parametrize(
-    "draw",
-    [lambda g: random_points_in_box(9, 1.3, generator=g), lambda g: random_points_in_frusta(CAMERAS, 9, generator=g)],
-)
-def test_random_points_repeat_and_leave_the_global_state(draw):
+@pytest.mark.parametrize(("target", "in_box"), [([0.0, 0.0, 0.0], True), ([1.0, 2.0, 3.0], False)])
+def test_random_points_repeat_and_leave_the_global_state(target, in_box):
+    looks = frames(looking(camera.position.tolist(), target) for camera in CAMERAS)
     before = torch.get_rng_state()
-    one, two = (draw(torch.Generator().manual_seed(5)) for _ in range(2))
+    one, two, other = (random_points(looks, 99, torch.Generator().manual_seed(seed)) for seed in (5, 5, 6))
     assert torch.equal(one.positions, two.positions)
     assert torch.equal(torch.get_rng_state(), before)
-    assert not torch.equal(draw(torch.Generator().manual_seed(6)).positions, one.positions)
+    assert not torch.equal(other.positions, one.positions)
+    assert (one.positions.abs().max().item() <= 1.3) == in_box
 
 
 def test_a_thin_cloud_gets_random_points_at_its_depths(generator):
-    frames = [
-        Frame(name, Path(name), looking(at, (0.0, 0.0, 10.0)))
-        for name, at in (("a", (0.0, 0.0, 0.0)), ("b", (1.0, 0.0, 0.0)))
-    ]
+    cameras = [looking(at, (0.0, 0.0, 10.0)) for at in ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))]
     flat = torch.rand(999, 3, generator=generator) + torch.tensor([0.0, 0.0, 8.0])
     thin = PointCloud(flat, torch.rand(999, 3, generator=generator), "sparse/0", frozenset("ab"))
-    more, note = filled(thin, frames, generator)
+    more, note = filled(thin, frames(cameras), generator)
     assert "10,000 random ones at their depths" in note
     assert torch.equal(more.positions[:999], flat)
     assert torch.equal(more.colors[:999], thin.colors)
     assert (more.source, more.seen_by, len(more.positions)) == ("sparse/0", frozenset("ab"), 10_999)
-    known = torch.stack([frame.camera.project(flat)[1] for frame in frames])
-    depths = torch.stack([frame.camera.project(more.positions[999:])[1] for frame in frames])
+    known = torch.stack([camera.project(flat)[1] for camera in cameras])
+    depths = torch.stack([camera.project(more.positions[999:])[1] for camera in cameras])
     within = (depths > known.min() - 1e-4) & (depths < known.max() + 1e-4)  # of the camera that drew it, at least
     assert within.any(0).all()
     assert within.sum() > 10_000
 
 
 def test_a_cloud_that_is_large_or_tells_no_depths_stays_as_it_is(generator):
-    frames = [Frame("a", Path("a"), looking((0.0, 0.0, 0.0), (0.0, 0.0, 10.0)))]
+    train = frames([looking((0.0, 0.0, 0.0), (0.0, 0.0, 10.0))])
     many = PointCloud(torch.rand(1000, 3, generator=generator) + 5, torch.zeros(1000, 3), "sparse/0")
     behind = PointCloud(torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -2.0]]), torch.zeros(2, 3), "sparse/0")
-    for cloud in (many, behind, PointCloud(many.positions[:9], many.colors[:9], "random")):
-        assert filled(cloud, frames, generator) == (cloud, "")
+    random = PointCloud(many.positions[:9], many.colors[:9], "random")
+    for cloud in (many, behind, random):
+        assert filled(cloud, train, generator) == (cloud, "")
+
+
+@pytest.mark.parametrize(("count", "source"), [(1000, "sparse/0"), (9, "random")])
+def test_what_is_not_filled_up_is_projected_nowhere(count, source, generator, monkeypatch):
+    """Millions of points into hundreds of cameras would take gigabytes."""
+    monkeypatch.setattr(Camera, "project", lambda *_: pytest.fail("projected without need"))
+    cloud = PointCloud(torch.zeros(count, 3), torch.zeros(count, 3), source)
+    assert filled(cloud, frames(CAMERAS), generator) == (cloud, "")

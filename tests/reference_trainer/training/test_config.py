@@ -3,6 +3,7 @@ import math
 
 import pytest
 
+from reference_trainer.density import DENSITY, AdaptiveDensity
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
 
@@ -69,6 +70,7 @@ def test_all_regularizers_are_one_expression(settings, text):
         ("prune_size_from", -1),
         ("opacity_reset", 0.0),
         ("opacity_reset_every", -5),
+        ("opacity_reset_from", -1),
         ("opacity_decay", 0.0),
         ("opacity_decay", 1.1),
     ],
@@ -76,6 +78,11 @@ def test_all_regularizers_are_one_expression(settings, text):
 def test_impossible_values_are_named(field, value):
     with pytest.raises(ValueError, match=f"{field} must .*{value}"):
         TrainConfig(**{field: value})
+
+
+def test_the_first_reset_has_a_step():
+    with pytest.raises(TypeError):
+        TrainConfig(opacity_reset_from=None)
 
 
 @pytest.mark.parametrize(
@@ -92,6 +99,15 @@ def test_impossible_values_are_named(field, value):
 def test_expressions_are_read_before_anything_is_trained(settings, message):
     with pytest.raises(ValueError, match=message):
         TrainConfig(**settings).check()
+
+
+def test_only_what_the_renderer_lacks_is_named(monkeypatch):
+    class Greedy(AdaptiveDensity):
+        needs = frozenset({"absgrad", "fields", "moments"})
+
+    monkeypatch.setitem(DENSITY._factories, "greedy", Greedy)
+    with pytest.raises(ValueError, match="greedy needs moments, which the renderer gsplat lacks"):
+        TrainConfig(density="greedy", fields=2, renderer="gsplat").check()
 
 
 @pytest.mark.parametrize("regularizer", [{"dropout": 0.2}, {"noise": 0.8}])

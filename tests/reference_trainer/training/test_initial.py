@@ -3,7 +3,7 @@ import dataclasses
 import pytest
 import torch
 
-from reference_trainer.camera import Camera, pixels_of
+from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.training.config import TrainConfig
@@ -69,12 +69,3 @@ def test_no_point_in_view_says_what_to_do(tiny_scene):
     scene = dataclasses.replace(tiny_scene, points=points, train=(View("a", camera(), torch.zeros(3, 24, 32)),))
     with pytest.raises(ValueError, match=r"no initial Gaussian .* training view.*other points"):
         initial_gaussians(scene, TrainConfig(initial_points="seen"))
-
-
-def test_pixels_of_points():
-    positions = torch.tensor([[0.0, 0.0, 1.0], [0.8, 0.0, 1.0], [-0.79, -0.59, 1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
-    column, row, within = pixels_of(positions, camera())
-    assert within.tolist() == [True, False, True, False, False]  # x = 0.8 lies on the right edge, outside
-    assert (column[0], row[0], column[2], row[2]) == (16, 12, 0, 0)
-    assert set(column.tolist()) <= set(range(32))
-    assert set(row.tolist()) <= set(range(24))

@@ -73,11 +73,6 @@ def test_given_must_name_fields(tiny_scene):
         make_plan(tiny_scene, TrainConfig(), given=["sh"])
 
 
-def test_a_scene_without_points_says_what_to_do(tiny_scene):
-    with pytest.raises(ValueError, match="load it with points='random'"):
-        make_plan(dataclasses.replace(tiny_scene, points=None), TrainConfig())
-
-
 @pytest.mark.parametrize(("iterations", "degree"), [(1, 0), (499, 0), (500, 1), (1_499, 2), (1_500, 3), (9_000, 3)])
 def test_bands_that_never_begin_are_left_out(tiny_scene, iterations, degree):
     config = TrainConfig(iterations=iterations)

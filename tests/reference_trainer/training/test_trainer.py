@@ -220,11 +220,6 @@ def test_views_that_show_nothing_are_steps_without_a_move(tiny_scene):
         assert trainer.density.statistics.steps.sum() == 0
 
 
-def test_a_scene_without_points_says_what_to_do(tiny_scene):
-    with pytest.raises(ValueError, match="no initial points: load it with points='random'"):
-        Trainer(dataclasses.replace(tiny_scene, points=None), TrainConfig())
-
-
 # Schedules
 
 
@@ -264,7 +259,7 @@ def test_regularizers_wait_for_their_step(tiny_scene):
 def control(monkeypatch, scene: Scene, config: TrainConfig, steps: int) -> dict[str, list[int]]:
     """Run with nothing but the calls of density control, and list the steps of each."""
     trainer = Trainer(scene, config)
-    calls: dict[str, list[int]] = {"densify": [], "prune": [], "reset_opacity": [], "decay_opacity": []}
+    calls: dict[str, list[int]] = {name: [] for name in ("clone", "split", "prune", "reset_opacity", "decay_opacity")}
 
     def note(name: str) -> None:
         monkeypatch.setattr(adaptive, name, lambda *args, **keywords: calls[name].append(trainer.step))
@@ -282,7 +277,7 @@ def test_when_density_is_controlled(tiny_scene, monkeypatch):
         opacity_reset_from=7, opacity_reset_every=9,
     )  # fmt: skip
     calls = control(monkeypatch, tiny_scene, config, 40)
-    assert calls["densify"] == calls["prune"] == [15, 20]  # densify_until ends it
+    assert calls["clone"] == calls["split"] == calls["prune"] == [15, 20]  # densify_until ends it
     assert calls["reset_opacity"] == [7, 16]
     assert calls["decay_opacity"] == list(range(11, 40))
 
@@ -295,7 +290,7 @@ def test_when_density_is_left_alone(tiny_scene, monkeypatch):
 def test_growth_ends_at_the_limit_but_pruning_goes_on(tiny_scene, monkeypatch):
     config = TrainConfig(iterations=40, densify_from=10, densify_every=5, max_gaussians=150, opacity_reset_every=0)
     calls = control(monkeypatch, tiny_scene, config, 40)
-    assert calls["densify"] == []
+    assert calls["clone"] == calls["split"] == []
     assert calls["prune"] == [15, 20, 25, 30, 35]
 
 
