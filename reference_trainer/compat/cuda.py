@@ -25,8 +25,8 @@ def cuda_on_cpu() -> Iterator[None]:
     """Make torch functions use the CPU wherever they are told to use a CUDA device.
 
     With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
-    ``.cuda()`` of tensors and modules, ``.pin_memory()``, ``torch.load(map_location="cuda")`` and
-    ``torch.Generator("cuda")`` mean the CPU. In ``torch.cuda``, ``Event``, ``Stream``, ``stream``, ``synchronize``,
+    ``.cuda()`` of tensors and modules, ``.pin_memory()``, ``torch.load`` by default or with ``map_location="cuda"``,
+    and ``torch.Generator("cuda")`` mean the CPU. In ``torch.cuda``, ``Event``, ``Stream``, ``stream``, ``synchronize``,
     ``set_device``, ``current_device``, ``current_stream``, ``reset_peak_memory_stats`` and ``nvtx`` run without effect,
     and ``mem_get_info``, ``get_device_properties`` and ``get_device_name`` report a device with `MEMORY` bytes.
     Everything is restored at the end. ``torch.cuda.is_available()`` stays False.
@@ -72,7 +72,7 @@ def _load_on_cpu(load: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(load)
     def load_on_cpu(f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
-        return load(f, _on_cpu(map_location), *args, **kwargs)
+        return load(f, "cpu" if map_location is None else _on_cpu(map_location), *args, **kwargs)
 
     return load_on_cpu
 

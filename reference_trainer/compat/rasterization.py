@@ -61,9 +61,9 @@ def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterizat
         ...                   render_mode="RGB", absgrad=False, rasterize_mode="classic", eps2d=0.3): ...
         >>> draw_on_any_device = make_rasterization(rasterization, per_axis=True)
         >>> one, pose = torch.ones(1, 3), torch.eye(4)[None]
-        >>> lens = torch.tensor([[[50.0, 0, 16], [0, 50, 16], [0, 0, 1]]])
+        >>> intrinsics = torch.tensor([[[50.0, 0, 16], [0, 50, 16], [0, 0, 1]]])
         >>> image, alpha, info = draw_on_any_device(
-        ...     one * pose[0, 2, :3], pose[0, :1], 0.1 * one, one[0, :1], one, pose, lens, 32, 32)
+        ...     one * pose[0, 2, :3], pose[0, :1], 0.1 * one, one[0, :1], one, pose, intrinsics, 32, 32)
         >>> image.shape, alpha.shape, info["radii"].tolist()
         (torch.Size([1, 32, 32, 3]), torch.Size([1, 32, 32, 1]), [[17, 17]])
     """

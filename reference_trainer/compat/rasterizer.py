@@ -135,20 +135,25 @@ class GaussianRasterizer(nn.Module):
         projection = splats.projection
         splats = splats._replace(projection=projection._replace(means=projection.means + (sink - sink.detach())[:, :2]))
         inverse, surfaces = "inverse_depth" in parts, not SURFACES.isdisjoint(parts)
+        true_depth = surfaces or "depth" in parts
         depths = projection.depths.reciprocal() if inverse else projection.depths  # only summed: sorting is done
         rendering = draw(
             splats._replace(projection=splats.projection._replace(depths=depths)),
             background=settings.bg,
-            depth=inverse or surfaces or "depth" in parts,
+            depth=inverse or true_depth,
         )
         if columns == 4:
             rendering = with_absolute_gradients(rendering, sink[:, 2:], settings.bg)
         found: dict[str, Tensor] = {"image": rendering.image, "alpha": rendering.alpha[None]}
         if rendering.depth is not None:
             found["inverse_depth" if inverse else "depth"] = rendering.depth[None]
+        if inverse and true_depth:  # absolute gradients are those of the first picture
+            rendering = draw(splats, depth=True)
+            assert rendering.depth is not None
+            found["depth"] = rendering.depth[None]
         if "weights" in parts:
             found["weights"] = means3D.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
-        if surfaces and not inverse:
+        if surfaces:
             found |= surface_planes(rendering._replace(splats=splats), means3D, rotations, scales, camera)
         drawn = rendering.alpha.detach() > 0
         found["radii"] = visible_radii(means3D, rotations, scales, camera, blur=blur)

@@ -80,21 +80,21 @@ def camera_of(settings: GaussianRasterizationSettings) -> Camera:
         ValueError: if the projection matrix is not that of a pinhole camera with the settings' fields of view.
 
     Example:
-        >>> lens = torch.tensor([[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 1, 1], [0, 0, -0.01, 0]])
+        >>> projection = torch.tensor([[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 1, 1], [0, 0, -0.01, 0]])
         >>> camera = camera_of(GaussianRasterizationSettings(
-        ...     24, 32, 0.5, 0.5, torch.zeros(3), 1.0, torch.eye(4), lens, 0, torch.zeros(3)))
+        ...     24, 32, 0.5, 0.5, torch.zeros(3), 1.0, torch.eye(4), projection, 0, torch.zeros(3)))
         >>> camera.fx, camera.fy, camera.cx, camera.cy
         (32.0, 24.0, 16.0, 12.0)
     """
     width, height = int(settings.image_width), int(settings.image_height)
     view = settings.viewmatrix.detach().double()
-    lens = torch.linalg.solve(view, settings.projmatrix.detach().double())[:, [0, 1, 3]]
-    shift_x, shift_y = lens[2, :2].tolist()
-    expected = lens.new_tensor([[1 / settings.tanfovx, 0, 0], [0, 1 / settings.tanfovy, 0], [shift_x, shift_y, 1]])
-    if not torch.allclose(lens, torch.nn.functional.pad(expected, (0, 0, 0, 1)), rtol=TOLERANCE, atol=TOLERANCE):
+    projection = torch.linalg.solve(view, settings.projmatrix.detach().double())[:, [0, 1, 3]]
+    shift_x, shift_y = projection[2, :2].tolist()
+    expected = view.new_tensor([[1 / settings.tanfovx, 0, 0], [0, 1 / settings.tanfovy, 0], [shift_x, shift_y, 1]])
+    if not torch.allclose(projection, torch.nn.functional.pad(expected, (0, 0, 0, 1)), rtol=TOLERANCE, atol=TOLERANCE):
         raise ValueError(
             "viewmatrix^-1 projmatrix must be a pinhole camera with the fields of view tanfovx="
-            f"{settings.tanfovx} and tanfovy={settings.tanfovy}; its columns x, y and w are {lens.tolist()}. "
+            f"{settings.tanfovx} and tanfovy={settings.tanfovy}; its columns x, y and w are {projection.tolist()}. "
             "Both matrices must be transposed (for row vectors), as the INRIA code passes them."
         )
     return Camera(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
 from collections.abc import Callable, Iterator
@@ -48,19 +49,18 @@ def describe_compilation(folder: str | None) -> str:
     return f"Compiling the renderer's loops, {when}: about 20 s of one core."
 
 
-class _Log:
-    """Logs once per process that loops are compiled."""
-
-    said = False
-
-    def __call__(self, name: str, where: str | None) -> None:
-        if self.said:
-            return
-        self.said = True
-        logging.getLogger(__name__).warning(describe_compilation(where))
+@functools.cache
+def _warn(message: str) -> None:
+    """Log a message once per process."""
+    logging.getLogger(__name__).warning(message)
 
 
-_report: Callable[[str, str | None], None] = _Log()
+def _log(name: str, where: str | None) -> None:
+    """Log that loops are compiled."""
+    _warn(describe_compilation(where))
+
+
+_report: Callable[[str, str | None], None] = _log
 
 
 @contextmanager

@@ -9,7 +9,6 @@ results do not depend on the number of threads.
 from __future__ import annotations
 
 import collections
-import itertools
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -20,7 +19,6 @@ import torch
 __all__ = ["in_threads"]
 
 _RANGES = 32  # per thread, enough that none waits long for the others
-_LEAST = 64  # items worth a call
 
 _pools: dict[int, ThreadPoolExecutor] = {}
 
@@ -38,8 +36,8 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_begin_forked_process)
 
 
-def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any, least: int = _LEAST) -> list[Any]:
-    """Call ``kernel(first, last, *arguments)`` for ranges that make up ``range(count)``; return what the calls return.
+def in_threads(kernel: Callable[..., None], count: int, *arguments: Any, least: int) -> None:
+    """Call ``kernel(first, last, *arguments)`` for ranges that make up ``range(count)``.
 
     Once this returns, or raises a kernel's error or KeyboardInterrupt, no thread writes any more.
 
@@ -52,22 +50,25 @@ def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any, least: i
     threads = torch.get_num_threads()
     size = max(least, -(-count // (_RANGES * threads)))
     if threads == 1 or count <= size:
-        return [kernel(0, count, *arguments)]
+        kernel(0, count, *arguments)
+        return
     firsts = iter(range(0, count, size))  # shared: whoever is free takes the next
 
-    def work() -> list[Any]:
-        return [kernel(first, min(first + size, count), *arguments) for first in firsts]
+    def work() -> None:
+        for first in firsts:
+            kernel(first, min(first + size, count), *arguments)
 
-    others: list[Future[list[Any]]] = []
+    others: list[Future[None]] = []
     try:
         _start(work, threads - 1, others)
-        results = work()
+        work()
     finally:
         started = _finish(firsts, others)
-    return list(itertools.chain(results, *(other.result() for other in started)))
+    for other in started:
+        other.result()  # raises what it raised
 
 
-def _start(work: Callable[[], Any], count: int, futures: list[Future[Any]]) -> None:
+def _start(work: Callable[[], None], count: int, futures: list[Future[None]]) -> None:
     """Submit work to other threads; to none while the interpreter shuts down."""
     pool = _pools.get(count)
     if pool is None:
@@ -79,7 +80,7 @@ def _start(work: Callable[[], Any], count: int, futures: list[Future[Any]]) -> N
             return
 
 
-def _finish(ranges: Iterator[int], futures: list[Future[Any]]) -> list[Future[Any]]:
+def _finish(ranges: Iterator[int], futures: list[Future[None]]) -> list[Future[None]]:
     """Wait for all calls that have begun, despite Ctrl-C, and return them; the others never begin.
 
     Ranges that are left after an error or Ctrl-C are discarded.

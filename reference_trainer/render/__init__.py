@@ -5,14 +5,12 @@ The loops are tested against the latter. `use_engine` chooses.
 """
 
 from reference_trainer.render.checks import NotFiniteError
-from reference_trainer.render.engine import ENGINES, Engine, chosen_engine, describe_engine, use_engine
+from reference_trainer.render.engine import chosen_engine, describe_engine, use_engine
 from reference_trainer.render.moments import render_moments, variance_shares
 from reference_trainer.render.renderer import draw, draw_masks, render, splat
 from reference_trainer.render.splats import MomentImages, Rendering, Splats
 
 __all__ = [
-    "ENGINES",
-    "Engine",
     "MomentImages",
     "NotFiniteError",
     "Rendering",

@@ -15,7 +15,7 @@ from reference_trainer.camera import Camera
 from reference_trainer.render.constants import MAX_ROUNDING
 from reference_trainer.render.splats import Projection, Splats
 
-__all__ = ["NotFiniteError", "check_projection", "checked_background", "either"]
+__all__ = ["NotFiniteError", "check_projection", "checked_background", "checked_colors"]
 
 
 class NotFiniteError(ValueError):
@@ -50,7 +50,7 @@ def check_projection(
         )
 
 
-def either(sh: Tensor | None, sh_degree: int | None, colors: Tensor | None) -> tuple[Tensor, int | None]:
+def checked_colors(sh: Tensor | None, sh_degree: int | None, colors: Tensor | None) -> tuple[Tensor, int | None]:
     """Return coefficients and their highest band, or colors and None; raise unless exactly one is given, and valid."""
     if (sh is None) == (colors is None):
         raise ValueError("give either sh (N, K, 3) or colors (N, 3), not both and not neither.")

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.checks import check_projection, checked_background, either
+from reference_trainer.render.checks import check_projection, checked_background, checked_colors
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.engine import engine_for
 from reference_trainer.render.splats import Rendering, Splats
@@ -37,7 +37,7 @@ def splat(
         NotFiniteError: if an input that affects the view is nan or infinite. Of Gaussians behind the camera, or
             dropped, only position and opacity must be finite.
     """
-    values, degree = either(sh, sh_degree, colors)
+    values, degree = checked_colors(sh, sh_degree, colors)
     n = means.shape[0]
     if opacities.shape not in ((n,), (n, 1)):
         raise ValueError(f"opacities must have shape ({n},) or ({n}, 1), got {tuple(opacities.shape)}.")

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.checks import either
+from reference_trainer.render.checks import checked_colors
 from reference_trainer.render.constants import DILATION, NEAR_PLANE
 
 __all__ = ["GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
@@ -87,7 +87,7 @@ def render_by(
         TypeError: if the Gaussians are not float32, the only dtype that gsplat takes.
         ValueError: if not exactly one of ``sh`` and ``colors`` is given.
     """
-    values, degree = either(sh, sh_degree, colors)
+    values, degree = checked_colors(sh, sh_degree, colors)
     if means.dtype != torch.float32:
         raise TypeError(f"the gsplat renderer knows float32 only, got {means.dtype}: use the torch renderer.")
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]

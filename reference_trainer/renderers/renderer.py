@@ -49,7 +49,7 @@ class OwnRenderer(Renderer):
         out = render(**arguments)
         if absgrad and out.splats.projection.means.requires_grad:
             sink = absgrad_sink(out.splats.projection.means)
-            return with_absolute_gradients(out, sink, arguments["background"])
+            return with_absolute_gradients(out, sink, arguments.get("background"))
         return out
 
 

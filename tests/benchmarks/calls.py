@@ -22,18 +22,12 @@ Draw = Callable[[Mapping[str, Tensor], Camera], Tensor]
 """From the five tensors of the Gaussians and a camera to an image (3, H, W)."""
 
 
-def _by(function: Callable[..., Tensor], parameters: Mapping[str, Tensor], camera: Camera) -> Tensor:
-    """Draw with a function that has the arguments of `render`."""
-    p = parameters
-    return function(p["means"], p["quaternions"], p["scales"], p["opacities"], camera, colors=p["colors"])
-
-
 def draw_of(engine: str) -> Draw:
     """Return one of the engines of the renderer as something to time."""
 
     def draw(parameters: Mapping[str, Tensor], camera: Camera) -> Tensor:
         with drawn_by(engine):  # projection and drawing; the gradient goes through what they have chosen
-            return _by(lambda *x, **of: render(*x, **of).image, parameters, camera)
+            return render(**parameters, camera=camera).image
 
     return draw
 
@@ -58,10 +52,7 @@ def others_on(device: torch.device) -> dict[str, Draw]:
         gsplat = load_gsplat_render(device)
     except (ImportError, RuntimeError):
         return found
-    return {
-        **found,
-        "gsplat": lambda parameters, camera: _by(lambda *x, **of: gsplat(*x, **of).image, parameters, camera),
-    }
+    return {**found, "gsplat": lambda parameters, camera: gsplat(**parameters, camera=camera).image}
 
 
 @torch.no_grad()

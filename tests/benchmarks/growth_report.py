@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from benchmarks.calls import PASSES
 from reference_trainer.evaluation.results import markdown_table
 from reference_trainer.runs.figures import new_figure
@@ -60,13 +62,9 @@ def fit_exponent(points: Mapping[float, float]) -> Fit | None:
     xs = sorted(points)[-max(_FEWEST, math.ceil(len(points) / 2)) :]
     if len(xs) < _FEWEST:
         return None
-    u, v = [math.log(x) for x in xs], [math.log(points[x]) for x in xs]
-    u_mean, v_mean = math.fsum(u) / len(u), math.fsum(v) / len(v)
-    spread = math.fsum((a - u_mean) ** 2 for a in u)
-    slope = math.fsum((a - u_mean) * (b - v_mean) for a, b in zip(u, v, strict=True)) / spread
-    residual = math.fsum((b - v_mean - slope * (a - u_mean)) ** 2 for a, b in zip(u, v, strict=True))
-    error = math.sqrt(residual / (len(xs) - 2) / spread)
-    return Fit(slope, error, xs[0], xs[-1], len(xs), math.exp(v_mean + slope * (u[-1] - u_mean)))
+    line, covariance = np.polyfit(np.log(xs), np.log([points[x] for x in xs]), 1, cov=True)
+    slope, error = float(line[0]), math.sqrt(covariance[0, 0])
+    return Fit(slope, error, xs[0], xs[-1], len(xs), math.exp(np.polyval(line, math.log(xs[-1]))))
 
 
 class _Curve(NamedTuple):

@@ -15,9 +15,9 @@ from reference_trainer.runs.engines.engine import Failure, Task
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all
 
-__all__ = ["peak_memory"]
+__all__ = ["PROCESS", "peak_memory", "process_status"]
 
-_PROCESS = Path("/proc/self")
+PROCESS = Path("/proc/self")
 _TINY = WorkloadSpec(100, 64, 64, 0.05)
 
 
@@ -42,7 +42,7 @@ def peak_memory(spec: WorkloadSpec, engine: str, device: torch.device) -> dict[s
     """
     if device.type == "cuda":
         return _in_this_process(spec, engine, str(device), torch.get_num_threads())
-    if not (_PROCESS / "clear_refs").exists():
+    if not (PROCESS / "clear_refs").exists():
         return None
     task = Task("peak memory", _in_this_process, (spec, engine, str(device), torch.get_num_threads()))
     with mock.patch.dict(os.environ, {"MALLOC_MMAP_THRESHOLD_": str(1 << 16)}):
@@ -73,16 +73,16 @@ def _restart(device: torch.device) -> int:
         torch.cuda.synchronize(device)
         torch.cuda.reset_peak_memory_stats(device)
         return torch.cuda.memory_allocated(device)
-    (_PROCESS / "clear_refs").write_text("5", encoding="ascii")  # 5 resets the peak (proc(5))
-    return _status("VmRSS")
+    (PROCESS / "clear_refs").write_text("5", encoding="ascii")  # 5 resets the peak (proc(5))
+    return process_status("VmRSS")
 
 
 def _peak(device: torch.device) -> int:
     """Return the peak since the last restart, bytes."""
-    return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else _status("VmHWM")
+    return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else process_status("VmHWM")
 
 
-def _status(entry: str) -> int:
+def process_status(entry: str) -> int:
     """Return an entry of /proc/self/status, which is in KiB, as bytes."""
-    lines = (_PROCESS / "status").read_text(encoding="ascii").splitlines()
+    lines = (PROCESS / "status").read_text(encoding="ascii").splitlines()
     return next(int(line.split()[1]) << 10 for line in lines if line.startswith(f"{entry}:"))

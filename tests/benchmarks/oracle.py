@@ -133,7 +133,7 @@ def best_factors(model: TrainedModel, views: Sequence[View], steps: int, rate: f
 
 def _error(model: TrainedModel, factors: Tensor, views: Sequence[View]) -> Tensor:
     opacities = model.test_opacities * factors
-    errors = [(model.rendering(opacities, view).image - view.image).square().mean() for view in views]
+    errors = [(model.render(opacities, view)[0] - view.image).square().mean() for view in views]
     return torch.stack(errors).sum()
 
 
@@ -218,7 +218,7 @@ def _rates(model: TrainedModel, test: Sequence[View], steps: int) -> dict[str, f
 def _quality(model: TrainedModel, factors: Sequence[Tensor], views: Sequence[View]) -> float:
     """Return the mean PSNR of views, each with its own factors of the opacities."""
     plain = model.test_opacities
-    images = [model.rendering(plain * each, view).image for each, view in zip(factors, views, strict=True)]
+    images = [model.render(plain * each, view)[0] for each, view in zip(factors, views, strict=True)]
     return mean_std(psnr(image.clamp(0, 1), view.image) for image, view in zip(images, views, strict=True))[0]
 
 

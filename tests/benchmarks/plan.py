@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import torch
 import tyro
 
+from benchmarks.memory import PROCESS, process_status
 from benchmarks.plan_parts import parts_of_a_step
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
@@ -206,10 +207,8 @@ def _train(options: SceneOptions, variant: str, config: TrainConfig, device: str
 
 def _peak_bytes() -> int:
     """Return the largest memory that this process has held so far, libraries included; bytes."""
-    status = Path("/proc/self/status")
-    for line in status.read_text(encoding="utf-8").splitlines() if status.exists() else ():
-        if line.startswith("VmHWM:"):  # Linux, where getrusage counts the peak of the parent, too
-            return int(line.split()[1]) << 10
+    if PROCESS.exists():  # Linux, where getrusage counts the peak of the parent, too
+        return process_status("VmHWM")
     import resource
     import sys
 

@@ -50,7 +50,7 @@ def staged(workload: Workload, engine: str, clock: Clock) -> Staged:
         True
     """
     leaves = {name: x.detach().requires_grad_() for name, x in workload.parameters.items()}
-    colors = leaves.pop("colors")
+    colors = leaves["colors"]
     binning = 0.0
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -65,8 +65,7 @@ def staged(workload: Workload, engine: str, clock: Clock) -> Staged:
 
     with drawn_by(engine), mock.patch.object(room := engine_for(colors.device, colors.dtype), "bin", timed(room.bin)):
         times = [clock()]
-        p = leaves
-        splats = splat(p["means"], p["quaternions"], p["scales"], p["opacities"], workload.camera, colors=colors)
+        splats = splat(**leaves, camera=workload.camera)
         end = clock()
         times += [end - binning, end]
     ends = (splats.projection.means, splats.projection.factors, splats.opacities, splats.colors)
@@ -81,8 +80,8 @@ def staged(workload: Workload, engine: str, clock: Clock) -> Staged:
     times.append(clock())
     flat = torch.autograd.grad(image, cut, to_image)
     times.append(clock())
-    outer = torch.autograd.grad(ends, [*leaves.values(), colors], flat)
+    outer = torch.autograd.grad(ends, list(leaves.values()), flat)
     times.append(clock())
     seconds = {name: end - start for name, start, end in zip(STAGES, times[:-1], times[1:], strict=True)}
-    gradients = dict(zip((*leaves, "colors"), outer, strict=True))
+    gradients = dict(zip(leaves, outer, strict=True))
     return Staged(seconds, image.detach(), gradients, splats.lists.gaussians.shape[0])

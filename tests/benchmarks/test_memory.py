@@ -57,5 +57,5 @@ def test_on_a_gpu_the_tensors_count():
 
 
 def test_without_proc_there_is_no_number(monkeypatch, tmp_path):
-    monkeypatch.setattr(memory, "_PROCESS", tmp_path)
+    monkeypatch.setattr(memory, "PROCESS", tmp_path)
     assert peak_memory(WorkloadSpec(5, 8, 8, 0.1), "torch", torch.device("cpu")) is None

@@ -26,7 +26,7 @@ def too_many() -> tuple[TrainedModel, View]:
     )
     view = View("a", scene.camera, torch.zeros(3, 17, 25, dtype=torch.float64))
     without = model.test_opacities.index_fill(0, torch.tensor([2]), 0.0)
-    return model, dataclasses.replace(view, image=model.rendering(without, view).image.detach())
+    return model, dataclasses.replace(view, image=model.render(without, view)[0].detach())
 
 
 def test_slopes_are_differences_and_name_the_one_too_many(too_many):
@@ -34,7 +34,7 @@ def test_slopes_are_differences_and_name_the_one_too_many(too_many):
     slopes = oracle.error_slopes(model, [view, view])
 
     def error(factors):
-        image = model.rendering(model.test_opacities * factors, view).image
+        image = model.render(model.test_opacities * factors, view)[0]
         return 2 * (image - view.image).square().mean()
 
     ones = torch.ones(5, dtype=torch.float64)

@@ -1,13 +1,11 @@
 import math
-import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-import sweep_tasks
 from stand_ins.engine import Here
+from subprocesses import subprocess_environment
 from waiting import PATIENCE, until
 
 from benchmarks import plan as plan_module
@@ -29,9 +27,6 @@ TWO = Plan(
         PlanItem("size", "reduced", "random", {"initial_scale": 0.5}),
     )
 )
-
-
-TESTS = Path(sweep_tasks.__file__).parent
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +122,7 @@ run_study(study, Path("out"), engine=Processes(1))
 @pytest.mark.slow
 def test_a_training_is_interrupted_with_its_study(tmp_path):
     """However else a study may end, the tests of `Processes` end it so."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}
+    environment = subprocess_environment()
     study = subprocess.Popen(
         [sys.executable, "-c", STUDY], cwd=tmp_path, env=environment, start_new_session=True, stderr=subprocess.DEVNULL
     )

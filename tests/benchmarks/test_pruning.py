@@ -95,7 +95,7 @@ def test_training_on_changes_no_numbers_and_moves_means_slowly(trained, monkeypa
     rates: list[float] = []
     set_rate = trainer.optimizer.set_means_rate
     monkeypatch.setattr(trainer.optimizer, "set_means_rate", lambda rate: (rates.append(rate), set_rate(rate)))
-    for name in ("densify", "prune", "reset_opacity"):
+    for name in ("clone", "split", "prune", "reset_opacity"):
         monkeypatch.setattr(adaptive, name, lambda *args, **rest: pytest.fail("the set was changed"))
     train_on(trainer, 6)
     assert (trainer.step, len(trainer.gaussians)) == (start + 6, count)

@@ -22,19 +22,14 @@ _C3 = (
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Evaluate the (degree + 1)^2 real spherical harmonics of unit vectors (N, 3).
+    """Evaluate the (degree + 1)^2 real spherical harmonics, of degree at most 3, of unit vectors (N, 3).
 
     Convention: the Condon-Shortley phase is kept and the order within a band is m = -l .. l, as in the INRIA code.
-
-    Raises:
-        ValueError: if the degree is not 0 to 3.
 
     Example:
         >>> sh_basis(torch.tensor([[0.0, 0.0, 1.0]]), 1).shape
         torch.Size([1, 4])
     """
-    if degree not in (0, 1, 2, 3):
-        raise ValueError(f"the degree of the spherical harmonics must be 0, 1, 2 or 3, got {degree}.")
     x, y, z = directions.unbind(-1)
     basis = [torch.full_like(x, _C0)]
     if degree >= 1:
@@ -60,24 +55,19 @@ def evaluate_sh(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor
 
     Convention: 0.5 is added and the result is clamped below at 0, as in the INRIA code; it is not clamped above.
 
-    The coefficients are (N, K, 3), the directions unit vectors from the camera center to the Gaussians, (N, 3), the
-    colors (N, 3).
-
-    Raises:
-        ValueError: if there are fewer than (degree + 1)^2 coefficients.
+    The coefficients are (N, (degree + 1)^2, 3), of degree at most 3, the directions unit vectors from the camera center
+    to the Gaussians, (N, 3), the colors (N, 3).
 
     Example:
         >>> evaluate_sh(torch.zeros(2, 1, 3), torch.eye(3)[:2], 0).tolist()
         [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]
     """
-    count = (degree + 1) ** 2
-    if coefficients.shape[1] < count:
-        raise ValueError(f"degree {degree} needs {count} coefficients, got {coefficients.shape[1]}: lower the degree.")
     if degree == 0:
         return torch.relu(_C0 * coefficients[:, 0] + 0.5)
+    count = coefficients.shape[1]
     # Repeating the basis per channel and summing over it as matrix products keeps all axes long: on a CPU this is
     # several times faster than a batched product or a broadcast over the three channels.
     channels = torch.eye(3, dtype=coefficients.dtype, device=coefficients.device)
     spread = torch.eye(count, dtype=coefficients.dtype, device=coefficients.device).repeat_interleave(3, dim=1)
-    terms = (sh_basis(directions, degree) @ spread) * coefficients[:, :count].flatten(1)
+    terms = (sh_basis(directions, degree) @ spread) * coefficients.flatten(1)
     return torch.relu(terms @ channels.repeat(count, 1) + 0.5)

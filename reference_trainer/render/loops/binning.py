@@ -15,7 +15,8 @@ from torch import Tensor
 
 from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.compiled.threads import in_threads
-from reference_trainer.render.constants import MIN_ALPHA, TILE
+from reference_trainer.render.constants import TILE
+from reference_trainer.render.loops.tiles import LEAST_ALPHA
 from reference_trainer.render.splats import Projection, TileLists
 
 __all__ = ["bin_gaussians"]
@@ -23,7 +24,7 @@ __all__ = ["bin_gaussians"]
 Array = Any
 f4 = np.float32
 _ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
-_MIN, _TILE = f4(MIN_ALPHA), f4(TILE)
+_TILE = f4(TILE)
 _PARTS = 8  # of the depth order; each counts its own entries per tile, so that all can be filled in parallel
 _BITS = 12  # of a digit of the radix sort
 
@@ -43,7 +44,7 @@ def _last_pixel(x: Any, size: Any) -> Any:
 @inlined
 def _squared_radius(opacity: Any) -> Any:
     """Return the squared Mahalanobis distance at which alpha is `MIN_ALPHA`."""
-    return _TWO * max(_ZERO, math.log(opacity / _MIN))
+    return _TWO * max(_ZERO, math.log(opacity / LEAST_ALPHA))
 
 
 @kernel

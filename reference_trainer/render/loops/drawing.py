@@ -14,60 +14,60 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from reference_trainer.compiled.compiling import inlined, kernel, prefetch
-from reference_trainer.render.constants import MIN_ALPHA, MIN_TRANSMITTANCE
+from reference_trainer.render.constants import MIN_TRANSMITTANCE
 from reference_trainer.render.loops import tiles
-from reference_trainer.render.loops.tiles import CHUNK, PIXELS
+from reference_trainer.render.loops.tiles import CHUNK, LEAST_ALPHA, PIXELS
 from reference_trainer.render.splats import Splats
 
 __all__ = ["absolute_gradients", "composite", "composite_masks"]
 
 Array = Any
 f4 = np.float32
-_ZERO, _ONE, _LEAST_LIGHT, _LEAST = f4(0), f4(1), f4(MIN_TRANSMITTANCE), f4(MIN_ALPHA)
+_ZERO, _ONE, _MIN_TRANSMITTANCE = f4(0), f4(1), f4(MIN_TRANSMITTANCE)
 
 # Offsets into a tile's state. All values of the pixels share one array, so that the compiler sees that nothing
 # overlaps; with an array for each it would not vectorize: four times slower.
-_LIGHT, _RED, _GREEN, _BLUE, _DEPTH, _BEHIND, _SLOPE = (i * PIXELS for i in range(7))
+_TRANSMITTANCE, _RED, _GREEN, _BLUE, _DEPTH, _BEHIND, _SLOPE = (i * PIXELS for i in range(7))
 
 
 @inlined
-def _pass(alpha: Any, light: Any) -> Any:
-    """Return the weight of a splat, and the light left behind it."""
-    rest = light * (_ONE - alpha)
-    goes_on = rest >= _LEAST_LIGHT
-    return alpha * light if goes_on else _ZERO, rest if goes_on else -abs(light)
+def _pass(alpha: Any, transmittance: Any) -> Any:
+    """Return the weight of a splat, and the transmittance behind it."""
+    rest = transmittance * (_ONE - alpha)
+    goes_on = rest >= _MIN_TRANSMITTANCE
+    return alpha * transmittance if goes_on else _ZERO, rest if goes_on else -abs(transmittance)
 
 
 @inlined
 def _have_ended(state: Any) -> Any:
-    most = state[_LIGHT]
+    most = state[_TRANSMITTANCE]
     for p in range(PIXELS):
-        most = state[_LIGHT + p] if state[_LIGHT + p] > most else most
+        most = state[_TRANSMITTANCE + p] if state[_TRANSMITTANCE + p] > most else most
     return most < _ZERO
 
 
 @inlined
-def _finish(state: Any, background: Any, light: Any, image: Any, tile: Any, columns: Any) -> None:
+def _finish(state: Any, background: Any, transmittance: Any, image: Any, tile: Any, columns: Any) -> None:
     """Put the background behind a tile, and the tile into the picture."""
     for p in range(PIXELS):
-        through = abs(state[_LIGHT + p])
-        state[_LIGHT + p] = through
+        through = abs(state[_TRANSMITTANCE + p])
+        state[_TRANSMITTANCE + p] = through
         state[_RED + p] += through * background[0]
         state[_GREEN + p] += through * background[1]
         state[_BLUE + p] += through * background[2]
-    tiles.store(state, _LIGHT, light, tile, columns)
+    tiles.store(state, _TRANSMITTANCE, transmittance, tile, columns)
     tiles.store(state, _RED, image, tile, columns)
 
 
 @kernel
 def _forward(
-    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array, light: Array,
-    image: Array,
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array,
+    transmittance: Array, image: Array,
 ) -> None:  # fmt: skip
     s, entries = np.empty(4 * PIXELS, f4), np.empty((CHUNK + 1, 9), f4)
     for tile in range(first, last):
         s[:] = _ZERO
-        s[_LIGHT : _LIGHT + PIXELS] = _ONE
+        s[_TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
         for begin in range(starts[tile], starts[tile + 1], CHUNK):
             end = min(begin + CHUNK, starts[tile + 1])
             for k in range(0, tiles.read_entries(gaussians, begin, end, 1, table, tile, columns, entries), 2):
@@ -75,28 +75,28 @@ def _forward(
                 shape_a, shape_b = tiles.footprint_of(a), tiles.footprint_of(b)
                 red_a, green_a, blue_a, red_b, green_b, blue_b = a[6], a[7], a[8], b[6], b[7], b[8]
                 for p in range(PIXELS):
-                    weight_a, between = _pass(tiles.clamped(tiles.alpha_at(shape_a, p)), s[_LIGHT + p])
+                    weight_a, between = _pass(tiles.clamped(tiles.alpha_at(shape_a, p)), s[_TRANSMITTANCE + p])
                     weight_b, rest = _pass(tiles.clamped(tiles.alpha_at(shape_b, p)), between)
                     s[_RED + p] += weight_a * red_a + weight_b * red_b
                     s[_GREEN + p] += weight_a * green_a + weight_b * green_b
                     s[_BLUE + p] += weight_a * blue_a + weight_b * blue_b
-                    s[_LIGHT + p] = rest
+                    s[_TRANSMITTANCE + p] = rest
             if _have_ended(s):
                 break
-        _finish(s, background, light, image, tile, columns)
+        _finish(s, background, transmittance, image, tile, columns)
 
 
 @inlined
 def _lowered(alpha: Any, factor: Any) -> Any:
     """Return an alpha times a factor, cut off and clamped like any alpha."""
     lower = alpha * factor
-    return tiles.clamped(lower) if lower >= _LEAST else _ZERO
+    return tiles.clamped(lower) if lower >= LEAST_ALPHA else _ZERO
 
 
 @kernel
 def _masked(
     first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array,
-    lights: Array, images: Array,
+    transmittances: Array, images: Array,
 ) -> None:  # fmt: skip
     """Draw K pictures of the same lists; the last K columns of the table are factors on the alphas in each."""
     count = images.shape[0]
@@ -104,7 +104,7 @@ def _masked(
     entries, alphas = np.empty((CHUNK + 1, table.shape[1]), f4), np.empty((CHUNK + 1, PIXELS), f4)
     for tile in range(first, last):
         states[:] = _ZERO
-        states[:, _LIGHT : _LIGHT + PIXELS] = _ONE
+        states[:, _TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
         ended[:] = False
         for begin in range(starts[tile], starts[tile + 1], CHUNK):
             if ended.all():
@@ -129,15 +129,15 @@ def _masked(
                     red_a, green_a, blue_a, red_b, green_b, blue_b = a[6], a[7], a[8], b[6], b[7], b[8]
                     factor_a, factor_b = a[9 + picture], b[9 + picture]
                     for p in range(PIXELS):
-                        weight_a, between = _pass(_lowered(alpha_a[p], factor_a), s[_LIGHT + p])
+                        weight_a, between = _pass(_lowered(alpha_a[p], factor_a), s[_TRANSMITTANCE + p])
                         weight_b, rest = _pass(_lowered(alpha_b[p], factor_b), between)
                         s[_RED + p] += weight_a * red_a + weight_b * red_b
                         s[_GREEN + p] += weight_a * green_a + weight_b * green_b
                         s[_BLUE + p] += weight_a * blue_a + weight_b * blue_b
-                        s[_LIGHT + p] = rest
+                        s[_TRANSMITTANCE + p] = rest
                 ended[picture] = _have_ended(s)
         for picture in range(count):
-            _finish(states[picture], background, lights[picture], images[picture], tile, columns)
+            _finish(states[picture], background, transmittances[picture], images[picture], tile, columns)
 
 
 def _make_backward(absolute: bool) -> Any:
@@ -145,21 +145,21 @@ def _make_backward(absolute: bool) -> Any:
 
     @kernel
     def _backward(
-        first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array, light: Array,
-        image: Array, to_light: Array, to_image: Array, rows: Array,
+        first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array,
+        transmittance: Array, image: Array, to_transmittance: Array, to_image: Array, rows: Array,
     ) -> None:  # fmt: skip
         s, d = np.empty(7 * PIXELS, f4), np.empty(5 * PIXELS, f4)
         for tile in range(first, last):
-            tiles.load(to_light, tile, columns, s, _LIGHT)
+            tiles.load(to_transmittance, tile, columns, s, _TRANSMITTANCE)
             tiles.load(to_image, tile, columns, s, _RED)
-            tiles.load(light, tile, columns, d, _LIGHT)
+            tiles.load(transmittance, tile, columns, d, _TRANSMITTANCE)
             tiles.load(image, tile, columns, d, _RED)
             for p in range(PIXELS):
                 of_colors = s[_RED + p] * d[_RED + p] + s[_GREEN + p] * d[_GREEN + p] + s[_BLUE + p] * d[_BLUE + p]
-                s[_BEHIND + p] = of_colors + s[_LIGHT + p] * d[_LIGHT + p]
+                s[_BEHIND + p] = of_colors + s[_TRANSMITTANCE + p] * d[_TRANSMITTANCE + p]
                 if absolute:
                     s[_BEHIND + p] += s[_DEPTH + p] * d[_DEPTH + p]
-                s[_LIGHT + p] = _ONE
+                s[_TRANSMITTANCE + p] = _ONE
             ended = False
             for e in range(starts[tile], starts[tile + 1]):
                 ahead = min(e + 6, len(gaussians) - 1)
@@ -174,14 +174,14 @@ def _make_backward(absolute: bool) -> Any:
                 r, g, b = table[i, 6], table[i, 7], table[i, 8]
                 to_r, to_g, to_b = _ZERO, _ZERO, _ZERO
                 for p in range(PIXELS):
-                    raw, now = tiles.alpha_at(polynomial, p), s[_LIGHT + p]
+                    raw, now = tiles.alpha_at(polynomial, p), s[_TRANSMITTANCE + p]
                     alpha = tiles.clamped(raw)
                     weight, rest = _pass(alpha, now)
                     along = s[_RED + p] * r + s[_GREEN + p] * g + s[_BLUE + p] * b
                     if absolute:
                         along += s[_DEPTH + p] * table[i, 9]
                     beyond = s[_BEHIND + p] - weight * along
-                    s[_BEHIND + p], s[_LIGHT + p] = beyond, rest
+                    s[_BEHIND + p], s[_TRANSMITTANCE + p] = beyond, rest
                     # A splat adds T c alpha, and scales all light from behind by 1 - alpha; gradients pass the clamp.
                     s[_SLOPE + p] = raw * (now * along - beyond / (_ONE - alpha)) if rest > _ZERO else _ZERO
                     to_r += weight * s[_RED + p]
@@ -205,43 +205,44 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
     """Draw all in one pass, see `Engine.composite_masks`: what does not depend on the opacity is evaluated once."""
     highest = opacities.amax(0)
     table = tiles.make_table(splats._replace(opacities=highest), (opacities / highest).T)
-    lights, images = (tiles.whole_tiles(splats.lists, len(opacities), channels) for channels in (1, 3))
-    tiles.over_tiles(_masked, splats.lists, table, background, lights, images)
-    return splats.lists.cut(images), 1 - splats.lists.cut(lights[:, 0])
+    transmittances, images = (tiles.whole_tiles(splats.lists, len(opacities), channels) for channels in (1, 3))
+    tiles.over_tiles(_masked, splats.lists, table, background, transmittances, images)
+    return splats.lists.cut(images), 1 - splats.lists.cut(transmittances[:, 0])
 
 
 class _Composite(torch.autograd.Function):
-    """The light left behind all splats, (1, H, W), and their image over the background, (3, H, W)."""
+    """The transmittance of all splats, (1, H, W), and their image over the background, (3, H, W)."""
 
     @staticmethod
     def forward(ctx: Any, splats: Splats, background: Tensor, *_differentiable: Tensor) -> tuple[Tensor, Tensor]:
         table, ctx.lists = tiles.make_table(splats), splats.lists
-        light, image = (tiles.whole_tiles(ctx.lists, channels) for channels in (1, 3))
-        tiles.over_tiles(_forward, ctx.lists, table, background, light, image)
-        ctx.save_for_backward(table, light, image)
-        return ctx.lists.cut(light), ctx.lists.cut(image)
+        transmittance, image = (tiles.whole_tiles(ctx.lists, channels) for channels in (1, 3))
+        tiles.over_tiles(_forward, ctx.lists, table, background, transmittance, image)
+        ctx.save_for_backward(table, transmittance, image)
+        return ctx.lists.cut(transmittance), ctx.lists.cut(image)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, to_light: Tensor, to_image: Tensor) -> tuple[Tensor | None, ...]:
-        table, light, image = ctx.saved_tensors
-        upstream = ctx.lists.padded(to_light), ctx.lists.padded(to_image)
+    def backward(ctx: Any, to_transmittance: Tensor, to_image: Tensor) -> tuple[Tensor | None, ...]:
+        table, transmittance, image = ctx.saved_tensors
+        upstream = ctx.lists.padded(to_transmittance), ctx.lists.padded(to_image)
         rows = table.new_empty(ctx.lists.gaussians.shape[0], 9)
-        tiles.over_tiles(_backward, ctx.lists, ctx.lists.slots, table, light, image, *upstream, rows)
-        to_background = (upstream[1] * light).sum((1, 2)) if ctx.needs_input_grad[1] else None
+        tiles.over_tiles(_backward, ctx.lists, ctx.lists.slots, table, transmittance, image, *upstream, rows)
+        to_background = (upstream[1] * transmittance).sum((1, 2)) if ctx.needs_input_grad[1] else None
         return None, to_background, *tiles.sum_rows(rows, table, ctx.lists)[:4]
 
 
 def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
     """Draw splats front to back, see `Engine.composite`; depth is the red channel of a second picture."""
     p = splats.projection
-    light, image = _Composite.apply(  # type: ignore[no-untyped-call]
+    transmittance, image = _Composite.apply(  # type: ignore[no-untyped-call]
         splats, background, p.means, p.factors, splats.opacities, splats.colors
     )
     if not depth:
-        return image, 1 - light[0], None
+        return image, 1 - transmittance[0], None
     red = torch.nn.functional.pad(p.depths[:, None], (0, 2))
-    return image, 1 - light[0], composite(splats._replace(colors=red), torch.zeros_like(background), depth=False)[0][0]
+    depths, _, _ = composite(splats._replace(colors=red), torch.zeros_like(background), depth=False)
+    return image, 1 - transmittance[0], depths[0]
 
 
 def absolute_gradients(splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:

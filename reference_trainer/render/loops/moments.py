@@ -5,7 +5,7 @@ Back to front, with ``d_i = c_i - mu_{i+1}`` the contrast of a splat with the me
     mu_i = mu_{i+1} + m alpha_i d_i        V = sum_i spread_i S_i d_i^2        S_i = prod_{j<i} shrink_j
 
 where ``spread = v alpha^2`` and ``shrink = (1 - m alpha)^2 + spread``. Every term of V is a square times a non-negative
-weight: nothing cancels. ``light`` is 1 minus the expected accumulated alpha.
+weight: nothing cancels. The expected transmittance is 1 minus the expected accumulated alpha.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ f4 = np.float32
 _ZERO, _ONE, _TWO = f4(0), f4(1), f4(2)
 
 # Offsets into a tile's state, see drawing.py.
-_MEAN, _MEAN_1, _MEAN_2, _LIGHT = (i * PIXELS for i in range(4))
+_MEAN, _MEAN_1, _MEAN_2, _TRANSMITTANCE = (i * PIXELS for i in range(4))
 _VARIANCE, _VARIANCE_1, _VARIANCE_2 = (i * PIXELS for i in range(4, 7))
-_TO_MEAN, _TO_MEAN_1, _TO_MEAN_2, _TO_LIGHT = (i * PIXELS for i in range(7, 11))
+_TO_MEAN, _TO_MEAN_1, _TO_MEAN_2, _TO_TRANSMITTANCE = (i * PIXELS for i in range(7, 11))
 _HIDDEN, _FRONT, _SLOPE, _SIZE = (i * PIXELS for i in range(11, 15))
 # Offsets into what is kept of an entry.
 _RAW, _D0, _D1, _D2, _BEYOND, _D3 = (i * PIXELS for i in range(6))
@@ -47,15 +47,15 @@ def _random(alpha: Any, factor: Any, varies: Any) -> Any:
 
 
 @inlined
-def _over(alpha: Any, entry: Any, means: Any, variances: Any, light: Any) -> Any:
-    """Return means, variances and light with one more splat in front."""
+def _over(alpha: Any, entry: Any, means: Any, variances: Any, transmittance: Any) -> Any:
+    """Return means, variances and transmittance with one more splat in front."""
     r, g, b, factor, varies = entry
     (m0, m1, m2), (v0, v1, v2) = means, variances
     expected, spread, passed, shrink = _random(tiles.clamped(alpha), factor, varies)
     d0, d1, d2 = r - m0, g - m1, b - m2
     means = m0 + expected * d0, m1 + expected * d1, m2 + expected * d2
     variances = v0 * shrink + spread * d0 * d0, v1 * shrink + spread * d1 * d1, v2 * shrink + spread * d2 * d2
-    return means, variances, passed * light
+    return means, variances, passed * transmittance
 
 
 @kernel
@@ -65,7 +65,7 @@ def _forward(
 ) -> None:  # fmt: skip
     s, entries = np.empty(7 * PIXELS, f4), np.empty((CHUNK + 1, 11), f4)
     for tile in range(first, last):
-        s[_LIGHT : _LIGHT + PIXELS] = _ONE
+        s[_TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
         s[_VARIANCE:] = _ZERO
         tiles.load(behind, tile, columns, s, _MEAN)
         for begin in range(starts[tile + 1] - 1, starts[tile] - 1, -CHUNK):
@@ -77,13 +77,13 @@ def _forward(
                 for p in range(PIXELS):
                     m = s[_MEAN + p], s[_MEAN_1 + p], s[_MEAN_2 + p]
                     v = s[_VARIANCE + p], s[_VARIANCE_1 + p], s[_VARIANCE_2 + p]
-                    m, v, light = _over(tiles.alpha_at(shape_a, p), value_a, m, v, s[_LIGHT + p])
-                    m, v, s[_LIGHT + p] = _over(tiles.alpha_at(shape_b, p), value_b, m, v, light)
+                    m, v, transmittance = _over(tiles.alpha_at(shape_a, p), value_a, m, v, s[_TRANSMITTANCE + p])
+                    m, v, s[_TRANSMITTANCE + p] = _over(tiles.alpha_at(shape_b, p), value_b, m, v, transmittance)
                     s[_MEAN + p], s[_MEAN_1 + p], s[_MEAN_2 + p] = m
                     s[_VARIANCE + p], s[_VARIANCE_1 + p], s[_VARIANCE_2 + p] = v
         for p in range(PIXELS):
-            s[_LIGHT + p] = _ONE - s[_LIGHT + p]
-        tiles.store(s, _LIGHT, alpha, tile, columns)
+            s[_TRANSMITTANCE + p] = _ONE - s[_TRANSMITTANCE + p]
+        tiles.store(s, _TRANSMITTANCE, alpha, tile, columns)
         tiles.store(s, _MEAN, mean, tile, columns)
         tiles.store(s, _VARIANCE, variance, tile, columns)
 
@@ -110,13 +110,13 @@ def _make_backward(complete: bool) -> Any:
         kept = np.empty(np.diff(starts[first : last + 1]).max() * size * PIXELS, f4)
         s = np.empty(_SIZE, f4)  # _VARIANCE holds the gradient of the variance
         for tile in range(first, last):
-            s[_LIGHT : _LIGHT + PIXELS] = _ONE
+            s[_TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
             s[_HIDDEN : _HIDDEN + PIXELS] = _ZERO
             s[_FRONT : _FRONT + PIXELS] = _ONE
             tiles.load(behind, tile, columns, s, _MEAN)
             tiles.load(to_mean, tile, columns, s, _TO_MEAN)
             tiles.load(to_variance, tile, columns, s, _VARIANCE)
-            tiles.load(to_alpha[:1], tile, columns, s, _TO_LIGHT)
+            tiles.load(to_alpha[:1], tile, columns, s, _TO_TRANSMITTANCE)
             begin = starts[tile]
             for k in range(starts[tile + 1] - begin - 1, -1, -1):
                 i = gaussians[begin + k]
@@ -128,13 +128,13 @@ def _make_backward(complete: bool) -> Any:
                 for p in range(PIXELS):
                     raw = tiles.alpha_at(polynomial, p)
                     expected, spread, passed, shrink = _random(tiles.clamped(raw), factor, varies)
-                    d0, d1, d2, d3 = r - s[_MEAN + p], g - s[_MEAN_1 + p], b - s[_MEAN_2 + p], s[_LIGHT + p]
+                    d0, d1, d2, d3 = r - s[_MEAN + p], g - s[_MEAN_1 + p], b - s[_MEAN_2 + p], s[_TRANSMITTANCE + p]
                     hidden = s[_HIDDEN + p]
                     of_entry[_RAW + p], of_entry[_D0 + p], of_entry[_D1 + p] = raw, d0, d1
                     of_entry[_D2 + p], of_entry[_BEYOND + p] = d2, hidden
                     if complete:
                         of_entry[_D3 + p] = d3
-                        s[_LIGHT + p] = passed * d3
+                        s[_TRANSMITTANCE + p] = passed * d3
                     weight = s[_VARIANCE + p] * d0 * d0 + s[_VARIANCE_1 + p] * d1 * d1
                     weight += s[_VARIANCE_2 + p] * d2 * d2
                     s[_HIDDEN + p] = hidden * shrink + weight * spread
@@ -168,8 +168,8 @@ def _make_backward(complete: bool) -> Any:
                     to_g += t1
                     to_b += t2
                     if complete:
-                        to_expected += s[_TO_LIGHT + p] * of_entry[_D3 + p]
-                        s[_TO_LIGHT + p] *= passed
+                        to_expected += s[_TO_TRANSMITTANCE + p] * of_entry[_D3 + p]
+                        s[_TO_TRANSMITTANCE + p] *= passed
                         to_factor += to_expected * alpha
                         to_varies += to_spread * alpha * alpha
                         share += of_spread * spread

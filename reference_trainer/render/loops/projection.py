@@ -89,11 +89,12 @@ def _axes(matrix: Any, row: Any, scales: Any) -> Any:
 
 
 @inlined
-def _rows(slope_x: Any, slope_y: Any, z: Any, view: Array, lens: Array) -> Any:
+def _rows(slope_x: Any, slope_y: Any, z: Any, view: Array, intrinsics: Array) -> Any:
     """Return the two rows of (Jacobian x view rotation), linearized at slopes within the limits."""
+    right, down = (view[0, 0], view[0, 1], view[0, 2]), (view[1, 0], view[1, 1], view[1, 2])
     forward = view[2, 0], view[2, 1], view[2, 2]
-    row_x = _times(lens[0] / z, _plus((view[0, 0], view[0, 1], view[0, 2]), -_clip(slope_x, lens[4]), forward))
-    row_y = _times(lens[1] / z, _plus((view[1, 0], view[1, 1], view[1, 2]), -_clip(slope_y, lens[5]), forward))
+    row_x = _times(intrinsics[0] / z, _plus(right, -_clip(slope_x, intrinsics[4]), forward))
+    row_y = _times(intrinsics[1] / z, _plus(down, -_clip(slope_y, intrinsics[5]), forward))
     return row_x, row_y
 
 
@@ -107,10 +108,10 @@ def _towards(means: Array, i: int, position: Array) -> Any:
 
 
 @inlined
-def _ellipse(means: Array, quaternions: Array, scales: Array, i: int, view: Array, lens: Array) -> Any:
+def _ellipse(means: Array, quaternions: Array, scales: Array, i: int, view: Array, intrinsics: Array) -> Any:
     """Project a Gaussian; return all that its gradient needs, the results last."""
     x, y, z = _in_camera(means, i, view)
-    row_x, row_y = _rows(x / z, y / z, z, view, lens)
+    row_x, row_y = _rows(x / z, y / z, z, view, intrinsics)
     matrix, unit, scale = _rotation(quaternions, i)
     ux, uy = _axes(matrix, row_x, scales[i]), _axes(matrix, row_y, scales[i])
     xx, xy, yy = _dot(ux, ux) + _DILATION, _dot(ux, uy), _dot(uy, uy) + _DILATION
@@ -125,7 +126,7 @@ def _ellipse(means: Array, quaternions: Array, scales: Array, i: int, view: Arra
 @kernel
 def _forward(
     first: int, last: int, indices: Array, means: Array, quaternions: Array, scales: Array, sh: Array, degree: int,
-    view: Array, lens: Array, position: Array, centers: Array, factors: Array, covariances: Array, depths: Array,
+    view: Array, intrinsics: Array, position: Array, centers: Array, factors: Array, covariances: Array, depths: Array,
     colors: Array,
 ) -> None:  # fmt: skip
     """Project and color."""
@@ -133,9 +134,9 @@ def _forward(
     for k in range(first, last):
         i = indices[k]
         (slope_x, slope_y, z), _, _, _, _, (xx, xy, yy), (l11, l22) = _ellipse(
-            means, quaternions, scales, i, view, lens
+            means, quaternions, scales, i, view, intrinsics
         )
-        centers[k, 0], centers[k, 1] = lens[0] * slope_x + lens[2], lens[1] * slope_y + lens[3]
+        centers[k, 0], centers[k, 1] = intrinsics[0] * slope_x + intrinsics[2], intrinsics[1] * slope_y + intrinsics[3]
         factors[k, 0], factors[k, 1], factors[k, 2] = l11, -xy * (l22 * l22) * l11, l22
         covariances[k, 0], covariances[k, 1], covariances[k, 2] = xx, xy, yy
         depths[k] = z
@@ -155,15 +156,15 @@ def _forward(
 @kernel
 def _backward(
     first: int, last: int, indices: Array, means: Array, quaternions: Array, scales: Array, sh: Array, degree: int,
-    view: Array, lens: Array, position: Array, colors: Array, to_centers: Array, to_factors: Array, to_depths: Array,
-    to_colors: Array, to_means: Array, to_quaternions: Array, to_scales: Array, to_sh: Array,
+    view: Array, intrinsics: Array, position: Array, colors: Array, to_centers: Array, to_factors: Array,
+    to_depths: Array, to_colors: Array, to_means: Array, to_quaternions: Array, to_scales: Array, to_sh: Array,
 ) -> None:  # fmt: skip
     """Carry gradients back to the Gaussians."""
     values = np.empty(16, f4)
     for k in range(first, last):
         i = indices[k]
         (slope_x, slope_y, z), rotation, (row_x, row_y), (ux, uy), (w, spread, cross), (_, xy, _), (l11, l22) = (
-            _ellipse(means, quaternions, scales, i, view, lens)
+            _ellipse(means, quaternions, scales, i, view, intrinsics)
         )
         matrix, (qw, qx, qy, qz), scale = rotation
         s = scales[i]
@@ -205,11 +206,11 @@ def _backward(
         to_quaternions[i, 3] = scale * (to_qz - along * qz)
         # row = f / z (axis - clipped slope forward); center = f slope + c
         forward = view[2, 0], view[2, 1], view[2, 2]
-        to_slope_x, to_slope_y = lens[0] * to_centers[k, 0], lens[1] * to_centers[k, 1]
-        if abs(slope_x) <= lens[4]:
-            to_slope_x -= lens[0] / z * _dot(forward, to_row_x)
-        if abs(slope_y) <= lens[5]:
-            to_slope_y -= lens[1] / z * _dot(forward, to_row_y)
+        to_slope_x, to_slope_y = intrinsics[0] * to_centers[k, 0], intrinsics[1] * to_centers[k, 1]
+        if abs(slope_x) <= intrinsics[4]:
+            to_slope_x -= intrinsics[0] / z * _dot(forward, to_row_x)
+        if abs(slope_y) <= intrinsics[5]:
+            to_slope_y -= intrinsics[1] / z * _dot(forward, to_row_y)
         to_z = to_depths[k] - (_dot(row_x, to_row_x) + _dot(row_y, to_row_y)) / z
         to_z -= (slope_x * to_slope_x + slope_y * to_slope_y) / z
         to_x, to_y = to_slope_x / z, to_slope_y / z
@@ -242,10 +243,10 @@ class _Project(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:  # fmt: skip
         count = indices.shape[0]
         limits = (0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
-        lens = [camera.fx, camera.fy, camera.cx, camera.cy, *(FRUSTUM_MARGIN * limit for limit in limits)]
+        intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy, *(FRUSTUM_MARGIN * limit for limit in limits)]
         inputs = [x.detach().contiguous() for x in (indices, means, quaternions, scales, sh)]
         view = (x.contiguous().numpy() for x in (camera.world_to_camera, camera.position))
-        ctx.view = degree, next(view), np.array(lens, f4), next(view)
+        ctx.view = degree, next(view), np.array(intrinsics, f4), next(view)
         outputs = tuple(means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,)))
         in_threads(_forward, count, *(x.numpy() for x in inputs), *ctx.view, *(x.numpy() for x in outputs), least=4096)
         ctx.save_for_backward(*inputs, outputs[-1])

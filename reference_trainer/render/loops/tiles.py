@@ -17,8 +17,9 @@ from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
-    "CHUNK", "PIXELS", "X", "Y", "absolute_slopes", "alpha_at", "clamped", "footprint", "footprint_gradient",
-    "footprint_of", "is_faint", "load", "make_table", "over_tiles", "read_entries", "store", "sum_rows", "whole_tiles",
+    "CHUNK", "LEAST_ALPHA", "PIXELS", "X", "Y", "absolute_slopes", "alpha_at", "clamped", "footprint",
+    "footprint_gradient", "footprint_of", "is_faint", "load", "make_table", "over_tiles", "read_entries", "store",
+    "sum_rows", "whole_tiles",
 ]  # fmt: skip
 
 Array = Any
@@ -28,6 +29,9 @@ PIXELS = TILE * TILE
 CHUNK = 16
 """Entries of a list that are read at once."""
 
+LEAST_ALPHA = f4(MIN_ALPHA)
+"""`MIN_ALPHA` in single precision."""
+
 X = np.tile(np.arange(TILE, dtype=f4) - f4((TILE - 1) / 2), TILE)
 """x of every pixel relative to its tile's center, row by row."""
 Y = np.repeat(np.arange(TILE, dtype=f4) - f4((TILE - 1) / 2), TILE)
@@ -35,7 +39,6 @@ Y = np.repeat(np.arange(TILE, dtype=f4) - f4((TILE - 1) / 2), TILE)
 
 _ZERO, _ONE, _TWO, _MAX = f4(0), f4(1), f4(2), f4(MAX_ALPHA)
 _HALF = f4(0.5 * np.log2(np.e))  # exp(-x / 2) = 2^(-_HALF x)
-_LEAST = f4(MIN_ALPHA)
 _FAINT = f4(np.log2(MIN_ALPHA))
 _ABSENT = f4(-1e4)  # binary logarithm of an opacity that is 0 everywhere
 
@@ -106,7 +109,7 @@ def _sum_rows(
         to_means[i, 0], to_means[i, 1] = total[0], total[1]
         to_factors[i, 0], to_factors[i, 1], to_factors[i, 2] = total[2], total[3], total[4]
         # A splat dropped by a mask has opacity 0, without a logarithm; its gradient is 0.
-        to_opacities[i] = total[5] / max(np.exp2(table[i, 5]), _LEAST)
+        to_opacities[i] = total[5] / max(np.exp2(table[i, 5]), LEAST_ALPHA)
         to_colors[i, 0], to_colors[i, 1], to_colors[i, 2] = total[6], total[7], total[8]
         for column in range(more.shape[1]):
             more[i, column] = total[9 + column]

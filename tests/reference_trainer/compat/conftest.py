@@ -13,10 +13,10 @@ from reference_trainer.compat.settings import GaussianRasterizationSettings
 
 def _settings_of(camera: Camera, **changes) -> GaussianRasterizationSettings:
     pose = camera.world_to_camera
-    lens = pose.new_zeros(4, 4)  # textbook order: a column vector (x, y, z, 1) to clip space
-    lens[0, 0], lens[0, 2] = 2 * camera.fx / camera.width, 2 * camera.cx / camera.width - 1
-    lens[1, 1], lens[1, 2] = 2 * camera.fy / camera.height, 2 * camera.cy / camera.height - 1
-    lens[2, 2], lens[2, 3], lens[3, 2] = 1.0001, -0.01, 1.0
+    projection = pose.new_zeros(4, 4)  # textbook order: a column vector (x, y, z, 1) to clip space
+    projection[0, 0], projection[0, 2] = 2 * camera.fx / camera.width, 2 * camera.cx / camera.width - 1
+    projection[1, 1], projection[1, 2] = 2 * camera.fy / camera.height, 2 * camera.cy / camera.height - 1
+    projection[2, 2], projection[2, 3], projection[3, 2] = 1.0001, -0.01, 1.0
     fields = {
         "image_height": camera.height,
         "image_width": camera.width,
@@ -25,7 +25,7 @@ def _settings_of(camera: Camera, **changes) -> GaussianRasterizationSettings:
         "bg": pose.new_zeros(3),
         "scale_modifier": 1.0,
         "viewmatrix": pose.T,
-        "projmatrix": (lens @ pose).T,
+        "projmatrix": (projection @ pose).T,
         "sh_degree": 0,
         "campos": camera.position,
     }

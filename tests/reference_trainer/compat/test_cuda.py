@@ -103,12 +103,17 @@ def test_with_a_device_nothing_changes():
 
 
 @without_cuda
-def test_a_file_of_a_card_is_loaded(tmp_path):
+def test_a_file_of_a_card_is_loaded(tmp_path, monkeypatch):
     load = torch.load
-    torch.save({"x": torch.ones(2)}, tmp_path / "x.pt")
+    with monkeypatch.context() as card:
+        card.setattr(torch.serialization, "location_tag", lambda storage: "cuda:0")
+        torch.save({"x": torch.ones(2)}, tmp_path / "x.pt")
+    with pytest.raises(RuntimeError, match="CUDA"):
+        torch.load(tmp_path / "x.pt", weights_only=True)
     with cuda_on_cpu():
         for place in ("cuda:0", CUDA, None):
             assert torch.load(tmp_path / "x.pt", map_location=place, weights_only=True)["x"].device.type == "cpu"
+        assert torch.load(tmp_path / "x.pt", weights_only=True)["x"].tolist() == [1, 1]
     assert torch.load is load
 
 

@@ -48,7 +48,7 @@ def test_every_output_equals_brute_force(settings_of):
     )  # fmt: skip
     image = sums[:3] + (1 - alpha) * background[:, None, None]
     values = {"depth": sums[3:4], "inverse_depth": sums[4:], "alpha": alpha[None]}
-    for members in ((), ("depth",), ("inverse_depth",), DEPTH_ALPHA):
+    for members in ((), ("depth",), ("inverse_depth",), DEPTH_ALPHA, ("depth", "inverse_depth")):
         tensors = [image, *(values[member] for member in members)]
         color, radii, *rest = _call(settings, scene, members)
         assert (radii > 0).any()

@@ -78,3 +78,8 @@ def test_further_channels_of_the_image_are_those_of_the_planes(settings_of):
     normals = torch.from_numpy(axes) @ pose[:3, :3].T
     normals = normals * -(normals * local).sum(1, keepdim=True).sign()
     torch.testing.assert_close(picture[3:6], torch.einsum("nhw,nc->chw", weights, normals), rtol=0, atol=1e-9)
+    planes = draw("image", "radii", "inverse_depth", "normal", "mean_depth", "distortion")[2:]
+    inverse_depth = torch.einsum("nhw,n->hw", weights, 1 / local[:, 2])
+    torch.testing.assert_close(planes[0][0], inverse_depth, rtol=0, atol=1e-9)
+    assert torch.equal(planes[1], apart[2])
+    assert torch.equal(planes[3], apart[5])

@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from engines import subprocess_environment
+from subprocesses import subprocess_environment
 
 numba = pytest.importorskip("numba")
 from reference_trainer.compiled import compiling  # noqa: E402
@@ -104,13 +104,13 @@ def test_a_machine_on_which_nothing_can_be_written(tmp_path, folder, loaded, mon
 
 
 def test_it_says_so_once(caplog, monkeypatch, folder, loaded):
-    log = compiling._Log()
-    log("a", "/cache")
-    log("b", "/cache")
+    compiling._warn.cache_clear()
+    compiling._log("a", "/cache")
+    compiling._log("b", "/another cache")
     assert [record.getMessage() for record in caplog.records] == [
         "Compiling the renderer's loops, once on this machine: about 20 s of one core."
     ]
-    compiling._Log()("a", None)
+    compiling._log("a", None)
     assert "in every process, as no folder can be written (set NUMBA_CACHE_DIR)" in caplog.text
 
 

@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 import pytest
-from engines import subprocess_environment
+from subprocesses import PYTHONPATH, subprocess_environment
 
 pytestmark = pytest.mark.slow  # each starts interpreters that import torch
 
@@ -125,7 +125,8 @@ def test_omp_num_threads_decides_for_the_loops(count):
 import threading, time, torch
 from reference_trainer.render import describe_engine
 from reference_trainer.compiled.threads import in_threads
-used = in_threads(lambda *_: time.sleep(0.05) or threading.get_ident(), 20, least=1)
+used = []
+in_threads(lambda *_: time.sleep(0.05) or used.append(threading.get_ident()), 20, least=1)
 print(torch.get_num_threads(), len(set(used)), describe_engine("cpu"))
 """,
         OMP_NUM_THREADS=count,
@@ -194,7 +195,6 @@ def test_a_numba_that_cannot_be_imported_is_as_good_as_none(tmp_path):
     """Such as one that is too old for the installed NumPy, which raises ImportError."""
     (tmp_path / "numba").mkdir()
     (tmp_path / "numba" / "__init__.py").write_text("raise ImportError('Numba needs NumPy 1.0 or less')")
-    root = subprocess_environment()["PYTHONPATH"]
     out = run(
         """
 import warnings
@@ -207,7 +207,7 @@ try:
 except ImportError as error:
     print(error)
 """,
-        PYTHONPATH=f"{tmp_path}:{root}",
+        PYTHONPATH=f"{tmp_path}:{PYTHONPATH}",
     )
     assert out.startswith("torch torch ['numba is installed but cannot be imported (Numba needs NumPy 1.0 or less): ")
     assert out.count("numba is installed") == 1

@@ -11,7 +11,6 @@ import torch
 from oracles import random_scene
 from stand_ins.gsplat import centered, rasterization
 
-from reference_trainer.compat.rasterization import make_rasterization
 from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.render import render
 from reference_trainer.renderers import OwnRenderer
@@ -21,6 +20,11 @@ N, WIDTH, HEIGHT = 80, 40, 24
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 
 by_stand_in = functools.partial(render_by, rasterization)
+
+
+def own(means, quaternions, scales, opacities, camera, **options):
+    given = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities, "camera": camera}
+    return OwnRenderer()(**given, **options)
 
 
 def scene_of(device="cpu"):
@@ -108,23 +112,23 @@ def test_the_constants_are_those_of_the_own_renderer():
 
 def test_absolute_gradients_are_left_where_density_control_looks():
     """Of gsplat's interface over the own renderer: the sums have a test of their own, here they are passed on."""
-    scene = scene_of()
-
-    def own(means, quaternions, scales, opacities, camera, **options):
-        return OwnRenderer()(
-            means=means, quaternions=quaternions, scales=scales, opacities=opacities, camera=camera, **options
-        )
-
-    def by_interface(**given):
-        images, alphas, info = make_rasterization(rasterization, per_axis=True)(**given)
-        return images, alphas, info | {"tiles_per_gauss": info["radii"].amin(-1)}
-
-    sums = []
-    for renderer in (own, functools.partial(render_by, by_interface)):
+    scene, sums = scene_of(), []
+    for renderer in (own, by_stand_in):
         splats = rendered(renderer, scene, absgrad=True)[0].splats
         assert (splats.projection.means.absgrad >= splats.projection.means.grad.abs() * (1 - 1e-4) - 1e-6).all()
         sums.append(torch.zeros(N, 2).index_copy(0, splats.indices, splats.projection.means.absgrad))
     torch.testing.assert_close(*sums)
+    assert sums[0].any()
+
+
+def test_absolute_gradients_without_a_background_are_those_over_black():
+    scene, sums = scene_of(), []
+    for options in ({}, {"background": torch.zeros(3)}):
+        means = scene.means.clone().requires_grad_()
+        out = own(means, *scene[1:4], scene.camera, colors=scene.colors, absgrad=True, **options)
+        out.image.square().sum().backward()
+        sums.append(out.splats.projection.means.absgrad)
+    assert torch.equal(*sums)
     assert sums[0].any()
 
 
