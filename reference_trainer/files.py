@@ -1,4 +1,4 @@
-"""Writing files atomically."""
+"""Writing files atomically, and telling what a file is by its name."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["remove_leftovers", "replacing", "write_text"]
+__all__ = ["is_ply", "remove_leftovers", "replacing", "write_text"]
 
 _PART = ".part"
 
@@ -54,15 +54,19 @@ def write_text(path: str | Path, text: str) -> None:
         place.write_text(text, encoding="utf-8")
 
 
-def remove_leftovers(folder: str | Path, *, below: bool = True) -> int:
-    """Remove the temporary files that killed processes left in a folder, and return their number.
+def remove_leftovers(folder: str | Path, *, below: bool = True) -> None:
+    """Remove the temporary files that killed processes left in a folder; ``below`` includes all subfolders.
 
-    No other process may be writing there. ``below`` includes all subfolders.
+    No other process may be writing there.
     """
-    leftovers = [path for path in Path(folder).glob(f"{'**/' * below}.*{_PART}") if path.is_file()]
-    for path in leftovers:
-        path.unlink(missing_ok=True)
-    return len(leftovers)
+    for path in [*Path(folder).glob(f"{'**/' * below}.*{_PART}")]:
+        if path.is_file():
+            path.unlink(missing_ok=True)
+
+
+def is_ply(path: Path) -> bool:
+    """Whether a path names a PLY file; it need not exist."""
+    return path.suffix.lower() == ".ply" and not path.is_dir()
 
 
 def _sync(path: Path) -> None:

@@ -7,22 +7,19 @@ from typing import Annotated, Literal
 
 import tyro
 
-__all__ = ["Device", "Draw", "DrawOfSweep", "Drawing", "DrawingOfSweep", "Warmup"]
+__all__ = ["Device", "Draw", "Drawing", "Warmup"]
 
 
 Device = Annotated[str, tyro.conf.arg(help='"cpu" or "cuda".')]
-_Engine = Literal["auto", "torch", "loops"] | None
-_ENGINE_HELP = (
-    'What draws: "loops" (compiled; float32 on a CPU), "torch" (anything), or "auto", whichever fits. By default '
-    '$CA_REG_ENGINE, or "auto".'
-)
 
 
 @dataclass(frozen=True)
 class Drawing:
     """The rendering engine, for all commands that render."""
 
-    engine: Annotated[_Engine, tyro.conf.arg(help=_ENGINE_HELP)] = None
+    engine: Literal["auto", "torch", "loops"] | None = None
+    """What draws: "loops" (compiled; float32 on a CPU), "torch" (anything), or "auto", whichever fits. By default
+    $CA_REG_ENGINE, or "auto"."""
 
     def begin(self, device: str, *, trains: bool = False) -> None:
         """Choose the engine of this process and its workers, and print which it is.
@@ -42,15 +39,7 @@ class Drawing:
             warm_up(_say)
 
 
-@dataclass(frozen=True)
-class DrawingOfSweep(Drawing):
-    """The same option as --drawing-engine, for commands whose --engine says where runs execute."""
-
-    engine: Annotated[_Engine, tyro.conf.arg(name="drawing-engine", help=_ENGINE_HELP)] = None
-
-
 Draw = Annotated[Drawing, tyro.conf.arg(name="")]
-DrawOfSweep = Annotated[DrawingOfSweep, tyro.conf.arg(name="")]
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from reference_trainer.files import is_ply
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 
 __all__ = ["Orbit", "PlyScene", "place_of"]
@@ -30,7 +31,7 @@ def place_of(source: Path, scene: PlyScene, orbit: OrbitOptions) -> SceneOptions
     Raises:
         ValueError: if options are given that do not apply.
     """
-    if source.is_dir() or source.suffix.lower() != ".ply":
+    if not is_ply(source):
         if (scene, orbit) != (PlyScene(), OrbitOptions()):
             raise ValueError(
                 f"{source} is no PLY, and a run is looked at on its own scene: leave out options of scene and orbit."

@@ -69,7 +69,7 @@ class View:
         with Viewer(self.port) as viewer:
             self.drawing.begin(self.device, trains=True)  # so that no later picture waits for the compiler
             if where is None:
-                model, scene, _ = of_run(self.run, **shared)
+                model, scene = of_run(self.run, **shared)
                 viewer.show(model, measured_views(scene, print))
             else:
                 placed = place(self.run, where, background=self.scene.background, **shared)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from reference_trainer.cli.drawing import Device, Draw, Drawing, DrawingOfSweep, DrawOfSweep
+from reference_trainer.cli.drawing import Device, Draw, Drawing
 from reference_trainer.cli.places import Orbit, PlyScene, place_of
 from reference_trainer.runs.engines.choice import EngineName
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
@@ -90,9 +90,9 @@ class Demo:
             config=TrainConfig(iterations=steps, opacity_reset_every=0, densify_from=min(500, steps // 4)),
             seeds=self.seeds,
             jobs=self.jobs,
-            engine="processes",
+            executor="processes",
             monitor_every=max(1, steps // 5),
-            drawing=DrawingOfSweep(self.drawing.engine),
+            drawing=self.drawing,
         )
         what = f"the built-in scene (3 views) with {', '.join(comparison.strategies)}"
         print(f"Training {what}: {steps} steps each, {self.jobs} at a time.")
@@ -227,6 +227,7 @@ class Evaluate:
     def __call__(self) -> None:
         from reference_trainer.evaluation.lpips import load_lpips
         from reference_trainer.evaluation.trajectory import measured_views
+        from reference_trainer.runs.folder import folder_name
         from reference_trainer.runs.measure import measure, of_run
         from reference_trainer.runs.score_ply import score_ply
 
@@ -238,8 +239,10 @@ class Evaluate:
             "samples": self.samples, "seed": self.seed, "perceptual": load_lpips(self.lpips, device=self.device)
         }  # fmt: skip
         if place is None:
-            model, scene, default = of_run(self.run, self.device, regularizer=self.regularizer)
-            measure(model, measured_views(scene, print), self.out or default, about={"scene": scene.name}, **shared)
+            model, scene = of_run(self.run, self.device, regularizer=self.regularizer)
+            name = "evaluation" if self.regularizer is None else f"evaluation_{folder_name(self.regularizer)}"
+            views, out = measured_views(scene, print), self.out or self.run / name
+            measure(model, views, out, about={"scene": scene.name}, **shared)
         else:
             shared |= {"regularizer": self.regularizer, "device": self.device, "background": self.scene.background}
             score_ply(self.run, place, self.out, **shared)
@@ -299,8 +302,9 @@ class Compare:
     """Number of seeds."""
     jobs: int = 1
     """Runs at a time, each in its own process with its share of the processors (of the whole cluster, on Ray)."""
-    engine: EngineName = "auto"
-    """"processes" of this machine, or "ray" (needs ca_reg[ray]); "auto" is Ray if there is an address."""
+    executor: EngineName = "auto"
+    """What executes runs: "processes" of this machine, or "ray" (needs ca_reg[ray]); "auto" is Ray if there is an
+    address."""
     address: str | None = None
     """A running Ray cluster, "host:6379" or "auto", instead of one on this machine; by default $RAY_ADDRESS. --out
     and the scenes must be on a file system that its machines share."""
@@ -312,12 +316,12 @@ class Compare:
     checkpoint_every: int = 500
     """Steps between checkpoints: what a dead worker costs at most."""
     lpips: Lpips = None
-    drawing: DrawOfSweep = field(default_factory=DrawingOfSweep)
+    drawing: Draw = field(default_factory=Drawing)
 
     @property
     def elsewhere(self) -> bool:
         """Whether runs may execute on other machines, whose devices are unknown here."""
-        return self.engine != "processes" and bool(self.address or os.environ.get("RAY_ADDRESS"))
+        return self.executor != "processes" and bool(self.address or os.environ.get("RAY_ADDRESS"))
 
     def __call__(self) -> None:
         from reference_trainer.runs.compare import compare, scene_folders, strategies
@@ -334,7 +338,7 @@ class Compare:
             )
         paths = self.folders or self.path or ("synthetic",)
         running = Running(
-            choose_engine(self.engine, jobs=self.jobs, address=self.address, device=self.device),
+            choose_engine(self.executor, jobs=self.jobs, address=self.address, device=self.device),
             retries=self.retries,
             device=self.device,
             monitor_every=self.monitor_every,

@@ -9,7 +9,7 @@ from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 from torch.nn.functional import pad
 
-__all__ = ["DepthErrors", "depth_errors", "on_white", "psnr", "ssim"]
+__all__ = ["DepthErrors", "counted", "depth_errors", "on_white", "psnr", "ssim"]
 
 _WINDOW = 11
 
@@ -22,7 +22,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     Args:
         image: colors in [0, 1], shape (3, H, W).
         target: colors in [0, 1], shape (3, H, W).
-        mask: in [0, 1], shape (H, W), such as DTU's object; the pixels count where it rounds to 255 in 8 bits.
+        mask: in [0, 1], shape (H, W), such as DTU's object; see `counted`.
 
     Returns:
         Decibels, computed in float64; infinite for equal images, nan if no pixel counts.
@@ -36,9 +36,13 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
         20.0
     """
     x, y = _checked(image, target)
-    squares = (x - y).square()
-    error = (squares if mask is None else squares[:, mask > 254.5 / 255]).mean().item()
+    error = counted((x - y).square(), mask).mean().item()
     return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def counted(image: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the pixels of an image (C, H, W) where a mask (H, W) in [0, 1] rounds to 255 in 8 bits, or all: (C, P)."""
+    return image.flatten(1) if mask is None else image[:, mask > 254.5 / 255]
 
 
 def ssim(image: Tensor, target: Tensor) -> float:

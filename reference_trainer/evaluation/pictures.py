@@ -64,11 +64,11 @@ def save_png(path: str | Path, image: Tensor) -> None:
         picture.save(place, format="PNG")
 
 
-def save_gif(path: str | Path, images: Sequence[Tensor], *, fps: int = 20) -> None:
-    """Write pictures, at least one, as a looping GIF at ``fps`` pictures per second; otherwise as `save_png`."""
+def save_gif(path: str | Path, images: Sequence[Tensor]) -> None:
+    """Write pictures, at least one, as a looping GIF of 20 per second; otherwise as `save_png`."""
     frames = [as_pillow(image) for image in images]
     with replacing(path) as place:
-        frames[0].save(place, "GIF", save_all=True, append_images=frames[1:], duration=1000 // fps, loop=0)
+        frames[0].save(place, "GIF", save_all=True, append_images=frames[1:], duration=50, loop=0)
 
 
 def as_pillow(image: Tensor) -> Any:

@@ -16,7 +16,6 @@ _TITLES = {
     "lpips": "LPIPS",
     "ca": "CA x1e-3",
     "ca_std_error": "CA std error x1e-3",
-    "ca_half": "CA at 1/2",
     "ca_exact": "exact CA x1e-3",
     "ca_exact_half": "exact CA at 1/2 x1e-3",
     "ca_neutral": "neutral CA x1e-3",
@@ -39,12 +38,12 @@ def evaluation_table(data: Mapping[str, Any]) -> str:
     """
     rows = {f"{view['split']} {view['name']}": view for view in data["views"]}
     rows |= {f"mean {split}": mean for split, mean in data["mean"].items()}
-    left_out = {
-        name for name in _NOT_EVERYWHERE if all(row[name] is None or math.isnan(row[name]) for row in rows.values())
+    left_out = {"ca_exact_half", "gaussians"} | {
+        name
+        for name in _NOT_EVERYWHERE
+        if all(math.isnan(x) for row in rows.values() if (x := row.get(name)) is not None)
     }
-    return _table(
-        "view", rows, [name for name in _TITLES if name not in {*left_out, "ca_half", "ca_exact_half", "gaussians"}]
-    )
+    return _table("view", rows, [name for name in _TITLES if name not in left_out])
 
 
 def summary(results: dict[str, Any]) -> str:
@@ -85,7 +84,7 @@ def _table(first: str, rows: Mapping[str, Mapping[str, Any]], names: Sequence[st
     """Return labeled rows of quantities in their units; None and nan become n/a."""
     cells: list[dict[str, object]] = []
     for label, row in rows.items():
-        known = {_TITLES.get(name, name): row[name] / _unit(name) for name in names if row[name] is not None}
+        known = {_TITLES.get(name, name): row[name] / _unit(name) for name in names if row.get(name) is not None}
         cells.append({first: label} | known)
     return markdown_table(cells, [first, *(_TITLES.get(name, name) for name in names)])
 

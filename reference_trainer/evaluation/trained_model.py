@@ -95,14 +95,10 @@ class TrainedModel:
 
     def render(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
         """Render a view with given opacities (N,), the render function of `CAScore`: image (3, H, W), alpha (H, W)."""
-        out = self.rendering(opacities, view)
-        return out.image, out.alpha
-
-    def rendering(self, opacities: Tensor, view: Viewpoint) -> Rendering:
-        """Render a view with given opacities (N,); return everything the renderer gives."""
-        return render_gaussians(
+        out = render_gaussians(
             self.gaussians, view.camera, self.background, opacities=opacities, sh_degree=self.sh_degree
         )
+        return out.image, out.alpha
 
     def moments(
         self, opacities: Tensor, view: Viewpoint, multiplier: Multiplier, background: Tensor | None = None

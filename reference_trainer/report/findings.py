@@ -108,7 +108,7 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
     Raises:
         FileNotFoundError: if the folder holds no run.
     """
-    model, scene, _ = of_run(run, device)
+    model, scene = of_run(run, device)
     notes: list[str] = []
     if model.depends_on_camera:
         notes.append(f"{label}: its test-time opacities depend on the camera; the model is drawn with the plain ones.")

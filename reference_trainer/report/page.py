@@ -162,8 +162,10 @@ def _dynamics(runs: dict[str, Path]) -> tuple[str, list[str]]:
         try:
             read_dynamics(run)
             logged[label] = run
-        except (FileNotFoundError, ValueError):
+        except FileNotFoundError:
             missing.append(f"{label}: no CA and PSNR against the step, because nothing was measured while it trained.")
+        except ValueError as error:
+            missing.append(f"{label}: no CA and PSNR against the step: {error}")
     if not logged:
         return "", missing
     with tempfile.TemporaryDirectory() as folder:

@@ -23,11 +23,9 @@ __all__ = ["comparison_figure", "dynamics_figure", "new_figure"]
 @contextmanager
 def new_figure(path: Path) -> Iterator[Figure]:
     """Yield an empty figure, and save it on exit in the format of the extension of ``path``, such as PNG or SVG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(layout="constrained")
-    FigureCanvasAgg(figure)
     yield figure
     with replacing(path) as place:
         figure.savefig(place, dpi=110, format=path.suffix[1:])

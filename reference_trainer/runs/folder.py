@@ -15,7 +15,7 @@ from reference_trainer.training.plan import Plan
 
 __all__ = [
     "BAKED_PLY", "CHECKPOINT", "CONFIG", "PLAN", "PLY", "RESULTS", "VIEWS",
-    "begun_with", "claim", "folder_name", "read_results", "read_run_settings",
+    "begun_with", "folder_name", "read_results", "read_run_settings", "run_settings",
 ]  # fmt: skip
 
 CONFIG = "config.json"
@@ -37,7 +37,7 @@ def folder_name(text: str) -> str:
     return re.sub(r"[^\w.=-]+", "_", text).strip("_") or "plain"
 
 
-def claim(options: SceneOptions, config: TrainConfig) -> dict[str, Any]:
+def run_settings(options: SceneOptions, config: TrainConfig) -> dict[str, Any]:
     """Return the content of ``config.json``, which claims a folder for one run."""
     return {"scene": dataclasses.asdict(options.absolute()), "config": dataclasses.asdict(config)}
 
@@ -88,10 +88,10 @@ def begun_with(
             config = Plan.from_dict(read_json(out / PLAN)).applied(config, given=given)
         except ValueError as error:
             raise ValueError(f"{out / PLAN}: {error}") from error
-    found = claim(*read_run_settings(out / CONFIG))
+    found = run_settings(*read_run_settings(out / CONFIG))
     changed = [
         f"{key}: {found[part][key]} -> {value}"
-        for part, values in claim(options, config).items()
+        for part, values in run_settings(options, config).items()
         for key, value in values.items()
         if found[part][key] != value
     ]
@@ -103,13 +103,29 @@ def begun_with(
 
 
 def read_results(out: Path) -> dict[str, Any]:
-    """Read the results of a complete run.
+    """Read the results of a complete run; scores that an older version did not measure may be missing.
 
     Raises:
         ValueError: if the file is damaged.
         OSError: if it cannot be read.
     """
-    results = read_json(out / RESULTS)
-    if not isinstance(results, dict) or "mean" not in results:
-        raise ValueError(f"{out / RESULTS} does not hold the results of a run: delete it to measure again.")
-    return results
+    results: dict[str, Any] = read_json(out / RESULTS)
+    match results:
+        case {
+            "config": {"seed": int()},
+            "gaussians": int() as count,
+            "seconds": float(),
+            "mean": {"train": _} as means,
+            "views": [_, *_] as views,
+        }:
+            named = all(isinstance(view, dict) and {"name", "split"} <= view.keys() for view in views)
+            if named and all(map(_is_row, (*means.values(), *views))) and count.bit_length() < 64:
+                return results
+    raise ValueError(f"{out / RESULTS} does not hold the results of a run: delete it to measure again.")
+
+
+def _is_row(row: Any) -> bool:
+    """Whether these are the scores of a view or their means: text where it belongs, else a number or None."""
+    return isinstance(row, dict) and all(
+        isinstance(x, str if name in ("name", "split", "ca_reason") else float | None) for name, x in row.items()
+    )

@@ -7,7 +7,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from reference_trainer.camera import pixels_of
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.scenes.scene import Scene
@@ -15,7 +14,7 @@ from reference_trainer.scenes.scene import Scene
 __all__ = ["check_frame"]
 
 NEARLY_NONE = 0.01
-"""Share of the Gaussians below which a camera counts as blind to a model: stray ones may be anywhere."""
+"""Fraction of the Gaussians below which a camera counts as blind to a model: stray ones may be anywhere."""
 
 
 def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[str]:
@@ -43,7 +42,7 @@ def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[st
         )
     views = [*scene.train, *scene.test]
     before = torch.stack([view.camera.project(means)[1] >= NEAR_PLANE for view in views])
-    inside = torch.stack([pixels_of(means, view.camera)[2] for view in views]) & before
+    inside = torch.stack([view.camera.inside(*view.camera.project(means)) for view in views]) & before
     seen = int(inside.any(0).sum())
     if seen < NEARLY_NONE * count:
         behind = int((~before).all(0).sum())

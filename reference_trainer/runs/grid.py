@@ -144,6 +144,6 @@ def _line(outcome: dict[str, Any] | Failure, when: str) -> str:
     if isinstance(outcome, Failure):
         return f"FAILED, {outcome.error}"
     mean = outcome["mean"]
-    psnr = mean["test" if "test" in mean else "train"]["psnr"]
+    psnr = mean["test" if "test" in mean else "train"].get("psnr")
     quality = "no PSNR" if psnr is None else f"{psnr:.2f} dB"
     return f"{quality}, finished {when}" if when != "now" else f"{quality} in {outcome['seconds']:.0f} s"

@@ -70,19 +70,14 @@ def run_lock(folder: Path) -> Iterator[None]:
         )
     try:
         if lock.is_locked:
-            _note_holder(folder)
+            with suppress(OSError):  # no run must fail over a note
+                (folder / _HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
         yield
     finally:
         if lock.is_locked:
             with suppress(OSError):
                 (folder / _HOLDER).unlink()
             lock.release()
-
-
-def _note_holder(folder: Path) -> None:
-    """Record who holds the lock; best effort, because no run must fail over it."""
-    with suppress(OSError):
-        (folder / _HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
 
 
 def _holder(folder: Path) -> str:

@@ -18,7 +18,7 @@ from reference_trainer.evaluation.tables import evaluation_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import remove_leftovers, write_text
-from reference_trainer.runs.folder import VIEWS, folder_name
+from reference_trainer.runs.folder import VIEWS
 from reference_trainer.runs.lock import run_lock
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene, Viewpoint
@@ -29,8 +29,8 @@ __all__ = ["measure", "of_run", "render_run"]
 Say = Callable[[str], None]
 
 
-def of_run(run: Path, device: str = "cpu", *, regularizer: str | None = None) -> tuple[TrainedModel, Scene, Path]:
-    """Return a run's model at its last checkpoint, its scene, and the folder for its evaluation.
+def of_run(run: Path, device: str = "cpu", *, regularizer: str | None = None) -> tuple[TrainedModel, Scene]:
+    """Return a run's model at its last checkpoint, and its scene.
 
     Args:
         run: folder of the run.
@@ -44,10 +44,10 @@ def of_run(run: Path, device: str = "cpu", *, regularizer: str | None = None) ->
     """
     trainer = load_run(run, device)
     model = model_of(trainer)
-    if regularizer is None:
-        return model, trainer.scene, run / "evaluation"
-    parse(regularizer)
-    return replace(model, regularizer=regularizer), trainer.scene, run / f"evaluation_{folder_name(regularizer)}"
+    if regularizer is not None:
+        parse(regularizer)
+        model = replace(model, regularizer=regularizer)
+    return model, trainer.scene
 
 
 def measure(
@@ -119,15 +119,14 @@ def render_run(
     Raises:
         ValueError: if there is no test view to render.
     """
-    trainer = load_run(run, device)
-    model = model_of(trainer)
+    model, scene = of_run(run, device)
     folder = out or run / f"render_{what}"
     views: Sequence[Viewpoint]
     if what == "flight":
-        path = interpolate_cameras([view.camera for view in trainer.scene.train], frames)
+        path = interpolate_cameras([view.camera for view in scene.train], frames)
         views = [Viewpoint(f"{i:04d}", camera) for i, camera in enumerate(path)]
     else:
-        views = trainer.scene.test if what == "test" else trainer.scene.train
+        views = scene.test if what == "test" else scene.train
     if not views:
         raise ValueError(f"the scene of {run} has no test view: give --what train or --what flight.")
     images = []

@@ -6,7 +6,7 @@ import dataclasses
 import signal
 import sys
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +32,9 @@ from reference_trainer.runs.folder import (
     RESULTS,
     VIEWS,
     begun_with,
-    claim,
     read_results,
     read_run_settings,
+    run_settings,
 )  # fmt: skip
 from reference_trainer.runs.lock import run_lock
 from reference_trainer.scenes.options import SceneOptions
@@ -69,12 +69,16 @@ def save_for_viewers(model: TrainedModel, path: Path, *, pad_to_degree: int | No
         path: the file.
         pad_to_degree: as in `save_ply`.
     """
-    factor = model.factor
-    trained_with: dict[str, Any] = {"regularizer": model.regularizer, "step": model.step}
-    if factor is None:
-        save_ply(model.gaussians, path, opacities=model.test_opacities, pad_to_degree=pad_to_degree, **trained_with)
-    else:  # a uniform factor, which a reader can undo
-        save_ply(model.gaussians, path, bake_p=1 - factor, pad_to_degree=pad_to_degree, **trained_with)
+    factor = model.factor  # a uniform one, which a reader can undo, or None
+    save_ply(
+        model.gaussians,
+        path,
+        bake_p=None if factor is None else 1 - factor,
+        opacities=model.test_opacities if factor is None else None,
+        pad_to_degree=pad_to_degree,
+        regularizer=model.regularizer,
+        step=model.step,
+    )
 
 
 def run_experiment(
@@ -146,7 +150,7 @@ def run_experiment(
         remove_leftovers(out / VIEWS)
         resumed = (out / CHECKPOINT).exists()
         trainer = Trainer.load(out / CHECKPOINT, scene, device) if resumed else Trainer(scene, settings, device)
-        write_json(out / CONFIG, claim(options, settings))
+        write_json(out / CONFIG, run_settings(options, settings))
         if resumed:
             say(f"{out}: continues from step {trainer.step}")
         else:
@@ -230,45 +234,39 @@ def _train(
     """Train to the end, with monitoring and checkpoints."""
     last = trainer.config.iterations
 
-    def checkpoint(trainer: Trainer) -> None:
-        if trainer.step % checkpoint_every == 0 or trainer.step == last:
-            trainer.save(out / CHECKPOINT)
-        watch(trainer)
-
-    if not monitor_every:
-        trainer.train(after_step=checkpoint, progress=progress)
-        return
-    monitor_every = min(monitor_every, last)
-
     def render_now(opacity: Tensor, view: View) -> tuple[Tensor, Tensor]:
         return model_of(trainer).render(opacity, view)
 
-    score = model_of(trainer).ca_score(render_fn=render_now)
-    views = {"train": trainer.views, "test": [view.to(trainer.device) for view in trainer.scene.test]}
-
     def quality(opacity: Tensor, view: View) -> float:  # the monitor's own test-time scaling knows only dropout
-        return psnr(model_of(trainer).test_rendering(view).image.clamp(0, 1), view.image)
+        return psnr(model_of(trainer).test_rendering(view).image.clamp(0, 1), view.image, view.mask)
 
     def details(opacity: Tensor, view: View) -> dict[str, Tensor]:
         return glance(model_of(trainer), view)
 
-    with CAMonitor(
-        score,
-        out,
-        views={name: group for name, group in views.items() if group},
-        every=monitor_every,
-        psnr=quality,
-        details=details if pictures else None,
-        resume_step=trainer.step if resumed else None,
-    ) as monitor:
-        say(f"{out}: CA and PSNR go to {' and '.join(monitor.backends)} every {monitor_every} steps")
-
-        if trainer.step > 0:  # the last measurement may be missing; one in the log is not repeated
-            monitor(trainer.step, trainer.gaussians.opacities)
+    monitored: AbstractContextManager[CAMonitor | None] = nullcontext()
+    if monitor_every:
+        views = {"train": trainer.views, "test": [view.to(trainer.device) for view in trainer.scene.test]}
+        monitored = CAMonitor(
+            model_of(trainer).ca_score(render_fn=render_now),
+            out,
+            views={name: group for name, group in views.items() if group},
+            every=min(monitor_every, last),
+            psnr=quality,
+            details=details if pictures else None,
+            resume_step=trainer.step if resumed else None,
+        )
+    with monitored as monitor:
+        if monitor is not None:
+            say(f"{out}: CA and PSNR go to {' and '.join(monitor.backends)} every {monitor.every} steps")
+            if trainer.step > 0:  # the last measurement may be missing; one in the log is not repeated
+                monitor(trainer.step, trainer.gaussians.opacities)
 
         def after_step(trainer: Trainer) -> None:
-            monitor(trainer.step, trainer.gaussians.opacities)
-            checkpoint(trainer)
+            if monitor is not None:
+                monitor(trainer.step, trainer.gaussians.opacities)
+            if trainer.step % checkpoint_every == 0 or trainer.step == last:
+                trainer.save(out / CHECKPOINT)
+            watch(trainer)
 
         trainer.train(after_step=after_step, progress=progress)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from ca_reg.regularizers import parse
 from reference_trainer.evaluation.evaluate import Evaluation
 from reference_trainer.evaluation.lpips import LPIPS
-from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.metrics import counted, psnr
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.gaussians import Gaussians
@@ -102,7 +102,7 @@ def of_ply(
         gaussians = replace(
             gaussians, opacity_logits=torch.logit((gaussians.opacities / loaded.opacity_scale).clamp(max=1 - 1e-6))
         )
-        text = text or f"dropout({baked:g})"
+        text = text or f"dropout({baked})"
     degrees = range(1, gaussians.sh_degree + 1)
     used = max((d for d in degrees if gaussians.sh_rest[:, d**2 - 1 : (d + 1) ** 2 - 1].any()), default=0)
     facts = PlyFacts(len(gaussians), gaussians.sh_degree, used, loaded.opacity_scale, loaded.for_rendering, text)
@@ -239,10 +239,11 @@ def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
 
 
 def _worse_than_one_color(result: Evaluation, scene: Scene) -> bool:
-    """Whether every training view has a lower PSNR than the mean color of its photograph."""
+    """Whether every training view has a lower PSNR than the mean color of the pixels of its photograph that count."""
 
     def of_mean(view: View) -> float:
-        return psnr(view.image.mean((1, 2), keepdim=True).expand_as(view.image), view.image)
+        pixels = counted(view.image, view.mask)[:, None]
+        return psnr(pixels.mean(2, keepdim=True).expand_as(pixels), pixels)
 
     limits = {view.name: of_mean(view) for view in scene.train}
     return bool(limits) and all(v.psnr < limits[v.name] for v in result.views if v.split == "train")

@@ -19,11 +19,12 @@ from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.maps import first_order_map
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.files import is_ply
 from reference_trainer.render.engine import drawn_by, engines_on
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.score_ply import of_plain_ply
 from reference_trainer.scenes.orbit import orbit_views
-from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.studies.clocks import in_turns, now
 from reference_trainer.studies.study import Record, Records, Study, checkpoints
 
@@ -63,8 +64,8 @@ def error_runtime_study(
             f"expected max_samples, a power of two of at least {2 * FIT_FROM}, and at least 1 seed, got {max_samples} "
             f"and {seeds}."
         )
-    plys = [source for source in sources if source.suffix == ".ply"]
-    runs = [source for source in sources if source.suffix != ".ply"]
+    plys = [source for source in sources if is_ply(source)]
+    runs = [source for source in sources if not is_ply(source)]
     named = {**(checkpoints(runs) if runs or not plys else {}), **{ply.stem: ply for ply in plys}}
     if len(named) < len({*sources}) or len({*plys}) < len(plys):
         raise ValueError(f"sources must have different names, got {[str(source) for source in sources]}.")
@@ -75,14 +76,20 @@ def error_runtime_study(
 
 def _measure(source: Path, max_samples: int, seeds: int, device: str) -> Record:
     """Measure one source: the checkpoint of a run, or a PLY."""
-    if source.suffix == ".ply":
-        return error_runtime(*_of_ply(source, device), max_samples=max_samples, seeds=seeds)
-    model, scene, _ = of_run(source.parent, device)
-    return error_runtime(model, (*scene.test, *scene.train)[0].to(device), max_samples=max_samples, seeds=seeds)
+    view: Viewpoint
+    if is_ply(source):
+        model, _ = of_plain_ply(source, device=device)
+        means, opacities = model.gaussians.means, model.gaussians.opacities
+        (camera,) = orbit_views(means, opacities, count=1, width=PICTURE, height=PICTURE)
+        view = Viewpoint("orbit", camera)
+    else:
+        model, scene = of_run(source.parent, device)
+        view = (*scene.test, *scene.train)[0].to(device)
+    return error_runtime(model, view, max_samples=max_samples, seeds=seeds)
 
 
 @torch.no_grad()
-def error_runtime(model: TrainedModel, view: View, *, max_samples: int = 1024, seeds: int = 3) -> Record:
+def error_runtime(model: TrainedModel, view: Viewpoint, *, max_samples: int = 1024, seeds: int = 3) -> Record:
     """Measure error and wall-clock time of all estimators of one view's co-adaptation at drop rate 1/2.
 
     - Monte Carlo with K = 2, 4, 8, ... renders: the unbiased variance (ddof = 1), accumulated in float64 in one running
@@ -96,7 +103,7 @@ def error_runtime(model: TrainedModel, view: View, *, max_samples: int = 1024, s
 
     Args:
         model: what to measure, float32; its dropout rate does not matter.
-        view: what to render; only its name and camera matter.
+        view: what to render, on the model's device.
         max_samples: largest K.
         seeds: number of Monte Carlo runs; their masks come from the seeds 0, 1, 2, ...
 
@@ -115,7 +122,6 @@ def error_runtime(model: TrainedModel, view: View, *, max_samples: int = 1024, s
     device = opacities.device
 
     exact = double.moments(precise, view, multiplier)
-    assert exact.alpha_mean is not None
     region = exact.alpha_mean > THRESHOLD
     if not bool(region.any()):
         raise ValueError(
@@ -172,7 +178,9 @@ def error_runtime(model: TrainedModel, view: View, *, max_samples: int = 1024, s
     }
 
 
-def _monte_carlo(model: TrainedModel, view: View, max_samples: int, seed: int) -> Iterator[tuple[int, float, Tensor]]:
+def _monte_carlo(
+    model: TrainedModel, view: Viewpoint, max_samples: int, seed: int
+) -> Iterator[tuple[int, float, Tensor]]:
     """Yield K = 2, 4, 8, ..., the seconds spent so far, and the unbiased variance (3, H, W)."""
     opacities = model.gaussians.opacities
     device = opacities.device
@@ -316,11 +324,3 @@ def _panel(axes: Any, record: Record) -> None:
     for m in (sampled[0], sampled[-1]):
         place = (statistics.median(m["seconds"]), rms(m, "map"))
         axes.annotate(f"K = {m['K']}", place, (0, 9), textcoords="offset points", ha="center", fontsize="small")
-
-
-def _of_ply(ply: Path, device: str) -> tuple[TrainedModel, View]:
-    """Return the model of a PLY over black, and a view on an orbit, whose image is a black placeholder."""
-    model, _ = of_plain_ply(ply, device=device)
-    means, opacities = model.gaussians.means, model.gaussians.opacities
-    camera = orbit_views(means, opacities, count=1, width=PICTURE, height=PICTURE)[0]
-    return model, View("orbit", camera, model.background[:, None, None].expand(3, PICTURE, PICTURE))

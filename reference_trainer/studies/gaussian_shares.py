@@ -76,7 +76,7 @@ def study_attribution(
     """
     if split not in ("train", "test"):
         raise ValueError(f"split must be 'train' or 'test', got {split!r}.")
-    model, scene, _ = of_run(run, device)
+    model, scene = of_run(run, device)
     out = run / "attribution" if out is None else out
     views = [view.to(device) for view in (scene.train if split == "train" else scene.test)]
     if not views:

@@ -10,14 +10,14 @@ import socket
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, get_args
 
 import numpy as np
 import torch
 
 from ca_reg.neighbors import nearest_neighbors
-from reference_trainer.camera import Camera, pixels_of
+from reference_trainer.camera import Camera
 from reference_trainer.evaluation.pictures import as_pillow
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
@@ -127,9 +127,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         new = start >= self._next_model
         if new:
             model = model_of(trainer)
-            model = TrainedModel(
-                model.gaussians.map(torch.clone), model.background, model.regularizer, model.step, model.sh_degree
-            )
+            model = replace(model, gaussians=model.gaussians.map(torch.clone))
             self.show(model, measured_views(trainer.scene, lambda text: None))
         with contextlib.suppress(NotFiniteError):  # the training reports it itself
             self.draw()
@@ -267,5 +265,6 @@ def _pose(camera: Camera, distance: float) -> dict[str, Any]:
 
 def _distance(gaussians: Gaussians, camera: Camera) -> float:
     """Return the median depth of the Gaussians that a camera sees; 1 if it sees none."""
-    depth = camera.project(gaussians.means)[1][pixels_of(gaussians.means, camera)[2]]
+    pixels, depth = camera.project(gaussians.means)
+    depth = depth[camera.inside(pixels, depth)]
     return depth.median().item() if len(depth) else 1.0

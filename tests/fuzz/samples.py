@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from PIL import Image
 
+from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
+from reference_trainer.evaluation.results import write_json
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.scenes import synthetic_scene
@@ -25,7 +27,7 @@ from reference_trainer.training.trainer import Trainer
 __all__ = [
     "small_scene", "write_arrays", "write_blender", "write_checkpoint", "write_colmap_binary", "write_colmap_text",
     "write_image", "write_llff", "write_log", "write_lpips", "write_model", "write_model_ascii", "write_points",
-    "write_run_settings", "write_split", "write_trainer",
+    "write_results", "write_run_settings", "write_split", "write_trainer",
 ]  # fmt: skip
 
 VIEWS = 3
@@ -195,6 +197,15 @@ def write_log(folder: Path) -> None:
     """The log of a monitor."""
     records = [{"step": 10 * i, "gaussians": 5, "ca/test": 0.01 * i, "method": "sampling"} for i in range(1, 5)]
     (folder / "ca.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+
+
+def write_results(folder: Path) -> None:
+    """The results of a run with two views."""
+    quantities = [name for name in ViewScores.__dataclass_fields__ if name not in ("name", "split", "ca_reason")]
+    scores = {name: 0.25 * number for number, name in enumerate(quantities)}
+    views = [ViewScores(name="r", split=split, ca_reason="ok", **scores) for split in ("train", "test")]
+    content = {"scene": "fern", "config": dataclasses.asdict(TrainConfig()), "seconds": 2.5, "processor_seconds": 2.0}
+    write_json(folder / "results.json", content | Evaluation(views, 1000).as_dict())
 
 
 def write_run_settings(folder: Path) -> None:

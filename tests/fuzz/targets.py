@@ -13,8 +13,10 @@ from fuzz.harness import Target
 
 from ca_reg.dynamics import read_dynamics
 from reference_trainer.evaluation.lpips import load_lpips
+from reference_trainer.evaluation.tables import comparison_table, evaluation_table, summary
 from reference_trainer.model.ply import load_ply
-from reference_trainer.runs.folder import read_run_settings
+from reference_trainer.runs.folder import read_results, read_run_settings
+from reference_trainer.runs.grid import _line
 from reference_trainer.scenes.arrays import read_arrays
 from reference_trainer.scenes.colmap import read_colmap
 from reference_trainer.scenes.idr import read_idr
@@ -105,6 +107,14 @@ def _trainer_fits(trainer: Any) -> None:
         assert all(bool(x.isfinite().all()) for x in moments.values()), "moments that are not finite"
 
 
+def _results_fit(results: Any) -> None:
+    """Whatever shows results must take them; an error of any kind ends the test."""
+    assert comparison_table({"a": [results]})
+    assert evaluation_table(results)
+    assert summary(results)
+    assert _line(results, "now")
+
+
 TARGETS = (
     *(
         Target(f"COLMAP {name}.bin", f"{name}.bin", samples.write_colmap_binary, read_colmap, "binary",
@@ -187,6 +197,8 @@ TARGETS = (
     ),
     Target("run config.json", "config.json", samples.write_run_settings,
            lambda folder: read_run_settings(folder / "config.json"), "json", expansion=JSON),
+    Target("run results.json", "results.json", samples.write_results, read_results, "json", finite=False,
+           expansion=JSON, check=_results_fit),
     Target("monitor log", "ca.jsonl", samples.write_log, read_dynamics, "json", finite=False, grows=True,
            expansion=JSON),
 )  # fmt: skip

@@ -13,7 +13,7 @@ from fuzz import samples
 from ca_reg import CAMonitor, CAScore
 from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.colmap import read_colmap
-from reference_trainer.scenes.colmap_model import view_matrix
+from reference_trainer.scenes.colmap_model import view_matrix_from_quaternion
 from reference_trainer.scenes.images import LARGEST_IMAGE, read_image
 from reference_trainer.scenes.llff import read_llff
 from reference_trainer.scenes.points import ply_points
@@ -235,7 +235,7 @@ def test_a_tiff_with_lost_strips_is_refused(tmp_path):
 
 def test_a_quaternion_whose_length_overflows_is_no_identity():
     with pytest.raises(ValueError, match="finite non-zero quaternion"):
-        view_matrix((1e200, 1e200, 0.0, 0.0), (0.0, 0.0, 0.0))
+        view_matrix_from_quaternion((1e200, 1e200, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("bad", ["[1, 2]", '["r_1.png", null]', '[["r_1.png"]]', '["r_1.png", {"a": 1}]'])

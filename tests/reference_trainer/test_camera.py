@@ -44,6 +44,13 @@ def test_a_point_lands_where_the_hand_puts_it():
     torch.testing.assert_close(depths, projected.depths)
 
 
+def test_which_points_are_in_the_picture():
+    points = torch.tensor([[0.0, 0.0, 1.0], [0.8, 0.0, 1.0], [-0.79, -0.59, 1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
+    wide = camera(fx=20.0, fy=20.0, cx=16.0, cy=12.0, width=32, height=24)
+    assert wide.inside(*wide.project(points)).tolist() == [True, False, True, False, False]  # 0.8: on the right edge
+    assert wide.inside(*wide.project(points[2])).item()
+
+
 @pytest.mark.parametrize("factor", [0.5, 0.3, 2.0, 1e-3])
 def test_scaling_keeps_the_field_of_view_and_the_principal_ray(factor):
     old = camera()

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from ca_reg.neighbors import mean_neighbor_distance
+from ca_reg.neighbors import rms_neighbor_distance
 from reference_trainer.cli import main
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
@@ -21,7 +21,7 @@ def test_commands(card, tmp_path, options):
     """From a tenth of the points: the card counts every operation, and the longest list decides how many there are."""
     points = SceneOptions(downscale=8.0).load().points
     places, colors = points.positions[::10], points.colors[::10]
-    start = Gaussians.from_points(places, colors, mean_neighbor_distance(places), sh_degree=0, opacity=0.5)
+    start = Gaussians.from_points(places, colors, rms_neighbor_distance(places), sh_degree=0, opacity=0.5)
     save_ply(start, tmp_path / "start.ply")
     main([*TRAIN.split(), *options.split(), "--init", str(tmp_path / "start.ply"), "--out", str(tmp_path)])
     assert json.loads((tmp_path / RESULTS).read_text())["mean"]["test"]["psnr"] > 15

@@ -13,6 +13,7 @@ from reference_trainer import cli
 from reference_trainer.cli import main
 from reference_trainer.evaluation import tables
 from reference_trainer.runs import compare as compare_module
+from reference_trainer.runs import measure as measure_module
 from reference_trainer.runs import run as run_module
 from reference_trainer.runs import score_ply as score_module
 from reference_trainer.runs.compare_report import Comparison
@@ -84,8 +85,8 @@ def trained(tmp_path_factory):
                 "--seeds",
                 "--jobs",
                 "--iterations",
+                "--executor",
                 "--engine",
-                "--drawing-engine",
                 "--address",
                 "--path",
             ],
@@ -240,6 +241,14 @@ def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
     assert (tmp_path / "flight" / "flight.gif").exists()
 
 
+@pytest.mark.parametrize(("given", "folder"), [("", "evaluation"), ("noise(0.8)", "evaluation_noise_0.8")])
+def test_the_folder_of_an_evaluation(given, folder, trained, monkeypatch):
+    asked: list = []
+    monkeypatch.setattr(measure_module, "measure", lambda model, views, out, **named: asked.append(out))
+    main(["evaluate", str(trained), *(["--regularizer", given] if given else [])])
+    assert asked == [trained / folder]
+
+
 @pytest.mark.slow
 def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path):
     main(["train", "--out", str(tmp_path / "run"), "--noise", "0.8", *SMALL])
@@ -370,7 +379,7 @@ def test_several_scenes_and_how_they_are_run(monkeypatch, tmp_path):
     monkeypatch.setattr(compare_module, "compare", fake)
     with pytest.raises(SystemExit) as exit_:
         main(["compare", "--out", str(tmp_path), "--path", "data/fern", "synthetic", "--downscale", "2",
-              "--engine", "processes", "--retries", "1", "--checkpoint-every", "50"])  # fmt: skip
+              "--executor", "processes", "--retries", "1", "--checkpoint-every", "50"])  # fmt: skip
     assert exit_.value.code == 1  # a run failed
     assert asked["scenes"] == {
         tmp_path / "fern": SceneOptions("data/fern", downscale=2.0),
@@ -429,7 +438,7 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["compare", "--jobs", "0"], "at least 1 job, got 0"),
         (["compare", "--path", "a/fern", "b/fern"], "scenes whose folders have different names"),
         (["compare", "--retries", "-1"], "retries of at least 0"),
-        (["compare", "--engine", "processes", "--address", "auto"], "--address auto is that of a Ray cluster"),
+        (["compare", "--executor", "processes", "--address", "auto"], "--address auto is that of a Ray cluster"),
         (["evaluate", "nowhere"], "nowhere holds no run (no config.json): give the --out folder"),
         (["render", "nowhere"], "nowhere holds no run"),
         (["evaluate", "nowhere.ply"], "nowhere.ply"),

@@ -1,8 +1,9 @@
 import errno
+from pathlib import Path
 
 import pytest
 
-from reference_trainer.files import remove_leftovers, replacing
+from reference_trainer.files import is_ply, remove_leftovers, replacing
 
 
 def test_the_new_content_replaces_the_old(tmp_path):
@@ -56,6 +57,14 @@ def test_an_error_about_another_file_keeps_its_name(tmp_path):
         (tmp_path / "other").read_text()
 
 
+def test_a_ply_is_a_file_of_that_name(tmp_path):
+    assert is_ply(Path("a.ply"))
+    assert is_ply(Path("nowhere", "A.PLY"))
+    assert not is_ply(Path("ply"))
+    (tmp_path / "run.ply").mkdir()
+    assert not is_ply(tmp_path / "run.ply")
+
+
 def test_leftovers_of_killed_processes(tmp_path):
     keep = [tmp_path / "part", tmp_path / "a.part", tmp_path / ".hidden", tmp_path / "deep"]
     keep[-1].mkdir()
@@ -64,7 +73,9 @@ def test_leftovers_of_killed_processes(tmp_path):
     with replacing(tmp_path / "deep" / "x.png") as place:
         place.write_text("whole")
         (tmp_path / "deep" / place.name.replace("x.png", "y.png")).write_text("ha")  # of a process that is no more
-    assert remove_leftovers(tmp_path, below=False) == 0
-    assert remove_leftovers(tmp_path) == 1
-    assert sorted(tmp_path.rglob("*")) == sorted([*keep, tmp_path / "deep" / "x.png"])
-    assert remove_leftovers(tmp_path / "nowhere") == 0
+    there = set(tmp_path.rglob("*"))
+    for folder, below in ((tmp_path, False), (tmp_path / "nowhere", True)):
+        remove_leftovers(folder, below=below)
+        assert set(tmp_path.rglob("*")) == there
+    remove_leftovers(tmp_path)
+    assert set(tmp_path.rglob("*")) == {*keep, tmp_path / "deep" / "x.png"}

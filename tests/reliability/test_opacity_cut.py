@@ -25,7 +25,7 @@ def lowered(scene: Scene, opacity: float, steps: int, **settings: Any) -> tuple[
     config = TrainConfig(iterations=steps, opacity_reset_every=0, **{"densify_every": 0, **settings})
     trainer = Trainer(scene, config)
     logits = torch.logit(torch.full((150,), opacity))
-    trainer.optimizer.set_opacity_logits(logits, forget=True)
+    trainer.optimizer.set_opacity_logits(logits)
     reached, step = torch.zeros(150, dtype=torch.bool), trainer.optimizer.step
 
     def note() -> None:
@@ -75,7 +75,7 @@ def test_what_stays_below_is_pruned_at_the_next_densification(scene):
     _, trainer = lowered(scene, 0.02, 6, densify_every=4, densify_from=1, densify_gradient=1e9)
     logits = trainer.gaussians.opacity_logits.detach().clone()
     logits[:40] = math.log(BELOW / (1 - BELOW))
-    trainer.optimizer.set_opacity_logits(logits, forget=True)
+    trainer.optimizer.set_opacity_logits(logits)
     before = len(trainer.gaussians)
     trainer.step = 4
     trainer.density.before_step(trainer.optimizer, trainer.step)

@@ -33,7 +33,7 @@ def choose_engine(name: EngineName, *, jobs: int, address: str | None = None, de
         2
     """
     if name == "processes" and address is not None:
-        raise ValueError(f"--address {address} is that of a Ray cluster: use --engine ray, or leave the address out.")
+        raise ValueError(f"--address {address} is that of a Ray cluster: use --executor ray, or leave the address out.")
     if name == "ray" or (name == "auto" and (address or os.environ.get("RAY_ADDRESS"))):
         return RayCluster(jobs, address=address, gpus=1.0 if device.startswith("cuda") else 0.0)
     return Processes(jobs)

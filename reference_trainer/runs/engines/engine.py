@@ -62,7 +62,8 @@ Answer: TypeAlias = Value | Failure | Death
 class Engine(Protocol):
     """Starts calls in other processes and reports how they ended; `run_all` queues and retries, for every engine.
 
-    An engine serves one sweep. It starts nothing before the first task, so a sweep with nothing left to do is free.
+    An engine serves one sweep after another. It starts nothing before the first task of each, so a sweep with nothing
+    left to do is free.
     """
 
     @property

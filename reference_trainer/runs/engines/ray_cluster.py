@@ -39,7 +39,7 @@ class RayCluster:
             import ray
         except ImportError as error:
             raise ImportError(
-                "running on Ray needs Ray: pip install 'ca_reg[ray]'; --engine processes does without."
+                "running on Ray needs Ray: pip install 'ca_reg[ray]'; --executor processes does without."
             ) from error
         self.jobs = jobs
         self._address = address or os.environ.get("RAY_ADDRESS") or "local"
@@ -68,6 +68,7 @@ class RayCluster:
         if self._running:
             self._ray.wait(list(self._running), num_returns=len(self._running), timeout=_PATIENCE)
         self._running.clear()
+        self._attempt = None
         if self._mine:
             self._ray.shutdown()
             self._mine = False

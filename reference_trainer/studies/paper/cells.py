@@ -21,7 +21,7 @@ from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedMod
 from reference_trainer.runs.engines.engine import Failure, Task, attempt
 from reference_trainer.runs.folder import folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
-from reference_trainer.runs.run import load_run, model_of
+from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.paper.claims import Claim, Setting
@@ -205,13 +205,13 @@ def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, dev
         log = [json.loads(line) for line in (run / LOG_NAME).read_text("utf-8").splitlines()]
         row["path"] = {str(sixth): each["ca/test"] for sixth, each in enumerate(log[:SIXTHS], start=1)}
     if cell.needs & {"renders", "depth"}:
-        trainer = load_run(run, device)
-        model, views = model_of(trainer), [view.to(device) for view in trainer.scene.test]
-        with threads_for(trainer.scene.pixels):
+        model, scene = of_run(run, device)
+        views = [view.to(device) for view in scene.test]
+        with threads_for(scene.pixels):
             if "renders" in cell.needs:
                 row["renders"] = _mean([renders(model, view, cell.seed) for view in views])
             if "depth" in cell.needs:
-                truth = None if views[0].depth is not None else model_of(load_run(dense, device))
+                truth = None if views[0].depth is not None else of_run(dense, device)[0]
                 row["depth"] = _mean([depths(model, view, truth) for view in views])
     return {**_rounded(row), **origin}
 

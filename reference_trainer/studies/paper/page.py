@@ -55,7 +55,7 @@ def differences(check: Check, scene: str, kept: Kept) -> list[float]:
 def judged(claim: Claim, kept: Kept) -> dict[str, tuple[int, Verdict]]:
     """Return, for every scene with measurements for all checks of a claim, the number of seeds and the verdict."""
     found = {}
-    for scene in kept.scenes:
+    for scene in _tested(claim, kept):
         of = [(check, differences(check, scene, kept)) for check in claim.checks]
         if of and all(seeds for _, seeds in of):
             verdicts = [verdict(seeds, check.low, check.high) for check, seeds in of]
@@ -84,9 +84,9 @@ def claims_table(kept: Kept) -> str:
 def details(name: str, kept: Kept) -> str:
     """Return, for every scene, the table of a claim's settings and its checks; "" if nothing is measured."""
     claim, parts = CLAIMS[name], []
-    for scene in kept.scenes:
+    for scene in _tested(claim, kept):
         found = {}
-        for setting in claim.settings if scene in claim.scenes or scene not in SCENES else ():
+        for setting in claim.settings:
             if of := [row for row in kept.of(scene, setting).values() if claim.needs <= row.keys()]:
                 found[_name(setting, kept)] = of
         if len(found) >= min(2, len(claim.settings)):
@@ -108,10 +108,10 @@ def gains(name: str, kept: Kept) -> str:
         plain = {key: x for key, x in setting.items() if key in ("recipe", "views")}
         cells: dict[str, object] = {}
         means = []
-        for scene in kept.scenes if setting != plain else ():
+        for scene in _tested(claim, kept) if setting != plain else ():
             of = differences(Check("test psnr", setting, plain), scene, kept)
             score = differences(Check("test ca_exact_half", setting, plain, relative=True), scene, kept)
-            if len(of) > 1 and (scene in claim.scenes or scene not in SCENES):
+            if len(of) > 1:
                 mean, spread = interval(of)
                 less = f", {100 * statistics.fmean(score):+.0f} %" if score else ""
                 cells[scene] = f"{mean:+.2f} ± {spread:.2f} dB{less}"
@@ -152,6 +152,11 @@ def page(text: str, kept: Kept) -> str:
         return f"{match[1]}{body}{match[5]}"
 
     return _MARKS.sub(made, text)
+
+
+def _tested(claim: Claim, kept: Kept) -> list[str]:
+    """Return the kept scenes that a claim is tested on: those it names, and a user's own."""
+    return [scene for scene in kept.scenes if scene in claim.scenes or scene not in SCENES]
 
 
 def _heading(name: str) -> str:

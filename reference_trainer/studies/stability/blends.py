@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -25,7 +25,7 @@ _LOGITS = (1.0, 10.0, 20.0, 50.0, 100.0)
 _STACKS = (0.01, 0.5, 0.95)
 _RATES = {"0": 0.0, "1e-6": 1e-6, "0.999": 0.999, "1 - 1e-7": 1 - 1e-7}
 _SIGMAS = (1e-6, 1e-3, 0.05, 0.8, 1.0, 10.0)
-_HDR = {"white to HDR background": 0.0, "white to HDR colors and background": 1.0}
+_HDR = {"white to HDR background": False, "white to HDR colors and background": True}
 _SQUARES = "variances are squares, which overflow float32: the score says NOT_FINITE"
 
 
@@ -53,16 +53,19 @@ def blend_cases() -> list[Case]:
         single(_RANDOM, "all dropped", lambda: _masked(torch.zeros(24, dtype=torch.bool))),
         single(_RANDOM, "one left", lambda: _masked(torch.arange(24) == 5)),
         single(_RANDOM, "none dropped", lambda: _masked(torch.ones(24, dtype=torch.bool))),
-        *(single(_RANDOM, f"drop rate {name}", partial(_rate, x)) for name, x in _RATES.items()),
+        *(
+            single(_RANDOM, f"drop rate {name}", partial(of_scene, base_scene(), independent=False, rate=x))
+            for name, x in _RATES.items()
+        ),
         Case(_RANDOM, "sigma of the opacity noise", _noise, _SIGMAS),
         single(_RANDOM, "opacity noise of sigma 0", partial(_noise, 0.0)),
         Case(_RANDOM, "renders K of a score", _renders, (2.0, 100.0, 10_000.0), draws=False),
         single(_RANDOM, "K = 1", partial(_renders, 1.0), refused="the variance of one render", draws=False),
         single(_RANDOM, "no visible pixel: no score, but a reason", partial(_opacities, 0.01)),
-        single(_COLOR, "black background", partial(_colored, 0.0, 0.0)),
+        single(_COLOR, "black background", partial(_colored, False, 0.0)),
         *(
-            Case(_COLOR, name, partial(_colored, x), decades(0, 30, 3), until=1e18, beyond="overflow", note=_SQUARES)
-            for name, x in _HDR.items()
+            Case(_COLOR, name, partial(_colored, hdr), decades(0, 30, 3), until=1e18, beyond="overflow", note=_SQUARES)
+            for name, hdr in _HDR.items()
         ),
         single(_DTYPE, "float16 inputs", lambda: of_scene(base_scene(), dtype=torch.float16)),
         single(_DTYPE, "bfloat16 inputs", lambda: of_scene(base_scene(), dtype=torch.bfloat16)),
@@ -73,7 +76,7 @@ def blend_cases() -> list[Case]:
 
 def _opacities(value: float) -> Probe:
     scene = base_scene()
-    return of_scene(scene.with_(opacities=torch.full_like(scene.opacities, value)))
+    return of_scene(replace(scene, opacities=torch.full_like(scene.opacities, value)))
 
 
 def _logits(value: float) -> Probe:
@@ -82,7 +85,7 @@ def _logits(value: float) -> Probe:
     def measured() -> Quantities:
         points, logits = torch.zeros(1, 3), torch.tensor([value], requires_grad=True)
         model = Gaussians.from_points(points, points, torch.ones(1), sh_degree=0)
-        opacities = dataclasses.replace(model, opacity_logits=logits).opacities
+        opacities = replace(model, opacity_logits=logits).opacities
         (gradient,) = torch.autograd.grad(opacities.sum(), logits)
         return {"alpha": opacities.detach(), "d opacities": gradient}
 
@@ -100,7 +103,7 @@ def _one_plane() -> Probe:
     """Put all Gaussians at one depth: they must be drawn in storage order."""
     camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 38.0, 15.0, 12.7, 32, 24)
     scene = base_scene(camera=camera)
-    return of_scene(scene.with_(means=torch.cat([scene.means[:, :2], torch.full((24, 1), 3.0).double()], dim=1)))
+    return of_scene(replace(scene, means=torch.cat([scene.means[:, :2], torch.full((24, 1), 3.0).double()], dim=1)))
 
 
 def _copies(count: float) -> Probe:
@@ -108,13 +111,13 @@ def _copies(count: float) -> Probe:
     n = int(count)
     scene = base_scene(n)
     same = {name: getattr(scene, name)[:1].expand(n, -1) for name in ("means", "quaternions", "scales")}
-    return of_scene(scene.with_(**same, opacities=torch.full((n,), 0.3, dtype=torch.float64)))
+    return of_scene(replace(scene, **same, opacities=torch.full((n,), 0.3, dtype=torch.float64)))
 
 
 def _nothing() -> Probe:
     """Compare an empty model with its background."""
     scene = base_scene()
-    empty = scene.with_(**{name: getattr(scene, name)[:0] for name in PARAMETERS})
+    empty = replace(scene, **{name: getattr(scene, name)[:0] for name in PARAMETERS})
     image = scene.background.float().double()[:, None, None].expand(3, 24, 32)
     known = dict.fromkeys(("image", "mean", "dropout", "noise"), image)
     known |= {"alpha": torch.zeros_like(image[0]), "variance": torch.zeros_like(image)}
@@ -123,26 +126,17 @@ def _nothing() -> Probe:
 
 
 def _masked(keep: Tensor) -> Probe:
-    scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
-    left = scene.with_(opacities=scene.opacities * keep)
+    scene = base_scene().rounded()
+    left = replace(scene, opacities=scene.opacities * keep)
     return Probe(
         lambda: {"dropout": scene_quantities(scene, torch.float32, keep=keep)["dropout"]},
         lambda: {"dropout": reference_quantities(left)["image"]},
     )
 
 
-def _rate(rate: float) -> Probe:
-    """Set the drop rate of the draw, the moments and the score."""
-    scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
-    return Probe(
-        lambda: scene_quantities(scene, torch.float32, rate=rate),
-        lambda: scene_quantities(scene, torch.float64, rate=rate),
-    )
-
-
 def _noise(sigma: float) -> Probe:
     """Set sigma of the draw, and of the clamped noise's moments and mean opacity for faint to opaque Gaussians."""
-    scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
+    scene = base_scene().rounded()
     grid = torch.cat([torch.logspace(-8, -1, 8), torch.linspace(0.2, 1.0, 9), 1 - torch.logspace(-7, -2, 6)])
 
     def compute(dtype: torch.dtype) -> Quantities:
@@ -177,11 +171,11 @@ def _renders(count: float) -> Probe:
     return Probe(lambda: score(torch.float32), lambda: score(torch.float64))
 
 
-def _colored(share: float, background: float) -> Probe:
-    """Set the background and, with a share other than 0, scale the colors by it."""
+def _colored(hdr: bool, background: float) -> Probe:
+    """Set the background; for HDR colors, scale them by it."""
     scene = base_scene()
     behind = torch.full_like(scene.background, background)
-    return of_scene(scene.with_(background=behind, colors=scene.colors * (background if share else 1.0)))
+    return of_scene(replace(scene, background=behind, colors=scene.colors * (background if hdr else 1.0)))
 
 
 def _short_lists() -> Probe:

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import torch
 
-from reference_trainer.studies.stability.quantities import Quantities, reference_quantities, scene_quantities
+from reference_trainer.studies.stability.quantities import RATE, Quantities, reference_quantities, scene_quantities
 from reference_trainer.studies.stability.scenes import StressScene
 
 __all__ = ["Case", "Probe", "decades", "of_scene", "single"]
@@ -64,16 +64,21 @@ def decades(first: int, last: int, step: int = 1) -> tuple[float, ...]:
     return tuple(float(f"1e{k}") for k in range(first, last + 1, step))
 
 
-def of_scene(scene: StressScene, *, dtype: torch.dtype = torch.float32, independent: bool = True) -> Probe:
+def of_scene(
+    scene: StressScene, *, dtype: torch.dtype = torch.float32, independent: bool = True, rate: float = RATE
+) -> Probe:
     """Compare everything computed from a scene with float64, at inputs that both precisions represent exactly.
 
     Args:
         scene: what to render; it is first rounded to ``dtype``, except for the pose.
         dtype: of the computation.
         independent: compare image, alpha and gradients with the independent renderer, not with the same one in float64.
+        rate: of dropout, in the draw, the moments and the score.
     """
-    scene = scene.to(dtype, camera=torch.float64).to(torch.float64)
+    scene = scene.rounded(dtype)
     return Probe(
-        lambda: scene_quantities(scene, dtype),
-        lambda: reference_quantities(scene) if independent else scene_quantities(scene, torch.float64),
+        lambda: scene_quantities(scene, dtype, rate=rate),
+        lambda: (
+            reference_quantities(scene, rate=rate) if independent else scene_quantities(scene, torch.float64, rate=rate)
+        ),
     )

@@ -63,26 +63,26 @@ def geometry_cases() -> list[Case]:
 def _axes(a: float, b: float, c: float, *, independent: bool = True) -> Probe:
     """Give all Gaussians the same axis lengths; their orientations are random."""
     axes = torch.tensor([[a, b, c]], dtype=torch.float64)
-    return of_scene(base_scene().with_(scales=axes.expand(24, 3)), independent=independent)
+    return of_scene(replace(base_scene(), scales=axes.expand(24, 3)), independent=independent)
 
 
 def _scaled(factor: float) -> Probe:
     scene = base_scene()
-    return of_scene(scene.with_(scales=scene.scales * factor))
+    return of_scene(replace(scene, scales=scene.scales * factor))
 
 
 def _quaternions(norm: float) -> Probe:
     scene = base_scene()
-    return of_scene(scene.with_(quaternions=scene.quaternions / scene.quaternions.norm(dim=1, keepdim=True) * norm))
+    return of_scene(replace(scene, quaternions=scene.quaternions / scene.quaternions.norm(dim=1, keepdim=True) * norm))
 
 
 def _no_rotation() -> Probe:
     """Compare zero quaternions with the identity; their gradient is defined as 0."""
-    scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
+    scene = base_scene().rounded()
     zero = torch.zeros_like(scene.quaternions)
-    identity = scene.with_(quaternions=zero + torch.tensor([1.0, 0, 0, 0], dtype=torch.float64))
+    identity = replace(scene, quaternions=zero + torch.tensor([1.0, 0, 0, 0], dtype=torch.float64))
     return Probe(
-        lambda: scene_quantities(scene.with_(quaternions=zero), torch.float32),
+        lambda: scene_quantities(replace(scene, quaternions=zero), torch.float32),
         lambda: {**reference_quantities(identity), "d quaternions": zero},
     )
 
@@ -93,7 +93,7 @@ def _replaced(point: Tensor, scale: float, scene: StressScene) -> Probe:
     means, scales = scene.means.clone(), scene.scales.clone()
     means[0] = pose[:3, :3].T @ (point - pose[:3, 3])
     scales[0] = scale
-    return of_scene(scene.with_(means=means, scales=scales))
+    return of_scene(replace(scene, means=means, scales=scales))
 
 
 def _at_depth(depth: float) -> Probe:
@@ -101,7 +101,7 @@ def _at_depth(depth: float) -> Probe:
     camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 38.0, 15.0, 12.7, 32, 24)
     scene = base_scene(camera=camera)
     ahead = scene.means + torch.tensor([0.0, 0, 3], dtype=torch.float64)
-    return _replaced(torch.tensor([0.01, -0.02, depth], dtype=torch.float64), 0.02, scene.with_(means=ahead))
+    return _replaced(torch.tensor([0.01, -0.02, depth], dtype=torch.float64), 0.02, replace(scene, means=ahead))
 
 
 def _on_border() -> Probe:
@@ -111,7 +111,7 @@ def _on_border() -> Probe:
     depths = 2.0 + 0.125 * torch.arange(8, dtype=torch.float64)
     slopes = (torch.tensor(pixels, dtype=torch.float64) - torch.tensor([16.0, 12.0])) / 32.0
     means = torch.cat([slopes * depths[:, None], depths[:, None]], dim=1)
-    return of_scene(base_scene(8, camera=camera).with_(means=means))
+    return of_scene(replace(base_scene(8, camera=camera), means=means))
 
 
 def _beside(pixels: float, sigma: float | None = None) -> Probe:
@@ -128,16 +128,16 @@ def _far(factor: float) -> Probe:
     pose = scene.camera.world_to_camera.clone()
     pose[:3, 3] *= factor
     camera = replace(scene.camera, world_to_camera=pose)
-    return of_scene(scene.with_(means=scene.means * factor, scales=scene.scales * factor, camera=camera))
+    return of_scene(replace(scene, means=scene.means * factor, scales=scene.scales * factor, camera=camera))
 
 
 def _offset(offset: float) -> Probe:
     """Shift scene and camera in the world; the reference stays unrounded, because float32's rounding is the subject."""
-    scene = base_scene().to(torch.float32, camera=torch.float64).to(torch.float64)
+    scene = base_scene().rounded()
     shift = offset * torch.tensor([1.0, -0.7, 0.4], dtype=torch.float64)
     pose = scene.camera.world_to_camera.clone()
     pose[:3, 3] -= pose[:3, :3] @ shift
-    moved = scene.with_(means=scene.means + shift, camera=replace(scene.camera, world_to_camera=pose))
+    moved = replace(scene, means=scene.means + shift, camera=replace(scene.camera, world_to_camera=pose))
     return Probe(lambda: scene_quantities(moved, torch.float32), lambda: reference_quantities(moved))
 
 
@@ -146,7 +146,7 @@ def _telephoto(focal: float) -> Probe:
     scene = base_scene(camera=Camera(torch.eye(4, dtype=torch.float64), focal, focal, 15.0, 12.7, 32, 24))
     across = torch.tensor([40.0 / focal, 40.0 / focal, 1.0], dtype=torch.float64)
     means = scene.means * across + torch.tensor([0.0, 0, 3], dtype=torch.float64)
-    return of_scene(scene.with_(means=means, scales=scene.scales * min(40.0 / focal, 4.0)))
+    return of_scene(replace(scene, means=means, scales=scene.scales * min(40.0 / focal, 4.0)))
 
 
 def _backs_away(focal: float) -> Probe:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from reference_trainer.studies.stability.baseline import render_simply
 from reference_trainer.studies.stability.scenes import PARAMETERS, StressScene
 
 __all__ = [
-    "IMAGES", "SCENE_QUANTITIES", "Quantities",
+    "IMAGES", "RATE", "SCENE_QUANTITIES", "Quantities",
     "independent_images", "loss_weights", "reference_quantities", "scene_quantities", "splats_of",
 ]  # fmt: skip
 
@@ -26,11 +27,13 @@ _GRADIENTS = tuple(f"d {name}" for name in PARAMETERS)
 IMAGES = ("image", "alpha", *_GRADIENTS)
 SCENE_QUANTITIES = (*IMAGES, "mean", "variance", "d variance", "CA", "dropout", "noise")
 
-_RATE, _SIGMA, _SEED = 0.3, 0.5, 7
+RATE = 0.3
+"""Rate of dropout, unless a case sets another."""
+_SIGMA, _SEED = 0.5, 7
 
 
 def scene_quantities(
-    scene: StressScene, dtype: torch.dtype, *, rate: float = _RATE, sigma: float = _SIGMA, keep: Tensor | None = None
+    scene: StressScene, dtype: torch.dtype, *, rate: float = RATE, sigma: float = _SIGMA, keep: Tensor | None = None
 ) -> Quantities:
     """Compute image, gradients, exact moments, score, and renders under one draw of dropout and of noise.
 
@@ -46,22 +49,21 @@ def scene_quantities(
     """
     scene = scene.to(dtype, camera=torch.float64)
     n = scene.means.shape[0]
-    parameters = _leaves(scene)
-    out = draw(splats_of(scene, parameters), background=scene.background)
+    leaves = _leaves(scene)
+    out = draw(splats_of(leaves), background=scene.background)
     result = {"image": out.image.detach(), "alpha": out.alpha.detach()}
-    result |= _gradients(_loss(out.image, out.alpha, scene.camera), parameters, _GRADIENTS)
+    result |= _gradients(_loss(out.image, out.alpha, scene.camera), leaves.parameters, _GRADIENTS)
 
     multiplier = Multiplier.dropout(rate)
-    parameters = _leaves(scene)
-    moments = render_moments(splats_of(scene, parameters), multiplier, background=scene.background)
-    assert moments.alpha_mean is not None
+    leaves = _leaves(scene)
+    moments = render_moments(splats_of(leaves), multiplier, background=scene.background)
     result |= {"mean": moments.mean.detach(), "variance": moments.variance.detach()}
     loss = _loss(moments.variance, moments.alpha_mean, scene.camera)
-    result |= _gradients(loss, {"means": parameters["means"]}, ["d variance"])
+    result |= _gradients(loss, [leaves.means], ["d variance"])
 
     def exact(opacity: Tensor, view: None, multiplier: Multiplier, background: Tensor | None) -> object:
         behind = scene.background if background is None else background
-        return render_moments(splats_of(scene.with_(opacities=opacity)), multiplier, background=behind)
+        return render_moments(splats_of(replace(scene, opacities=opacity)), multiplier, background=behind)
 
     score = CAScore(exact=exact, drop_rate=rate, threshold=0.5)(scene.opacities, None)
     result["CA"] = torch.tensor([score.value], dtype=torch.float64)
@@ -71,29 +73,28 @@ def scene_quantities(
     noise = draw_opacity_noise(n, sigma, generator=torch.Generator().manual_seed(_SEED))
     drawn = {"dropout": apply_dropout(scene.opacities, keep), "noise": apply_opacity_noise(scene.opacities, noise)}
     for name, opacities in drawn.items():
-        result[name] = draw(splats_of(scene.with_(opacities=opacities)), background=scene.background).image
+        result[name] = draw(splats_of(replace(scene, opacities=opacities)), background=scene.background).image
     return result
 
 
-def reference_quantities(scene: StressScene) -> Quantities:
+def reference_quantities(scene: StressScene, *, rate: float = RATE) -> Quantities:
     """Compute the same in float64, with image, alpha and gradients by the independent renderer `render_simply`.
 
     Returns:
         `SCENE_QUANTITIES`. Moments, score and draws are those of the package's renderer in float64.
     """
-    return {**scene_quantities(scene, torch.float64), **independent_images(scene)}
+    return {**scene_quantities(scene, torch.float64, rate=rate), **independent_images(scene)}
 
 
 def independent_images(scene: StressScene) -> Quantities:
     """Compute `IMAGES` in float64 with `render_simply`; a fourth color channel of ones gives alpha."""
-    scene = scene.to(torch.float64)
-    parameters = _leaves(scene)
-    means, quaternions, scales, opacities, colors = parameters.values()
+    scene = _leaves(scene.to(torch.float64))
+    means, quaternions, scales, opacities, colors = scene.parameters
     columns = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1)
     sums = render_simply(means, quaternions, scales, opacities, columns, scene.camera)
     image, alpha = sums[:3] + (1 - sums[3]) * scene.background[:, None, None], sums[3]
     result = {"image": image.detach(), "alpha": alpha.detach()}
-    return result | _gradients(_loss(image, alpha, scene.camera), parameters, _GRADIENTS)
+    return result | _gradients(_loss(image, alpha, scene.camera), scene.parameters, _GRADIENTS)
 
 
 def loss_weights(camera: Camera) -> Tensor:
@@ -106,17 +107,14 @@ def loss_weights(camera: Camera) -> Tensor:
     return torch.randint(-20, 45, (4, camera.height, camera.width), generator=generator).double() / 64
 
 
-def splats_of(scene: StressScene, parameters: Mapping[str, Tensor] | None = None) -> Splats:
-    """Project the Gaussians of a scene, or other ones in their place."""
-    means, quaternions, scales, opacities, colors = (
-        getattr(scene, name) if parameters is None else parameters[name] for name in PARAMETERS
-    )
-    return splat(means, quaternions, scales, opacities, scene.camera, colors=colors)
+def splats_of(scene: StressScene) -> Splats:
+    """Project the Gaussians of a scene."""
+    return splat(scene.means, scene.quaternions, scene.scales, scene.opacities, scene.camera, colors=scene.colors)
 
 
-def _leaves(scene: StressScene) -> dict[str, Tensor]:
-    """Return copies of a scene's parameters that require gradients."""
-    return {name: getattr(scene, name).clone().requires_grad_() for name in PARAMETERS}
+def _leaves(scene: StressScene) -> StressScene:
+    """Return the scene with copies of its parameters that require gradients."""
+    return replace(scene, **{name: getattr(scene, name).clone().requires_grad_() for name in PARAMETERS})
 
 
 def _loss(image: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
@@ -124,9 +122,8 @@ def _loss(image: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
     return (image * weights[:3]).sum() + (alpha * weights[3]).sum()
 
 
-def _gradients(loss: Tensor, parameters: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+def _gradients(loss: Tensor, leaves: Sequence[Tensor], names: Sequence[str]) -> dict[str, Tensor]:
     """Return the gradients of a loss by name, 0 for what it does not depend on."""
-    leaves = [*parameters.values()]
     if not loss.requires_grad:
         return dict(zip(names, map(torch.zeros_like, leaves), strict=True))
     with torch.autocast("cpu", enabled=False):  # as PyTorch recommends for backward passes

@@ -40,14 +40,19 @@ class StressScene:
     background: Tensor
     camera: Camera
 
-    def with_(self, **changes: object) -> StressScene:
-        """Return the scene with some fields replaced."""
-        return replace(self, **changes)  # type: ignore[arg-type]
+    @property
+    def parameters(self) -> list[Tensor]:
+        """The Gaussians' tensors, by `PARAMETERS`."""
+        return [getattr(self, name) for name in PARAMETERS]
 
     def to(self, dtype: torch.dtype, *, camera: torch.dtype | None = None) -> StressScene:
         """Return the scene in another dtype; ``camera`` is that of the camera's pose, if it differs."""
         tensors = {x.name: getattr(self, x.name).to(dtype) for x in fields(self) if x.name != "camera"}
         return StressScene(**tensors, camera=self.camera.to(dtype=camera or dtype))
+
+    def rounded(self, dtype: torch.dtype = torch.float32) -> StressScene:
+        """Return the scene in float64, with all but the pose rounded to a dtype."""
+        return self.to(dtype, camera=torch.float64).to(torch.float64)
 
 
 def camera_of(width: int = 32, height: int = 24, *, focal: float = 40.0, distance: float = _DISTANCE) -> Camera:
@@ -59,19 +64,18 @@ def camera_of(width: int = 32, height: int = 24, *, focal: float = 40.0, distanc
     return Camera(pose, focal, 0.95 * focal, 0.47 * width, 0.53 * height, width, height)
 
 
-def base_scene(n: int = 24, *, camera: Camera | None = None, seed: int = _SEED) -> StressScene:
+def base_scene(n: int = 24, *, camera: Camera | None = None) -> StressScene:
     """Draw n ordinary Gaussians around the origin, float64.
 
     Args:
         n: number of Gaussians.
         camera: the view, by default 32 x 24 pixels from a distance of 3.
-        seed: of the draw.
 
     Example:
         >>> base_scene(5).means.shape
         torch.Size([5, 3])
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(_SEED)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
@@ -93,4 +97,4 @@ def stack(n: int, opacity: float, *, spacing: float = 1e-3) -> StressScene:
     means = torch.zeros(n, 3, dtype=torch.float64)
     means[:, 2] = 2.0 + spacing * torch.arange(n, dtype=torch.float64)
     opacities = torch.full((n,), opacity, dtype=torch.float64)
-    return scene.with_(means=means, scales=scene.scales + 0.5, opacities=opacities)
+    return replace(scene, means=means, scales=scene.scales + 0.5, opacities=opacities)

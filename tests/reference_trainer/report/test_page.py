@@ -13,13 +13,14 @@ from browser import CHROMIUM, Page
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.shares import blend_weights, colored_by, mean_shares, share_per_weight
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.report import page as page_module
 from reference_trainer.report.findings import find
 from reference_trainer.report.page import write_report
-from reference_trainer.runs.folder import CHECKPOINT, CONFIG, claim
+from reference_trainer.runs.folder import CHECKPOINT, CONFIG, run_settings
 from reference_trainer.runs.measure import of_run
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
@@ -114,7 +115,7 @@ def test_the_views_come_with_their_pictures(pair):
         "train train_0",
         "train train_2",
     ]
-    model, scene, _ = of_run(runs[1])
+    model, scene = of_run(runs[1])
     for view, entry in zip(two_of_each(scene), page.data["views"], strict=True):
         pose = np.array(entry["pose"]).reshape(3, 4)
         np.testing.assert_array_equal(pose, view.camera.world_to_camera[:3].numpy())
@@ -129,7 +130,7 @@ def test_the_views_come_with_their_pictures(pair):
 def test_the_models_are_those_of_the_runs(pair):
     runs, page = pair
     for run, packed in zip(runs, page.data["runs"], strict=True):
-        model, scene, _ = of_run(run)
+        model, scene = of_run(run)
         gaussians, n = model.gaussians, len(model.gaussians)
         table = array(packed["geometry"], "<f4", n, 16)
         np.testing.assert_array_equal(table[:, :3], gaussians.means)
@@ -159,7 +160,7 @@ def unfinished(folder: Path, options: SceneOptions, config: TrainConfig) -> Trai
     trainer = Trainer(options.load(), config)
     trainer.train(until=4)
     trainer.save(folder / CHECKPOINT)
-    write_json(folder / CONFIG, claim(options, config))
+    write_json(folder / CONFIG, run_settings(options, config))
     return trainer
 
 
@@ -183,6 +184,17 @@ def test_what_a_run_lacks_is_left_out_with_a_word(tmp_path, options, short, opac
         assert ("co-adaptation" in view["pictures"][0]) == (opacity == 0.9)
     assert bool(page.data["attribution"]) == (opacity == 0.9)
     assert ("mine: no co-adaptation: none of the" in notes) == (opacity != 0.9)
+
+
+def test_a_damaged_log_is_told_from_none(tmp_path):
+    for name, content in (("damaged", '{"step": "x"}\n'), ("none", None)):
+        (tmp_path / name).mkdir()
+        if content:
+            (tmp_path / name / LOG_NAME).write_text(content)
+    figure, notes = page_module._dynamics({name: tmp_path / name for name in ("damaged", "none")})
+    assert figure == ""
+    assert re.match(r"damaged: no CA and PSNR against the step: .*ca\.jsonl, line 1, is no measurement ", notes[0])
+    assert notes[1] == "none: no CA and PSNR against the step, because nothing was measured while it trained."
 
 
 def test_opacities_that_depend_on_the_camera_are_drawn_plain(tmp_path, options, short):
@@ -275,7 +287,7 @@ def test_a_browser_shows_what_the_renderer_draws(turned, opened):
     found = [of_run(run) for run in runs]
     for number, view in enumerate(two_of_each(found[0][1])):
         drawn = shown(opened, f"$('from').value = {number}; $('from').onchange()")
-        for (model, _, _), picture in zip(found, drawn, strict=True):
+        for (model, _), picture in zip(found, drawn, strict=True):
             assert_drawn(picture, model, view)
 
 
@@ -289,7 +301,7 @@ def test_a_browser_shows_the_heat_and_hides_what_co_adapts_most(turned, opened):
     plain = shown(opened, "$('from').value = 0; $('from').onchange(); $('color').click()")
     for hidden in (0, 30):
         drawn = shown(opened, f"$('heat').click(); $('hide').value = {hidden}")
-        for (model, _, _), picture, color in zip(found, drawn, plain, strict=True):
+        for (model, _), picture, color in zip(found, drawn, plain, strict=True):
             values = share_per_weight(mean_shares(model, views)[0], blend_weights(model, views))
             kept = values.argsort().argsort() < len(values) - len(values) * hidden // 100
             assert int(kept.sum()) == pytest.approx((1 - hidden / 100) * len(values), abs=1)

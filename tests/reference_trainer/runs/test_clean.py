@@ -16,7 +16,7 @@ def rows(means: torch.Tensor) -> list[tuple[float, ...]]:
 
 
 def test_those_that_co_adapt_most_for_what_they_contribute_go(run, options, tmp_path):
-    model, scene, _ = of_run(run[0])
+    model, scene = of_run(run[0])
     said: list[str] = []
     found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.3, refine=0, say=said.append)
     cleaned = load_ply(tmp_path / "c.ply")

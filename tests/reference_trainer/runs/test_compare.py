@@ -8,6 +8,7 @@ import pytest
 import sweep_tasks
 import torch
 from stand_ins.engine import Here
+from subprocesses import PYTHONPATH
 
 from ca_reg.monitor import LOG_NAME
 from reference_trainer.cli.drawing import Drawing
@@ -27,6 +28,7 @@ from reference_trainer.runs.measure import render_run
 from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import PointCloud
 from reference_trainer.training.config import TrainConfig
 
 
@@ -134,7 +136,8 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
     [({"loss": "pearson"}, "--depth"), ({"fields": 2, "loss": "co_regularization"}, "no initial point")],
 )
 def test_what_a_scene_lacks_is_said_once_before_any_run(changes, lacking, tmp_path, monkeypatch):
-    scene = dataclasses.replace(synthetic_scene(width=32, height=24, points=9), points=None)
+    nothing = PointCloud(torch.empty(0, 3), torch.empty(0, 3), "nowhere")
+    scene = dataclasses.replace(synthetic_scene(width=32, height=24, points=9), points=nothing)
     monkeypatch.setattr(SceneOptions, "load", lambda self: scene)
     engine = Here()
     with pytest.raises(ValueError, match=lacking):
@@ -281,8 +284,7 @@ def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_
     """The worker of seed 1 is killed at its first checkpoint; a second call starts no worker and writes no run."""
     if name == "ray":
         pytest.importorskip("ray")
-    tests = Path(sweep_tasks.__file__).parent
-    monkeypatch.setenv("PYTHONPATH", f"{tests.parent}:{tests}")  # Ray passes it to its workers
+    monkeypatch.setenv("PYTHONPATH", PYTHONPATH)  # Ray passes it to its workers
     monkeypatch.setattr(os, "cpu_count", lambda: 2)  # one thread for each of two workers: the bits depend on it
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr("reference_trainer.runs.grid.train_run", sweep_tasks.train_and_be_killed_once)

@@ -130,7 +130,7 @@ def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, opti
     with pytest.raises(FolderInUseError):
         run_experiment(options, short, tmp_path, monitor_every=0)
     assert (tmp_path / CHECKPOINT).read_bytes() == before
-    model, _, _ = of_run(tmp_path)  # who only reads is not kept out
+    model, _ = of_run(tmp_path)  # who only reads is not kept out
     assert len(model.gaussians) > 0
     end(process)
     said = []

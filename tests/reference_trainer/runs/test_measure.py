@@ -26,8 +26,7 @@ def test_the_flag_of_the_evaluation_and_that_of_the_training_are_the_same(run, s
     (plain, before), (out, results) = run, scaled
     one, other = (load_ply(folder / PLY).gaussians for folder in (plain, out))
     assert all(torch.equal(x, y) for (_, x), (_, y) in zip(one.named(), other.named(), strict=True))
-    model, scene, default = of_run(plain, regularizer="dropout(0.2) + noise(0.3, scale=True)")
-    assert default == plain / "evaluation_dropout_0.2_noise_0.3_scale=True"
+    model, scene = of_run(plain, regularizer="dropout(0.2) + noise(0.3, scale=True)")
     measure(model, both(scene), tmp_path, about={}, say=lambda text: None)
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]
@@ -48,6 +47,13 @@ def test_the_monitor_and_the_pictures_use_the_same_opacities(scaled, tmp_path):
         assert path.read_bytes() == (out / "views" / "test" / path.name).read_bytes()
 
 
+def test_the_monitor_counts_the_pixels_inside_the_masks(masked, tmp_path):
+    results = run_experiment(masked, TrainConfig(iterations=1), tmp_path)
+    (line,) = (tmp_path / "ca.jsonl").read_text().splitlines()
+    for split in ("train", "test"):
+        assert json.loads(line)[f"psnr/{split}"] == pytest.approx(results["mean"][split]["psnr"])
+
+
 def test_noise_alone_has_a_ply_for_viewers_too(options, tmp_path):
     config = TrainConfig(iterations=1, regularizer="noise(0.8, clip=True, scale=True)")
     run_experiment(options, config, tmp_path, monitor_every=0)
@@ -63,8 +69,7 @@ def test_a_run_is_not_rendered_as_if_trained_with_nonsense(run):
 
 def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):
     out, results = run
-    model, scene, default = of_run(out)
-    assert default == out / "evaluation"
+    model, scene = of_run(out)
     said: list[str] = []
     measure(model, both(scene), tmp_path / "new", about={"scene": "a name"}, say=said.append)
     found = json.loads((tmp_path / "new" / "evaluation.json").read_text())
@@ -78,7 +83,7 @@ def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):
 
 
 def test_the_seed_decides_the_masks(run, tmp_path):
-    model, scene, _ = of_run(run[0])
+    model, scene = of_run(run[0])
     views = {"train": scene.train[:1]}
     one, same, other = (
         measure(model, views, tmp_path, about={}, samples=3, seed=seed, say=lambda text: None) for seed in (0, 0, 1)

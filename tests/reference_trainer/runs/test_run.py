@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from ca_reg.monitor import LOG_NAME
-from reference_trainer.evaluation.tables import summary
+from reference_trainer.evaluation.tables import evaluation_table, summary
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import run as run_module
-from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, CONFIG, PLAN, PLY, RESULTS
+from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, CONFIG, PLAN, PLY, RESULTS, read_results
 from reference_trainer.runs.run import load_run, model_of, run_experiment
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
@@ -22,6 +22,17 @@ from reference_trainer.training.plan import Plan
 from reference_trainer.training.trainer import Trainer
 
 EVERY = {"monitor_every": 3, "checkpoint_every": 4}
+WHOLE = {
+    "config": {"seed": 0},
+    "gaussians": 1,
+    "seconds": 1.0,
+    "mean": {"train": {}},
+    "views": [{"name": "a", "split": "train"}],
+}
+DAMAGED = ("[]", '{"mean": {}}', *(json.dumps(WHOLE | change) for change in (
+    {"mean": {}}, {"mean": {"train": {"psnr": "x"}}}, {"views": []}, {"views": [{"name": "a"}]}, {"gaussians": 10**99},
+    {"config": {}}, {"seconds": None},
+)))  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +161,7 @@ def test_leftovers_of_a_killed_run_are_removed(options, short, tmp_path):
         (CONFIG, "{", r"config\.json is not valid JSON"),
         (CONFIG, "{}", r"config\.json is not the config\.json of a run"),
         (CONFIG, '{"scene": {}, "config": {"dropout": "much"}}', r"config\.json, config: dropout must be float, got"),
-        (RESULTS, "[]", r"results\.json does not hold the results of a run: delete it"),
+        *((RESULTS, content, r"results\.json does not hold the results of a run: delete it") for content in DAMAGED),
     ],
 )
 def test_damaged_files_are_named(finished, options, short, tmp_path, file, content, said):
@@ -161,6 +172,14 @@ def test_damaged_files_are_named(finished, options, short, tmp_path, file, conte
     if file == CONFIG:
         with pytest.raises(ValueError, match=said):
             load_run(tmp_path / "run")
+
+
+def test_results_of_a_version_without_a_score_are_read_and_shown(tmp_path):
+    (tmp_path / RESULTS).write_text(json.dumps(WHOLE))
+    results = read_results(tmp_path)
+    assert results == WHOLE
+    assert "| train | n/a |" in summary(results)
+    assert "| mean train | n/a |" in evaluation_table(results)
 
 
 def test_a_damaged_plan_is_named(options, short, tmp_path):

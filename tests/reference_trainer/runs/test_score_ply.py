@@ -42,7 +42,7 @@ def test_a_baked_ply_is_not_scaled_twice(run, options):
     scene = options.load()
     baked, facts = of_ply(out / BAKED_PLY, background=scene.background)  # it says its rate itself
     plain, _ = of_ply(out / PLY, background=scene.background, regularizer="dropout(0.2)")
-    trained, _, _ = of_run(out)
+    trained, _ = of_run(out)
     assert (facts.opacity_scale, facts.for_rendering) == (0.8, False)
     assert "0.8 baked in, taken out for CA; trained with: dropout(0.2)" in str(facts)
     assert baked.factor == plain.factor == trained.factor == 0.8
@@ -50,10 +50,10 @@ def test_a_baked_ply_is_not_scaled_twice(run, options):
     with pytest.raises(ValueError, match=r"was scaled for dropout 0\.2, not for dropout\(0\.5\)"):
         of_ply(out / BAKED_PLY, background=scene.background, regularizer="dropout(0.5)")
     for view in scene.test:
-        images = [model.rendering(model.test_opacities, view).image for model in (baked, plain, trained)]
+        images = [model.render(model.test_opacities, view)[0] for model in (baked, plain, trained)]
         torch.testing.assert_close(images[0], images[2], rtol=0, atol=1e-5)
         assert torch.equal(images[1], images[2])
-        unscaled = trained.rendering(trained.gaussians.opacities, view).image
+        unscaled = trained.render(trained.gaussians.opacities, view)[0]
         assert (unscaled - images[2]).abs().max() > 1e-3
 
 
@@ -72,7 +72,7 @@ def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options,
     torch.testing.assert_close(model.test_opacities, trained.test_opacities, rtol=0, atol=1e-6)
     assert model.ca_score().settings == trained.ca_score().settings
     for view, scores in zip(scene.test, results["views"][3:], strict=True):
-        image = model.rendering(model.test_opacities, view).image.clamp(0, 1)
+        image = model.render(model.test_opacities, view)[0].clamp(0, 1)
         assert psnr(image, view.image) == pytest.approx(scores["psnr"], abs=1e-3)
     save_for_viewers(of_run(run[0])[0], tmp_path / "dropout.ply")
     assert (tmp_path / "dropout.ply").read_bytes() == (run[0] / BAKED_PLY).read_bytes()
@@ -98,6 +98,13 @@ def test_what_the_caller_says_comes_first(tmp_path):
     save_ply(ball(), tmp_path / "b.ply", regularizer="dropout(1.5)")
     with pytest.raises(ValueError, match=r"b\.ply says what it was trained with: .*p must be in .* Give --regularizer"):
         of_ply(tmp_path / "b.ply", background=torch.zeros(3))
+
+
+def test_a_baked_rate_of_many_digits_is_read_as_it_is(tmp_path):
+    save_ply(ball(), tmp_path / "a.ply", bake_p=0.1234567)
+    model, facts = of_ply(tmp_path / "a.ply", background=torch.zeros(3))
+    assert facts.regularizer == "dropout(0.1234567)"
+    torch.testing.assert_close(model.gaussians.opacities, ball().opacities)
 
 
 def test_a_file_without_gaussians(tmp_path):
@@ -229,8 +236,10 @@ def test_a_ply_on_its_scene(run, options, tmp_path):
     assert said[-1] == f"Scores and pictures are in {tmp_path}"
 
 
-def test_a_model_that_fits_no_photograph(tmp_path, options):
+@pytest.mark.parametrize("photographs", ["options", "masked"])  # where the noise beside the masks is no measure
+def test_a_model_that_fits_no_photograph(tmp_path, photographs, request):
     """It is in the pictures, so only the photographs can tell."""
+    options = request.getfixturevalue(photographs)
     points = options.load().points
     right = Gaussians.from_points(points.positions, points.colors, torch.full((len(points.positions),), 0.05),
                                   sh_degree=0, opacity=0.9)  # fmt: skip

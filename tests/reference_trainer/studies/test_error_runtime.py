@@ -18,7 +18,7 @@ from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import run_experiment
-from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.studies import error_runtime as module
 from reference_trainer.studies.error_runtime import (
     DOUBLE,
@@ -38,7 +38,7 @@ from reference_trainer.studies.study import run_study
 BACKGROUND = (0.9, 0.2, 0.4)
 
 
-def made_of(n, width, height, *, size) -> tuple[TrainedModel, View]:
+def made_of(n, width, height, *, size) -> tuple[TrainedModel, Viewpoint]:
     """Opaque Gaussians that cover a part of the picture."""
     s = random_scene(n, width, height, seed=2, size=size)
     opacities = 0.8 + 0.19 * s.opacities
@@ -51,7 +51,7 @@ def made_of(n, width, height, *, size) -> tuple[TrainedModel, View]:
         sh_rest=torch.zeros(n, 0, 3),
     )
     model = TrainedModel(gaussians.map(torch.Tensor.float), torch.tensor(BACKGROUND))
-    return model, View("tiny", s.camera.to(dtype=torch.float32), torch.zeros(3, height, width))
+    return model, Viewpoint("tiny", s.camera.to(dtype=torch.float32))
 
 
 def entry(record, name) -> dict:
@@ -59,7 +59,7 @@ def entry(record, name) -> dict:
 
 
 @pytest.fixture(scope="module")
-def scene() -> tuple[TrainedModel, View]:
+def scene() -> tuple[TrainedModel, Viewpoint]:
     return made_of(9, 14, 11, size=0.45)
 
 
@@ -245,7 +245,7 @@ def test_runs_and_ply_files_are_sources(run, ball, tmp_path, monkeypatch):
     study = error_runtime_study([run, ball], max_samples=16, seeds=1)
     results = run_study(study, tmp_path / "out", say=lambda text: None)
     assert list(results) == ["scene/strategy/seed_0", "ball"]
-    model, scene, _ = of_run(run)
+    model, scene = of_run(run)
     exact = model.exact_ca_score(drop_rate=0.5)(model.gaussians.opacities, scene.test[0])
     assert results["scene/strategy/seed_0"]["view"] == scene.test[0].name
     assert results["scene/strategy/seed_0"]["score"] == pytest.approx(exact.value, rel=1e-4)
@@ -253,6 +253,10 @@ def test_runs_and_ply_files_are_sources(run, ball, tmp_path, monkeypatch):
     assert results["ball"]["covered"] > 0.1
     with Image.open(tmp_path / "out" / "error_runtime.png") as figure:
         assert figure.width > 1.5 * figure.height  # two panels
+
+
+def test_a_ply_is_known_by_its_name(tmp_path):
+    assert list(error_runtime_study([tmp_path / "BALL.PLY"]).cases) == ["BALL"]
 
 
 def test_sources_that_cannot_be_told_apart_or_are_scaled_are_refused(ball, tmp_path):

@@ -48,7 +48,7 @@ def luminance(gaussians: Gaussians) -> torch.Tensor:
 
 def test_the_shares_in_the_file_add_up_to_the_score_that_is_printed(run, study):
     data, out, said = study
-    model, scene, _ = of_run(run)
+    model, scene = of_run(run)
     exact = model.exact_ca_score(drop_rate=0.5)
     values = [exact(model.gaussians.opacities, view).value for view in scene.test]
     assert list(data["views"].values()) == values
@@ -108,9 +108,9 @@ def test_every_view_has_a_picture_of_four_panels(run, study):
 
 
 def test_views_of_the_same_name_in_two_folders_keep_their_pictures(run, tmp_path, monkeypatch):
-    model, scene, _ = of_run(run)
+    model, scene = of_run(run)
     views = tuple(dataclasses.replace(v, name=n) for v, n in zip(scene.test, ("a/r.png", "b/r.png"), strict=False))
-    monkeypatch.setattr(shares_module, "of_run", lambda *a: (model, dataclasses.replace(scene, test=views), run))
+    monkeypatch.setattr(shares_module, "of_run", lambda *a: (model, dataclasses.replace(scene, test=views)))
     study_attribution(run, tmp_path, say=lambda text: None)
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["a_r.png", "b_r.png"]
 
@@ -161,7 +161,7 @@ def test_blend_weights_are_those_of_brute_force():
 
 
 def test_a_view_without_a_score_does_not_count(run):
-    model, scene, _ = of_run(run)
+    model, scene = of_run(run)
     view = scene.test[0]
     pose = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ view.camera.world_to_camera  # turned around
     away = dataclasses.replace(view, camera=dataclasses.replace(view.camera, world_to_camera=pose))
@@ -176,7 +176,7 @@ def test_a_view_without_a_score_does_not_count(run):
 
 
 def test_shares_are_the_mean_over_the_views(run):
-    model, scene, _ = of_run(run)
+    model, scene = of_run(run)
     parts = [mean_shares(model, [view], drop_rate=0.3)[0] for view in scene.train]
     shares, results = mean_shares(model, scene.train, drop_rate=0.3)
     torch.testing.assert_close(shares, torch.stack(parts).mean(0), rtol=1e-12, atol=0)

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import math
+import re
 from contextlib import contextmanager
 
 import numpy as np
@@ -238,6 +239,16 @@ def test_details_show_what_is_measured_and_every_check(kept):
     assert "PSNR: +0.5 (claimed: above 0), undecided" in text
     assert details("9", kept).count("renders") == 0
     assert details("16", kept) == details("1", Kept(kept.folder, "inria")) == ""
+
+
+def test_a_declared_scene_counts_only_where_a_claim_names_it(kept, monkeypatch):
+    for name in ("fern", "lego"):
+        (kept.folder / f"{name}.json").write_text((kept.folder / "a.json").read_text())
+    kept, tested = Kept(kept.folder), dataclasses.replace(CLAIMS["1"], scenes=("fern",))
+    monkeypatch.setitem(CLAIMS, "1", tested)
+    assert judged(tested, kept).keys() == {"fern", "a", "b", "c"}
+    assert re.findall(r"^\*\*(.*)\*\*:", details("1", kept), re.MULTILINE) == ["a", "b", "c", "fern"]
+    assert gains("1", kept).splitlines()[0] == "| setting | mean | a | b | fern |"
 
 
 def test_a_relative_check_divides_by_the_other_figure(kept):

@@ -52,7 +52,7 @@ def test_a_camera_of_the_page_is_the_one_that_was_jumped_to(run):
 def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer, monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(window, "time", SimpleNamespace(monotonic=lambda: clock[0], perf_counter=time.perf_counter))
-    model, scene, _ = of_run(run[0])
+    model, scene = of_run(run[0])
     viewer.show(model, measured_views(scene, print))
     camera = scene.train[0].camera.resized(640, 480)
     client = Client(camera)
@@ -104,7 +104,7 @@ def test_a_training_that_nobody_looks_at_is_left_alone(viewer):
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium, such as Debian's package chromium")
 def test_a_browser_shows_what_was_drawn(run, viewer):
-    model, scene, _ = of_run(run[0])
+    model, scene = of_run(run[0])
     viewer.show(model, measured_views(scene, print))
 
     def picture(page, mode):

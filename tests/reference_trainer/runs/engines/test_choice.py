@@ -28,7 +28,7 @@ def test_without_ray_the_processes_of_this_machine_do(name):
 @pytest.mark.parametrize(("name", "address"), [("ray", None), ("ray", "auto"), ("auto", "10.0.0.1:6379")])
 @pytest.mark.usefixtures("without_ray")
 def test_without_ray_a_cluster_says_what_to_install(name, address):
-    with pytest.raises(ImportError, match=r"pip install 'ca_reg\[ray\]'; --engine processes does without"):
+    with pytest.raises(ImportError, match=r"pip install 'ca_reg\[ray\]'; --executor processes does without"):
         choose_engine(name, jobs=1, address=address)
 
 

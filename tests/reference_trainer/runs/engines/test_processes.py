@@ -9,13 +9,12 @@ from pathlib import Path
 
 import pytest
 import sweep_tasks
+from subprocesses import subprocess_environment
 from waiting import PATIENCE, until
 
 from reference_trainer.runs.engines.engine import Failure, Task, Value
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all
-
-TESTS = Path(sweep_tasks.__file__).parent
 
 
 def gone(pid):
@@ -74,9 +73,8 @@ def test_every_task_has_a_process_with_its_share_of_the_processors(monkeypatch):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_worker_is_interrupted_once_however_its_parent_ends(tmp_path, number):
     """The sweep runs in a session of its own; SIGINT goes to all of its group, as Ctrl-C in a terminal does."""
-    command = [sys.executable, str(TESTS / "sweep_tasks.py"), str(tmp_path)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}
-    sweep = subprocess.Popen(command, env=environment, start_new_session=True, stderr=subprocess.PIPE)
+    command = [sys.executable, sweep_tasks.__file__, str(tmp_path)]
+    sweep = subprocess.Popen(command, env=subprocess_environment(), start_new_session=True, stderr=subprocess.PIPE)
     until((tmp_path / "started").exists)
     worker = int((tmp_path / "started").read_text())
     if number == signal.SIGINT:

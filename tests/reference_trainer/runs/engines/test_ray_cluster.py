@@ -4,18 +4,16 @@ import os
 import signal
 import sys
 import threading
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import sweep_tasks
+from subprocesses import PYTHONPATH
 from waiting import until
 
 from reference_trainer.runs.engines.engine import Failure, Task, Value
 from reference_trainer.runs.engines.ray_cluster import RayCluster
 from reference_trainer.runs.engines.run_all import run_all
-
-TESTS = Path(sweep_tasks.__file__).parent
 
 
 @pytest.fixture(autouse=True)
@@ -117,11 +115,23 @@ def test_what_still_runs_is_interrupted_and_a_cluster_of_the_caller_is_left_runn
     assert stand_in.shut == (0 if joined_before else 1)
 
 
+def test_the_next_sweep_joins_a_cluster_again(monkeypatch):
+    """It may have other machines by then, and the one that ended is not there any more."""
+    stand_in = StandIn([4])
+    engine = engine_on(stand_in, monkeypatch, 2)
+    engine.close()
+    stand_in.asked.clear()
+    stand_in.processors = [8]
+    engine.start(0, Task("task", print, ()))
+    assert stand_in.asked["init"]["address"] == "local"
+    assert stand_in.asked["remote"]["num_cpus"] == 4
+
+
 @pytest.mark.slow
 def test_a_sweep_on_ray_with_a_worker_killed(tmp_path, monkeypatch):
     """One task of four raises, the worker of another is killed in the middle; one tells about itself."""
     ray = pytest.importorskip("ray")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(TESTS.parent), str(TESTS)]))  # Ray passes it to its workers
+    monkeypatch.setenv("PYTHONPATH", PYTHONPATH)  # Ray passes it to its workers
 
     def kill():
         until((tmp_path / "pid").exists)

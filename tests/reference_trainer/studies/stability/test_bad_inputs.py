@@ -27,7 +27,7 @@ def spoiled(x, bad):
 
 
 def drawn(**changes):
-    return scene_quantities(SCENE.with_(**changes), torch.float32)
+    return scene_quantities(dataclasses.replace(SCENE, **changes), torch.float32)
 
 
 def with_camera(**changes):

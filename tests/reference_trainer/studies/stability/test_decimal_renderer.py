@@ -1,5 +1,7 @@
 """Decimal arithmetic against brute force with autograd in float64, where float64 is not in doubt."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from decimal_renderer import exact_images
@@ -35,7 +37,7 @@ def test_splats_behind_the_near_plane_and_below_the_cut_are_left_out():
     means, opacities = scene.means.clone(), scene.opacities.clone()
     means[0] -= 4 * scene.camera.forward
     opacities[1] = 0.003
-    scene = scene.with_(means=means, opacities=opacities)
+    scene = replace(scene, means=means, opacities=opacities)
     _, alpha = brute_force(*(getattr(scene, name) for name in PARAMETERS), scene.camera)
     exact = exact_images(scene)
     torch.testing.assert_close(exact["alpha"], alpha, rtol=0, atol=1e-14)
@@ -45,7 +47,7 @@ def test_splats_behind_the_near_plane_and_below_the_cut_are_left_out():
 
 @pytest.mark.parametrize("opacities", [(0.995, 0.1), (0.98, 0.98, 0.98)])
 def test_opacities_that_are_clamped_or_end_a_pixel_are_refused(opacities):
-    scene = base_scene(len(opacities)).with_(opacities=torch.tensor(opacities).double())
+    scene = replace(base_scene(len(opacities)), opacities=torch.tensor(opacities).double())
     with pytest.raises(ValueError, match="neither clamp an alpha nor end a pixel"):
         exact_images(scene)
 
@@ -54,7 +56,7 @@ def needles(ratio):
     """Three long needles in 16 pixels, with numbers that float32 holds."""
     scene = base_scene(3, camera=camera_of(4, 4, focal=5.0))
     scales = torch.tensor([[0.02 * ratio, 0.02, 0.02]], dtype=torch.float64).expand(3, 3)
-    return scene.with_(scales=scales).to(torch.float32, camera=torch.float64).to(torch.float64)
+    return replace(scene, scales=scales).rounded()
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """What is computed of a scene, against brute force and against the enumeration of all masks."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -37,7 +38,8 @@ def test_the_references_equal_brute_force():
 
 
 def test_moments_and_score_are_those_of_all_masks():
-    scene = base_scene(5, camera=camera_of(10, 8, focal=15.0)).with_(opacities=torch.linspace(0.4, 0.8, 5).double())
+    scene = base_scene(5, camera=camera_of(10, 8, focal=15.0))
+    scene = replace(scene, opacities=torch.linspace(0.4, 0.8, 5).double())
     result = scene_quantities(scene, torch.float64, rate=0.3)
     mean = square = covered = 0.0
     for mask in itertools.product((0.0, 1.0), repeat=5):
