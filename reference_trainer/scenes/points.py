@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from reference_trainer.files import is_ply
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.ply_files import PlyVertices, read_ply
@@ -61,12 +62,12 @@ def choose_points(
         cloud = random_points(train, int(count or RANDOM_POINTS), generator)
         return cloud, f"initial points: {len(cloud.positions):,} random ones{passed}"
     path = path_inside(root, points)
-    if not path.is_dir() and path.suffix != ".ply":
+    if not path.is_dir() and not is_ply(path):
         found = sorted(folder.relative_to(root).as_posix() for folder in colmap_folders(root))
         raise FileNotFoundError(
             f"there is no folder {path} to take points from; choose auto, random or one of {found}."
         )
-    cloud = ply_points(path) if path.suffix == ".ply" else colmap_points(path)
+    cloud = ply_points(path) if is_ply(path) else colmap_points(path)
     if cloud is None:
         raise ValueError(f"{path} has no points to start from; choose another folder or random points.")
     return cloud, f"initial points: {len(cloud.positions):,} from {cloud.source}"
