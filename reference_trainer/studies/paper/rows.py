@@ -93,6 +93,6 @@ class Rows:
             same = ("setting", "seed")
             others = [old for old in self.rows if any(old[name] != row[name] for name in same)]
             self.content["rows"] = [*others, row]
-            head = {name: x for name, x in self.content.items() if name != "rows"}
+            about = [f"{json.dumps(name)}: {json.dumps(x)}, " for name, x in self.content.items() if name != "rows"]
             lines = ",\n".join(json.dumps(each, allow_nan=False) for each in self.rows)
-            write_text(self.file, f'{json.dumps(head)[:-1]}, "rows": [\n{lines}\n]}}\n')
+            write_text(self.file, f'{{{"".join(about)}"rows": [\n{lines}\n]}}\n')
