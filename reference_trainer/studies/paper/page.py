@@ -15,7 +15,7 @@ from reference_trainer.studies.paper.rows import Row, Rows, label, resolved, val
 from reference_trainer.studies.paper.scenes import SCENES
 from reference_trainer.studies.paper.verdict import ERRORS, Verdict, interval, overall, verdict
 
-__all__ = ["Kept", "claims_table", "details", "differences", "gains", "judged", "page", "spreads"]
+__all__ = ["Kept", "claims_table", "details", "differences", "gains", "judged", "page", "scenes_table"]
 
 _TITLES = {
     "test psnr": ("PSNR", 1.0), "test ssim": ("SSIM", 1.0), "test lpips": ("LPIPS", 1.0), "test ca": ("CA", 1e-3),
@@ -30,7 +30,6 @@ _TITLES = {
     "renders mean": ("D: exact mean", 1.0), "depth abs_rel": ("AbsRel", 1.0), "depth rmse": ("RMSE", 1.0),
     "depth mae": ("MAE", 1.0), "depth log10": ("log10", 1.0),
 } | {f"path {sixth}": (f"CA at {sixth}/6", 1e-3) for sixth in range(1, 7)}  # fmt: skip
-_SPREADS = ["scene", "settings", "one training", "difference of two", "seeds for ± 0.1 dB"]
 _MARKS = re.compile(r"(<!-- paper (\w+)(?: ([\w-]+))?(?: (\d+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -128,33 +127,36 @@ def gains(name: str, kept: Kept) -> str:
     return markdown_table(ordered, ["setting", "mean", *sorted(scenes)]) if rows else ""
 
 
-def spreads(kept: Kept) -> str:
-    """Return how far the PSNR of seeds lies apart on every scene, of settings with three seeds or more; "" if of none.
+def scenes_table(kept: Kept) -> str:
+    """Return one row per scene: its trainings, their processor hours, and how far the PSNR of seeds differs.
 
-    Standard deviations are pooled: of one setting's trainings, and of the differences of two settings, seed by seed.
-    The last column is the number of seeds with which two standard errors of such a difference are 0.1 dB.
+    Standard deviations are of settings with three seeds or more, pooled: of the trainings of one setting, and of the
+    differences of two settings, seed by seed. With the number of seeds in the last column, two standard errors of such
+    a difference are 0.1 dB.
     """
-    lines: list[dict[str, object]] = []
+    columns = ["scene", "trainings", "hours", "one training", "difference of two", "seeds for ± 0.1 dB"]
+    lines = []
     for scene, rows in kept.scenes.items():
+        of = [row for row in rows.rows if row["setting"]["iterations"] == kept.iterations]
         found: dict[str, dict[int, float]] = {}
-        for row in rows.rows:
-            if all(row["setting"][name] == getattr(kept, name) for name in ("recipe", "iterations")):
-                found.setdefault(label(row["setting"]), {})[row["seed"]] = value(row, "test psnr")
+        for row in of:
+            found.setdefault(label(row["setting"]), {})[row["seed"]] = value(row, "test psnr")
         several = [seeds for seeds in found.values() if len(seeds) > 2]
         apart = [[a[seed] - b[seed] for seed in a.keys() & b.keys()] for a, b in combinations(several, 2)]
+        cells: list[object] = [scene, len(of), f"{sum(value(row, 'seconds') for row in of) / 3600:.1f}"]
         if variances := [statistics.variance(each) for each in apart if len(each) > 1]:
             one = math.sqrt(statistics.fmean(statistics.variance(seeds.values()) for seeds in several))
             two = math.sqrt(statistics.fmean(variances))
-            figures = len(several), f"{one:.2f} dB", f"{two:.2f} dB", math.ceil((ERRORS * two / 0.1) ** 2)
-            lines.append(dict(zip(_SPREADS, (scene, *figures), strict=True)))
-    return markdown_table(lines, _SPREADS) if lines else ""
+            cells += [f"{one:.2f} dB", f"{two:.2f} dB", math.ceil((ERRORS * two / 0.1) ** 2)]
+        lines.append(dict(zip(columns, cells, strict=False)))
+    return markdown_table(lines, columns)
 
 
 def page(text: str, kept: Kept) -> str:
     """Return the text of a page with everything between its marks regenerated.
 
     The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``. WHAT is ``claims`` for the verdicts,
-    ``spreads`` for those of the seeds, ``details`` or ``gains`` for the claim NAME, ``details`` without a name for all
+    ``scenes`` for `scenes_table`, ``details`` or ``gains`` for the claim NAME, ``details`` without a name for all
     claims, or ``rows`` for all rows of ``NAME.json`` beside the folder, whose entry ``usual`` holds the parts of a
     setting that labels omit. ITERATIONS are by default those of ``kept``.
     """
@@ -162,8 +164,8 @@ def page(text: str, kept: Kept) -> str:
     def made(match: re.Match[str]) -> str:
         what, name = match[2], match[3]
         of = Kept(kept.folder, kept.recipe, int(match[4])) if match[4] else kept
-        if what in ("claims", "spreads"):
-            body = (claims_table if what == "claims" else spreads)(of)
+        if what in ("claims", "scenes"):
+            body = (claims_table if what == "claims" else scenes_table)(of)
         elif what == "rows":
             body = _rows(Rows(kept.folder.parent / f"{name}.json"))
         elif name:

@@ -30,7 +30,7 @@ from reference_trainer.studies.paper import figure as figure_module
 from reference_trainer.studies.paper.cells import Grid, declared, depths, estimate, is_done, renders, rows_of, run_cells
 from reference_trainer.studies.paper.claims import CLAIMS, Check, Claim, chosen
 from reference_trainer.studies.paper.figure import gains_figure
-from reference_trainer.studies.paper.page import Kept, claims_table, details, gains, judged, page, spreads
+from reference_trainer.studies.paper.page import Kept, claims_table, details, gains, judged, page, scenes_table
 from reference_trainer.studies.paper.rows import Rows, config_of, resolved, value
 from reference_trainer.studies.paper.scenes import SCENES, chosen_scenes
 from reference_trainer.studies.paper.verdict import overall, verdict
@@ -231,7 +231,7 @@ def test_gains_are_in_the_order_of_their_mean_and_those_that_lack_a_scene_are_la
     assert gains("11", Kept(kept.folder)) == ""
 
 
-def test_spreads_of_seeds_are_pooled_over_settings_and_pairs(tmp_path):
+def test_the_table_of_scenes_pools_what_seeds_differ_by_over_settings_and_pairs(tmp_path):
     """Values with a variance of 1, 4 and 1 in each setting; of their differences, 1, 0 and 1."""
     rows = Rows(tmp_path / "a.json")
     for name, psnrs in (("dropout(0.1)", (1, 2, 3)), ("dropout(0.2)", (12, 14, 16)), ("noise(0.8)", (7, 8, 9))):
@@ -239,10 +239,10 @@ def test_spreads_of_seeds_are_pooled_over_settings_and_pairs(tmp_path):
             rows.add(row(found, seed, regularizer=name))
     rows.add(row(99.0, regularizer="density"))  # of one seed nothing is known
     Rows(tmp_path / "b.json").add(row(20.0))
-    lines = spreads(Kept(tmp_path)).splitlines()
+    lines = scenes_table(Kept(tmp_path)).splitlines()
     one, two = math.sqrt(6 / 3), math.sqrt(2 / 3)
-    assert lines[2:] == [f"| a | 3 | {one:.2f} dB | {two:.2f} dB | {math.ceil(400 * 2 / 3)} |"]
-    assert spreads(Kept(tmp_path, "inria")) == ""
+    assert lines[2] == f"| a | 10 | 0.2 | {one:.2f} dB | {two:.2f} dB | {math.ceil(400 * 2 / 3)} |"
+    assert lines[3] == "| b | 1 | 0.0 | n/a | n/a | n/a |"
 
 
 def test_details_show_what_is_measured_and_every_check(kept):
