@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -102,29 +103,31 @@ def gains(name: str, kept: Kept) -> str:
     """Return how every setting of a claim differs from the plain training of the same views and recipe; "" if unknown.
 
     Differences are in dB of PSNR with two standard errors, and in percent of the exact score, on every scene with at
-    least two kept seeds. Settings are sorted by the mean over scenes; those that lack a scene come last.
+    least two kept seeds of most settings. Settings are sorted by the mean over scenes; those that lack a scene come
+    last.
     """
-    claim, rows, scenes = CLAIMS[name], list[tuple[int, float, dict[str, object]]](), dict[str, None]()
+    claim, found = CLAIMS[name], dict[str, dict[str, tuple[float, str]]]()
     for setting in claim.settings:
         plain = {key: x for key, x in setting.items() if key in ("recipe", "views")}
-        cells: dict[str, object] = {}
-        means = []
         for scene in _tested(claim, kept) if setting != plain else ():
             of = differences(Check("test psnr", setting, plain), scene, kept)
             score = differences(Check("test ca_exact_half", setting, plain, relative=True), scene, kept)
             if len(of) > 1:
                 mean, spread = interval(of)
                 less = f", {100 * statistics.fmean(score):+.0f} %" if score else ""
-                cells[scene] = f"{mean:+.2f} ± {spread:.2f} dB{less}"
-                means.append(mean)
-        if means:
-            scenes |= dict.fromkeys(cells)
-            average = statistics.fmean(means)
-            rows.append(
-                (len(means), average, {"setting": f"`{_name(setting, kept)}`", "mean": f"{average:+.2f} dB"} | cells)
-            )
+                cell = f"{mean:+.2f} ± {spread:.2f} dB{less}"
+                found.setdefault(_name(setting, kept), {})[scene] = mean, cell
+    counts = Counter(scene for cells in found.values() for scene in cells)
+    scenes = sorted(scene for scene, count in counts.items() if 2 * count >= len(found))
+    rows: list[tuple[int, float, dict[str, object]]] = []
+    for setting_name, cells in found.items():
+        shown = {scene: cells[scene] for scene in scenes if scene in cells}
+        if shown:
+            average = statistics.fmean(mean for mean, _ in shown.values())
+            row: dict[str, object] = {"setting": f"`{setting_name}`", "mean": f"{average:+.2f} dB"}
+            rows.append((len(shown), average, row | {scene: cell for scene, (_, cell) in shown.items()}))
     ordered = [cells for *_, cells in sorted(rows, key=lambda row: row[:2], reverse=True)]
-    return markdown_table(ordered, ["setting", "mean", *sorted(scenes)]) if rows else ""
+    return markdown_table(ordered, ["setting", "mean", *scenes]) if rows else ""
 
 
 def scenes_table(kept: Kept) -> str:
