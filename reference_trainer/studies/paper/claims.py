@@ -195,7 +195,7 @@ CLAIMS = {
                      shows=TIMED, scenes=("synthetic", "fern", "herz-jesu")),
     "further": Claim("further systems, likewise", "", _FURTHER, shows=TIMED, scenes=("synthetic", "fern")),
     "ensembled": Claim("SE-GS, likewise", "", _ENSEMBLED, shows=TIMED, scenes=("synthetic", "fern")),
-    "schemes": Claim("the field's schemes side by side", "", _SCHEMES),
+    "schemes": Claim("the field's schemes side by side", "", _SCHEMES, shows=TIMED),
     "views": Claim("dropout of 0.2 helps with 2 to 17 views", "", (*_VIEWS, *_DROPPED),
                    tuple(_higher(_PSNR, *pair) for pair in zip(_DROPPED, _VIEWS, strict=True)), scenes=_WITH_MORE),
     "many-views": Claim("dropout of 0.2 harms with 24 views and more (UGOD)", "",
