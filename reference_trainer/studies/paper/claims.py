@@ -219,7 +219,7 @@ GAINS: Mapping[str, Mapping[str, Mapping[float, tuple[Setting, Setting]]]] = {
     "scale of opacity noise": {"": {s: (each, _PLAIN) for s, each in _SIGMA.items()}},
     "training views": {
         name: {views: (each, {k: x for k, x in each.items() if k == "views"}) for views, each in of.items()}
-        for name, of in (("dropout 0.1", _BY_VIEWS[0.1]), ("dropout 0.2", _BY_VIEWS[0.2]))
+        for name, of in (("dropout 0.2", _BY_VIEWS[0.2]), ("dropout 0.1", _BY_VIEWS[0.1]))
     },
 }
 """The axes of the figure: for every line, by name, a pair of settings to compare at each position on the axis."""

@@ -13,12 +13,14 @@ from reference_trainer.studies.paper.verdict import interval
 __all__ = ["gains_figure"]
 
 _FIGURES = ("test psnr", "PSNR, dB more than without", 1.0), ("test ca_exact_half", "exact CA at 1/2, % more", 0.01)
+_DASHES = ".-", ".--"
 
 
 def gains_figure(kept: Kept, path: Path) -> None:
     """Draw what is kept of `GAINS`: differences in PSNR and in the exact score, with two standard errors, by scene.
 
-    A line needs at least three points, a column of panels at least one line. A single seed has no error bar.
+    A scene has one color; lines of one scene differ by their dashes. A line needs at least three points, a column of
+    panels at least one line. A single seed has no error bar.
 
     Args:
         kept: the rows.
@@ -34,6 +36,8 @@ def gains_figure(kept: Kept, path: Path) -> None:
         raise ValueError(
             f"{kept.folder} has no setting at three strengths or numbers of views: there is no line to draw."
         )
+    drawn = sorted({scene for of in panels.values() for lines in of for scene, _ in lines})
+    colors = {scene: f"C{number}" for number, scene in enumerate(drawn)}
     with new_figure(path) as figure:
         figure.set_size_inches(1.5 + 4.5 * len(panels), 7)
         grid = figure.subplots(len(_FIGURES), len(panels), sharex="col", sharey="row", squeeze=False)
@@ -42,9 +46,11 @@ def gains_figure(kept: Kept, path: Path) -> None:
         for column, (axis, of) in zip(grid.T, panels.items(), strict=True):
             for ax, lines in zip(column, of, strict=True):
                 ax.axhline(0, color="0.6", linewidth=0.8)
-                for label, places in lines.items():
+                for (scene, name), places in lines.items():
                     means, errors = zip(*places.values(), strict=True)
-                    ax.errorbar([*places], means, errors, label=label, marker=".", capsize=2)
+                    style = _DASHES[[*GAINS[axis]].index(name)]
+                    label = f"{scene} {name}".strip()
+                    ax.errorbar([*places], means, errors, fmt=style, color=colors[scene], label=label, capsize=2)
             ticks = sorted({x for lines in of for places in lines.values() for x in places})
             if ticks[0] > 0:  # numbers of views
                 ax.set_xscale("log")
@@ -54,8 +60,8 @@ def gains_figure(kept: Kept, path: Path) -> None:
             column[0].legend(fontsize="small")
 
 
-def _lines(axis: str, of: str, unit: float, kept: Kept) -> dict[str, dict[float, tuple[float, float]]]:
-    """Return the lines of a panel by label: mean and two standard errors in ``unit``, at each kept position."""
+def _lines(axis: str, of: str, unit: float, kept: Kept) -> dict[tuple[str, str], dict[float, tuple[float, float]]]:
+    """Return the lines of a panel by scene and name: mean and two standard errors in ``unit``, by position."""
     lines = {}
     for name, pairs in GAINS[axis].items():
         for scene in kept.scenes:
@@ -65,5 +71,5 @@ def _lines(axis: str, of: str, unit: float, kept: Kept) -> dict[str, dict[float,
                 x: (mean / unit, error / unit if math.isfinite(error) else 0.0) for x, (mean, error) in ends.items()
             }
             if len(places) > 2:
-                lines[f"{scene} {name}".strip()] = places
+                lines[scene, name] = places
     return lines
