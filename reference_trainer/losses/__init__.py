@@ -13,6 +13,7 @@ from reference_trainer.losses.pearson import Pearson
 from reference_trainer.losses.photometric import Photometric
 from reference_trainer.losses.scale import Scale
 from reference_trainer.losses.smooth_depth import SmoothDepth
+from reference_trainer.losses.straight_through import StraightThrough
 from reference_trainer.losses.term import LossTerm
 from reference_trainer.losses.views import Views
 from reference_trainer.losses.warp import Warp
@@ -35,6 +36,7 @@ LOSSES: Registry[LossTerm] = Registry(
     opacity=Opacity,
     co_adaptation=CoAdaptation,
     consistency=Consistency,
+    straight_through=StraightThrough,
     co_regularization=CoRegularization,
 )
 """The terms by name; ``LOSSES.register("name")`` adds a class."""
