@@ -1,0 +1,228 @@
+"""What every command has: help, errors in one line, devices, and the ends that it may come to."""
+
+import re
+import socket
+import subprocess
+import sys
+
+import pytest
+import torch
+from commands import plain, refused
+
+import ca_reg
+from reference_trainer import cli
+from reference_trainer.cli import main
+from reference_trainer.runs import run as run_module
+from reference_trainer.training.recipes import RECIPES
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ([], ["demo", "train", "evaluate", "bake", "render", "compare", "warmup"]),
+        (["demo"], ["--iterations", "--seeds", "--jobs", "--out"]),
+        (["warmup"], ["--engine", "{None,auto,torch,loops}"]),
+        (
+            ["train"],
+            [
+                "--engine",
+                "--out",
+                "--path",
+                "--views",
+                "--recipe",
+                "--dropout",
+                "--noise",
+                "--opacity-decay",
+                "--monitor-pictures",
+                "--viewer",
+                "--device",
+            ],
+        ),
+        (["evaluate"], ["--path", "--scene", "--regularizer", "--samples", "--lpips"]),
+        (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
+        (["bake"], ["PATH", "--regularizer", "--out"]),
+        (["view"], ["PATH", "--scene", "--arc", "--regularizer", "--port", "--device"]),
+        (["render"], ["--what", "--frames", "{test,train,flight}"]),
+        (
+            ["compare"],
+            [
+                "--strategies",
+                "--seeds",
+                "--jobs",
+                "--iterations",
+                "--executor",
+                "--engine",
+                "--address",
+                "--path",
+            ],
+        ),
+    ],
+)
+def test_help(command, options, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main([*command, "--help"])
+    assert exit_.value.code == 0
+    text = plain(capsys.readouterr().out)
+    assert "usage: ca-reg" in text
+    for option in options:
+        assert option in text
+
+
+def test_the_list_of_commands_says_what_each_does(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert len(re.findall(r"• \w+ +\w[^•\n]*\.[ │]*\n", text)) == text.count("•") > 12  # one sentence, one line
+    assert "Train the built-in scene" in text
+    assert "Finished runs are kept" not in text  # which the help of the command says
+
+
+def test_version_says_what_a_bug_report_needs(capsys):
+    main(["version"])
+    lines = dict(line.split(": ", 1) for line in capsys.readouterr().out.splitlines())
+    assert (lines["ca_reg"], lines["torch"]) == (ca_reg.__version__, str(torch.__version__))
+
+
+def test_help_and_mistakes_need_no_torch():
+    code = """if True:
+        import contextlib, io, sys
+        from reference_trainer.cli import main
+        commands = ("demo", "plan", "train", "evaluate", "bake", "render", "view", "compare", "study", "warmup")
+        for words in ([], *(command.split() for command in commands), ["train", "--nonsense"]):
+            with contextlib.suppress(SystemExit), contextlib.redirect_stderr(io.StringIO()):
+                main([*words, "--help"])
+        assert "torch" not in sys.modules and "numpy" not in sys.modules
+    """
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("command", ["evaluate x", "render", "train", "compare", "study attribution x"])
+def test_a_card_that_is_not_there(command, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    text = refused([*command.split(), "--device", "cuda"], capsys)
+    assert re.fullmatch(r"ca-reg: --device cuda: PyTorch \S+ finds 0 CUDA devices; take cpu.", text)
+
+
+@pytest.mark.parametrize("command", ["view runs/none", "train --viewer"])
+def test_without_viser(command, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert refused(command.split(), capsys) == "ca-reg: the viewer needs viser: pip install 'ca_reg[viewer]'."
+
+
+def test_a_port_that_is_not_free(capsys):
+    pytest.importorskip("viser")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        text = refused(["train", "--viewer", str(port)], capsys)
+    assert text.startswith(f"ca-reg: port {port} cannot be used for the viewer (")
+    assert text.endswith("in use): give another one.")
+    assert "from 0 to 65535, got 65536" in refused(["view", "runs/none", "--port", "65536"], capsys)
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [("gpu", "must be cpu, cuda or the number of a card as in cuda:1, got 'gpu'"), ("meta", "cannot compute there"),
+     ("cuda:7", "finds 2 CUDA devices"), ("", "must be cpu, cuda")],
+)  # fmt: skip
+def test_a_device_that_is_none(device, message, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    text = refused(["render", "--device", device], capsys)
+    assert message in text
+    assert len(text) < 200
+
+
+def test_recipes_are_listed(capsys):
+    main(["recipes"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines] == list(RECIPES)
+    assert all("Needs" in line and "Differs" in line for line in lines)
+
+
+# Mistakes end with one line that says what to do, and exit code 2
+
+
+def test_an_unknown_scene(capsys, tmp_path):
+    text = refused(["train", "--path", str(tmp_path / "fren"), "--out", str(tmp_path / "out")], capsys)
+    assert text == f"ca-reg: there is no scene folder {tmp_path / 'fren'}; for the built-in scene, say 'synthetic'."
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "--dropout", "1.5"], "dropout must be in [0, 1), got 1.5"),
+        (["train", "--sh-every", "-1"], "sh_every must be at least 0, got -1"),
+        (["train", "--downscale", "0.5"], "downscale must be at least 1"),
+        (["compare", "--seeds", "0"], "at least 1 scene, 1 strategy and 1 seed"),
+        (["compare", "--jobs", "0"], "at least 1 job, got 0"),
+        (["compare", "--path", "a/fern", "b/fern"], "scenes whose folders have different names"),
+        (["compare", "--retries", "-1"], "retries of at least 0"),
+        (["compare", "--executor", "processes", "--address", "auto"], "--address auto is that of a Ray cluster"),
+        (["evaluate", "nowhere"], "nowhere holds no run (no config.json): give the --out folder"),
+        (["render", "nowhere"], "nowhere holds no run"),
+        (["evaluate", "nowhere.ply"], "nowhere.ply"),
+        (["evaluate", "a.ply", "--downscale", "8"], "without photographs no option of a scene but --background"),
+        (
+            ["evaluate", "a.ply", "--scene", "synthetic", "--cameras", "3"],
+            "the options of an orbit do not apply",
+        ),
+        (["evaluate", "a.ply", "--lpips", "installed"], "give --path"),
+        (["evaluate", "run", "--scene", "synthetic"], "run is no PLY, and a run is looked at on its own scene"),
+        (["view", "run", "--background", "white"], "run is no PLY, and a run is looked at on its own scene"),
+        (["clean", "a.ply", "--views", "3"], "without photographs no option of a scene but --background"),
+        (["compare", "--regularizer", "d2gs"], "--strategies says what is compared"),
+        (["compare", "--analytic", "--dropout", "0.2"], "--strategies says what is compared"),
+        (["evaluate", "a.ply", "--background", "red"], "background must be one of black, white, got 'red'"),
+        (["bake", "nowhere.ply"], "nowhere.ply"),
+        (["train", "--regularizer", "dropot(0.2)"], "there is no regularizer 'dropot'; choose one of"),
+        (["train", "--loss", "photometric(2.0)"], "lambda_dssim must lie in [0, 1], got 2.0"),
+        (["train", "--density", "none"], "there is no density strategy 'none'"),
+    ],
+)
+def test_mistakes(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = refused(arguments, capsys)
+    assert text.startswith("ca-reg: ")
+    assert message in text
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "--recipe", "gsplat"], "gsplat"),
+        (["train", "--recipe", "fsgs", "--iterations", "few"], "few"),
+        (["fly"], "fly"),
+        (["train", "--dropuot", "0.2"], "--dropuot"),
+    ],
+)
+def test_what_cannot_be_parsed(arguments, message, capsys):
+    assert message in refused(arguments, capsys)
+
+
+def test_an_interruption(monkeypatch, capsys, tmp_path):
+    def interrupt(*args, **keywords):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_module, "run_experiment", interrupt)
+    with pytest.raises(SystemExit) as exit_:
+        main(["train", "--out", str(tmp_path)])
+    assert exit_.value.code == 130
+    assert "the same command goes on from what is finished" in capsys.readouterr().err
+
+
+def test_the_real_arguments_are_the_default(monkeypatch, capsys):
+    monkeypatch.setattr(cli.sys, "argv", ["ca-reg", "evaluate", "nowhere"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "nowhere holds no run" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_reader_that_has_seen_enough_is_no_error():
+    code = "from reference_trainer.cli import main; main(['study', 'attribution', '--help'])"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert b"ca-reg:" not in process.stderr.read()

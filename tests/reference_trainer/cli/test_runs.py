@@ -1,0 +1,197 @@
+"""The commands about one run, from the training to pictures, and about a PLY in its place."""
+
+import json
+import re
+
+import pytest
+from commands import plain, refused
+
+from reference_trainer.cli import main
+from reference_trainer.evaluation import tables
+from reference_trainer.runs import measure as measure_module
+from reference_trainer.runs import run as run_module
+from reference_trainer.runs import score_ply as score_module
+from reference_trainer.scenes.options import OrbitOptions, SceneOptions
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.recipes import RECIPES, with_recipe
+from reference_trainer.viewer.window import Viewer
+
+SMALL = ["--downscale", "8", "--iterations", "3", "--monitor-every", "2"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    out = tmp_path_factory.mktemp("cli") / "run"
+    main(["train", "--out", str(out), "--dropout", "0.2", *SMALL])
+    return out
+
+
+@pytest.mark.parametrize("what", ["", "point_cloud.ply"])
+def test_a_run_or_a_ply_is_shown_until_ctrl_c(what, trained, capsys, monkeypatch):
+    pytest.importorskip("viser")
+    shown = []
+
+    def draw(viewer):
+        shown.append(viewer._subject.draw(viewer._look, viewer._subject._views[0].camera)[0])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "draw", draw)
+    main(["view", str(trained / what), "--port", "0"])
+    assert re.search(r"The viewer is at http://127\.0\.0\.1:\d+, .*; Ctrl-C ends it\.", capsys.readouterr().out)
+    assert shown[0].std() > 0
+
+
+@pytest.mark.parametrize("arguments", [["garden"], ["--path", "garden"], ["garden", "--path", "garden"]])
+def test_the_scene_of_a_training_may_be_given_either_way(arguments, monkeypatch, capsys, tmp_path):
+    asked = []
+    monkeypatch.setattr(run_module, "run_experiment", lambda scene, config, out, **rest: asked.append(scene))
+    monkeypatch.setattr(tables, "summary", lambda results: "")
+    main(["train", *arguments, "--views", "5", "--out", str(tmp_path)])
+    assert asked == [SceneOptions("garden", views=5)]
+    assert "not both: got garden and fern" in refused(["train", "garden", "--path", "fern"], capsys)
+
+
+def test_a_ply_is_known_by_its_name(monkeypatch):
+    asked: list = []
+    monkeypatch.setattr(score_module, "score_ply", lambda ply, *rest, **named: asked.append(str(ply)))
+    main(["evaluate", "somewhere/a.PLY"])
+    assert asked == ["somewhere/a.PLY"]
+
+
+@pytest.mark.parametrize("engine", ["torch", "loops"])
+def test_the_engine_is_chosen_said_and_noted(engine, trained, capsys, tmp_path, monkeypatch):
+    if engine == "loops":
+        pytest.importorskip("numba")
+    monkeypatch.setenv("CA_REG_ENGINE", "auto")  # which the option changes, for workers
+    main(["evaluate", str(trained), "--samples", "2", "--engine", engine, "--out", str(tmp_path)])
+    said = capsys.readouterr().out.splitlines()
+    assert [line.startswith(f"Engine: {engine}") for line in said].count(True) == 1
+    noted = json.loads((tmp_path / "evaluation.json").read_text())["machine"]["engine"]
+    assert f"Engine: {noted}" in said
+
+
+def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
+    assert (trained / "results.json").exists()
+    results = json.loads((trained / "results.json").read_text())
+    assert results["config"]["dropout"] == 0.2
+
+    main(["evaluate", str(trained), "--samples", "3", "--out", str(tmp_path / "e")])
+    assert "| mean test |" in capsys.readouterr().out
+    evaluation = json.loads((tmp_path / "e" / "evaluation.json").read_text())
+    assert evaluation["ca_settings"]["samples"] == 3
+    assert evaluation["mean"]["test"]["psnr"] == results["mean"]["test"]["psnr"]
+
+    main(["evaluate", str(trained / "point_cloud.ply"), "--scene", "synthetic", "--downscale", "8",
+          "--out", str(tmp_path / "p")])  # fmt: skip
+    of_ply = json.loads((tmp_path / "p" / "evaluation.json").read_text())
+    assert of_ply["views"] == results["views"]
+
+    main(["render", str(trained)])
+    assert len(list((trained / "render_test").glob("*.png"))) == 3
+    main(["render", str(trained), "--what", "flight", "--frames", "4", "--out", str(tmp_path / "flight")])
+    assert (tmp_path / "flight" / "flight.gif").exists()
+
+
+@pytest.mark.parametrize(("given", "folder"), [("", "evaluation"), ("noise(0.8)", "evaluation_noise_0.8")])
+def test_the_folder_of_an_evaluation(given, folder, trained, monkeypatch):
+    asked: list = []
+    monkeypatch.setattr(measure_module, "measure", lambda model, views, out, **named: asked.append(out))
+    main(["evaluate", str(trained), *(["--regularizer", given] if given else [])])
+    assert asked == [trained / folder]
+
+
+@pytest.mark.slow
+def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path):
+    main(["train", "--out", str(tmp_path / "run"), "--noise", "0.8", *SMALL])
+    main(["evaluate", str(tmp_path / "run"), "--regularizer", "noise(0.8, scale=True)", "--samples", "2"])
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    found = json.loads((tmp_path / "run" / "evaluation_noise_0.8_scale=True" / "evaluation.json").read_text())
+    assert found["mean"]["test"]["psnr"] != results["mean"]["test"]["psnr"]
+
+
+@pytest.mark.parametrize("flag", ["--path", "--scene"])
+def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch):
+    asked: list = []
+    monkeypatch.setattr(score_module, "score_ply", lambda *given, **named: asked.append((given, named)))
+    main(
+        [
+            "evaluate",
+            "a.ply",
+            flag,
+            "garden",
+            "--images",
+            "images_8",
+            "--views",
+            "12",
+            "--regularizer",
+            "noise",
+        ]
+    )
+    main(["evaluate", "a.ply", "--cameras", "3", "--size", "64", "--world", "z-up", "--arc", "90",
+          "--background", "white", "--samples", "7", "--seed", "1", "--out", "o"])  # fmt: skip
+    ((ply, scene, out), named), ((other, orbit, folder), others) = asked
+    assert (str(ply), scene.path, scene.images, scene.views, out) == ("a.ply", "garden", "images_8", 12, None)
+    assert named == {"regularizer": "noise", "samples": 5, "seed": 0, "device": "cpu", "perceptual": None,
+                     "background": "auto"}  # fmt: skip
+    assert (str(other), orbit, str(folder)) == ("a.ply", OrbitOptions(3, 64, "z-up", 90.0), "o")
+    assert others == {"regularizer": None, "samples": 7, "seed": 1, "device": "cpu", "background": "white",
+                      "perceptual": None}  # fmt: skip
+
+
+def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):
+    small = ["--cameras", "1", "--size", "24", "--samples", "2"]
+    main(["bake", str(trained / "point_cloud.ply"), "--out", str(tmp_path / "baked.ply")])
+    said = plain(capsys.readouterr().out)
+    assert "baked.ply: opacities are those of the test after dropout(0.2), and marked so" in said
+    main(["evaluate", str(tmp_path / "baked.ply"), *small])
+    out = capsys.readouterr().out
+    assert "0.8 baked in, taken out for CA; trained with: dropout(0.2)" in out
+    assert "| mean orbit |" in out
+    ply = str(trained / "point_cloud.ply")
+    main(["evaluate", ply, "--out", str(tmp_path / "p"), *small])
+    one, other = (
+        json.loads((tmp_path / folder / "evaluation.json").read_text()) for folder in ("baked_evaluation", "p")
+    )
+    assert one["mean"]["orbit"]["covered"] > 0
+    for name in ("covered", "cv"):  # after three steps nothing is opaque enough for CA
+        assert one["mean"]["orbit"][name] == pytest.approx(other["mean"]["orbit"][name], rel=1e-4)
+
+
+def test_training_again_says_that_nothing_is_to_be_done(trained, capsys):
+    main(["train", "--out", str(trained), "--dropout", "0.2", *SMALL])
+    out = capsys.readouterr().out
+    assert "complete, nothing to do" in out
+    assert "| test |" in out
+
+
+@pytest.mark.parametrize("recipe", [None, *RECIPES])
+def test_options_override_the_recipe(recipe, monkeypatch, tmp_path):
+    asked: dict = {}
+
+    def fake(scene, config, out, **keywords):
+        asked.update(scene=scene, config=config, out=out, **keywords)
+        return {}
+
+    monkeypatch.setattr(run_module, "run_experiment", fake)
+    monkeypatch.setattr(tables, "summary", lambda results: "")
+    chosen = ["--recipe", recipe] if recipe else []
+    main(["train", *chosen, "--iterations", "3000", "--densify-from", "70", "--noise", "0.8", "--path", "fern",
+          "--images", "images_8", "--views", "5", "--out", str(tmp_path)])  # fmt: skip
+    given = {"iterations": 3_000, "densify_from": 70, "noise": 0.8}
+    expected = with_recipe(recipe, **given) if recipe else TrainConfig(**given)  # at which nothing scales
+    assert asked["config"] == expected
+    assert asked["scene"] == SceneOptions("fern", images="images_8", views=5)
+    assert asked["out"] == tmp_path
+
+
+def test_the_recipe_of_binocular_decays_opacities(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(run_module, "run_experiment", lambda scene, config, out, **rest: asked.append(config))
+    monkeypatch.setattr(tables, "summary", lambda results: "")
+    main(["train", "--iterations", "3", "--recipe=binocular", "--out", str(tmp_path)])
+    assert (asked[0].opacity_decay, asked[0].iterations) == (0.995, 3)
+
+
+def test_other_settings_in_the_same_folder(trained, capsys):
+    text = refused(["train", "--out", str(trained), "--dropout", "0.3", *SMALL], capsys)
+    assert "holds a run with other settings (dropout: 0.2 -> 0.3)" in text
