@@ -23,7 +23,7 @@ PANEL = "_panel"
 
 _GAP = 4  # pixels between pictures
 _LABEL_HEIGHT = 16  # pixels; Pillow's built-in font is about 11 high
-_UNDEFINED = 0.5  # gray for values that are not finite; not a color of the map
+_UNDEFINED = "0.5"  # gray for values that are not finite; not a color of the map
 
 
 def file_names(views: Sequence[str]) -> list[str]:
@@ -102,12 +102,9 @@ def heat_map(values: Tensor, vmax: float) -> Tensor:
         raise ValueError(f"values must have shape (H, W), got {tuple(values.shape)}.")
     if not vmax > 0:
         raise ValueError(f"vmax must be positive, got {vmax}.")
-    table = torch.from_numpy(matplotlib.colormaps["inferno"](range(256))[:, :3]).float()  # [256, 3]
-    values = values.detach().to("cpu", torch.float64)
-    defined = values.isfinite()
-    index = (torch.where(defined, values, 0) / vmax).clamp(0, 1).mul(255).round().long()
-    colors = torch.where(defined[..., None], table[index], torch.tensor(_UNDEFINED))
-    return colors.permute(2, 0, 1).contiguous()
+    colors = matplotlib.colormaps["inferno"].with_extremes(bad=_UNDEFINED)
+    defined = np.ma.masked_invalid(values.detach().to("cpu", torch.float64).numpy())
+    return torch.from_numpy(colors(defined / vmax)[..., :3]).float().permute(2, 0, 1).contiguous()
 
 
 def heat_colors(values: Tensor, low: float, high: float) -> Tensor:
