@@ -59,7 +59,7 @@ class IndependentDropout(Regularizer):
         return Draw(keep=keep)
 
     def replay(self, x: Params, draw: Draw) -> Params:
-        """Set the opacities of dropped Gaussians to 0, and compensate the others if asked to."""
+        """Set the opacities of dropped Gaussians to 0; if asked to, compensate the others for the rates of ``x``."""
         if draw.keep is None:
             return x
         rates = self.rates(x) if self.compensate else 0.0
