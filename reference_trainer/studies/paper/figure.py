@@ -36,8 +36,7 @@ def gains_figure(kept: Kept, path: Path) -> None:
         raise ValueError(
             f"{kept.folder} has no setting at three strengths or numbers of views: there is no line to draw."
         )
-    drawn = sorted({scene for of in panels.values() for lines in of for scene, _ in lines})
-    colors = {scene: f"C{number}" for number, scene in enumerate(drawn)}
+    colors = {scene: f"C{number}" for number, scene in enumerate(kept.scenes)}
     with new_figure(path) as figure:
         figure.set_size_inches(1.5 + 4.5 * len(panels), 7)
         grid = figure.subplots(len(_FIGURES), len(panels), sharex="col", sharey="row", squeeze=False)

@@ -1,6 +1,4 @@
-"""The commands about several runs: what they ask of the comparison and of the studies."""
-
-from pathlib import Path
+"""What `ca-reg compare` asks of the comparison."""
 
 import pytest
 import torch
@@ -12,9 +10,6 @@ from reference_trainer.runs.engines import choice as choice_module
 from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies import error_runtime as error_runtime_module
-from reference_trainer.studies import gaussian_shares as shares_module
-from reference_trainer.studies import study as study_module
 
 
 def test_a_cluster_may_have_the_card(monkeypatch, tmp_path):
@@ -62,34 +57,3 @@ def test_several_scenes_and_how_they_are_run(monkeypatch, tmp_path):
         tmp_path / "synthetic": SceneOptions("synthetic", downscale=2.0),
     }
     assert (asked["running"].retries, asked["running"].checkpoint_every) == (1, 50)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["attribution", "r"], ("r", None, {"split": "test", "drop_rate": 0.5})),
-        (["attribution", "r", "--out", "o", "--split", "train", "--drop-rate", "0.3"],
-         ("r", "o", {"split": "train", "drop_rate": 0.3})),
-    ],
-)  # fmt: skip
-def test_attribution(arguments, expected, monkeypatch):
-    asked = []
-
-    def fake(run, out, **keywords):
-        asked.append((str(run), out and str(out), keywords))
-
-    monkeypatch.setattr(shares_module, "study_attribution", fake)
-    main(["study", *arguments])
-    source, out, keywords = expected
-    assert asked == [(source, out, {**keywords, "device": "cpu"})]
-
-
-def test_error_runtime(monkeypatch):
-    declared, ran = [], []
-    monkeypatch.setattr(
-        error_runtime_module, "error_runtime_study", lambda runs, **keywords: declared.append((runs, keywords))
-    )
-    monkeypatch.setattr(study_module, "run_study", lambda study, out: ran.append(out))
-    main(["study", "error-runtime", "r", "s", "--seeds", "2", "--out", "o"])
-    assert declared == [((Path("r"), Path("s")), {"max_samples": 1024, "seeds": 2, "device": "cpu"})]
-    assert ran == [Path("o")]

@@ -1,3 +1,5 @@
+"""`ca-reg plan`, and what a training takes from the plan."""
+
 import dataclasses
 import json
 
