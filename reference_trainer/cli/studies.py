@@ -104,7 +104,8 @@ class Paper:
     pages: tuple[Path, ...] = ()
     """Update these Markdown files with what is kept, between their marks; train nothing."""
     figure: Path | None = None
-    """Plot the effect of dropout and noise against their strength and the number of views; train nothing."""
+    """Plot the effect of dropout and noise against their strength and the number of views, or, with --claims, rank the
+    settings of these by what they gain; train nothing."""
     out: Path = Path("runs/paper")
     """Folder for the trainings, each removed once its row is kept."""
     rows: Path | None = None
@@ -121,7 +122,8 @@ class Paper:
         from reference_trainer.runs.grid import Running
         from reference_trainer.studies.paper.cells import Grid, listing, run_cells
         from reference_trainer.studies.paper.claims import chosen
-        from reference_trainer.studies.paper.page import Kept, details, page
+        from reference_trainer.studies.paper.comparison import Kept
+        from reference_trainer.studies.paper.page import details, page
         from reference_trainer.studies.paper.scenes import chosen_scenes
 
         rows = self.rows or self.out
@@ -133,9 +135,9 @@ class Paper:
         for path in self.pages:
             write_text(path, page(path.read_text("utf-8"), kept))
         if self.figure is not None:
-            from reference_trainer.studies.paper.figure import gains_figure
+            from reference_trainer.studies.paper.figure import gains_figure, ranking_figure
 
-            gains_figure(kept, self.figure)
+            ranking_figure(kept, self.claims, self.figure) if self.claims else gains_figure(kept, self.figure)
         if self.pages or self.figure:
             return
         if self.list:

@@ -1,22 +1,20 @@
-"""Tables and verdicts from the kept rows, and their insertion between marks in pages of the docs."""
+"""Tables of the kept rows, inserted between marks in pages of the docs."""
 
 from __future__ import annotations
 
 import math
 import re
 import statistics
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from pathlib import Path
 
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
-from reference_trainer.studies.paper.claims import CLAIMS, TIMED, Check, Claim
-from reference_trainer.studies.paper.rows import Row, Rows, label, resolved, value
-from reference_trainer.studies.paper.scenes import SCENES
-from reference_trainer.studies.paper.verdict import ERRORS, Verdict, interval, overall, verdict
+from reference_trainer.studies.paper.claims import CLAIMS, TIMED, Check
+from reference_trainer.studies.paper.comparison import Kept, differences, judged, name_of, ranked, tested
+from reference_trainer.studies.paper.rows import Row, Rows, label, value
+from reference_trainer.studies.paper.verdict import ERRORS, interval, overall, verdict
 
-__all__ = ["Kept", "claims_table", "details", "differences", "gains", "judged", "page", "scenes_table"]
+__all__ = ["claims_table", "details", "gains", "page", "scenes_table"]
 
 _TITLES = {
     "test psnr": ("PSNR", 1.0), "test ssim": ("SSIM", 1.0), "test lpips": ("LPIPS", 1.0), "test ca": ("CA", 1e-3),
@@ -32,37 +30,6 @@ _TITLES = {
     "depth mae": ("MAE", 1.0), "depth log10": ("log10", 1.0),
 } | {f"path {sixth}": (f"CA at {sixth}/6", 1e-3) for sixth in range(1, 7)}  # fmt: skip
 _MARKS = re.compile(r"(<!-- paper (\w+)(?: ([\w-]+))?(?: (\d+))? -->\n).*?(<!-- end -->)", re.DOTALL)
-
-
-class Kept:
-    """The kept rows of all scenes in a folder, looked up for one recipe and number of iterations."""
-
-    def __init__(self, folder: Path, recipe: str = "3dgs", iterations: int = 3_000) -> None:
-        self.folder, self.recipe, self.iterations = folder, recipe, iterations
-        self.scenes = {file.stem: Rows(file) for file in sorted(folder.glob("*.json"))}
-
-    def of(self, scene: str, setting: Mapping[str, object]) -> dict[int, Row]:
-        """Return the rows of a setting on a scene by seed."""
-        return self.scenes[scene].of(resolved(setting, self.recipe, self.iterations))
-
-
-def differences(check: Check, scene: str, kept: Kept) -> list[float]:
-    """Return the finite differences that a check is about, one per seed that has both figures."""
-    a, b = kept.of(scene, check.a), kept.of(scene, check.b)
-    pairs = [(value(a[seed], check.of), value(b[seed], check.to or check.of)) for seed in sorted(a.keys() & b.keys())]
-    found = [(x - y) / (y if check.relative else 1.0) for x, y in pairs]
-    return [difference for difference in found if math.isfinite(difference)]
-
-
-def judged(claim: Claim, kept: Kept) -> dict[str, tuple[int, Verdict]]:
-    """Return, for every scene with measurements for all checks of a claim, the number of seeds and the verdict."""
-    found = {}
-    for scene in _tested(claim, kept):
-        of = [(check, differences(check, scene, kept)) for check in claim.checks]
-        if of and all(seeds for _, seeds in of):
-            verdicts = [verdict(seeds, check.low, check.high) for check, seeds in of]
-            found[scene] = min(len(seeds) for _, seeds in of), overall(verdicts, needs_all=True)
-    return found
 
 
 def claims_table(kept: Kept) -> str:
@@ -86,11 +53,11 @@ def claims_table(kept: Kept) -> str:
 def details(name: str, kept: Kept) -> str:
     """Return, for every scene, the table of a claim's settings and its checks; "" if nothing is measured."""
     claim, parts = CLAIMS[name], []
-    for scene in _tested(claim, kept):
+    for scene in tested(claim, kept):
         found = {}
         for setting in claim.settings:
             if of := [row for row in kept.of(scene, setting).values() if claim.needs <= row.keys()]:
-                found[_name(setting, kept)] = of
+                found[name_of(setting, kept)] = of
         if len(found) >= min(2, len(claim.settings)):
             about = kept.scenes[scene].content.get("about", "")
             parts.append(f"**{scene}**: {about}\n\n{_table(found, claim.shows)}")
@@ -100,34 +67,12 @@ def details(name: str, kept: Kept) -> str:
 
 
 def gains(name: str, kept: Kept) -> str:
-    """Return how every setting of a claim differs from the plain training of the same views and recipe; "" if unknown.
-
-    Differences are in dB of PSNR with two standard errors, and in percent of the exact score, on every scene with at
-    least two kept seeds of most settings. Settings are sorted by the mean over scenes; those that lack a scene come
-    last.
-    """
-    claim, found = CLAIMS[name], dict[str, dict[str, tuple[float, str]]]()
-    for setting in claim.settings:
-        plain = {key: x for key, x in setting.items() if key in ("recipe", "views")}
-        for scene in _tested(claim, kept) if setting != plain else ():
-            of = differences(Check("test psnr", setting, plain), scene, kept)
-            score = differences(Check("test ca_exact_half", setting, plain, relative=True), scene, kept)
-            if len(of) > 1:
-                mean, spread = interval(of)
-                less = f", {100 * statistics.fmean(score):+.0f} %" if score else ""
-                cell = f"{mean:+.2f} ± {spread:.2f} dB{less}"
-                found.setdefault(_name(setting, kept), {})[scene] = mean, cell
-    counts = Counter(scene for cells in found.values() for scene in cells)
-    scenes = sorted(scene for scene, count in counts.items() if 2 * count >= len(found))
-    rows: list[tuple[int, float, dict[str, object]]] = []
-    for setting_name, cells in found.items():
-        shown = {scene: cells[scene] for scene in scenes if scene in cells}
-        if shown:
-            average = statistics.fmean(mean for mean, _ in shown.values())
-            row: dict[str, object] = {"setting": f"`{setting_name}`", "mean": f"{average:+.2f} dB"}
-            rows.append((len(shown), average, row | {scene: cell for scene, (_, cell) in shown.items()}))
-    ordered = [cells for *_, cells in sorted(rows, key=lambda row: row[:2], reverse=True)]
-    return markdown_table(ordered, ["setting", "mean", *scenes]) if rows else ""
+    """Return the settings of a claim as `ranked`, as a table; "" if nothing is known of them."""
+    lines: list[dict[str, object]] = []
+    for named, mean, of in ranked(name, kept):
+        lines.append({"setting": f"`{named}`", "mean": f"{mean:+.2f} dB", **of})
+    scenes = sorted({column for line in lines for column in line} - {"setting", "mean"})
+    return markdown_table(lines, ["setting", "mean", *scenes]) if lines else ""
 
 
 def scenes_table(kept: Kept) -> str:
@@ -183,11 +128,6 @@ def page(text: str, kept: Kept) -> str:
     return _MARKS.sub(made, text)
 
 
-def _tested(claim: Claim, kept: Kept) -> list[str]:
-    """Return the kept scenes that a claim is tested on: those it names, and a user's own."""
-    return [scene for scene in kept.scenes if scene in claim.scenes or scene not in SCENES]
-
-
 def _heading(name: str) -> str:
     """Return the heading of a claim, with its number, or of another comparison, without its name."""
     says = CLAIMS[name].says
@@ -230,11 +170,6 @@ def _line(check: Check, of: Sequence[float], kept: Kept) -> str:
         if math.isfinite(end)
     ]
     than = _TITLES[check.to or check.of][0]
-    pair = f"{_name(check.a, kept)} - {_name(check.b, kept)}" if check.a != check.b else _name(check.a, kept)
+    pair = f"{name_of(check.a, kept)} - {name_of(check.b, kept)}" if check.a != check.b else name_of(check.a, kept)
     what = title if than == title else f"{title} - {than}"
     return f"- `{pair}`, {what}: {measured} (claimed: {' and '.join(ends)}), {verdict(of, check.low, check.high)}\n"
-
-
-def _name(setting: Mapping[str, object], kept: Kept) -> str:
-    """Return the label of a setting among those of the same recipe."""
-    return label(setting, {"recipe": kept.recipe})

@@ -29,8 +29,9 @@ from reference_trainer.studies.paper import cells as cells_module
 from reference_trainer.studies.paper import figure as figure_module
 from reference_trainer.studies.paper.cells import Grid, declared, depths, estimate, is_done, renders, rows_of, run_cells
 from reference_trainer.studies.paper.claims import CLAIMS, Check, Claim, chosen
-from reference_trainer.studies.paper.figure import gains_figure
-from reference_trainer.studies.paper.page import Kept, claims_table, details, gains, judged, page, scenes_table
+from reference_trainer.studies.paper.comparison import Kept, judged
+from reference_trainer.studies.paper.figure import gains_figure, ranking_figure
+from reference_trainer.studies.paper.page import claims_table, details, gains, page, scenes_table
 from reference_trainer.studies.paper.rows import Rows, config_of, resolved, value
 from reference_trainer.studies.paper.scenes import SCENES, chosen_scenes
 from reference_trainer.studies.paper.verdict import overall, verdict
@@ -290,22 +291,28 @@ def test_a_mark_names_one_comparison_and_its_iterations(kept):
     assert "Not yet measured." in page(text.replace("100", "50"), kept)
 
 
-def test_the_figure_draws_means_of_differences_where_three_places_are_kept(kept, monkeypatch):
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that were drawn."""
+    figures = []
+
+    @contextmanager
+    def held(path):
+        with new_figure(path) as figure:
+            yield figure
+        figures.append(figure)
+
+    monkeypatch.setattr(figure_module, "new_figure", held)
+    return figures
+
+
+def test_the_figure_draws_means_of_differences_where_three_places_are_kept(kept, drawn):
     gained = [0.5, 0.4, 0.9]
     with pytest.raises(ValueError, match="no line to draw"):
         gains_figure(kept, kept.folder / "gains.png")
     rows = Rows(kept.folder / "a.json")
     for seed, plain in enumerate((20.0, 20.2, 19.9)):
         rows.add(row(plain + gained[seed], seed, regularizer="dropout(0.1)"))
-    drawn = []
-
-    @contextmanager
-    def held(path):
-        with new_figure(path) as figure:
-            yield figure
-        drawn.append(figure)
-
-    monkeypatch.setattr(figure_module, "new_figure", held)
     gains_figure(Kept(kept.folder), kept.folder / "gains.png")
     assert [len(panel.containers) for panel in drawn[0].axes] == [1, 0]  # other scenes and axes have two places at most
     (bars,) = drawn[0].axes[0].containers
@@ -314,6 +321,28 @@ def test_the_figure_draws_means_of_differences_where_three_places_are_kept(kept,
     assert np.allclose(line.get_xydata(), [(0.0, 0.0), (0.1, np.mean(gained)), (0.2, 1.0)])
     assert np.allclose(np.ptp(errors.get_segments()[1], 0), (0.0, 4 * np.std(gained, ddof=1) / math.sqrt(3)))
     assert (kept.folder / "gains.png").stat().st_size > 1_000
+
+
+def test_the_ranking_draws_the_best_setting_first_and_the_score_beside_it(kept, drawn):
+    with pytest.raises(ValueError, match="claim 11: nothing to rank"):
+        ranking_figure(kept, ["7", "11"], kept.folder / "ranking.png")
+    rows = Rows(kept.folder / "a.json")
+    for seed, of in rows.of(resolved({}, "3dgs", 3_000)).items():
+        better = row(of["test"]["psnr"] + 3.0 + seed, seed, regularizer="dropout(0.3)")
+        for each, score in ((of, 8e-3), (better, 2e-3)):
+            rows.add(each | {"test": each["test"] | {"ca_exact_half": score}})
+    ranking_figure(Kept(kept.folder), ["7"], kept.folder / "ranking.png")
+    gained, score = drawn[0].axes
+    assert [tick.get_text() for tick in gained.get_yticklabels()] == ["dropout(0.2)", "dropout(0.3)"]  # 0.3 lacks b
+    assert [bars.get_label() for bars in gained.containers] == ["a", "b"]
+    on_a, on_b = (bars[0].get_xydata() for bars in gained.containers)
+    assert np.allclose(on_a[:, 0], (1.0, 4.0))
+    assert np.allclose(on_b[:, 0], -1.05)
+    assert gained.yaxis_inverted()
+    assert list(on_a[:, 1] // 0.5) == [-1, 1]  # above the middles of their rows, 0 and 1
+    (errors,) = gained.containers[0][2]
+    assert np.allclose(np.ptp(errors.get_segments()[1], 0), (4 / math.sqrt(3), 0.0))  # 3, 4 and 5 dB
+    assert np.allclose(score.lines[0].get_xdata(), (math.nan, -75.0), equal_nan=True)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "docs").glob("*.md")), ids=lambda path: path.name)
