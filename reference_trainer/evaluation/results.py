@@ -6,6 +6,7 @@ import json
 import math
 import os
 import platform
+import re
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
@@ -20,6 +21,7 @@ from reference_trainer.render import describe_engine
 __all__ = ["format_mean_std", "machine", "markdown_table", "mean_std", "write_json"]
 
 _ABSENT = "n/a"
+_FIGURE = re.compile(r"[-+]?\d|-?$")  # also a dash or nothing in its place
 
 
 def write_json(path: str | Path, data: object) -> None:
@@ -84,7 +86,7 @@ def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str])
     """Return rows, mappings from column to content, as a Markdown table that ends with a line break.
 
     Text is kept, floats get four digits; what is missing, None or not finite becomes ``n/a``. The columns, at least
-    one, are also the headers; the first is left-aligned, the others right-aligned.
+    one, are also the headers. Columns of words are left-aligned, as is the first; columns of figures right-aligned.
 
     Example:
         >>> print(markdown_table([{"run": "baseline", "PSNR": 19.36}, {"run": "dropout"}], ["run", "PSNR"]), end="")
@@ -95,10 +97,11 @@ def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str])
     """
     if not columns:
         raise ValueError("a table needs at least one column.")
-    lines = [[_cell(column) for column in columns]]
-    lines += [[_cell(row.get(column)) for column in columns] for row in rows]
-    text = [f"| {' | '.join(line)} |" for line in lines]
-    return "\n".join([text[0], "|:---" + "|---:" * (len(columns) - 1) + "|", *text[1:], ""])
+    lines = [[_cell(row.get(column)) for column in columns] for row in rows]
+    words = {place for line in lines for place, cell in enumerate(line) if cell != _ABSENT and not _FIGURE.match(cell)}
+    rule = [":---" if place in {0, *words} else "---:" for place in range(len(columns))]
+    text = [f"| {' | '.join(line)} |" for line in [[_cell(column) for column in columns], *lines]]
+    return "\n".join([text[0], f"|{'|'.join(rule)}|", *text[1:], ""])
 
 
 def machine() -> dict[str, str | int]:

@@ -88,6 +88,8 @@ def test_table():
         "| x y | n/a | n/a |",
         "| n/a | n/a | n/a |",
     ]
+    words = markdown_table([{"n": "+1 dB", "why": None}, {"n": "-2", "why": "too few"}, {"n": ""}], ["", "n", "why"])
+    assert words.splitlines()[1] == "|:---|---:|:---|"  # words read from the left, figures compare from the right
     with pytest.raises(ValueError, match="column"):
         markdown_table([], [])
 
