@@ -27,7 +27,7 @@ class Params(NamedTuple):
         sh: spherical-harmonic coefficients, constant band first, shape (N, K, 3).
         view_matrix: of the rendered camera, the first if there are several, shape (4, 4).
         learned: per-Gaussian values that regularizers learn, by name, each (N,).
-        step: the training step, which schedules follow.
+        step: the training step, which schedules follow; 0 for that of the module or score that is called.
 
     Example:
         >>> import torch

@@ -114,7 +114,8 @@ class Regularizer(Scheduled):
         """Return what to render.
 
         Args:
-            x: activated opacities in [0, 1], shape (N,) or (N, 1), or all parameters.
+            x: activated opacities in [0, 1], shape (N,) or (N, 1), or all parameters with such opacities. If these have
+                no step, i.e. 0, that of :meth:`set_step` counts.
             drawn: an earlier draw to replay instead of a new one; in training only.
             generator: source of the draw; the global random state is then untouched.
 
@@ -126,10 +127,12 @@ class Regularizer(Scheduled):
             ValueError: if a shape is wrong, the opacities look like logits, a needed field is missing, or ``drawn`` is
                 given in evaluation.
         """
-        self._check(x.opacities if isinstance(x, Params) else x)
+        given = x if isinstance(x, Params) else Params(x)
+        self._check(given.opacities)
         # Reading the step would recompile the graph at every step; the graph reads the rate from a tensor.
-        step = 0 if torch.compiler.is_compiling() else self.step
-        params = x if isinstance(x, Params) else Params(x.reshape(-1) if x.ndim > 1 else x, step=step)
+        step = given.step or (0 if torch.compiler.is_compiling() else self.step)
+        flat = given.opacities.reshape(-1) if given.opacities.ndim > 1 else given.opacities
+        params = given._replace(opacities=flat, step=step)
         if not self.training:
             if drawn is not None:
                 raise ValueError("a draw was given in eval(), where nothing is drawn; call train() or leave it out.")
@@ -140,9 +143,10 @@ class Regularizer(Scheduled):
             self.last, out = drawn, self.replay(params, drawn)
         else:
             out = self.regularize(params, generator)
-        if isinstance(x, Params):
-            return out
-        return x if out.opacities is params.opacities else out.opacities.view_as(x)
+        opacities = given.opacities if out.opacities is flat else out.opacities.view_as(given.opacities)
+        if not isinstance(x, Params):
+            return opacities
+        return x if out is params else out._replace(opacities=opacities, step=x.step)
 
     def check_needs(self, x: Params) -> None:
         """Raise a ValueError unless ``x`` has everything that the regularizer needs."""

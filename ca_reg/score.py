@@ -214,11 +214,11 @@ class CAScore:
 
     def _params(self, given: Tensor | Params) -> Params:
         """Check the opacities or parameters that a score was called with, and return them with opacities detached."""
-        x = given if isinstance(given, Params) else Params(given, step=self.regularizer.step)
+        x = given if isinstance(given, Params) else Params(given)
         check_opacity(x.opacities)
         check_opacity_range(x.opacities)
         self.regularizer.check_needs(x)
-        return x._replace(opacities=x.opacities.detach())
+        return x._replace(opacities=x.opacities.detach(), step=x.step or self.regularizer.step)
 
     def update(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> CAResult:
         """Measure one view and count it in the mean that :meth:`compute` returns.

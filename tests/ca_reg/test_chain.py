@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from ca_reg import Chain, Draw, GaussianDropout, IndependentDropout, OpacityNoise, Params, Regularizer
+from ca_reg.regularizers import REGULARIZERS
 
 OPACITY = torch.tensor([0.1, 0.45, 0.8, 0.97], dtype=torch.float64)
 
@@ -155,6 +156,38 @@ def test_a_bare_tensor_meets_the_step_that_a_member_was_told():
     assert (chain(opacity) == 0).any()
     chain.set_step(0)  # also back
     assert chain(opacity) is opacity
+
+
+@pytest.mark.parametrize("wrap", [lambda dropout: dropout, Chain, nn.Sequential])
+def test_parameters_without_a_step_meet_the_one_that_a_member_was_told(wrap):
+    dropout = GaussianDropout(lambda step: 0.9 * (step >= 50))
+    module, x = wrap(dropout), Params(torch.full((1000,), 0.5))
+    assert module(x) is x
+    dropout.set_step(50)
+    drawn = module(x)
+    assert (drawn.opacities == 0).any()
+    assert drawn.step == x.step
+    assert torch.equal(dropout(x, keep=dropout.keep).opacities, drawn.opacities)
+    torch.testing.assert_close(module.eval()(x).opacities, 0.1 * x.opacities)
+    earlier = x._replace(step=49)  # a step that is given counts
+    assert module.train()(earlier) is earlier
+
+
+@pytest.mark.parametrize("name", [*REGULARIZERS])
+def test_parameters_may_have_a_column_of_opacities(name):
+    rates = {"dropout": "(0.5)", "noise": "(0.8, scale=True)", "clustered": "(0.5)", "position_noise": "(0.1)"}
+    x = Params(
+        torch.rand(20), torch.rand(20, 3), torch.rand(20, 3), torch.rand(20, 4), torch.rand(20, 16, 3), torch.eye(4),
+        {"dropout_logits": torch.zeros(20)}, step=3000,
+    )  # fmt: skip
+    column = x._replace(opacities=x.opacities[:, None])
+    module = REGULARIZERS.make_one(name + rates.get(name, ""))
+    for training in (True, False):
+        module.train(training)
+        flat, other = (module(given, generator=torch.Generator().manual_seed(0)) for given in (x, column))
+        assert torch.equal(other.opacities, flat.opacities[:, None])
+        assert other.opacities is column.opacities or flat.opacities is not x.opacities
+        assert all(torch.equal(a, b) for a, b in zip(flat[1:6], other[1:6], strict=True))
 
 
 def test_the_text_of_a_regularizer_has_its_arguments():

@@ -85,11 +85,14 @@ def test_sampled_scores_draw_what_the_regularizer_draws():
     assert abs(result.value - independent) > 0.05 * independent  # the neighbors' company shows
 
 
-def test_a_score_of_opacities_is_taken_at_the_step_of_the_regularizer():
+@pytest.mark.parametrize("given", [OPACITY, Params(OPACITY), Params(OPACITY[:, None])])
+def test_a_score_is_taken_at_the_step_of_the_regularizer(given):
     dropout = GaussianDropout(LinearRamp(0.0, 0.5, 0, 100))
     dropout.set_step(50)
     expected = CAScore(exact=ListMoments(lists), drop_rate=0.25, threshold=0.1)(OPACITY, None).value
-    assert CAScore(exact=ListMoments(lists), regularizer=dropout, threshold=0.1)(OPACITY, None).value == expected
+    score = CAScore(exact=ListMoments(lists), regularizer=dropout, threshold=0.1)
+    assert score(given, None).value == expected
+    assert score(Params(OPACITY, step=1), None).value < expected  # a step that is given counts
 
 
 def test_a_score_does_not_ask_for_the_mode_of_the_regularizer():
