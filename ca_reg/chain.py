@@ -139,7 +139,7 @@ class Foreign(Regularizer):
         module: called as ``module(opacity)``, or ``module(opacity, generator=...)`` if there is a generator.
 
     Raises:
-        TypeError: if it is not a module.
+        TypeError: if it is not a module; in a draw with a generator, if its ``forward`` takes none.
 
     Example:
         >>> Foreign(nn.Dropout(0.5)).eval()(torch.full((3,), 0.5))
@@ -152,11 +152,14 @@ class Foreign(Regularizer):
         super().__init__()
         self.module = module
 
-    @property
-    def takes_generator(self) -> bool:
-        """Whether its ``forward`` takes ``generator``, or any keyword argument."""
+    def check_generator(self) -> None:
+        """Raise a TypeError unless its ``forward`` takes ``generator``, or any keyword argument."""
         parameters = inspect.signature(self.module.forward).parameters
-        return "generator" in parameters or any(x.kind is x.VAR_KEYWORD for x in parameters.values())
+        if "generator" not in parameters and all(x.kind is not x.VAR_KEYWORD for x in parameters.values()):
+            raise TypeError(
+                f"the forward of {type(self.module).__name__} takes no argument generator, by which hooks and scores "
+                "repeat a draw and leave the global random numbers alone. Add generator=None to it, and draw from it."
+            )
 
     def set_step(self, step: int) -> None:
         """Pass the step to the `set_step` of the module and its submodules, where they have one."""
@@ -166,6 +169,8 @@ class Foreign(Regularizer):
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Call the module."""
         before = x.opacities
+        if generator is not None:
+            self.check_generator()
         after: Tensor = self.module(before) if generator is None else self.module(before, generator=generator)
         if after is before:
             return Draw(after)

@@ -116,12 +116,8 @@ class RasterizerHook(Hook):
         if not len(self._chain):
             raise ValueError("regularizer is empty; without one there is nothing to install.")
         for member in self._chain:
-            if isinstance(member, Foreign) and not member.takes_generator:
-                raise TypeError(
-                    f"the forward of {type(member.module).__name__} takes no argument generator, by which the hook "
-                    "repeats the draws of a step and leaves the global random numbers alone. Add generator=None to it, "
-                    "and draw from it."
-                )
+            if isinstance(member, Foreign):
+                member.check_generator()
         check_count(seed, "seed", minimum=0)
         self._scope = scope
         self._seed = int(seed)
