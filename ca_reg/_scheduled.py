@@ -30,8 +30,8 @@ class Scheduled(nn.Module):
     def __init__(self, rate: float | Schedule | None = None) -> None:
         super().__init__()
         value = rate.value if isinstance(rate, Constant) else rate
-        if not (value is None or callable(value)):
-            self._check_rate(value, self.rate_name)
+        if not callable(value) and (value is not None or self.rate_name):
+            self._check_rate(value, self.rate_name)  # type: ignore[arg-type]  # refuses None
         self._schedule = as_schedule(0.0 if rate is None else rate)
         self._opacity_seen = False
         self._rate: Tensor | None = None

@@ -118,6 +118,12 @@ def test_rates_are_checked_at_construction(make):
         make()
 
 
+@pytest.mark.parametrize("kind", [GaussianDropout, OpacityNoise])
+def test_a_rate_that_is_missing_is_refused(kind):
+    with pytest.raises(TypeError, match="must be a real number, got NoneType"):
+        kind(None)
+
+
 def test_a_schedule_that_leaves_the_range_is_refused_with_its_step():
     dropout = GaussianDropout(lambda step: step / 100)
     with pytest.raises(ValueError, match="p at step 100"):
