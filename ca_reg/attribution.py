@@ -113,6 +113,7 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
     return CAAttribution(shares.to(torch.float64), result)
 
 
+@torch.inference_mode(False)  # it would record no gradient
 def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATotalEffects:
     """Measure a view exactly and find how much the score would fall if one Gaussian's factor were fixed at its mean.
 

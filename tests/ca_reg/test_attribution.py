@@ -7,7 +7,7 @@ import pytest
 import torch
 from oracles import random_scene
 
-from ca_reg import CAScore, ListMoments, Params, PixelLists, Reason, attribute, total_effects
+from ca_reg import CAScore, ListMoments, OpacityNoise, Params, PixelLists, Reason, attribute, total_effects
 from ca_reg.types import ExactMoments
 from reference_trainer.render import splat
 from reference_trainer.render.moments import render_moments
@@ -124,6 +124,16 @@ def test_a_total_effect_is_what_the_score_loses_when_one_factor_is_fixed(n, rate
         fixed = [*supports[:k], ((1 - rate,), (1.0,)), *supports[k + 1 :]]
         loss = value - scene.value(fixed, rate, neutral)
         torch.testing.assert_close(effects[gaussian], loss, rtol=1e-11, atol=1e-15)
+
+
+@pytest.mark.parametrize("regularizer", [None, OpacityNoise(0.5)])
+def test_inference_mode_does_not_keep_the_gradient_away(regularizer):
+    scene = Scene(4)
+    score = CAScore(exact=scene.moments, regularizer=regularizer, threshold=THRESHOLD)
+    expected = total_effects(score, scene.opacity, None)
+    with torch.inference_mode():
+        opacity = scene.opacity * 1.0
+        assert torch.equal(total_effects(score, opacity, None).effects, expected.effects)
 
 
 @pytest.mark.parametrize("neutral", [False, True])

@@ -108,7 +108,7 @@ def test_what_a_score_cannot_render_is_refused():
     with pytest.raises(TypeError, match=r"must be a ca_reg.Regularizer, got Dropout: wrap it in ca_reg.Chain"):
         CAScore(render, regularizer=nn.Dropout(0.5))
     score = CAScore(render, regularizer=Chain(nn.Dropout(0.5)))
-    with pytest.raises(TypeError, match="forward of Dropout takes no argument generator.* Add generator=None to it"):
+    with pytest.raises(TypeError, match=r"forward of Dropout takes no argument generator.* Add generator=None to it"):
         score(OPACITY, None)
     score = CAScore(render, regularizer=Chain(GaussianDropout(0.5), ScaleNoise(0.5)), threshold=0.1)
     with pytest.raises(ValueError, match="Chain changes more than opacities"):
