@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -44,7 +44,7 @@ class Regularizer(Scheduled):
         learns: what it learns per Gaussian, by name; supported by the bundled trainer only.
         drops: whether it may set opacities to 0.
         renders_mean: whether its test-time value is the mean of its draws.
-        last: the last draw; None if there was none, or in evaluation.
+        last: the last draw; None if there was none, in evaluation, and in a copy.
         step: the training step, set with :meth:`set_step`.
 
     Example:
@@ -71,6 +71,10 @@ class Regularizer(Scheduled):
     drops: ClassVar[bool] = True
     renders_mean: bool = False
     last: Draw | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Without the draw, which may be part of the graph of a step and then cannot be copied.
+        return {name: x for name, x in vars(self).items() if name != "last"}
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw for one training step, for which ``x`` is what the rasterizer would receive without a regularizer.

@@ -2,13 +2,14 @@
 
 import copy
 import io
+import pickle
 
 import pytest
 import torch
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from ca_reg import CAPenalty, GaussianDropout, LinearRamp, OpacityNoise
+from ca_reg import CAPenalty, Chain, GaussianDropout, LinearRamp, OpacityNoise
 from ca_reg.functional import Multiplier
 
 OPACITY = torch.linspace(0.05, 0.95, 40)
@@ -27,8 +28,34 @@ KINDS = {"dropout": GaussianDropout, "noise": OpacityNoise, "penalty": penalty}
 each_kind = pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
 
 
+def seeded():
+    return torch.Generator().manual_seed(0)
+
+
 def model(*regularizers):
     return nn.Sequential(nn.Linear(3, 2), *regularizers)
+
+
+# --- copies ---
+
+
+class Half(nn.Module):
+    """Knows nothing of this package; what it returns is part of the graph of a step."""
+
+    def forward(self, opacity, generator=None):
+        return 0.5 * opacity
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda module: pickle.loads(pickle.dumps(module))])
+def test_a_module_can_be_copied_between_a_render_and_its_backward_pass(copied):
+    logits = torch.zeros(40, requires_grad=True)
+    chain = Chain(GaussianDropout(0.5), Half())
+    out = chain(logits.sigmoid())
+    twin = copied(chain)
+    assert twin.keep is None
+    assert torch.equal(twin(OPACITY, generator=seeded()), chain(OPACITY, generator=seeded()))
+    out.sum().backward()
+    assert logits.grad.any()
 
 
 # --- state dicts ---
