@@ -97,7 +97,6 @@ def alpha_moments(alphas: Tensor, multiplier: Multiplier) -> PixelMoments:
         >>> alpha_moments(torch.tensor([0.5, 0.5]), Multiplier.dropout(0.5)).mean
         tensor(0.4375)
     """
-    _check_alphas(alphas)
     mean, variance = pixel_moments(alphas, torch.ones_like(alphas)[..., None], multiplier)
     return PixelMoments(mean[..., 0], variance[..., 0])
 
