@@ -43,9 +43,10 @@ def check_opacity_range(opacity: Tensor, upper: float = 1.0) -> None:
     low, high = (float(x) for x in torch.aminmax(opacity.detach()))
     if not (low >= 0.0 and high <= upper and math.isfinite(high)):
         allowed = "at least 0" if math.isinf(upper) else f"in [0, {upper:g}]"
+        remedy = "pass torch.sigmoid(logits), what the rasterizer receives, not the raw parameter."
         raise ValueError(
             f"opacity must be activated, {allowed}, got values from {low:g} to {high:g}; "
-            "pass torch.sigmoid(logits), what the rasterizer receives, not the raw parameter."
+            + ("the training has diverged." if math.isnan(low) else remedy)
         )
 
 

@@ -87,6 +87,8 @@ def test_logits_are_recognized_at_the_first_call():
     for module in (GaussianDropout(0.2), OpacityNoise(0.2), GaussianDropout(0.2).eval()):
         with pytest.raises(ValueError, match="sigmoid"):
             module(torch.randn(50))
+        with pytest.raises(ValueError, match="got values from nan to nan; the training has diverged"):
+            module(OPACITY.clone().index_fill_(0, torch.tensor(7), torch.nan))
 
 
 def test_a_draw_cannot_be_replayed_in_eval_nor_on_another_number_of_gaussians():
