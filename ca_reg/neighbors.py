@@ -56,7 +56,7 @@ def _by_tree(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     coordinates = _on_cpu(points)
     distances, numbers = cKDTree(coordinates).query(coordinates, count + 1, workers=torch.get_num_threads())
     found, places = torch.from_numpy(distances), torch.from_numpy(numbers)
-    others = places != torch.arange(len(points))[:, None]
+    others = places != torch.arange(len(points), device=places.device)[:, None]
     others[others.all(1), -1] = False  # among more than `count` points at one place it may not have found itself
     shape = (len(points), count)
     return found[others].view(shape).square_().to(points), places[others].view(shape).to(points.device)

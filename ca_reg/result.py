@@ -191,7 +191,7 @@ def summarize(results: Iterable[CAResult]) -> CASummary:
         >>> summarize(score(torch.ones(10), view=None, index=i) for i in range(2)).views
         2
     """
-    sums, settings = torch.zeros(5, dtype=torch.float64), set()
+    sums, settings = torch.zeros(5, dtype=torch.float64, device="cpu"), set()
     for result in results:
         sums += row_of(result)
         settings.add(result.settings)
@@ -205,7 +205,7 @@ def row_of(result: CAResult) -> Tensor:
     ok = result.reason is Reason.OK
     row = [result.value, result.std_error**2] if ok else [0.0, 0.0]
     row += [1.0, float(result.reason is Reason.EMPTY), float(result.reason is Reason.NOT_FINITE)]
-    return torch.tensor(row, dtype=torch.float64)
+    return torch.tensor(row, dtype=torch.float64, device="cpu")
 
 
 def summary_of(sums: Tensor, settings: CASettings) -> CASummary:

@@ -254,7 +254,7 @@ class CAScore:
 
     def reset(self) -> None:
         """Forget all views."""
-        self._sums = torch.zeros(5, dtype=torch.float64)
+        self._sums = torch.zeros(5, dtype=torch.float64, device="cpu")
         self._updates = 0
 
     def _exact(self, moments_fn: MomentsFn, x: Params, view: Any) -> ExactView:

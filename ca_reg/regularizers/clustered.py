@@ -60,7 +60,7 @@ class ClusteredDropout(Regularizer):
         """Return the rate of the anchors, given ``p`` at the step and the neighbor indices of all Gaussians, (N, k)."""
         clusters = 1 + neighbors.flatten().bincount(minlength=len(neighbors))
         counts = clusters.bincount().double().cpu()
-        sizes = torch.arange(len(counts), dtype=torch.float64)
+        sizes = torch.arange(len(counts)).to(counts)
         stay = 1.0
         for _ in range(30):  # Newton's method from above, monotone because the mean is convex in `stay`
             excess = float(counts @ stay**sizes / counts.sum()) - (1 - float(rate))

@@ -13,6 +13,7 @@ from ca_reg import (
     ListMoments,
     OpacityNoise,
     attribute,
+    summarize,
 )
 from ca_reg.functional import Multiplier
 from ca_reg.lists import PixelLists
@@ -85,6 +86,17 @@ def test_scores_are_those_of_the_processor(scenes, kind):
         found.append(score.compute().value)
     assert found[0] > 0
     assert found[1] == pytest.approx(found[0], rel=1e-12)
+
+
+def test_a_score_goes_on_under_another_default_device(scenes, card):
+    """As after ``torch.set_default_device("cuda")``."""
+    scene = scenes[1]
+    score = CAScore(scene.render, threshold=0.1)
+    first = score.update(scene.opacity, None)
+    with card:
+        second = score.update(scene.opacity, None)
+        assert summarize([first, second]) == score.compute()
+    assert score.compute().value == pytest.approx((first.value + second.value) / 2, rel=1e-15)
 
 
 @pytest.mark.parametrize("repeatable", [False, True])

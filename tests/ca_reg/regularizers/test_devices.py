@@ -1,9 +1,12 @@
 """Every registered regularizer wherever the Gaussians are: the draw is the generator's, the result theirs."""
 
+import itertools
+
 import pytest
 import torch
 
 from ca_reg import Params
+from ca_reg.neighbors import TREE_FROM
 from ca_reg.regularizers import REGULARIZERS, parse
 
 ARGUMENTS = {"dropout": "(0.5)", "noise": "(0.5)", "clustered": "(0.3)", "position_noise": "(0.1)"}
@@ -11,12 +14,12 @@ ARGUMENTS = {"dropout": "(0.5)", "noise": "(0.5)", "clustered": "(0.3)", "positi
 N = 60
 
 
-def params(chain, device) -> Params:
+def params(chain, device, n=N) -> Params:
     g = torch.Generator().manual_seed(0)
     named = {"means": (3,), "scales": (3,), "quaternions": (4,), "sh": (9, 3)}
-    tensors = {name: (0.1 + torch.rand(N, *shape, generator=g)).to(device) for name, shape in named.items()}
-    learned = {name: torch.full((N,), of.start, device=device) for name, of in chain.learns.items()}
-    opacities = torch.rand(N, generator=g).to(device)
+    tensors = {name: (0.1 + torch.rand(n, *shape, generator=g)).to(device) for name, shape in named.items()}
+    learned = {name: torch.full((n,), of.start, device=device) for name, of in chain.learns.items()}
+    opacities = torch.rand(n, generator=g).to(device)
     return Params(opacities, **tensors, view_matrix=torch.eye(4, device=device), learned=learned, step=3_000)
 
 
@@ -32,3 +35,18 @@ def test_draw_and_test_time_value_are_those_of_the_cpu(name, device):
             x, y = getattr(here, field), getattr(there, field)
             assert y.device.type == device.type, field
             torch.testing.assert_close(y.cpu(), x)
+
+
+@pytest.mark.parametrize("name", list(REGULARIZERS))
+@pytest.mark.parametrize("n", [N, TREE_FROM])
+def test_another_default_device_changes_nothing(name, n, card):
+    """As after ``torch.set_default_device("cuda")``, wherever the Gaussians are."""
+    for where, training in itertools.product(("cpu", card), (True, False)):
+        found = []
+        for default in (torch.device("cpu"), card):
+            chain = parse(name + ARGUMENTS.get(name, "")).train(training)
+            x = params(chain, where, n)
+            with default:
+                found.append(chain(x, generator=torch.Generator("cpu").manual_seed(1)).opacities)
+            assert found[-1].device == x.opacities.device
+        assert torch.equal(*found)
