@@ -31,7 +31,7 @@ class Scheduled(nn.Module):
         super().__init__()
         value = rate.value if isinstance(rate, Constant) else rate
         if not callable(value) and (value is not None or self.rate_name):
-            self._check_rate(value, self.rate_name)  # type: ignore[arg-type]  # refuses None
+            self._check_rate(value, self.rate_name or "the rate")  # type: ignore[arg-type]  # refuses None
         self._schedule = as_schedule(0.0 if rate is None else rate)
         self._opacity_seen = False
         self._rate: Tensor | None = None
@@ -61,7 +61,7 @@ class Scheduled(nn.Module):
         """Return the rate at a step, by default the current one, after a check."""
         step = self.step if step is None else step
         rate = self._schedule(step)
-        self._check_rate(rate, f"{self.rate_name} at step {step}")
+        self._check_rate(rate, f"{self.rate_name or 'the rate'} at step {step}")
         return rate
 
     def _rate_at(self, step: int) -> Rate:

@@ -199,3 +199,8 @@ def test_the_text_of_a_regularizer_has_its_arguments():
             self.share = share
 
     assert repr(Fade(0.1)) == "Fade(speed=0.1, share=0.5)"
+    for kind, name in ((Fade, "speed"), (IndependentDropout, "the rate")):
+        with pytest.raises(ValueError, match=rf"^{name} must be in \[0, 1\), got 1.5"):
+            kind(1.5)
+        with pytest.raises(ValueError, match=rf"^{name} at step 9 must be in \[0, 1\), got 1.5"):
+            kind(lambda step: 1.5).set_step(9)
