@@ -50,6 +50,10 @@ class Call:
         """Rasterize."""
         return self.function(*self._bound.args, **self._bound.kwargs)
 
+    def takes(self, name: str) -> bool:
+        """Whether the function has an argument of this name, given or not."""
+        return name in self._bound.signature.parameters
+
     @classmethod
     def check(cls, chain: Chain, signature: inspect.Signature) -> None:
         """Raise a ValueError if a regularizer needs a field that no call with this signature can supply."""

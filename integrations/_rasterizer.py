@@ -133,6 +133,11 @@ def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
 
 def white_alpha(call: ForwardCall) -> Tensor:
     """Measure the accumulated alpha (H, W) of a call by repeating it with all colors 1 over a background of 0."""
+    if not call.takes("colors_precomp"):
+        raise ValueError(
+            f"{type(call.rasterizer).__name__} takes no colors_precomp, by which its alpha could be measured in white: "
+            "return it from render, named alpha."
+        )
     settings = call.rasterizer.raster_settings
     opacities: Tensor = call.arguments["opacities"]
     before = dict(call.arguments)

@@ -38,7 +38,8 @@ def render_fn(
     Raises:
         ImportError: when called, if no rasterizer is installed and none was given.
         RuntimeError: when called, if ``render`` does not call the rasterizer exactly once.
-        ValueError: when called, if ``render`` does not rasterize as many Gaussians as there are opacities.
+        ValueError: when called, if ``render`` does not rasterize as many Gaussians as there are opacities, or returns
+            no alpha and the rasterizer takes no ``colors_precomp``.
 
     Example:
         >>> import torch

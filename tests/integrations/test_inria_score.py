@@ -3,10 +3,12 @@
 import sys
 import threading
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import pytest
 import torch
 from stand_ins.inria import PIPE, Model, make_rasterizer, make_render
+from torch import nn
 
 from ca_reg import CAScore, GaussianDropout
 from ca_reg.integrations.inria import RasterizerHook
@@ -15,6 +17,12 @@ from reference_trainer.render import render as reference_render
 
 FORMS = ["plain", "inverse-depth", "weights", "depth-alpha"]
 BACKGROUND = torch.tensor([0.3, 0.1, 0.7])
+
+
+class Settings(NamedTuple):
+    bg: torch.Tensor
+    image_height: int
+    image_width: int
 
 
 def reference(model):
@@ -106,3 +114,22 @@ def test_what_cannot_be_scored_is_said():
     fn = render_fn(make_render(rasterizer), model, PIPE, BACKGROUND, rasterizer=rasterizer)
     with pytest.raises(ValueError, match="rasterizes 60 Gaussians, but 59 opacities"):
         fn(opacity[1:], model.camera)
+
+
+def test_an_alpha_is_not_measured_where_colors_cannot_be_given():
+    class Rasterizer(nn.Module):
+        def __init__(self, settings):
+            super().__init__()
+            self.raster_settings = settings
+
+        def forward(self, means3D, means2D, opacities, features):
+            return features.mean(0)[:, None, None].expand(3, 24, 32), torch.ones(len(means3D), dtype=torch.int32)
+
+    model, settings = Model(), Settings(BACKGROUND, 24, 32)
+
+    def render(camera, gaussians, pipe, background):
+        return {"render": Rasterizer(settings)(gaussians.get_xyz, None, gaussians.get_opacity, torch.rand(60, 3))[0]}
+
+    fn = render_fn(render, model, PIPE, BACKGROUND, rasterizer=Rasterizer)
+    with pytest.raises(ValueError, match=r"Rasterizer takes no colors_precomp.* return it from render, named alpha"):
+        fn(model.get_opacity.detach(), model.camera)
