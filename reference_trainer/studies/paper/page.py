@@ -51,14 +51,14 @@ def claims_table(kept: Kept) -> str:
 
 
 def details(name: str, kept: Kept) -> str:
-    """Return, for every scene, the table of a claim's settings and its checks; "" if nothing is measured."""
+    """Return the table of a claim's settings and the checks, for every scene that has more than half of the settings."""
     claim, parts = CLAIMS[name], []
     for scene in tested(claim, kept):
         found = {}
         for setting in claim.settings:
             if of := [row for row in kept.of(scene, setting).values() if claim.needs <= row.keys()]:
                 found[name_of(setting, kept)] = of
-        if len(found) >= min(2, len(claim.settings)):
+        if 2 * len(found) > len(claim.settings):
             about = kept.scenes[scene].content.get("about", "")
             parts.append(f"**{scene}**: {about}\n\n{_table(found, claim.shows)}")
             lines = [_line(check, apart, kept) for check in claim.checks if (apart := differences(check, scene, kept))]
@@ -122,7 +122,9 @@ def page(text: str, kept: Kept) -> str:
             found = {key: details(key, of) for key in CLAIMS}
             headed = [f"## {_heading(key)}\n\n{text}" for key, text in found.items() if text]
             missing = ", ".join(key for key, text in found.items() if not text)
-            body = "\n".join([*headed, f"Not yet measured: {missing}.\n"] if missing else headed)
+            body = "\n".join(
+                [*headed, f"Not yet measured after {of.iterations:,} steps: {missing}.\n"] if missing else headed
+            )
         return f"{match[1]}{body}{match[5]}"
 
     return _MARKS.sub(made, text)
