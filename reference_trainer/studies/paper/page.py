@@ -51,7 +51,7 @@ def claims_table(kept: Kept) -> str:
 
 
 def details(name: str, kept: Kept) -> str:
-    """Return the table of a claim's settings and the checks, for every scene that has more than half of the settings."""
+    """Return the table of a claim's settings and its checks for every scene with more than half of the settings."""
     claim, parts = CLAIMS[name], []
     for scene in tested(claim, kept):
         found = {}

@@ -9,7 +9,7 @@ from typing import Literal
 
 __all__ = ["Verdict", "interval", "overall", "verdict"]
 
-Verdict = Literal["holds", "fails", "undecided"]
+Verdict = Literal["holds", "fails", "undecided", "depends on the scene"]
 ERRORS = 2.0
 """Half the width of the interval, in standard errors of the mean over the seeds."""
 
@@ -46,16 +46,17 @@ def verdict(differences: Sequence[float], low: float, high: float) -> Verdict:
 def overall(verdicts: Iterable[Verdict], *, needs_all: bool = False) -> Verdict:
     """Combine verdicts: "holds" if more than half hold and none fails, "fails" if more than half fail and none holds.
 
-    With ``needs_all``, for the checks of one claim, all must hold, and a single failure makes it "fails".
+    Where some hold and others fail, the claim "depends on the scene". With ``needs_all``, for the checks of one claim,
+    all must hold, and a single failure makes it "fails".
 
     Example:
         >>> overall(["holds", "holds", "undecided"]), overall(["holds", "holds", "fails"]), overall(["fails"])
-        ('holds', 'undecided', 'fails')
+        ('holds', 'depends on the scene', 'fails')
     """
     found = list(verdicts)
     holds, fails = found.count("holds"), found.count("fails")
     if needs_all:
         return "fails" if fails else "holds" if found and holds == len(found) else "undecided"
-    if holds > len(found) / 2 and not fails:
-        return "holds"
-    return "fails" if fails > len(found) / 2 and not holds else "undecided"
+    if holds and fails:
+        return "depends on the scene"
+    return "holds" if holds > len(found) / 2 else "fails" if fails > len(found) / 2 else "undecided"

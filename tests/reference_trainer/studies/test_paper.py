@@ -137,7 +137,7 @@ def test_the_verdict_of_checks_and_of_scenes():
     assert overall(["holds", "undecided"], needs_all=True) == "undecided"
     assert overall(["holds", "undecided", "fails"], needs_all=True) == "fails"
     assert overall(["holds", "holds", "undecided"]) == "holds"
-    assert overall(["holds", "holds", "holds", "fails"]) == "undecided"
+    assert overall(["holds", "holds", "holds", "fails"]) == "depends on the scene"
     assert overall(["holds", "undecided"]) == "undecided"
     assert overall(["fails", "fails", "undecided"]) == "fails"
     assert overall([]) == overall([], needs_all=True) == "undecided"
@@ -213,7 +213,7 @@ def test_claims_are_judged_scene_by_scene(kept):
     assert judged(CLAIMS["1"], kept) == {"a": (3, "holds"), "b": (2, "fails"), "c": (1, "undecided")}
     assert judged(CLAIMS["2"], kept) == {}
     lines = {line.split(" | ")[0].strip("| "): line for line in claims_table(kept).splitlines()[2:]}
-    assert lines["1"].endswith("| undecided | holds: a (3); fails: b (2); undecided: c (1) |")
+    assert lines["1"].endswith("| depends on the scene | holds: a (3); fails: b (2); undecided: c (1) |")
     assert lines["2"].endswith("| not yet measured | - |")
     assert "systems" not in lines
 
