@@ -195,7 +195,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         from kornia.geometry.quaternion import Quaternion
 
         gui, scene = self._server.gui, self._server.scene
-        cameras = {f"{split} {view.name}": view.camera for split, of in views.items() for view in of}
+        cameras = {f"{split} {view.name}": view.camera.to("cpu") for split, of in views.items() for view in of}
         distance = _distance(gaussians, next(iter(cameras.values())))
         size = 0.04 * distance  # of a frustum
         if len(cameras) > 1:
@@ -253,8 +253,8 @@ def _camera(view: Any, most: int) -> Camera:
 
 
 def _pose(camera: Camera, distance: float) -> dict[str, Any]:
-    """Convert a camera to properties of viser's, which orbits around the point at ``distance`` in front of it."""
-    position, axes = camera.position.cpu(), camera.world_to_camera[:3, :3].cpu()
+    """Convert a camera on the CPU to properties of viser's, which orbits around a point ``distance`` in front of it."""
+    position, axes = camera.position, camera.world_to_camera[:3, :3]
     return {
         "position": position.numpy(),
         "look_at": (position + distance * axes[2]).numpy(),

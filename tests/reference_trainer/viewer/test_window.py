@@ -11,6 +11,8 @@ from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import run_experiment
+from reference_trainer.scenes.orbit import orbit_views
+from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.viewer import window
 from reference_trainer.viewer.picture import Look, Subject
 from reference_trainer.viewer.window import MOST, Viewer, _camera, _pose
@@ -95,6 +97,14 @@ def test_a_training_that_is_watched_ends_with_the_same_model(run, options, short
     results = run_experiment(options, short, tmp_path, monitor_every=0, watch=watch)
     assert len(client.shown) == short.iterations + len(results["views"])  # also while the result is measured
     assert (tmp_path / "point_cloud.ply").read_bytes() == (run[0] / "point_cloud.ply").read_bytes()
+
+
+def test_a_model_on_a_card_is_shown_from_an_orbit_around_it(run, viewer, card):
+    model, _ = of_run(run[0], str(card))
+    cameras = orbit_views(model.gaussians.means, model.gaussians.opacities, count=3, width=32, height=24)
+    viewer.show(model, {"orbit": [Viewpoint(str(number), camera) for number, camera in enumerate(cameras)]})
+    first = cameras[0].position.cpu().numpy()
+    np.testing.assert_allclose(viewer._server.initial_camera.position, first, rtol=1e-6)
 
 
 def test_a_training_that_nobody_looks_at_is_left_alone(viewer):
