@@ -16,6 +16,7 @@ from reference_trainer.runs.engines.engine import Engine, Failure, Task
 from reference_trainer.runs.engines.run_all import run_all
 from reference_trainer.runs.figures import new_figure
 from reference_trainer.runs.folder import CHECKPOINT
+from reference_trainer.runs.lock import run_lock
 
 if TYPE_CHECKING:  # an extra
     from matplotlib.figure import Figure
@@ -69,36 +70,42 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
 
     Raises:
         ValueError: if there is no case, or what ``study.measure`` raises.
+        FolderInUseError: if another process is at work in the folder; nothing there was touched.
         RuntimeError: after the others are written, if cases failed on the engine; the same call tries them again.
     """
     if not study.cases:
         raise ValueError(f"expected at least 1 case of {study.name}, got none.")
-    here, file = machine(), out / f"{study.name}.records.json"
-    kept = KeptRecords(file, study.name, say)
-    keys = {name: f"{name} {fingerprint([here, _decisive(dict(case))])}" for name, case in study.cases.items()}
-    missing = [name for name, key in keys.items() if kept.get(key) is None]
-    failed = {}
-    for name, outcome in _measured(study, missing, engine, say):
-        if isinstance(outcome, Failure):
-            failed[name] = outcome.error
-        else:
-            kept.add(keys[name], json.loads(json.dumps(outcome)))  # as it will be when read back
-    records = {name: record for name, key in keys.items() if (record := kept.get(key)) is not None}
-    write_json(out / f"{study.name}.json", {"study": study.name, "machine": here, "cases": records, "failed": failed})
-    if records:
-        text = study.report(records)
-        write_text(out / f"{study.name}.md", text)
-        say(text)
-        if study.draw is not None:
-            with new_figure(out / f"{study.name}.png") as figure:
-                study.draw(records, figure)
-        say(f"numbers, tables and figures: {study.name}.* in {out}")
-    if failed:
-        reasons = "".join(f"\n  {name}: {error}" for name, error in failed.items())
-        raise RuntimeError(f"{len(failed)} of {len(keys)} cases FAILED; the same command tries them again:{reasons}")
-    if study.check:
-        file.unlink(missing_ok=True)
-    return records
+    with run_lock(out):
+        here, file = machine(), out / f"{study.name}.records.json"
+        kept = KeptRecords(file, study.name, say)
+        keys = {name: f"{name} {fingerprint([here, _decisive(dict(case))])}" for name, case in study.cases.items()}
+        missing = [name for name, key in keys.items() if kept.get(key) is None]
+        failed = {}
+        for name, outcome in _measured(study, missing, engine, say):
+            if isinstance(outcome, Failure):
+                failed[name] = outcome.error
+            else:
+                kept.add(keys[name], json.loads(json.dumps(outcome)))  # as it will be when read back
+        records = {name: record for name, key in keys.items() if (record := kept.get(key)) is not None}
+        write_json(
+            out / f"{study.name}.json", {"study": study.name, "machine": here, "cases": records, "failed": failed}
+        )
+        if records:
+            text = study.report(records)
+            write_text(out / f"{study.name}.md", text)
+            say(text)
+            if study.draw is not None:
+                with new_figure(out / f"{study.name}.png") as figure:
+                    study.draw(records, figure)
+            say(f"numbers, tables and figures: {study.name}.* in {out}")
+        if failed:
+            reasons = "".join(f"\n  {name}: {error}" for name, error in failed.items())
+            raise RuntimeError(
+                f"{len(failed)} of {len(keys)} cases FAILED; the same command tries them again:{reasons}"
+            )
+        if study.check:
+            file.unlink(missing_ok=True)
+        return records
 
 
 def checkpoints(runs: Sequence[Path]) -> dict[str, Path]:

@@ -10,6 +10,7 @@ from PIL import Image
 from stand_ins.engine import Here
 
 from reference_trainer.runs.folder import CHECKPOINT
+from reference_trainer.runs.lock import FolderInUseError, run_lock
 from reference_trainer.studies import study as study_module
 from reference_trainer.studies.study import Study, checkpoints, run_study
 
@@ -96,7 +97,7 @@ def test_an_interrupted_study_continues_and_writes_nothing_of_all(tmp_path):
         with pytest.raises(ValueError, match="no -1 times"):
             run_study(study(**cases), tmp_path, say=quiet)
     assert measured == ["x"]
-    assert [path.name for path in tmp_path.iterdir()] == ["letters.records.json"]
+    assert [path.name for path in tmp_path.glob("letters.*")] == ["letters.records.json"]
 
 
 def test_a_check_continues_where_it_was_interrupted_and_begins_anew_when_it_is_finished(tmp_path):
@@ -139,3 +140,13 @@ def test_checkpoints_are_named_by_the_last_parts_of_their_paths_that_tell_them_a
     other.mkdir(parents=True)
     (other / CHECKPOINT).touch()
     assert [*checkpoints([runs[0], other])] == [f"{tmp_path.name}/fern/dropout/seed_0", "other/fern/dropout/seed_0"]
+
+
+def test_a_folder_where_another_study_is_at_work_is_left_alone(tmp_path):
+    with run_lock(tmp_path):
+        before = sorted(tmp_path.iterdir())
+        with pytest.raises(FolderInUseError, match="another process is at work there"):
+            run_study(study(a={"text": "x"}), tmp_path, say=quiet)
+        assert (measured, sorted(tmp_path.iterdir())) == ([], before)
+    run_study(study(a={"text": "x"}), tmp_path, say=quiet)
+    assert measured == ["x"]
