@@ -97,13 +97,16 @@ def chosen_scenes(names: Sequence[str], data: Path, own: SceneOptions) -> dict[s
         own: the user's own scene instead, if it has a path.
 
     Raises:
-        ValueError: if a scene is not declared, or both declared scenes and an own one are given.
+        ValueError: if a scene is not declared, both declared scenes and an own one are given, or options of an own one
+            that has no path.
     """
     if own.path:
         if names:
             raise ValueError(f"give declared scenes or --path, not both: got {[*names]} and {own.path}.")
         name = own.path if own.path == "synthetic" else Path(own.path).resolve().name
         return {name: PaperScene(own, depth="true" if own.path == "synthetic" else "points")}
+    if own != SceneOptions(""):
+        raise ValueError("the options of a scene apply to one of your own, the declared ones have theirs: give --path.")
     if unknown := [name for name in names if name not in SCENES]:
         raise ValueError(f"there is no declared scene {unknown[0]}; choose of {', '.join(SCENES)}, or give --path.")
     return {name: SCENES[name].below(data) for name in names or SCENES}

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import torch
+from commands import refused
 from oracles import brute_force, random_scene
 from pages import ROOT
 from stand_ins.engine import Here
@@ -100,6 +101,12 @@ def test_unknown_names_are_refused(tmp_path):
         chosen_scenes(["garden"], tmp_path, SceneOptions(""))
     with pytest.raises(ValueError, match="declared scenes or --path, not both"):
         chosen_scenes(["fern"], tmp_path, SceneOptions("mine"))
+
+
+def test_options_that_would_change_nothing_are_refused(capsys):
+    assert "options of a scene apply to one of your own" in refused(
+        ["study", "paper", "--list", "--images", "images_8"], capsys
+    )
 
 
 def test_one_claim_on_a_scene_of_ones_own(tmp_path, capsys):
