@@ -131,7 +131,7 @@ def _split(root: Path, capture: Capture, options: SceneOptions) -> tuple[list[Fr
     frames, test, split = capture.frames, capture.test or [], options.split
     if split == "auto":
         split = "split" if (root / "split.json").is_file() else capture.split
-        few = split != "split" and options.views is None and capture.test is None and len(frames) < FEW
+        few = split != "split" and options.views in (None, len(frames)) and capture.test is None and len(frames) < FEW
     else:
         few = False
     if options.test == "none" or few:

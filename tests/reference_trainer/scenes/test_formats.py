@@ -81,6 +81,8 @@ def test_few_photographs_all_train_from_whatever_points_there_are(photographs, c
     assert [view.name for view in scene.train] == list(PICTURES)
     assert scene.test == ()
     assert scene.points.positions[:2].tolist() == [[0.5, -1.5, 2.25], [-4, 8, 0.125]]
+    every = load_scene(photographs, views=3)  # as many as there are: none is left to hold out
+    assert ([view.name for view in every.train], every.test) == (list(PICTURES), ())
     held_out = load_scene(photographs, views=2)
     assert (len(held_out.train), len(held_out.test)) == (2, 1)
     assert held_out.points.source == "random"
