@@ -86,7 +86,7 @@ def begun_with(
     if auto and (out / PLAN).exists():
         try:
             config = Plan.from_dict(read_json(out / PLAN)).applied(config, given=given)
-        except ValueError as error:
+        except (ValueError, TypeError, AttributeError) as error:  # whatever a damaged file, or another version's, holds
             raise ValueError(f"{out / PLAN}: {error}") from error
     found = run_settings(*read_run_settings(out / CONFIG))
     changed = [

@@ -182,10 +182,23 @@ def test_results_of_a_version_without_a_score_are_read_and_shown(tmp_path):
     assert "| mean train | n/a |" in evaluation_table(results)
 
 
-def test_a_damaged_plan_is_named(options, short, tmp_path):
+def with_changes(changes):
+    return {"items": [{"name": "SH bands", "decision": "reduced", "reason": "none", "changes": changes}]}
+
+
+@pytest.mark.parametrize(
+    ("plan", "error"),
+    [
+        ([], "expected a plan"),
+        (with_changes({"no_setting": 0}), "no_setting"),  # of another version
+        (with_changes({"initial_scale": "half"}), "str"),
+        (with_changes(3), "int"),
+    ],
+)
+def test_a_damaged_plan_is_named(options, short, tmp_path, plan, error):
     (tmp_path / CONFIG).write_text('{"scene": {}, "config": {}}')
-    (tmp_path / PLAN).write_text("[]")
-    with pytest.raises(ValueError, match=r"plan\.json: expected a plan"):
+    (tmp_path / PLAN).write_text(json.dumps(plan))
+    with pytest.raises(ValueError, match=rf"plan\.json: .*{error}"):
         run_experiment(options, short, tmp_path, auto=True)
 
 
