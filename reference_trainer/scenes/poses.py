@@ -108,7 +108,7 @@ def find_poses(
                 "from in between, or take the poses of VGGT or InstantSplat."
             )
         registered = {image.name for image in model.images.values() if image.has_pose}
-        if out != scene:
+        if out.resolve() != scene.resolve():
             (out / "images").mkdir(parents=True, exist_ok=True)
             for photo in photos:
                 shutil.copy2(photo, out / "images")

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from reference_trainer.cli import main
-from reference_trainer.scenes import load_scene
+from reference_trainer.scenes import load_scene, poses
 from reference_trainer.scenes.colmap import read_colmap
 from reference_trainer.scenes.poses import _write, find_poses
 
@@ -153,3 +154,20 @@ def test_a_model_is_written_whole_or_not_at_all(tmp_path):
     _write(Model(fails=False), folder)
     assert {path.name for path in folder.iterdir()} == {"cameras.bin", "images.bin"}
     assert not killed.exists()
+
+
+def test_a_scene_named_in_two_ways_is_not_copied_onto_itself(noise, monkeypatch):
+    (noise / "images").mkdir()
+    for photo in noise.glob("*.png"):
+        photo.rename(noise / "images" / photo.name)
+    found = SimpleNamespace(
+        images={0: SimpleNamespace(name="1.png", has_pose=True)},
+        cameras={0: SimpleNamespace(mean_focal_length=lambda: 50.0)},
+        num_points3D=lambda: 3,
+        compute_mean_reprojection_error=lambda: 0.5,
+        write_binary=lambda folder: None,
+    )
+    monkeypatch.setattr(poses, "_reconstruct", lambda *arguments: found)
+    monkeypatch.chdir(noise.parent)
+    assert find_poses(noise.name, noise).registered == ("1.png",)
+    assert sorted(path.name for path in noise.iterdir()) == ["images", "sparse"]
