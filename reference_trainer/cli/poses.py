@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -32,4 +33,5 @@ class Poses:
         from reference_trainer.scenes.poses import find_poses
 
         found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, progress=True)
-        print(f"{found}\nThe cameras are in {found.folder}: ca-reg train {found.folder.parents[1]}")
+        command = shlex.join(["ca-reg", "train", str(found.folder.parents[1])])
+        print(f"{found}\nThe cameras are in {found.folder}: {command}")

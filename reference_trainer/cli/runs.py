@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -168,7 +169,8 @@ class Train:
                 **watched,
             )
         print(summary(results))
-        print(f"Everything is in {self.out}; a page: ca-reg report {self.out}; curves: tensorboard --logdir {self.out}")
+        out = shlex.quote(str(self.out))
+        print(f"Everything is in {self.out}; a page: ca-reg report {out}; curves: tensorboard --logdir {out}")
 
 
 @dataclass(frozen=True)

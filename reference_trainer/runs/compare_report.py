@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,5 +86,5 @@ def _report(comparison: Comparison, out: Path, say: Callable[[str], None]) -> No
         for name in file_names([view["name"] for view in views if view["split"] == split]):
             comparison_figure(first, out / f"{split}_{name}.png", view=name, split=split)
             say(f"the pictures of each strategy: {out / f'{split}_{name}.png'}")
-    say(f"a page about the first seed of each: ca-reg report {' '.join(map(str, first.values()))}")
-    say(f"table and all numbers: {out / TABLE}, {out / REPORT}; curves: tensorboard --logdir {out}")
+    say(f"a page about the first seed of each: ca-reg report {shlex.join(map(str, first.values()))}")
+    say(f"table and all numbers: {out / TABLE}, {out / REPORT}; curves: tensorboard --logdir {shlex.quote(str(out))}")

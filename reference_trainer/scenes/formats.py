@@ -6,6 +6,7 @@ A new format is a module with a reader and an entry in `load.py`. Formats from o
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,8 +101,8 @@ def find_format(root: Path, name: str) -> tuple[str, Reader]:
         raise ValueError(f"format must be auto, module:function or one of {', '.join(_FORMATS)}, got {name!r}.")
     if any(map(is_image, (*root.glob("*"), *root.glob("images/*")))):
         raise ValueError(
-            f"the photographs in {root} have no cameras yet: `ca-reg poses {root}` finds them (pip install "
-            "'ca_reg[colmap]'), as do COLMAP, VGGT and InstantSplat."
+            f"the photographs in {root} have no cameras yet: `ca-reg poses {shlex.quote(str(root))}` finds them (pip "
+            "install 'ca_reg[colmap]'), as do COLMAP, VGGT and InstantSplat."
         )
     raise ValueError(
         f"{root} has none of {', '.join(format.sign for format in _FORMATS.values())}; it has "

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 
 import pytest
 from commands import plain, refused
@@ -49,6 +50,16 @@ def test_the_scene_of_a_training_may_be_given_either_way(arguments, monkeypatch,
     main(["train", *arguments, "--views", "5", "--out", str(tmp_path)])
     assert asked == [SceneOptions("garden", views=5)]
     assert "not both: got garden and fern" in refused(["train", "garden", "--path", "fern"], capsys)
+
+
+def test_the_commands_that_a_training_ends_with_can_be_pasted(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(run_module, "run_experiment", lambda *arguments, **named: {})
+    monkeypatch.setattr(tables, "summary", lambda results: "")
+    out = str(tmp_path / "my run")
+    main(["train", "--out", out])
+    *_, page, curves = capsys.readouterr().out.strip().split(";")
+    assert shlex.split(page)[-3:] == ["ca-reg", "report", out]
+    assert shlex.split(curves)[-3:] == ["tensorboard", "--logdir", out]
 
 
 def test_a_ply_is_known_by_its_name(monkeypatch):

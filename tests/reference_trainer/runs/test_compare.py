@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import os
+import shlex
 import statistics
 from pathlib import Path
 
@@ -179,17 +180,20 @@ def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch):
 @pytest.mark.parametrize("lines", [None, ""])
 def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, lines):
     """As after --monitor-every 0, or fewer steps than that."""
+    out = tmp_path / "my runs"
     results = made(20.0) | {"config": {"seed": 0}, "views": [{"split": "test", "name": f"{x}/r_0.png"} for x in "ab"]}
     for strategy, width in (("baseline", 90), ("dropout", 84)):  # a label with a digit less makes a narrower panel
-        folder = tmp_path / strategy / "seed_0"
+        folder = out / strategy / "seed_0"
         for name in ("a_r_0", "b_r_0"):
             save_png(folder / "views" / "test" / f"{name}_panel.png", torch.rand(3, 8, width))
         if lines is not None:
             (folder / LOG_NAME).write_text(lines)
     said: list[str] = []
-    report({tmp_path: Comparison({"baseline": [results], "dropout": [results]}, {})}, say=said.append)
+    report({out: Comparison({"baseline": [results], "dropout": [results]}, {})}, say=said.append)
     assert any(line.startswith("no figure of CA and PSNR against the iteration: ") for line in said)
-    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["test_a_r_0.png", "test_b_r_0.png"]
+    assert sorted(path.name for path in out.glob("*.png")) == ["test_a_r_0.png", "test_b_r_0.png"]
+    (page,) = (line for line in said if "ca-reg report" in line)
+    assert shlex.split(page)[-2:] == [str(out / strategy / "seed_0") for strategy in ("baseline", "dropout")]
 
 
 def test_a_worker_that_does_not_share_the_folder_does_not_train(tmp_path, options):
