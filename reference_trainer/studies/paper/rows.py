@@ -68,11 +68,17 @@ class Rows:
         file: the JSON file, which need not exist.
         about: further entries of a new file.
         lock: a file on the same machine to lock while it is written.
+
+    Raises:
+        ValueError: if the file is of the scene with other ``options`` than those of ``about``.
     """
 
     def __init__(self, file: Path, about: Mapping[str, Any] | None = None, lock: Path | None = None) -> None:
         self.file, self.lock = file, lock or file.with_suffix(".lock")
         self.content: dict[str, Any] = read_json(file) if file.is_file() else {**(about or {}), "rows": []}
+        found, asked = (of.get("options") for of in (self.content, about or {}))
+        if None not in (found, asked) and found != asked:
+            raise ValueError(f"{file} holds trainings with the options {found}, not {asked}: give another --out.")
 
     @property
     def rows(self) -> Sequence[Row]:

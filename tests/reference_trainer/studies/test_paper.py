@@ -201,6 +201,20 @@ def test_what_lacks_a_figure_is_not_done(tmp_path):
     assert estimate(others[0], rows_of(grid)) == pytest.approx(60.0)  # as long as its like
 
 
+def test_what_is_kept_of_other_photographs_is_not_taken_for_these(tmp_path):
+    """The same scene at another size: neither counted as done, nor continued."""
+
+    def grid(**options):
+        scenes = chosen_scenes([], tmp_path, SceneOptions("synthetic", **options))
+        return Grid(chosen(["1"], [*scenes]), scenes, out=tmp_path, rows=tmp_path)
+
+    rows_of(grid(downscale=4.0))["synthetic"].add(row(20.0))
+    assert len(rows_of(grid(downscale=4.0))["synthetic"].rows) == 1
+    for other in ({}, {"downscale": 2.0}):
+        with pytest.raises(ValueError, match=r"holds trainings with the options {'downscale': 4.0}, not .*--out"):
+            rows_of(grid(**other))
+
+
 # The tables
 
 
