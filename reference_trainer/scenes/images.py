@@ -125,7 +125,9 @@ def list_images(folder: str | Path) -> list[Path]:
         raise FileNotFoundError(f"there is no image folder {folder}.")
     files = sorted(filter(is_image, folder.iterdir()))
     if not files:
-        raise ValueError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}).")
+        raise ValueError(
+            f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}); convert others, such as HEIC, first."
+        )
     return files
 
 

@@ -88,7 +88,8 @@ def find_poses(
     Raises:
         ImportError: if pycolmap is missing.
         FileNotFoundError: if there is no such folder.
-        ValueError: if it holds fewer than two photographs, or they show too little in common for any camera.
+        ValueError: if it holds fewer than two photographs, COLMAP cannot read one, or they show too little in common
+            for any camera.
         FileExistsError: if the scene has cameras already.
         OSError: if it cannot be written.
     """
@@ -137,9 +138,15 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
     features.sift.estimate_affine_shape = features.sift.domain_size_pooling = few
     alike, known = defaultdict(list), True
     for photo in photos:
-        taken_with = pycolmap.infer_camera_from_image(photo)
+        size = image_size(photo)
+        try:
+            taken_with = pycolmap.infer_camera_from_image(photo)
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(
+                f"COLMAP cannot read {photo}, WebP for one: save the photographs as JPEG or PNG."
+            ) from error
         known = known and taken_with.has_prior_focal_length
-        alike[(*image_size(photo), taken_with.mean_focal_length())].append(photo.name)
+        alike[(*size, taken_with.mean_focal_length())].append(photo.name)
     pycolmap.Database.open(database).close()
     for names in alike.values():  # in a fixed order: image numbers are part of the result
         pycolmap.import_images(

@@ -122,6 +122,20 @@ def test_photographs_without_cameras_are_told_how_to_get_them(noise, capsys):
     assert (said[1], shlex.split(said[2])) == (str(photos), ["ca-reg", "poses", str(photos)])
 
 
+@pytest.mark.parametrize(
+    ("kind", "error"),
+    [("WEBP", r"COLMAP cannot read .*0\.webp, .*: save the photographs as JPEG"), ("", "not a readable")],
+)
+def test_a_photograph_that_cannot_be_read_is_named(noise, kind, error):
+    pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
+    if kind:
+        Image.new("RGB", (40, 30)).save(noise / "0.webp", kind)
+    else:
+        (noise / "0.png").write_text("no picture")
+    with pytest.raises(ValueError, match=error):
+        find_poses(noise)
+
+
 def test_too_few_photographs_and_cameras_that_are_there(noise, colmap_text):
     (noise / "0.png").unlink()
     (noise / "1.png").unlink()
