@@ -27,12 +27,12 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
 
     Convention: ``transform_matrix`` is camera to world with OpenGL axes (x right, y up, z back); the frames' cameras
     are OpenCV and world to camera. nerfstudio's ``applied_transform`` is undone, so that the world is that of the
-    COLMAP files it came from. The focal length is ``fl_x`` and ``fl_y``, pixels, for a picture of ``w`` x ``h``, else
-    it follows from the horizontal field of view ``camera_angle_x``, radians. The principal point ``cx``, ``cy`` is the
-    center of the picture unless given; ``k1 k2 p1 p2 k3`` are OpenCV's distortion. A frame may override each of these.
-    ``file_path`` is relative to the JSON file; without an extension it means a PNG file. With ``images``, pictures of
-    the same names are taken from that folder beside the file. Frames are named by the relative path of their picture,
-    without extension.
+    COLMAP files it came from. The focal length is ``fl_x`` and ``fl_y``, pixels, for a picture of ``w`` x ``h``, or
+    without these for that of ``file_path``; else it follows from the horizontal field of view ``camera_angle_x``,
+    radians. The principal point ``cx``, ``cy`` is the center of the picture unless given; ``k1 k2 p1 p2 k3`` are
+    OpenCV's distortion. A frame may override each of these. ``file_path`` is relative to the JSON file; without an
+    extension it means a PNG file. With ``images``, pictures of the same names are taken from that folder beside the
+    file. Frames are named by the relative path of their picture, without extension.
 
     Raises:
         FileNotFoundError: if the file or images are missing.
@@ -75,7 +75,8 @@ def _file(root: Path, file_path: str, images: str | None) -> Path:
 
 def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float64]) -> Frame:
     """Build one frame from its entry, to which the file's shared values have been added."""
-    width, height = (int(entry["w"]), int(entry["h"])) if "w" in entry else image_size(file)
+    measured = _file(path.parent, entry["file_path"], None) if "fl_x" in entry else file  # whose pixels are meant
+    width, height = (int(entry["w"]), int(entry["h"])) if "w" in entry else image_size(measured)
     if "fl_x" in entry:
         fx = float(entry["fl_x"])
     else:

@@ -6,8 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
+from reference_trainer.scenes.frames import load_view
 from reference_trainer.scenes.transforms import read_transforms
 
 
@@ -41,6 +43,18 @@ def test_intrinsics_in_pixels_win_over_the_angle(blender_scene):
     rewrite(path, lambda c: c.update(w=80, h=60, fl_x=90.0, fl_y=91.0, cx=41.0, cy=29.0))
     camera = read_transforms(path)[0].camera
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (80, 60, 90, 91, 41, 29)
+
+
+def test_a_focal_length_without_a_size_is_for_the_picture_of_the_file(blender_scene):
+    """The same camera with pictures of half the size beside them."""
+    path, half = blender_scene / "transforms_train.json", blender_scene / "half"
+    rewrite(path, lambda c: c.update(fl_x=8.0))
+    half.mkdir()
+    for picture in (blender_scene / "train").iterdir():
+        with Image.open(picture) as image:
+            image.resize((4, 3)).save(half / picture.name)
+    views = [load_view(read_transforms(path, name)[0], background=torch.zeros(3)) for name in (None, "half")]
+    assert [(view.camera.width, view.camera.fx) for view in views] == [(8, 8), (4, 4)]
 
 
 def test_extension_may_be_given_and_dots_may_be_in_names(blender_scene):
