@@ -65,7 +65,7 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
 
 def _file(root: Path, file_path: str, images: str | None) -> Path:
     """Find the picture of a frame."""
-    file = path_inside(root, file_path)
+    file = path_inside(root, file_path.replace("\\", "/"))  # as written on Windows
     if file == root:
         raise ValueError(f"file_path {file_path!r} names the scene folder itself, not an image.")
     if images is not None:

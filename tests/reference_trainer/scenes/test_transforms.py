@@ -67,6 +67,15 @@ def test_extension_may_be_given_and_dots_may_be_in_names(blender_scene):
     assert [frame.name for frame in frames] == ["train/r_0", "train/r.1", "train/r_2"]
 
 
+def test_paths_may_have_been_written_on_windows(blender_scene):
+    path = blender_scene / "transforms_train.json"
+    expected = read_transforms(path)
+    rewrite(path, lambda c: [frame.update(file_path=frame["file_path"].replace("/", "\\")) for frame in c["frames"]])
+    assert "\\\\" in path.read_text()
+    found = read_transforms(path)
+    assert [(frame.name, frame.path) for frame in found] == [(frame.name, frame.path) for frame in expected]
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -77,6 +86,7 @@ def test_extension_may_be_given_and_dots_may_be_in_names(blender_scene):
         (lambda c: c["frames"].append(5), "not a valid transforms file"),
         (lambda c: c["frames"].append(c["frames"][0]), "lists an image twice"),
         (lambda c: c["frames"][0].update(file_path="../../etc/x"), "leads out of the scene"),
+        (lambda c: c["frames"][0].update(file_path="..\\..\\etc\\x"), "leads out of the scene"),
         (lambda c: c["frames"][0].update(file_path="/etc/x"), "leads out of the scene"),
         (lambda c: c["frames"][0].update(transform_matrix=[[1, 0], [0, 1]]), "finite 4x4"),
         (lambda c: c["frames"][0].update(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), "no rotation"),
