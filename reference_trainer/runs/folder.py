@@ -79,9 +79,12 @@ def begun_with(
         given: the settings that no plan changes.
 
     Raises:
-        ValueError: if the folder holds a run with other settings, or a damaged file.
+        ValueError: if the folder holds a run with other settings, a checkpoint without settings, or a damaged file.
     """
+    trained = (out / CHECKPOINT).exists()  # looked for first: another process writes it last
     if not (out / CONFIG).exists():
+        if trained:
+            raise ValueError(f"{out} holds a {CHECKPOINT} but no {CONFIG}: give another folder, or delete this one.")
         return None
     if auto and (out / PLAN).exists():
         try:

@@ -182,6 +182,13 @@ def test_results_of_a_version_without_a_score_are_read_and_shown(tmp_path):
     assert "| mean train | n/a |" in evaluation_table(results)
 
 
+def test_a_checkpoint_whose_settings_are_gone_is_not_continued_with_others(options, short, tmp_path, finished):
+    shutil.copy(finished[0] / CHECKPOINT, tmp_path)
+    with pytest.raises(ValueError, match=r"holds a checkpoint\.pt but no config\.json: give another folder"):
+        run_experiment(options, dataclasses.replace(short, dropout=0.5), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
+
+
 def with_changes(changes):
     return {"items": [{"name": "SH bands", "decision": "reduced", "reason": "none", "changes": changes}]}
 
