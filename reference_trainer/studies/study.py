@@ -87,9 +87,8 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
             else:
                 kept.add(keys[name], json.loads(json.dumps(outcome)))  # as it will be when read back
         records = {name: record for name, key in keys.items() if (record := kept.get(key)) is not None}
-        write_json(
-            out / f"{study.name}.json", {"study": study.name, "machine": here, "cases": records, "failed": failed}
-        )
+        data = {"study": study.name, "machine": here, "cases": records, "failed": failed}
+        write_json(out / f"{study.name}.json", data)
         if records:
             text = study.report(records)
             write_text(out / f"{study.name}.md", text)
@@ -99,10 +98,8 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
                     study.draw(records, figure)
             say(f"numbers, tables and figures: {study.name}.* in {out}")
         if failed:
-            reasons = "".join(f"\n  {name}: {error}" for name, error in failed.items())
-            raise RuntimeError(
-                f"{len(failed)} of {len(keys)} cases FAILED; the same command tries them again:{reasons}"
-            )
+            why = "".join(f"\n  {name}: {error}" for name, error in failed.items())
+            raise RuntimeError(f"{len(failed)} of {len(keys)} cases FAILED; the same command tries them again:{why}")
         if study.check:
             file.unlink(missing_ok=True)
         return records
