@@ -76,8 +76,8 @@ def save_ply(
             factor gives, as after opacity noise. A header comment records that they are not the plain ones.
         pad_to_degree: store at least this degree of spherical harmonics, 0 to 3, with zeros for the missing
             coefficients; many viewers read degree 3 only.
-        regularizer: what the model was trained with, for a header comment. What regularizers learned per Gaussian is
-            stored in separate properties.
+        regularizer: what the model was trained with, for a header comment, in ASCII with other letters escaped. What
+            regularizers learned per Gaussian is stored in separate properties.
         step: of the training, for the same comment.
 
     Raises:
@@ -123,7 +123,7 @@ def save_ply(
     header = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {n}"]
     header += [*(f"property float {name}" for name in names), "end_header", ""]
     with replacing(path) as place:
-        place.write_bytes("\n".join(header).encode("ascii") + table.numpy().astype("<f4").tobytes())
+        place.write_bytes("\n".join(header).encode("ascii", "backslashreplace") + table.numpy().astype("<f4").tobytes())
 
 
 def load_ply(path: str | Path) -> PlyModel:

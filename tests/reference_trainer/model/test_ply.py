@@ -363,3 +363,11 @@ def test_random_damage_is_read_or_refused(tmp_path, layout):
     assert read > 0
     assert refusals
     assert all(str(path) in message for message in refusals)
+
+
+def test_the_name_of_a_module_in_other_letters_does_not_stop_a_model_from_being_written(tmp_path):
+    """The header is ASCII, which other programs rely on."""
+    save_ply(make(), tmp_path / "a.ply", regularizer="m\u00f6dul:Drop(0.3)", step=7)
+    lines, _ = read_slowly(tmp_path / "a.ply")
+    assert r"comment ca_reg trained_with 7 m\xf6dul:Drop(0.3)" in lines
+    assert load_ply(tmp_path / "a.ply").step == 7
