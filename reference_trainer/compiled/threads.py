@@ -9,9 +9,11 @@ results do not depend on the number of threads.
 from __future__ import annotations
 
 import collections
+import contextlib
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+import queue
+import threading
+from collections.abc import Callable, Iterator, Sized
 from typing import Any
 
 import torch
@@ -20,7 +22,10 @@ __all__ = ["in_threads"]
 
 _RANGES = 32  # per thread, enough that none waits long for the others
 
-_pools: dict[int, ThreadPoolExecutor] = {}
+# A SimpleQueue is written in C: unlike futures, it cannot be left locked by a Ctrl-C that comes at the wrong moment.
+_Calls = queue.SimpleQueue[Callable[[], None]]
+_calls: _Calls = queue.SimpleQueue()
+_threads: list[threading.Thread] = []
 
 
 def _begin_forked_process() -> None:
@@ -28,7 +33,9 @@ def _begin_forked_process() -> None:
 
     PyTorch would wait for the latter forever; its DataLoader workers begin likewise.
     """
-    _pools.clear()
+    global _calls
+    _calls = queue.SimpleQueue()
+    _threads.clear()
     torch.set_num_threads(1)
 
 
@@ -53,47 +60,61 @@ def in_threads(kernel: Callable[..., None], count: int, *arguments: Any, least: 
         kernel(0, count, *arguments)
         return
     firsts = iter(range(0, count, size))  # shared: whoever is free takes the next
+    begun: list[None] = []
+    ended: list[BaseException | None] = []
+    bell: queue.SimpleQueue[None] = queue.SimpleQueue()
 
     def work() -> None:
+        begun.append(None)  # before it takes a range: whoever is not among these will find none
+        error = None
+        try:
+            for first in firsts:
+                kernel(first, min(first + size, count), *arguments)
+        except BaseException as raised:
+            error = raised
+        ended.append(error)
+        bell.put(None)
+
+    try:
+        _hand_out(work, threads - 1)
         for first in firsts:
             kernel(first, min(first + size, count), *arguments)
-
-    others: list[Future[None]] = []
-    try:
-        _start(work, threads - 1, others)
-        work()
     finally:
-        started = _finish(firsts, others)
-    for other in started:
-        other.result()  # raises what it raised
+        _finish(firsts, begun, ended, bell)
+    for error in filter(None, ended):
+        raise error
 
 
-def _start(work: Callable[[], None], count: int, futures: list[Future[None]]) -> None:
-    """Submit work to other threads; to none while the interpreter shuts down."""
-    pool = _pools.get(count)
-    if pool is None:
-        pool = _pools.setdefault(count, ThreadPoolExecutor(count, thread_name_prefix="loops"))
-    for _ in range(count):
+def _hand_out(work: Callable[[], None], count: int) -> None:
+    """Ask so many other threads to work; none begins while the interpreter shuts down."""
+    while len(_threads) < count:
+        thread = threading.Thread(target=_serve, args=(_calls,), name=f"loops_{len(_threads)}", daemon=True)
         try:
-            futures.append(pool.submit(work))
+            thread.start()
         except RuntimeError:
             return
+        _threads.append(thread)
+    for _ in range(count):
+        _calls.put(work)
 
 
-def _finish(ranges: Iterator[int], futures: list[Future[None]]) -> list[Future[None]]:
-    """Wait for all calls that have begun, despite Ctrl-C, and return them; the others never begin.
+def _serve(calls: _Calls) -> None:
+    """Do what is asked for, for ever."""
+    while True:
+        calls.get()()
 
-    Ranges that are left after an error or Ctrl-C are discarded.
-    """
+
+def _finish(ranges: Iterator[int], begun: Sized, ended: Sized, bell: queue.SimpleQueue[None]) -> None:
+    """Discard the ranges that are left after an error or Ctrl-C, and wait for all that have begun, despite Ctrl-C."""
     interruption = None
     while True:
         try:
             collections.deque(ranges, maxlen=0)
-            started = [future for future in futures if not future.cancel()]
-            wait(started)
+            while len(ended) < len(begun):
+                with contextlib.suppress(queue.Empty):
+                    bell.get(timeout=0.05)  # a ring may be lost to Ctrl-C
             break
         except KeyboardInterrupt as error:
             interruption = error
     if interruption is not None:
         raise interruption
-    return started
