@@ -84,13 +84,11 @@ def declared(grid: Grid) -> list[Cell]:
     found: dict[str, Cell] = {}
     for seed in range(grid.seeds):
         for claim in grid.claims.values():
-            for name, scene in grid.scenes.items():
+            for name in grid.scenes:
                 for given in claim.settings if name in claim.scenes else ():
-                    setting = resolved(given, grid.recipe, grid.iterations)
-                    if scene.recipes is None or setting["recipe"] in scene.recipes:
-                        cell = Cell(name, setting, seed, claim.needs)
-                        known = found.get(cell.name, cell)
-                        found[cell.name] = replace(cell, needs=cell.needs | known.needs)
+                    cell = Cell(name, resolved(given, grid.recipe, grid.iterations), seed, claim.needs)
+                    known = found.get(cell.name, cell)
+                    found[cell.name] = replace(cell, needs=cell.needs | known.needs)
     return list(found.values())
 
 

@@ -21,13 +21,11 @@ class PaperScene:
     Args:
         options: the scene; the path of a declared one is relative to the data folder.
         about: its protocol in words.
-        recipes: those that can be trained on it; None for all.
         depth: the depth option for losses with a depth prior.
     """
 
     options: SceneOptions
     about: str = "a scene of one's own"
-    recipes: tuple[str, ...] | None = None
     depth: str = "points"
 
     def below(self, data: Path) -> PaperScene:
@@ -65,7 +63,6 @@ SCENES = {
     "lego": PaperScene(
         SceneOptions("lego", downscale=1.5),
         "NeRF-synthetic, 267x267 over white, 8 and 25 views, 10,000 random points",
-        ("3dgs", "binocular"),  # random points have no depth, and its cameras do not look to one side
     ),
     "dtu-scan65": PaperScene(
         SceneOptions("dtu-scan65", **_DTU),  # type: ignore[arg-type]
