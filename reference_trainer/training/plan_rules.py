@@ -199,12 +199,12 @@ def initial_size(scene: Scene, config: TrainConfig) -> PlanItem:
 
 _BUILT_IN, RATES = "the built-in scene", (0.1, 0.2)
 DROPOUT_GAINS = {
-    2: {("fern", 0.2): 1.5, (_BUILT_IN, 0.1): 1.7, (_BUILT_IN, 0.2): 1.7},
+    2: {("fern", 0.2): 1.4, (_BUILT_IN, 0.1): 1.7, (_BUILT_IN, 0.2): 1.7},
     3: {("fern", 0.2): 1.0, ("herz-jesu", 0.1): 1.3, ("herz-jesu", 0.2): 1.5,
         (_BUILT_IN, 0.1): 1.8, (_BUILT_IN, 0.2): 1.5},
-    6: {("fern", 0.2): 0.5, (_BUILT_IN, 0.1): 0.6, (_BUILT_IN, 0.2): 0.3},
+    6: {("fern", 0.2): 0.4, (_BUILT_IN, 0.1): 0.6, (_BUILT_IN, 0.2): 0.3},
     9: {("fern", 0.2): 0.0, (_BUILT_IN, 0.1): 0.1, (_BUILT_IN, 0.2): 0.3},
-    17: {("fern", 0.2): -0.3, (_BUILT_IN, 0.1): -0.1, (_BUILT_IN, 0.2): -0.3},
+    17: {("fern", 0.2): -0.2, (_BUILT_IN, 0.1): -0.1, (_BUILT_IN, 0.2): -0.3},
     24: {(_BUILT_IN, 0.1): -0.1, (_BUILT_IN, 0.2): -0.2},
     48: {(_BUILT_IN, 0.1): -0.1, (_BUILT_IN, 0.2): -0.3},
 }  # fmt: skip
