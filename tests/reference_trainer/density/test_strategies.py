@@ -65,7 +65,7 @@ def test_gaussians_that_are_not_numbers_stop_the_training_and_are_said_to(tiny_s
     trainer.train(until=6)
     with torch.no_grad():
         getattr(trainer.fields[-1].gaussians, name)[0] = math.nan
-    with pytest.raises(TrainingStoppedError, match="finite|nan or infinite by step 6"):
+    with pytest.raises(TrainingStoppedError, match=r"finite|nan or infinite by step 6"):
         trainer.train()
 
 
