@@ -114,7 +114,7 @@ class TrainConfig:
             name, value = field.name, getattr(self, field.name)
             if isinstance(value, float) and not math.isfinite(value):  # JSON has no word for it
                 raise ValueError(f"{name} must be finite, got {value}.")
-            if type(value) not in _INTEGERS.get(str(field.type), {type(value)}):  # no checkpoint with it could be read
+            if type(value) not in _INTEGERS.get(str(field.type), (type(value),)):  # no checkpoint with it could be read
                 raise TypeError(f"{name} must be an integer, got {value!r}: convert it with int().")
         for names, right, rule, hint in _RANGES:
             for name in names:
@@ -204,7 +204,7 @@ class TrainConfig:
             )
 
 
-_INTEGERS = {"int": {int}, "int | None": {int, type(None)}}
+_INTEGERS: dict[str, tuple[type, ...]] = {"int": (int,), "int | None": (int, type(None))}
 """Types of values by annotation; a bool is no number here."""
 
 _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
