@@ -44,7 +44,7 @@ def filtered(
         splats = splats._replace(projection=splats.projection._replace(**own))
     if floor is None:
         return splats
-    xx, xy, yy = ellipses.covariances.unbind(-1)
-    before = (xx - blur) * (yy - blur) - xy * xy
-    share = (before / (xx * yy - xy * xy)).clamp_min(floor)
+    # det C / det(C + blur I) as 1 - blur (trace C + blur) / det(C + blur I): xx yy - xy^2 would cancel for needles.
+    (xx, _, yy), (l11, _, l22) = ellipses.covariances.unbind(-1), ellipses.factors.unbind(-1)
+    share = (1 - blur * (xx + yy - blur) * (l11 * l22).square()).clamp_min(floor)
     return splats.engine.masked(splats, splats.opacities * share.sqrt())

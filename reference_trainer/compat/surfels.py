@@ -38,6 +38,7 @@ def surface_planes(
     normals = rotation_matrices(turned).gather(2, shortest).squeeze(2) @ pose[:3, :3].T
     away = (normals * (seen @ pose[:3, :3].T + pose[:3, 3])).sum(1, keepdim=True) > 0
     mapped = FAR / (FAR - NEAR) * (1 - NEAR / splats.projection.depths)
+    mapped = mapped - mapped.detach().mean()  # differences count: near 1, the distortion of a thin wall would cancel
     first = draw(
         splats._replace(
             colors=torch.where(away, -normals, normals).to(splats.colors),

@@ -9,6 +9,7 @@ import torch
 from ca_reg._check import check_count
 from ca_reg.neighbors import nearest_distance
 from reference_trainer.density.adaptive import AdaptiveDensity
+from reference_trainer.density.operations import refuse_not_finite
 from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.field import Field
 
@@ -45,6 +46,8 @@ class CoPruning(AdaptiveDensity):
         """Prune all fields."""
         if not (step > self.config.densify_from and step % self.every == 0):
             return
+        for field in fields:
+            refuse_not_finite(field.optimizer, step)
         means = [field.gaussians.means.detach() for field in fields]
         keeps = [
             torch.stack([nearest_distance(own, other) < self.distance for other in means if other is not own]).all(0)

@@ -8,6 +8,7 @@ from torch import Tensor
 from ca_reg import attribute
 from ca_reg._check import check_count
 from reference_trainer.density.adaptive import AdaptiveDensity
+from reference_trainer.density.operations import refuse_not_finite
 from reference_trainer.evaluation.shares import all_but_highest, blend_weights, share_per_weight
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.optimizer import GaussianOptimizer
@@ -48,6 +49,7 @@ class SharePruning(AdaptiveDensity):
         """Prune by share as well, after all else; the other Gaussians keep their statistics."""
         super().before_step(optimizer, step)
         if self.config.densify_from < step < self.config.densify_end and step % self.every == 0:
+            refuse_not_finite(optimizer, step)
             self.select(optimizer, all_but_highest(self.shares_per_weight(optimizer, step), self.fraction))
 
     def shares_per_weight(self, optimizer: GaussianOptimizer, step: int) -> Tensor:

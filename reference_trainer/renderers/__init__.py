@@ -1,12 +1,16 @@
-"""The renderers of the training views, and their registry: what ``--renderer`` knows by name."""
+"""The renderers of the training views, one per file, and their registry: what ``--renderer`` knows by name."""
 
 from ca_reg.registry import Registry
-from reference_trainer.renderers.renderer import GsplatRenderer, OwnRenderer, Renderer
+from reference_trainer.renderers.gsplat import GsplatRenderer
+from reference_trainer.renderers.own import OwnRenderer
+from reference_trainer.renderers.renderer import Renderer
 
 __all__ = ["RENDERERS", "GsplatRenderer", "OwnRenderer", "Renderer"]
 
-RENDERERS: Registry[Renderer] = Registry("renderer", Renderer)  # type: ignore[type-abstract]
+RENDERERS: Registry[Renderer] = Registry(
+    "renderer",
+    Renderer,  # type: ignore[type-abstract]
+    torch=OwnRenderer,
+    gsplat=GsplatRenderer,
+)
 """The renderers by name; ``RENDERERS.register("name")`` adds a class."""
-
-RENDERERS.register("torch")(OwnRenderer)
-RENDERERS.register("gsplat")(GsplatRenderer)

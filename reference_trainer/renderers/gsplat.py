@@ -19,8 +19,9 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.render.checks import checked_colors
 from reference_trainer.render.constants import DILATION, NEAR_PLANE
+from reference_trainer.renderers.renderer import Renderer
 
-__all__ = ["GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
+__all__ = ["GsplatRenderer", "GsplatRendering", "GsplatSplats", "load_gsplat_render", "render_by"]
 
 
 class GsplatSplats(NamedTuple):
@@ -38,6 +39,20 @@ class GsplatRendering(NamedTuple):
     alpha: Tensor
     depth: Tensor | None
     splats: GsplatSplats
+
+
+class GsplatRenderer(Renderer):
+    """gsplat's CUDA kernels."""
+
+    capabilities = frozenset({"depth", "absgrad"})
+
+    def prepare(self, device: torch.device) -> None:
+        """Load gsplat."""
+        self._render = load_gsplat_render(device)
+
+    def __call__(self, **arguments: Any) -> Any:
+        """Draw."""
+        return self._render(**arguments)
 
 
 def load_gsplat_render(device: torch.device | str) -> Callable[..., GsplatRendering]:

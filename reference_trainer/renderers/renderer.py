@@ -1,4 +1,4 @@
-"""The renderers of the training views: the base class, this package's renderer, and gsplat's kernels."""
+"""The base class of the renderers of the training views."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradients
-from reference_trainer.render.renderer import render
-from reference_trainer.renderers.gsplat import load_gsplat_render
-
-__all__ = ["GsplatRenderer", "OwnRenderer", "Renderer"]
+__all__ = ["Renderer"]
 
 
 class Renderer(abc.ABC):
@@ -37,31 +33,3 @@ class Renderer(abc.ABC):
     @abc.abstractmethod
     def __call__(self, **arguments: Any) -> Any:
         """Return a `Rendering`, or an object with those fields that training reads: see `GsplatRendering`."""
-
-
-class OwnRenderer(Renderer):
-    """This package's renderer, with the chosen engine."""
-
-    capabilities = frozenset({"depth", "moments", "absgrad"})
-
-    def __call__(self, *, absgrad: bool = False, **arguments: Any) -> Any:
-        """Draw."""
-        out = render(**arguments)
-        if absgrad and out.splats.projection.means.requires_grad:
-            sink = absgrad_sink(out.splats.projection.means)
-            return with_absolute_gradients(out, sink, arguments.get("background"))
-        return out
-
-
-class GsplatRenderer(Renderer):
-    """gsplat's CUDA kernels."""
-
-    capabilities = frozenset({"depth", "absgrad"})
-
-    def prepare(self, device: torch.device) -> None:
-        """Load gsplat."""
-        self._render = load_gsplat_render(device)
-
-    def __call__(self, **arguments: Any) -> Any:
-        """Draw."""
-        return self._render(**arguments)

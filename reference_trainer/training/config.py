@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +19,12 @@ __all__ = ["TrainConfig"]
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of one training run. The defaults are those of the recipe ``3dgs``, but 3,000 iterations."""
+    """Settings of one training run. The defaults are those of the recipe ``3dgs``, but 3,000 iterations.
+
+    Raises:
+        TypeError: if a number of steps, fields, Gaussians or bands, or the seed, is no integer.
+        ValueError: if a setting is out of range, or two contradict each other.
+    """
 
     iterations: int = 3_000
     """Optimization steps, one view each."""
@@ -104,9 +110,12 @@ class TrainConfig:
     """Opacities are multiplied by this at every step after ``densify_from``; 1 does nothing."""
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
+        for field in dataclasses.fields(self):
+            name, value = field.name, getattr(self, field.name)
             if isinstance(value, float) and not math.isfinite(value):  # JSON has no word for it
                 raise ValueError(f"{name} must be finite, got {value}.")
+            if type(value) not in _INTEGERS.get(str(field.type), (type(value),)):  # no checkpoint with it could be read
+                raise TypeError(f"{name} must be an integer, got {value!r}: convert it with int().")
         for names, right, rule, hint in _RANGES:
             for name in names:
                 if not right(getattr(self, name)):
@@ -194,6 +203,9 @@ class TrainConfig:
                 f"analytic training has no draw, which {', '.join(drawn)} needs: leave out analytic, or the term."
             )
 
+
+_INTEGERS: dict[str, tuple[type, ...]] = {"int": (int,), "int | None": (int, type(None))}
+"""Types of values by annotation; a bool is no number here."""
 
 _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("iterations", "fields"), lambda x: x >= 1, "at least 1", ""),

@@ -144,12 +144,12 @@ class Trainer:
         Returns:
             The loss, of all fields together, and the mean squared error of the first one's (regularized) render.
         """
-        for field in self.fields:
-            field.density.before_step(field.optimizer, self.step)
-        self.density.together(self.fields, self.step)
-        steps = self._begin_steps()
         terms = [term for term in self.losses if term.acts(self.step)]
-        try:
+        try:  # also where density control renders
+            for field in self.fields:
+                field.density.before_step(field.optimizer, self.step)
+            self.density.together(self.fields, self.step)
+            steps = self._begin_steps()
             for step in steps:
                 if self.config.analytic and len(step.regularizer):
                     step.expect()

@@ -4,9 +4,10 @@ import math
 
 import pytest
 import torch
-from oracles import brute_force, random_scene
+from oracles import GaussianScene, brute_force, random_scene
 from scipy.spatial.transform import Rotation
 
+from reference_trainer.camera import Camera
 from reference_trainer.compat.rasterizer import rasterizer_module
 from reference_trainer.compat.settings import camera_of
 from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
@@ -193,6 +194,23 @@ def test_antialiasing_makes_up_for_the_blur(settings_of, asked, blur, floor):
     assert (plain[0] - blurred).abs().max() > 0.05
     assert (radii <= plain[1]).all()
     assert torch.equal(radii, plain[1]) == (blur == 0.3)
+
+
+@pytest.mark.parametrize("length", [10.0, 1e3, 1e5])
+def test_antialiasing_keeps_its_digits_in_float32_where_splats_are_needles(settings_of, length):
+    """A tenth of a pixel wide, on the optical axis, at 45 degrees: the closed form of its two variances, in pixels."""
+    camera = Camera(torch.eye(4), 20.0, 20.0, 8.5, 8.5, 17, 17)
+    variances, angle = torch.tensor([length, 0.1], dtype=torch.float64).square(), math.pi / 8
+    scales = torch.tensor([[length / 10, 0.01, 0.01]], requires_grad=True)  # at depth 2: ten pixels per unit
+    needle = GaussianScene(
+        torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[math.cos(angle), 0.0, 0.0, math.sin(angle)]]), scales,
+        torch.tensor([0.9]), torch.ones(1, 3), camera,
+    )  # fmt: skip
+    peak = _call(settings_of(camera, antialiasing=True), needle)[0][0, 8, 8]
+    expected = 0.9 * (variances / (variances + 0.3)).prod().sqrt()
+    assert peak.item() == pytest.approx(expected.item(), rel=1e-4)
+    (slope,) = torch.autograd.grad(peak, scales)
+    assert slope[0, 1].item() == pytest.approx((expected * 0.3 / 0.31 / 0.01).item(), rel=1e-3)
 
 
 def test_more_blur_than_the_renderers_is_refused(settings_of):

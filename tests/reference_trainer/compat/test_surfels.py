@@ -41,6 +41,32 @@ def test_depth_normals_and_distortion_are_sums_over_the_weights(settings_of):
     assert allmap[6].max() > 1e-4
 
 
+def test_the_distortion_of_a_thin_wall_keeps_its_digits_in_float32(settings_of):
+    """A hundredth thick at a depth of 4: against the pairs in float64, and the derivatives of their sum."""
+    n, g = 12, torch.Generator().manual_seed(0)
+    scene = random_scene(n, 14, 9, seed=5, size=0.3)
+    depths = 4 + 0.01 * torch.randn(n, generator=g, dtype=torch.float64)
+    pixels = torch.rand(n, 2, generator=g, dtype=torch.float64) * torch.tensor([14, 9])
+    scene = scene._replace(means=scene.camera.lift(pixels, depths), scales=scene.scales * torch.tensor([1, 1, 0]))
+    single, exact = (
+        scene.to(dtype)._replace(means=scene.means.to(dtype).requires_grad_())
+        for dtype in (torch.float32, torch.float64)
+    )
+    module = rasterizer_module("diff_surfel_rasterization", outputs=("image", "radii", "distortion"))
+    ours = module.GaussianRasterizer(settings_of(single.camera))(
+        means3D=single.means, means2D=torch.zeros_like(single.means), opacities=single.opacities[:, None],
+        colors_precomp=single.colors, scales=single.scales, rotations=single.quaternions,
+    )[2]  # fmt: skip
+    weights, _ = brute_force(*exact[:4], torch.eye(n).double(), exact.camera)
+    local = exact.means @ exact.camera.world_to_camera[2, :3] + exact.camera.world_to_camera[2, 3]
+    mapped = 100 / (100 - 0.2) * (1 - 0.2 / local)
+    pairs = sum(weights[i] * weights[j] * (mapped[i] - mapped[j]) ** 2 for i, j in itertools.combinations(range(n), 2))
+    assert (ours[0] - pairs).norm() < 1e-3 * pairs.norm()
+    ours.sum().backward()
+    pairs.sum().backward()
+    assert (single.means.grad - exact.means.grad).norm() < 1e-3 * exact.means.grad.norm()
+
+
 def test_pixels_without_surfels_have_no_gradient_that_is_nan(settings_of):
     scene = random_scene(4, 30, 20, seed=5, size=0.05)
     rasterizer = rasterizer_module("diff_surfel_rasterization").GaussianRasterizer(settings_of(scene.camera))

@@ -1,5 +1,7 @@
 """What every strategy must keep, whatever its rule."""
 
+import dataclasses
+import math
 import re
 
 import pytest
@@ -9,6 +11,7 @@ from strategies import short
 
 from reference_trainer.density import DENSITY
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.errors import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
 ALL = {
@@ -52,6 +55,18 @@ def test_all_work_on_a_device(tiny_scene, busy, expression, device):
     assert all(bool(x.isfinite().all()) for _, x in trainer.gaussians.named())
     found = [*trainer.gaussians.named(), *trainer.density.state_dict().items()]
     assert {x.device.type for _, x in found} == {torch.device(device).type}
+
+
+@pytest.mark.parametrize("name", ["means", "opacity_logits", "sh_dc"])
+@pytest.mark.parametrize("expression", ALL.values(), ids=ALL)
+def test_gaussians_that_are_not_numbers_stop_the_training_and_are_said_to(tiny_scene, busy, expression, name):
+    """At a step at which strategies that prune or render by a schedule of their own do so, and nothing is densified."""
+    trainer = Trainer(tiny_scene, dataclasses.replace(short(busy, expression, 14), densify_every=5))
+    trainer.train(until=6)
+    with torch.no_grad():
+        getattr(trainer.fields[-1].gaussians, name)[0] = math.nan
+    with pytest.raises(TrainingStoppedError, match=r"finite|nan or infinite by step 6"):
+        trainer.train()
 
 
 @pytest.mark.parametrize(

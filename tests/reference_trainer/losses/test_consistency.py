@@ -124,6 +124,7 @@ def test_the_full_render_is_the_plain_one_whatever_regularizes_the_step(exact):
 def test_it_does_not_act_without_weight_or_rate():
     for term in (Consistency(0.0), Consistency(0.4, 0.0), Consistency(0.0, exact=True)):
         assert not term.acts(0)
+    assert Consistency(0.4).acts(0)
 
 
 def test_the_exact_form_needs_moments_of_the_renderer():

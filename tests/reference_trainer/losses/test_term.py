@@ -1,6 +1,7 @@
 """What all terms share: weights that follow schedules, demands on the views, and that an idle term costs nothing."""
 
 import dataclasses
+from contextlib import nullcontext
 
 import pytest
 
@@ -51,10 +52,17 @@ def test_terms_look_at_the_photographs_before_the_first_step(tiny_scene):
             Trainer(tiny_scene, TrainConfig(loss=f"photometric + {loss}"))
 
 
-@pytest.mark.parametrize("name", ["pearson(offset=None)", "patch_depth", "warp", "smooth_depth", "alpha(dark=0.1)"])
-def test_what_needs_a_draw_is_refused_in_analytic_training(name):
-    with pytest.raises(ValueError, match="analytic training has no draw"):
-        TrainConfig(dropout=0.2, analytic=True, loss=f"photometric + {name}").check()
+@pytest.mark.parametrize("name", list(LOSSES))
+def test_analytic_training_refuses_what_needs_a_draw_and_nothing_else(name):
+    needs_one = name in {"pearson", "patch_depth", "warp", "smooth_depth", "alpha", "straight_through"}
+    with pytest.raises(ValueError, match="analytic training has no draw") if needs_one else nullcontext():
+        TrainConfig(dropout=0.2, analytic=True, fields=2, loss=f"photometric + {name}").check()
+
+
+@pytest.mark.parametrize("name", ["photometric", "views", "consistency", "straight_through", "co_regularization"])
+def test_a_weight_of_ssim_out_of_range_is_refused(name):
+    with pytest.raises(ValueError, match=r"lambda_dssim must lie in \[0, 1\], got 1\.5"):
+        LOSSES.make(f"{name}(lambda_dssim=1.5)")
 
 
 @pytest.mark.slow

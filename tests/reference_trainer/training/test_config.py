@@ -80,9 +80,15 @@ def test_impossible_values_are_named(field, value):
         TrainConfig(**{field: value})
 
 
-def test_the_first_reset_has_a_step():
-    with pytest.raises(TypeError):
-        TrainConfig(opacity_reset_from=None)
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("iterations", 1e4), ("seed", 1.5), ("sh_every", 2.0), ("max_gaussians", 1e6), ("sh_degree", True),
+     ("opacity_reset_from", None)],
+)  # fmt: skip
+def test_counts_are_integers(field, value):
+    """A training with another number had run, and its checkpoint was refused as damaged."""
+    with pytest.raises(TypeError, match=rf"{field} must be an integer, got {value!r}: convert it with int\(\)"):
+        TrainConfig(**{field: value})
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,13 @@ import pytest
 import torch
 from stand_ins.gsplat import rasterization
 
-from reference_trainer.renderers import renderer as module
-from reference_trainer.renderers.gsplat import render_by
+from reference_trainer.renderers import gsplat
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
 
 def test_a_run_with_gsplat_is_the_run_with_the_own_renderer(tiny_scene, busy, monkeypatch):
-    monkeypatch.setattr(module, "load_gsplat_render", lambda device: functools.partial(render_by, rasterization))
+    monkeypatch.setattr(gsplat, "load_gsplat_render", lambda device: functools.partial(gsplat.render_by, rasterization))
     ours, theirs = Trainer(tiny_scene, busy), Trainer(tiny_scene, dataclasses.replace(busy, renderer="gsplat"))
     for trainer in (ours, theirs):
         trainer.train(until=4)  # up to the first densification

@@ -23,7 +23,7 @@ from reference_trainer.losses.photometric import expected_photometric_loss, phot
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
 from reference_trainer.render import render
-from reference_trainer.renderers import renderer as renderers
+from reference_trainer.renderers import gsplat as kernels
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.training.config import TrainConfig
@@ -175,7 +175,7 @@ def put(trainer: Trainer, model: Gaussians) -> None:
 @pytest.fixture
 def gsplat(monkeypatch):
     """The renderer of this package in the place of gsplat, which needs a card."""
-    monkeypatch.setattr(renderers, "load_gsplat_render", lambda device: render)
+    monkeypatch.setattr(kernels, "load_gsplat_render", lambda device: render)
 
 
 @pytest.mark.parametrize("pair", list(combinations(OPTIONS, 2)), ids="-".join)
