@@ -87,9 +87,12 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         views["train"] = tuple(
             with_prior(view, frame, root, options) for view, frame in zip(views["train"], train, strict=True)
         )
-    about_more = ""
+    about_more = about_masks = ""
     if options.points == "auto" and start is None:
         cloud, about_more = filled(cloud, train, generator)
+    if any(frame.mask is not None for frame in [*train, *test]):
+        about_masks = "masks: scores count what is white in them, training uses the whole photographs"
+    about_lenses = _about_lenses([*train, *test], options)
     return Scene(
         name=root.resolve().name,
         **views,
@@ -97,7 +100,7 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         start=start,
         background=color,
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
-        notes=tuple(filter(None, (about_size, _about_lenses([*train, *test], options), about_points, about_more))),
+        notes=tuple(filter(None, (about_size, about_lenses, about_masks, about_points, about_more))),
     )
 
 
@@ -121,7 +124,7 @@ def _split(root: Path, capture: Capture, options: SceneOptions) -> tuple[list[Fr
     frames, test, split = capture.frames, capture.test or [], options.split
     if split == "auto":
         split = "split" if (root / "split.json").is_file() else capture.split
-        few = split != "split" and options.views in (None, len(frames)) and capture.test is None and len(frames) < FEW
+        few = split in RULES and options.views in (None, len(frames)) and capture.test is None and len(frames) < FEW
     else:
         few = False
     if options.test == "none" or few:

@@ -47,7 +47,8 @@ class SceneOptions:
     and 3."""
     split: str = "auto"
     """"llff" for every 8th view as test, "dtu" for that protocol, or the name of a JSON file within the scene, such as
-    split_near; by default split.json, else the format's rule, or no test views below 8 photographs."""
+    split_near; by default split.json, else nerfstudio's lists, else the format's rule, or no test views below 8
+    photographs."""
     test: Literal["auto", "none"] = "auto"
     """"none" to hold nothing out: all photographs train, or --views of them."""
     points: str = "auto"
