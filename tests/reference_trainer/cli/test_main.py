@@ -166,6 +166,7 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["compare", "--executor", "processes", "--address", "auto"], "--address auto is that of a Ray cluster"),
         (["evaluate", "nowhere"], "nowhere holds no run (no config.json): give the --out folder"),
         (["render", "nowhere"], "nowhere holds no run"),
+        (["report", "nowhere", "--out", "."], ". is a folder: --out is the file to write, such as report.html"),
         (["evaluate", "nowhere.ply"], "nowhere.ply"),
         (["evaluate", "a.ply", "--downscale", "8"], "without photographs no option of a scene but --background"),
         (
