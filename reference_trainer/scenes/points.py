@@ -68,7 +68,7 @@ def choose_points(
             f"there is no folder {path} to take points from; choose auto, random or one of {found}."
         )
     if own is not None and own.source == str(path):
-        cloud: PointCloud | None = own  # in the world of the cameras, which its file need not be, and of known origin
+        cloud = own  # in the world of the cameras, which its file need not be, and of known origin
     else:
         cloud = ply_points(path) if is_ply(path) else colmap_points(path)
     if cloud is None:
