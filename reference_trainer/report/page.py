@@ -59,11 +59,14 @@ def write_report(
         The file.
 
     Raises:
-        ValueError: if there is no run, one is given twice, their scenes differ, or a file is damaged.
+        ValueError: if there is no run, one is given twice, their scenes differ, a file is damaged, or ``out`` is a
+            folder.
         FileNotFoundError: if a folder holds no run.
     """
     if views < 1:
         raise ValueError(f"expected at least 1 view of each split, got {views}.")
+    if out is not None and out.is_dir():
+        raise ValueError(f"{out} is a folder: --out is the file to write, such as {out / 'report.html'}.")
     names, found = labels(runs), list[Findings]()
     for run, label in zip(runs, names, strict=True):
         say(f"[{len(found) + 1}/{len(runs)}] {run}")

@@ -13,7 +13,7 @@ from reference_trainer.render import chosen_engine, use_engine
 from reference_trainer.runs.engines.engine import Engine, Failure, Task, Value, attempt
 from reference_trainer.runs.engines.run_all import run_all
 from reference_trainer.runs.folder import RESULTS
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.run import check_intervals, run_experiment
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 
@@ -51,7 +51,7 @@ class Running:
         say: receives a line about every run and every worker that died.
 
     Raises:
-        ValueError: if ``retries`` is negative, or ``checkpoint_every`` not positive.
+        ValueError: if ``retries`` is negative, or an interval out of range.
     """
 
     engine: Engine
@@ -63,11 +63,9 @@ class Running:
     say: Callable[[str], None] = lambda text: None
 
     def __post_init__(self) -> None:
-        if self.retries < 0 or self.checkpoint_every < 1:
-            raise ValueError(
-                f"expected retries of at least 0 and checkpoint_every of at least 1, got {self.retries} and "
-                f"{self.checkpoint_every}."
-            )
+        check_intervals(self.monitor_every, self.checkpoint_every)
+        if self.retries < 0:
+            raise ValueError(f"expected retries of at least 0, got {self.retries}.")
 
 
 def run_grid(

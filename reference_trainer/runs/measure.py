@@ -81,19 +81,18 @@ def measure(
         result = evaluate(
             model, views, samples=samples, seed=seed, perceptual=perceptual, pictures=out / VIEWS, keep=keep, say=say
         )
-        computed_on = machine()
-    data = {
-        **about,
-        **result.as_dict(),
-        "ca_settings": asdict(model.ca_score(samples=samples, seed=seed).settings),
-        "background": model.background.tolist(),
-        "regularizer": model.regularizer,
-        "machine": computed_on,
-    }
-    write_json(out / "evaluation.json", data)
-    table = evaluation_table(data)
-    write_text(out / "evaluation.md", table + "\n")
-    keep.unlink(missing_ok=True)
+        data = {
+            **about,
+            **result.as_dict(),
+            "ca_settings": asdict(model.ca_score(samples=samples, seed=seed).settings),
+            "background": model.background.tolist(),
+            "regularizer": model.regularizer,
+            "machine": machine(),
+        }
+        write_json(out / "evaluation.json", data)
+        table = evaluation_table(data)
+        write_text(out / "evaluation.md", table + "\n")
+        keep.unlink(missing_ok=True)
     say(table)
     say(f"Scores and pictures are in {out}")
     return result

@@ -47,7 +47,16 @@ from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["load_run", "model_of", "run_experiment", "save_for_viewers"]
+__all__ = ["check_intervals", "load_run", "model_of", "run_experiment", "save_for_viewers"]
+
+
+def check_intervals(monitor_every: int, checkpoint_every: int) -> None:
+    """Raise a ValueError unless these numbers of steps are at least 0 and at least 1."""
+    if monitor_every < 0 or checkpoint_every < 1:
+        raise ValueError(
+            f"expected monitor_every of at least 0, for no measurements, and checkpoint_every of at least 1, got "
+            f"{monitor_every} and {checkpoint_every}."
+        )
 
 
 def model_of(trainer: Trainer) -> TrainedModel:
@@ -126,7 +135,7 @@ def run_experiment(
         The content of ``results.json``.
 
     Raises:
-        ValueError: if the folder holds a run with other settings, or a damaged file.
+        ValueError: if an interval is out of range, or the folder holds a run with other settings or a damaged file.
         FolderInUseError: if another process is at work in the folder; nothing there was touched.
         TrainingStoppedError: if training cannot go on; the last checkpoint is kept, and the message names it.
         TrainingInterrupted: on Ctrl-C, after a checkpoint has been saved; a second Ctrl-C does not wait for it. On
@@ -134,6 +143,7 @@ def run_experiment(
         OSError: if a file cannot be written, such as on a full disk; its previous content is kept.
     """
     config.check()
+    check_intervals(monitor_every, checkpoint_every)
     perceptual = load_lpips(lpips, device=device)
     begun_with(out, options, config, auto=auto, given=given)
     if (out / RESULTS).exists():

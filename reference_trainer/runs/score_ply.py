@@ -21,8 +21,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.frame_check import check_frame
 from reference_trainer.runs.measure import measure
-from reference_trainer.scenes.load import BACKGROUNDS
-from reference_trainer.scenes.options import OrbitOptions, SceneOptions
+from reference_trainer.scenes.options import BACKGROUNDS, OrbitOptions, SceneOptions
 from reference_trainer.scenes.orbit import bounding_sphere
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 

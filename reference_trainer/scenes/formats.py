@@ -28,7 +28,8 @@ class Capture:
         frames: the photographs with their cameras, in the order that split rules index.
         test: the held-out frames if the format itself keeps them apart; ``frames`` are then the training ones.
         points: initial points that the files name.
-        split: the rule where there is no split file: ``"llff"`` or ``"dtu"``.
+        split: the rule where there is no split file: ``"llff"``, ``"dtu"``, or the name of a JSON file of the scene
+            that holds lists as a split file does.
         views: the default number of training views.
         background: ``"black"`` or ``"white"``, behind transparent pictures.
     """

@@ -19,7 +19,7 @@ from reference_trainer.scenes.frames import Frame, load_view
 from reference_trainer.scenes.idr import IDR
 from reference_trainer.scenes.images import LARGE_PICTURE, image_size
 from reference_trainer.scenes.llff import LLFF
-from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.options import BACKGROUNDS, SceneOptions
 from reference_trainer.scenes.points import check_no_leak, choose_points, filled, model_start
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.scenes.splits import blender_split, dtu_split, evenly_spaced, file_split, llff_split
@@ -33,7 +33,6 @@ __all__ = ["load_options", "load_scene"]
 for _format in (BLENDER, IDR, COLMAP, TRANSFORMS, LLFF, ARRAYS):
     register_format(_format)
 
-BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 RULES = {"llff": llff_split, "dtu": dtu_split}
 FEW = 8
 """Below this many photographs all are trained on, unless a split is asked for: there are none to spare."""
@@ -64,16 +63,6 @@ def load_scene(path: str | Path, *, seed: int = 0, **options: Any) -> Scene:
 
 def load_options(options: SceneOptions, seed: int = 0) -> Scene:
     """Load the scene that options describe, as `load_scene` does."""
-    if options.downscale is not None and options.downscale < 1:
-        raise ValueError(f"downscale must be at least 1, got {options.downscale}.")
-    if options.background not in ("auto", *BACKGROUNDS):
-        raise ValueError(f"background must be auto, black or white, got {options.background!r}.")
-    if options.views is not None and options.views < 1:
-        raise ValueError(f"views must be at least 1, got {options.views}.")
-    if options.test not in ("auto", "none"):
-        raise ValueError(f"test must be auto or none, got {options.test!r}.")
-    if options.init is not None and options.points != "auto":
-        raise ValueError(f"init takes the place of points: leave out one of {options.init} and {options.points}.")
     if options.path == "synthetic":
         return _built_in(options, seed)
     root = Path(options.path)
@@ -98,9 +87,12 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         views["train"] = tuple(
             with_prior(view, frame, root, options) for view, frame in zip(views["train"], train, strict=True)
         )
-    about_more = ""
+    about_more = about_masks = ""
     if options.points == "auto" and start is None:
         cloud, about_more = filled(cloud, train, generator)
+    if any(frame.mask is not None for frame in [*train, *test]):
+        about_masks = "masks: scores count what is white in them, training uses the whole photographs"
+    about_lenses = _about_lenses([*train, *test], options)
     return Scene(
         name=root.resolve().name,
         **views,
@@ -108,7 +100,7 @@ def load_options(options: SceneOptions, seed: int = 0) -> Scene:
         start=start,
         background=color,
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
-        notes=tuple(filter(None, (about_size, _about_lenses([*train, *test], options), about_points, about_more))),
+        notes=tuple(filter(None, (about_size, about_lenses, about_masks, about_points, about_more))),
     )
 
 
@@ -118,7 +110,8 @@ def _built_in(options: SceneOptions, seed: int) -> Scene:
         "synthetic", images=options.images, split=options.split, points=options.points, background=options.background
     )
     downscale = options.downscale or 1.0
-    scene = synthetic_scene(round(160 / downscale), round(120 / downscale), train_views=options.views or 3, seed=seed)
+    width, height = (max(1, round(side / downscale)) for side in (160, 120))
+    scene = synthetic_scene(width, height, train_views=options.views or 3, seed=seed)
     scene = scene if options.test == "auto" else replace(scene, test=())
     if options.init is not None:
         start, cloud, note = model_start(options.init)
@@ -131,7 +124,7 @@ def _split(root: Path, capture: Capture, options: SceneOptions) -> tuple[list[Fr
     frames, test, split = capture.frames, capture.test or [], options.split
     if split == "auto":
         split = "split" if (root / "split.json").is_file() else capture.split
-        few = split != "split" and options.views in (None, len(frames)) and capture.test is None and len(frames) < FEW
+        few = split in RULES and options.views in (None, len(frames)) and capture.test is None and len(frames) < FEW
     else:
         few = False
     if options.test == "none" or few:

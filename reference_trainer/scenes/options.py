@@ -13,7 +13,9 @@ if TYPE_CHECKING:  # importing torch takes seconds, and --help needs none of it
     from reference_trainer.camera import Camera
     from reference_trainer.scenes.scene import Scene
 
-__all__ = ["OrbitOptions", "SceneOptions", "World"]
+__all__ = ["BACKGROUNDS", "OrbitOptions", "SceneOptions", "World"]
+
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 World = Literal["y-down", "y-up", "z-up", "z-down", "x-up", "x-down"]
 """Which axis of the world is vertical, and which way it points."""
@@ -22,6 +24,9 @@ World = Literal["y-down", "y-up", "z-up", "z-down", "x-up", "x-down"]
 @dataclass(frozen=True)
 class SceneOptions:
     """Which photographs, cameras and points to use.
+
+    Raises:
+        ValueError: if an option is out of range, whatever the scene holds.
 
     Example:
         >>> SceneOptions("synthetic").load(seed=0).name
@@ -42,7 +47,8 @@ class SceneOptions:
     and 3."""
     split: str = "auto"
     """"llff" for every 8th view as test, "dtu" for that protocol, or the name of a JSON file within the scene, such as
-    split_near; by default split.json, else the format's rule, or no test views below 8 photographs."""
+    split_near; by default split.json, else nerfstudio's lists, else the format's rule, or no test views below 8
+    photographs."""
     test: Literal["auto", "none"] = "auto"
     """"none" to hold nothing out: all photographs train, or --views of them."""
     points: str = "auto"
@@ -64,6 +70,18 @@ class SceneOptions:
     allow_test_points: bool = False
     """Accept initial points that were triangulated from test views; such results are not comparable with others."""
 
+    def __post_init__(self) -> None:
+        if self.downscale is not None and not 1 <= self.downscale < math.inf:
+            raise ValueError(f"downscale must be a finite number of at least 1, got {self.downscale}.")
+        if self.background not in ("auto", *BACKGROUNDS):
+            raise ValueError(f"background must be auto, {' or '.join(BACKGROUNDS)}, got {self.background!r}.")
+        if self.views is not None and self.views < 1:
+            raise ValueError(f"views must be at least 1, got {self.views}.")
+        if self.test not in ("auto", "none"):
+            raise ValueError(f"test must be auto or none, got {self.test!r}.")
+        if self.init is not None and self.points != "auto":
+            raise ValueError(f"init takes the place of points: leave out one of {self.init} and {self.points}.")
+
     def absolute(self) -> SceneOptions:
         """Return the options with absolute paths, valid in any working directory."""
         path = self.path if self.path == "synthetic" else str(Path(self.path).resolve())
@@ -80,6 +98,9 @@ class SceneOptions:
 class OrbitOptions:
     """Cameras around a model that comes without a scene.
 
+    Raises:
+        ValueError: if there is no camera or no pixel, or the arc is not in (0, 360] degrees.
+
     Example:
         >>> import torch
         >>> [camera.width for camera in OrbitOptions(cameras=2, size=64).views(torch.eye(3), torch.ones(3))]
@@ -94,6 +115,13 @@ class OrbitOptions:
     """Without a scene: the vertical axis. COLMAP worlds are mostly y-down, Blender and nerfstudio z-up."""
     arc: float = 360.0
     """Without a scene: degrees of the circle that the cameras cover; in a y-down world +z is the middle of it."""
+
+    def __post_init__(self) -> None:
+        if self.cameras < 1 or self.size < 1 or not 0 < self.arc <= 360:
+            raise ValueError(
+                f"an orbit needs at least 1 camera and a size of at least 1 pixel, and an arc in (0, 360] degrees, got "
+                f"cameras={self.cameras}, size={self.size} and arc={self.arc:g}."
+            )
 
     def views(self, means: Tensor, opacities: Tensor) -> list[Camera]:
         """Place the cameras around Gaussians; arguments and errors are those of `orbit_views`."""

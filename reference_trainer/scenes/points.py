@@ -67,7 +67,10 @@ def choose_points(
         raise FileNotFoundError(
             f"there is no folder {path} to take points from; choose auto, random or one of {found}."
         )
-    cloud = ply_points(path) if is_ply(path) else colmap_points(path)
+    if own is not None and own.source == str(path):
+        cloud = own  # in the world of the cameras, which its file need not be, and of known origin
+    else:
+        cloud = ply_points(path) if is_ply(path) else colmap_points(path)
     if cloud is None:
         raise ValueError(f"{path} has no points to start from; choose another folder or random points.")
     return cloud, f"initial points: {len(cloud.positions):,} from {cloud.source}"

@@ -14,6 +14,14 @@ __all__ = ["blender_split", "dtu_split", "evenly_spaced", "file_split", "llff_sp
 BLENDER_TRAIN = (2, 16, 26, 55, 73, 76, 86, 93)  # the 8 views of DietNeRF, adopted by every later paper
 BLENDER_TEST_FRAMES = 200  # the size of a full NeRF-synthetic test set
 TEST_EVERY = 8
+NERFSTUDIO = (
+    ("train_filenames", "train"),
+    ("train_filenames", "train_all"),
+    ("val_filenames", "test"),
+    ("test_filenames", "test"),
+)
+"""nerfstudio's lists, and what a split file calls them; of two for one, the last counts."""
+_OTHERS = "Another split, such as 'llff', does without the file, and --test none holds nothing out."
 DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)  # PixelNeRF's; a protocol of n views takes the first n
 DTU_TEST = (1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, *range(29, 36), 41, 42, 43, 45, 46, 47)
 
@@ -90,8 +98,10 @@ def file_split(path: str | Path, names: Sequence[str], views: int | None) -> tup
     """Read a split from a JSON file with a list ``test`` and one or more lists of training images.
 
     With ``views``, the training list is ``train_<views>``, else ``train`` if it has that length, else ``views`` images
-    spread evenly over ``train_all``. Without, it is ``train``, else ``train_3``. Images are named with or without
-    extension. Returns training and test indices into ``names``, all images of the scene, in increasing order.
+    spread evenly over ``train_all``. Without, it is ``train``, else ``train_3``. The lists of nerfstudio's
+    ``transforms.json`` will do as well: ``train_filenames`` is ``train`` and ``train_all``, ``test_filenames``, else
+    ``val_filenames``, is ``test``. Images are named with or without extension. Returns training and test indices into
+    ``names``, all images of the scene, in increasing order.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -104,16 +114,17 @@ def file_split(path: str | Path, names: Sequence[str], views: int | None) -> tup
     lists = (
         {key: value for key, value in content.items() if isinstance(value, list)} if isinstance(content, dict) else {}
     )
+    lists = {ours: lists[theirs] for theirs, ours in NERFSTUDIO if theirs in lists} | lists
     for key, value in lists.items():
         if key.startswith(("train", "test")) and not all(isinstance(name, str) for name in value):
             raise ValueError(f"{path}: the list {key!r} must hold names of images, strings.")
     train = _training_list(path, lists, views)
     if "test" not in lists:
-        raise ValueError(f"{path} has no list 'test'; it has {sorted(lists)}.")
+        raise ValueError(f"{path} has no list 'test'; it has {sorted(lists)}. {_OTHERS}")
     train_ids, test_ids = (_indices(path, chosen, names) for chosen in (train, lists["test"]))
     both = sorted(set(train_ids) & set(test_ids))
     if both:
-        raise ValueError(f"{path} uses {[names[i] for i in both]} both to train and to test.")
+        raise ValueError(f"{path} uses {[names[i] for i in both]} both to train and to test. {_OTHERS}")
     return train_ids, test_ids
 
 
@@ -138,15 +149,16 @@ def _training_list(path: Path, lists: dict[str, list[str]], views: int | None) -
 
 
 def _indices(path: Path, chosen: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Find the images by name, or by name without extension where that is unambiguous."""
+    """Find the images by path with or without extension, else by name without extension where that is unambiguous."""
     stems = [PurePosixPath(name).stem for name in names]
     indices = []
     for name in chosen:
-        stem = PurePosixPath(str(name)).stem
-        if name in names:
-            indices.append(list(names).index(name))
-        elif stems.count(stem) == 1:
-            indices.append(stems.index(stem))
+        listed = PurePosixPath(name)
+        same = [x for x in (name, str(listed), str(listed).removesuffix(listed.suffix)) if x in names]
+        if same:
+            indices.append(names.index(same[0]))
+        elif stems.count(listed.stem) == 1:
+            indices.append(stems.index(listed.stem))
         else:
             raise ValueError(
                 f"{path} names the image {name!r}; the scene has {list(names)[:4]}... ({len(names)} images)."

@@ -32,7 +32,8 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
     radians. The principal point ``cx``, ``cy`` is the center of the picture unless given; ``k1 k2 p1 p2 k3`` are
     OpenCV's distortion. A frame may override each of these. ``file_path`` is relative to the JSON file; without an
     extension it means a PNG file. With ``images``, pictures of the same names are taken from that folder beside the
-    file. Frames are named by the relative path of their picture, without extension.
+    file. ``mask_path`` is that of a mask, white where the picture counts. Frames are named by the relative path of
+    their picture, without extension.
 
     Raises:
         FileNotFoundError: if the file or images are missing.
@@ -65,12 +66,17 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
 
 def _file(root: Path, file_path: str, images: str | None) -> Path:
     """Find the picture of a frame."""
-    file = path_inside(root, file_path.replace("\\", "/"))  # as written on Windows
+    file = _inside(root, file_path)
     if file == root:
         raise ValueError(f"file_path {file_path!r} names the scene folder itself, not an image.")
     if images is not None:
         file = root / images / file.name
     return file if file.suffix.lower() in IMAGE_SUFFIXES else file.with_name(file.name + ".png")
+
+
+def _inside(root: Path, name: str) -> Path:
+    """Return the path of a file of the scene, which may have been written on Windows."""
+    return path_inside(root, name.replace("\\", "/"))
 
 
 def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float64]) -> Frame:
@@ -101,7 +107,8 @@ def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE") or entry.get("is_fisheye") or entry.get("k4"):
         raise ValueError(f"its camera {model} is no lens of OpenCV's model with k1 k2 p1 p2 k3: undistort it first")
     name = file.relative_to(path.parent).with_suffix("").as_posix()
-    return Frame(name, file, camera, distortion if any(distortion) else ())
+    mask = _inside(path.parent, entry["mask_path"]) if entry.get("mask_path") else None
+    return Frame(name, file, camera, distortion if any(distortion) else (), mask=mask)
 
 
 def _applied(content: dict[str, Any]) -> NDArray[np.float64]:
@@ -127,12 +134,11 @@ def _world_to_camera(entry: dict[str, Any], back: NDArray[np.float64]) -> torch.
         raise ValueError(f"transform_matrix of {entry['file_path']}: {error}") from error
 
 
-def _points(path: Path, frames: list[Frame]) -> PointCloud | None:
+def _points(path: Path, content: dict[str, Any], frames: list[Frame]) -> PointCloud | None:
     """Read the points that the file names, if any: in the world of its matrices, and possibly from any image."""
-    content = read_json(path)
     if "ply_file_path" not in content:
         return None
-    cloud = ply_points(path_inside(path.parent, str(content["ply_file_path"])))
+    cloud = ply_points(_inside(path.parent, str(content["ply_file_path"])))
     back = torch.from_numpy(np.linalg.inv(_applied(content))).to(cloud.positions)
     positions = cloud.positions @ back[:3, :3].T + back[:3, 3]
     return PointCloud(positions, cloud.colors, cloud.source, frozenset(frame.name for frame in frames))
@@ -141,8 +147,9 @@ def _points(path: Path, frames: list[Frame]) -> PointCloud | None:
 def _read_transforms(root: Path, options: SceneOptions) -> Capture:
     """Read a scene of one file."""
     path = root / "transforms.json"
-    frames = read_transforms(path, options.images)
-    return Capture(sorted(frames, key=lambda frame: frame.name), points=_points(path, frames))
+    frames, content = read_transforms(path, options.images), read_json(path)
+    points, split = _points(path, content, frames), "transforms" if "train_filenames" in content else "llff"
+    return Capture(sorted(frames, key=lambda frame: frame.name), points=points, split=split)
 
 
 def _read_blender(root: Path, options: SceneOptions) -> Capture:

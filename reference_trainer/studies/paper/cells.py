@@ -53,6 +53,9 @@ class Grid:
         seeds: number of seeds.
         out: folder for the trainings, ``NAME/LABEL/seed_K``, each removed once its row is kept.
         rows: folder of the kept rows, ``NAME.json``.
+
+    Raises:
+        ValueError: if there is no seed.
     """
 
     claims: Mapping[str, Claim]
@@ -62,6 +65,10 @@ class Grid:
     seeds: int = 3
     out: Path = Path("runs/paper")
     rows: Path = Path("runs/paper")
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1:
+            raise ValueError(f"expected at least 1 seed, got {self.seeds}.")
 
 
 @dataclass(frozen=True)

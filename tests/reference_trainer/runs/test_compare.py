@@ -209,9 +209,9 @@ def test_a_worker_that_does_not_share_the_folder_does_not_train(tmp_path, option
     assert not (tmp_path / "a" / "seed_0").exists()
 
 
-@pytest.mark.parametrize("wrong", [{"retries": -1}, {"checkpoint_every": 0}])
+@pytest.mark.parametrize("wrong", [{"retries": -1}, {"checkpoint_every": 0}, {"monitor_every": -1}])
 def test_what_running_refuses(wrong):
-    with pytest.raises(ValueError, match="retries of at least 0 and checkpoint_every of at least 1"):
+    with pytest.raises(ValueError, match=rf"expected .*{next(iter(wrong))} of at least \d"):
         Running(Here(), **wrong)
 
 

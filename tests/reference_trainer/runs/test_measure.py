@@ -1,16 +1,19 @@
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
 from PIL import Image
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
+from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.tables import evaluation_table
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import measure as measure_module
 from reference_trainer.runs.folder import BAKED_PLY, PLY
+from reference_trainer.runs.lock import FolderInUseError, run_lock
 from reference_trainer.runs.measure import measure, of_run, render_run
 from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.images import read_image
@@ -80,6 +83,28 @@ def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):
     assert found["background"] == [0.0, 0.0, 0.0]
     assert (tmp_path / "new" / "views" / "test" / "test_0_panel.png").exists()
     assert any("| mean test |" in text for text in said)
+
+
+def test_the_folder_is_locked_until_the_last_file_has_changed(run, tmp_path, monkeypatch):
+    """Otherwise a second evaluation that begins in between would lose its partial scores to the first."""
+    model, scene = of_run(run[0])
+    touched = []
+
+    def watched(change):
+        def locked_change(path, *arguments, **options):
+            if path.parent == tmp_path and path.name.startswith("evaluation"):
+                touched.append(path.name)
+                with pytest.raises(FolderInUseError), run_lock(tmp_path):
+                    pass
+            return change(path, *arguments, **options)
+
+        return locked_change
+
+    for owner, name in ((Path, "unlink"), (measure_module, "write_json"), (measure_module, "write_text")):
+        monkeypatch.setattr(owner, name, watched(getattr(owner, name)))
+    measure(model, {"test": scene.test[:1]}, tmp_path, about={}, say=lambda text: None)
+    assert touched == ["evaluation.json", "evaluation.md", "evaluation.partial.json"]
+    assert not (tmp_path / PARTIAL).exists()
 
 
 def test_the_seed_decides_the_masks(run, tmp_path):

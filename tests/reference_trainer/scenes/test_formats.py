@@ -150,6 +150,8 @@ def test_nerfstudio(nerfstudio):
     assert scene.train[2].camera.forward.tolist() == [0, 0, 1]
     assert [view.camera.fx for view in scene.train] == [50, 60, 50]
     torch.testing.assert_close(scene.points.positions, torch.tensor([[1.0, 2, 3]] * 2))
+    named = load_scene(nerfstudio, points="./sparse_pc.ply").points  # in the world of the cameras, not of the file
+    torch.testing.assert_close(named.positions, scene.points.positions)
     straight = load_scene(nerfstudio)
     assert "lens distortion, up to" in str(straight)
     assert straight.train[0].camera.fx > 50
@@ -157,12 +159,62 @@ def test_nerfstudio(nerfstudio):
     assert straight.train[0].camera.cx == 33
 
 
+def _change(path, **entries):
+    path.write_text(json.dumps(json.loads(path.read_text()) | entries))
+
+
+def test_the_lists_of_nerfstudio_split_its_scene(nerfstudio):
+    path = nerfstudio / "transforms.json"
+    _change(path, train_filenames=["images/c.png", "./images/a b.png"], val_filenames=["images/b.png"])
+    with pytest.raises(ValueError, match=r"the points from .*sparse_pc\.ply have seen 1 image outside .*: images/b\."):
+        load_scene(nerfstudio, points="sparse_pc.ply")
+    options = {"points": "sparse_pc.ply", "allow_test_points": True}
+    scene = load_scene(nerfstudio, **options)
+    assert [view.name for view in scene.train] == ["images/a b", "images/c"]
+    assert [view.name for view in scene.test] == ["images/b"]
+    assert [view.name for view in load_scene(nerfstudio, views=1, **options).train] == ["images/a b"]
+    assert len(load_scene(nerfstudio, test="none").train) == 3
+    _change(path, test_filenames=["images/c.png"])
+    with pytest.raises(ValueError, match=r"transforms\.json uses \['images/c'\] both .* --test none"):
+        load_scene(nerfstudio)
+    (nerfstudio / "split.json").write_text('{"train": ["a b", "b"], "test": ["c"]}')  # one's own file counts first
+    assert [view.name for view in load_scene(nerfstudio, **options).test] == ["images/c"]
+
+
+def test_pictures_of_one_name_in_two_folders_are_told_apart(nerfstudio):
+    path = nerfstudio / "transforms.json"
+    content = json.loads(path.read_text())
+    places = [f"images/{folder}/1.{number}.png" for folder, number in (("left", 0), ("left", 1), ("right", 0))]
+    for frame, name, place in zip(content["frames"], PICTURES[::-1], places, strict=True):
+        (nerfstudio / place).parent.mkdir(exist_ok=True)
+        (nerfstudio / "images" / name).rename(nerfstudio / place)
+        frame["file_path"] = place
+    _change(path, **content | {"train_filenames": places[:2], "test_filenames": places[2:]})
+    scene = load_scene(nerfstudio, points="sparse_pc.ply", allow_test_points=True)
+    assert [view.name for view in scene.train] == ["images/left/1.0", "images/left/1.1"]
+    assert [view.name for view in scene.test] == ["images/right/1.0"]
+
+
+def test_masks_of_nerfstudio(nerfstudio, save_image):
+    """White on the left half, in the order of the file, which is not that of the scene."""
+    path = nerfstudio / "transforms.json"
+    content = json.loads(path.read_text())
+    content["frames"][0]["mask_path"] = "masks\\c.png"
+    _change(path, frames=content["frames"])
+    with pytest.raises(FileNotFoundError, match=r"masks/c\.png"):
+        load_scene(nerfstudio)
+    save_image(nerfstudio / "masks" / "c.png", np.repeat(np.uint8([[255, 0]]), 32, axis=1).repeat(48, axis=0))
+    scene = load_scene(nerfstudio, undistort=False)
+    assert [view.mask is None for view in scene.train] == [True, True, False]
+    assert scene.train[2].mask.equal((torch.arange(64) < 32).float().expand(48, 64))
+    assert "masks: scores count what is white in them" in str(scene)
+
+
 @pytest.mark.parametrize(
     "change", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}, {"k4": 0.1}, {"applied_transform": [[0]]}]
 )
 def test_what_no_pinhole_stands_for_is_refused(nerfstudio, change):
-    path = nerfstudio / "transforms.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    _change(nerfstudio / "transforms.json", **change)
     with pytest.raises(ValueError, match=r"transforms\.json"):
         load_scene(nerfstudio)
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -183,6 +184,7 @@ def test_detect_format(photo_scene, blender_scene, tmp_path):
         ({"format": "nerf"}, "format must be"),
         ({"background": "green"}, "background must be"),
         ({"downscale": 0.5}, "downscale must be"),
+        ({"downscale": math.nan}, "downscale must be a finite number of at least 1, got nan"),
         ({"views": 0}, "views must be"),
         ({"views": 5}, "no training set of 5 views"),
         ({"split": "other"}, r"no split 'other'; choose auto, llff, dtu or a JSON file of the scene: \['split'\]"),

@@ -88,6 +88,8 @@ def test_paths_may_have_been_written_on_windows(blender_scene):
         (lambda c: c["frames"][0].update(file_path="../../etc/x"), "leads out of the scene"),
         (lambda c: c["frames"][0].update(file_path="..\\..\\etc\\x"), "leads out of the scene"),
         (lambda c: c["frames"][0].update(file_path="/etc/x"), "leads out of the scene"),
+        (lambda c: c["frames"][0].update(mask_path="../mask.png"), "leads out of the scene"),
+        (lambda c: c["frames"][0].update(mask_path=3), "not a valid transforms file"),
         (lambda c: c["frames"][0].update(transform_matrix=[[1, 0], [0, 1]]), "finite 4x4"),
         (lambda c: c["frames"][0].update(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), "no rotation"),
         (lambda c: c["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "no rotation"),
