@@ -85,7 +85,7 @@ def check_finite(x: Any, name: str, *, minimum: float = -math.inf, hint: str = "
     if not isinstance(x, Real):
         raise TypeError(f"{name} must be a real number, got {type(x).__name__}.")
     try:
-        finite = math.isfinite(x)
+        finite = -math.inf < float(x) < math.inf  # not math.isfinite, which has no place in a compiled graph
     except OverflowError:  # an integer above all floats
         finite = False
     if not finite or x < minimum:
