@@ -165,11 +165,12 @@ def relative_ranks(values: Tensor) -> Tensor:
 
 
 def camera_depths(x: Params) -> Tensor:
-    """Return the depths of the centers along the camera's z axis, (N,), negative behind the camera.
+    """Return the depths of the centers along the camera's z axis, (N,), at least float32, negative behind the camera.
 
     Convention: the view matrix is world to camera, for column vectors: its third row is the viewing direction.
     """
     assert x.means is not None
     assert x.view_matrix is not None
-    row = x.view_matrix.detach()[2].to(x.means)
-    return x.means.detach() @ row[:3] + row[3]
+    means = x.means.detach().to(torch.promote_types(x.means.dtype, torch.float32))
+    row = x.view_matrix.detach()[2].to(means)
+    return means @ row[:3] + row[3]

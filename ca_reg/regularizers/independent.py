@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ca_reg import functional
-from ca_reg._check import Rate, check_rate, is_zero
+from ca_reg._check import Rate, check_rate, is_zero, rate_like
 from ca_reg.functional import Multiplier
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Regularizer
@@ -83,7 +83,7 @@ class IndependentDropout(Regularizer):
 
     def _multiplied(self, x: Params, rates: Rate) -> tuple[Params, Multiplier]:
         if self.compensate:
-            x = x._replace(opacities=x.opacities / (1.0 - rates))
+            x = x._replace(opacities=x.opacities / (1.0 - rate_like(rates, x.opacities)))
         return x, Multiplier.dropout(rates)
 
     def _check_rate(self, rate: float, name: str) -> None:

@@ -75,7 +75,8 @@ class SEGSNoise(Regularizer):
         if draw.value is None:
             return x
         means, scales, rows = _geometry(x)
-        of_means, of_logits, of_scales, of_rows = (noise.to(x.opacities.dtype) for noise in draw.value)
+        given = (means, x.opacities, scales, rows)
+        of_means, of_logits, of_scales, of_rows = (n.to(of.dtype) for n, of in zip(draw.value, given, strict=True))
         raised = of_logits[:, 0].exp()  # sigmoid(logit o + n) without the logit, which is infinite at 0 and 1
         return x._replace(
             means=means + of_means,
