@@ -82,9 +82,9 @@ class SurroundingsDropout(IndependentDropout):
     needs: ClassVar[tuple[str, ...]] = ("means",)
 
     def __init__(
-        self, schedule: float | Schedule | None = None, *, every: int, compensate: bool = False, scale: bool = True
+        self, rate: float | Schedule | None = None, *, every: int, compensate: bool = False, scale: bool = True
     ) -> None:
-        super().__init__(schedule, compensate=compensate, scale=scale)
+        super().__init__(rate, compensate=compensate, scale=scale)
         self.trained, self.tested = Refreshed(every), Refreshed(1)
 
     def measure(self, means: Tensor) -> Tensor:

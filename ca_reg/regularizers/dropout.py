@@ -80,4 +80,4 @@ class GaussianDropout(IndependentDropout):
 
     def rates(self, x: Params) -> Rate:
         """Return the rate at the step."""
-        return self._rate_at(x.step)
+        return self.rate_at(x.step)

@@ -59,7 +59,7 @@ class SEGSNoise(Regularizer):
     @torch.no_grad()
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw the noise of centers (N, 3), logits (N, 1), log-scales (N, 3) and rotations (N, 6), float32."""
-        ratio = self._rate_at(x.step)
+        ratio = self.rate_at(x.step)
         if is_zero(ratio):
             return Draw()
         means, scales, rows = _geometry(x)
