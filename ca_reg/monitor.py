@@ -18,6 +18,7 @@ from torch import Tensor
 from ca_reg._check import check_callable, check_count, check_opacity
 from ca_reg._log import read_log
 from ca_reg.functional import scale_opacity
+from ca_reg.params import Params
 from ca_reg.result import summarize
 from ca_reg.score import CAScore
 
@@ -118,12 +119,13 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         hint = "" if self._writer else "; for TensorBoard: pip install 'ca_reg[tensorboard]'"
         _log.info("co-adaptation is logged to %s (%s)%s", self.path, ", ".join(self.backends), hint)
 
-    def __call__(self, step: int, opacity: Tensor) -> dict[str, float | int | str | None] | None:
+    def __call__(self, step: int, opacity: Tensor | Params) -> dict[str, float | int | str | None] | None:
         """Measure and log if the step is due: a multiple of ``every``, later than the last step in the log.
 
         Args:
             step: the training step.
-            opacity: activated opacities of the model in [0, 1], neither dropped nor scaled, shape (N,) or (N, 1).
+            opacity: activated opacities of the model in [0, 1], neither dropped nor scaled, shape (N,) or (N, 1); or
+                :class:`~ca_reg.Params`, as for a call of the score.
 
         Returns:
             The logged record, or None if the step was not due.
@@ -138,14 +140,15 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
             return None
         if self._file.closed:
             raise ValueError("the monitor is closed; make a new one with resume_step to add to its log.")
-        check_opacity(opacity)
-        opacity = opacity.detach()
+        x = opacity if isinstance(opacity, Params) else Params(opacity)
+        check_opacity(x.opacities)
+        opacity = x.opacities.detach()
         record: dict[str, float | int | str | None] = {"step": step, "gaussians": opacity.shape[0]}
         index = 0
         for name, group in self.views.items():
             results = []
             for view in group:
-                results.append(self.score(opacity, view, index=index))
+                results.append(self.score(x, view, index=index))
                 index += 1
             summary = summarize(results).as_dict()
             record[f"ca/{name}"] = summary["value"]
