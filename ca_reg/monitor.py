@@ -6,7 +6,7 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
@@ -48,8 +48,8 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
     Args:
         score: how to measure. Its ``p`` is also the rate by which opacities are scaled for ``psnr``.
         log_dir: directory of the log and the TensorBoard events; made if it does not exist.
-        views: non-empty groups of views by name, usually ``{"train": [...], "test": [...]}``. The views are passed on
-            to the callables as they are.
+        views: non-empty groups of views by name, usually ``{"train": [...], "test": [...]}``; a group is any iterable.
+            The views are passed on to the callables as they are.
         every: number of steps between measurements, at least 1.
         psnr: ``psnr(opacity, view)`` returns the PSNR in dB of the view rendered with these opacities, already scaled
             by ``1 - p`` for test time. Called without gradients. None leaves PSNR out.
@@ -84,7 +84,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         score: CAScore,
         log_dir: str | os.PathLike[str],
         *,
-        views: Mapping[str, Sequence[Any]],
+        views: Mapping[str, Iterable[Any]],
         every: int = 500,
         psnr: Callable[[Tensor, Any], float] | None = None,
         details: Callable[[Tensor, Any], Mapping[str, Tensor]] | None = None,
@@ -97,14 +97,14 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
             if fn is not None:
                 check_callable(fn, name)
         if not isinstance(views, Mapping):
-            raise TypeError(f"views must be a mapping from names to sequences of views, got {type(views).__name__}.")
-        if not views or any(len(group) == 0 for group in views.values()):
+            raise TypeError(f"views must be a mapping from names to views, got {type(views).__name__}.")
+        self.views = {name: list(group) for name, group in views.items()}
+        if not self.views or not all(self.views.values()):
             raise ValueError(
                 f"views must name at least one group and none may be empty, got "
-                f"{ {name: len(group) for name, group in views.items()} }; leave out groups without views."
+                f"{ {name: len(group) for name, group in self.views.items()} }; leave out groups without views."
             )
         self.score = score
-        self.views = {name: list(group) for name, group in views.items()}
         self.every = every
         self.psnr = psnr
         self.details = details
