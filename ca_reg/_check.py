@@ -16,7 +16,7 @@ from torch import Tensor
 
 __all__ = [
     "Rate", "check_callable", "check_count", "check_finite", "check_opacity", "check_opacity_range",
-    "check_per_gaussian", "check_rate", "is_zero", "rate_like",
+    "check_per_gaussian", "check_rate", "check_rates", "is_zero", "rate_like",
 ]  # fmt: skip
 
 Rate = float | Tensor
@@ -63,19 +63,21 @@ def check_per_gaussian(x: Any, opacity: Tensor, name: str) -> None:
 
 
 def check_rate(p: Any, name: str = "p") -> None:
-    """Raise unless ``p`` is a real number in [0, 1), or a tensor (N,) of such; the tensor's values are read."""
-    if _is_in_a_graph(p):
-        return
-    if isinstance(p, Tensor):
-        if p.ndim != 1 or not p.is_floating_point() or not bool(((p >= 0) & (p < 1)).all()):
-            raise ValueError(
-                f"{name} must be a number in [0, 1) or a floating-point tensor (N,) of such, got a {p.dtype} tensor of "
-                f"shape {tuple(p.shape)}" + (f" from {p.min():g} to {p.max():g}." if p.numel() else ".")
-            )
-        return
+    """Raise unless ``p`` is a real number in [0, 1)."""
     check_finite(p, name)
     if not 0.0 <= p < 1.0:
         raise ValueError(f"{name} must be in [0, 1), got {p}; it is the fraction of Gaussians that is dropped.")
+
+
+def check_rates(p: Any) -> None:
+    """Raise unless ``p`` is a real number in [0, 1), or a tensor (N,) of such; the tensor's values are read."""
+    if not isinstance(p, Tensor):
+        check_rate(p)
+    elif not _is_in_a_graph(p) and not (p.ndim == 1 and p.is_floating_point() and bool(((p >= 0) & (p < 1)).all())):
+        raise ValueError(
+            f"p must be a number in [0, 1) or a floating-point tensor (N,) of such, got a {p.dtype} tensor of shape "
+            f"{tuple(p.shape)}" + (f" from {p.min():g} to {p.max():g}." if p.numel() else ".")
+        )
 
 
 def check_finite(x: Any, name: str, *, minimum: float = -math.inf, hint: str = "") -> None:
@@ -85,7 +87,7 @@ def check_finite(x: Any, name: str, *, minimum: float = -math.inf, hint: str = "
     if not isinstance(x, Real):
         raise TypeError(f"{name} must be a real number, got {type(x).__name__}.")
     try:
-        finite = math.isfinite(x)
+        finite = -math.inf < float(x) < math.inf  # not math.isfinite, which has no place in a compiled graph
     except OverflowError:  # an integer above all floats
         finite = False
     if not finite or x < minimum:

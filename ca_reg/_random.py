@@ -38,7 +38,9 @@ def draw_numbers(
             "state and no other, so the gradient would be that of another draw. Draw outside the checkpointed function "
             "and give it keep= or noise=, or leave out generator."
         )
-    x = sample(n, generator=generator, dtype=torch.float32, device=device if generator is None else generator.device)
+    if generator is None:  # and unnamed: a compiled graph could not draw for a number of Gaussians that changes
+        return sample(n, dtype=torch.float32, device=device)
+    x = sample(n, generator=generator, dtype=torch.float32, device=generator.device)
     return x if device is None else x.to(device)
 
 

@@ -64,8 +64,11 @@ class Scheduled(nn.Module):
         self._check_rate(rate, f"{self.rate_name or 'the rate'} at step {step}")
         return rate
 
-    def _rate_at(self, step: int) -> Rate:
-        """Return the rate at a step: a number, or inside ``torch.compile`` the current one as a scalar tensor."""
+    def rate_at(self, step: int) -> Rate:
+        """Return the rate at a step, for a draw ``x.step``; a number, after a check of its range.
+
+        Inside ``torch.compile`` it is that of the last :meth:`set_step`, a scalar tensor, so that one graph serves all.
+        """
         if isinstance(self._schedule, Constant):
             return self._schedule.value  # checked at construction; does not read the step, which would recompile
         if self._rate is not None and torch.compiler.is_compiling():

@@ -48,7 +48,6 @@ def make_settings(
     ``given`` holds samples, ddof, relative_error and max_samples, each None unless the caller set it.
     """
     if drop_rate is not None:
-        check_finite(drop_rate, "drop_rate")
         check_rate(drop_rate, "drop_rate")
     check_finite(threshold, "threshold")
     check_count(seed, "seed", minimum=0)

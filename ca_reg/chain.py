@@ -114,7 +114,7 @@ class Chain(Regularizer):
         for member in means:
             member.check_needs(x)
         if len(means) > 1 and (both := _multiplied(means, x, test=True)) is not None:
-            x = both[0]._replace(opacities=both[0].opacities * both[1].mean)
+            x = both[0]._replace(opacities=(both[0].opacities * both[1].mean).to(x.opacities.dtype))
         else:
             for member in means:
                 x = member.expected(x)

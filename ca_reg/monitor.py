@@ -6,7 +6,7 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +18,7 @@ from torch import Tensor
 from ca_reg._check import check_callable, check_count, check_opacity
 from ca_reg._log import read_log
 from ca_reg.functional import scale_opacity
+from ca_reg.params import Params
 from ca_reg.result import summarize
 from ca_reg.score import CAScore
 
@@ -47,8 +48,8 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
     Args:
         score: how to measure. Its ``p`` is also the rate by which opacities are scaled for ``psnr``.
         log_dir: directory of the log and the TensorBoard events; made if it does not exist.
-        views: non-empty groups of views by name, usually ``{"train": [...], "test": [...]}``. The views are passed on
-            to the callables as they are.
+        views: non-empty groups of views by name, usually ``{"train": [...], "test": [...]}``; a group is any iterable.
+            The views are passed on to the callables as they are.
         every: number of steps between measurements, at least 1.
         psnr: ``psnr(opacity, view)`` returns the PSNR in dB of the view rendered with these opacities, already scaled
             by ``1 - p`` for test time. Called without gradients. None leaves PSNR out.
@@ -83,7 +84,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         score: CAScore,
         log_dir: str | os.PathLike[str],
         *,
-        views: Mapping[str, Sequence[Any]],
+        views: Mapping[str, Iterable[Any]],
         every: int = 500,
         psnr: Callable[[Tensor, Any], float] | None = None,
         details: Callable[[Tensor, Any], Mapping[str, Tensor]] | None = None,
@@ -96,14 +97,14 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
             if fn is not None:
                 check_callable(fn, name)
         if not isinstance(views, Mapping):
-            raise TypeError(f"views must be a mapping from names to sequences of views, got {type(views).__name__}.")
-        if not views or any(len(group) == 0 for group in views.values()):
+            raise TypeError(f"views must be a mapping from names to views, got {type(views).__name__}.")
+        self.views = {name: list(group) for name, group in views.items()}
+        if not self.views or not all(self.views.values()):
             raise ValueError(
                 f"views must name at least one group and none may be empty, got "
-                f"{ {name: len(group) for name, group in views.items()} }; leave out groups without views."
+                f"{ {name: len(group) for name, group in self.views.items()} }; leave out groups without views."
             )
         self.score = score
-        self.views = {name: list(group) for name, group in views.items()}
         self.every = every
         self.psnr = psnr
         self.details = details
@@ -118,12 +119,13 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         hint = "" if self._writer else "; for TensorBoard: pip install 'ca_reg[tensorboard]'"
         _log.info("co-adaptation is logged to %s (%s)%s", self.path, ", ".join(self.backends), hint)
 
-    def __call__(self, step: int, opacity: Tensor) -> dict[str, float | int | str | None] | None:
+    def __call__(self, step: int, opacity: Tensor | Params) -> dict[str, float | int | str | None] | None:
         """Measure and log if the step is due: a multiple of ``every``, later than the last step in the log.
 
         Args:
             step: the training step.
-            opacity: activated opacities of the model in [0, 1], neither dropped nor scaled, shape (N,) or (N, 1).
+            opacity: activated opacities of the model in [0, 1], neither dropped nor scaled, shape (N,) or (N, 1); or
+                :class:`~ca_reg.Params`, as for a call of the score.
 
         Returns:
             The logged record, or None if the step was not due.
@@ -138,14 +140,15 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
             return None
         if self._file.closed:
             raise ValueError("the monitor is closed; make a new one with resume_step to add to its log.")
-        check_opacity(opacity)
-        opacity = opacity.detach()
+        x = opacity if isinstance(opacity, Params) else Params(opacity)
+        check_opacity(x.opacities)
+        opacity = x.opacities.detach()
         record: dict[str, float | int | str | None] = {"step": step, "gaussians": opacity.shape[0]}
         index = 0
         for name, group in self.views.items():
             results = []
             for view in group:
-                results.append(self.score(opacity, view, index=index))
+                results.append(self.score(x, view, index=index))
                 index += 1
             summary = summarize(results).as_dict()
             record[f"ca/{name}"] = summary["value"]

@@ -25,11 +25,11 @@ def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     differently.
 
     Args:
-        points: finite, shape (N, 3), on any device.
+        points: finite, shape (N, 3), on any device; half precision is searched in float32.
         count: number of neighbors k, less than N.
 
     Returns:
-        Squared distances, shape (N, k), and the neighbors' indices, shape (N, k) int64, nearest first.
+        Squared distances, at least float32, and the neighbors' indices, int64, nearest first; shape (N, k) each.
 
     Raises:
         ValueError: if the shape is not (N, 3), or N is not above k.
@@ -43,6 +43,7 @@ def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     n = points.shape[0]
     if points.ndim != 2 or points.shape[1] != 3 or n <= count:
         raise ValueError(f"points must have shape (N, 3) with N > {count}, got {tuple(points.shape)}.")
+    points = points.to(torch.promote_types(points.dtype, torch.float32))
     if n >= TREE_FROM:
         with suppress(ImportError):
             return _by_tree(points, count)
@@ -98,7 +99,7 @@ def _search(ordered: Tensor, start: int, stop: int, low: int, high: int, count: 
 
 @torch.no_grad()
 def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
-    """Return the distance from every point, (N, D), to the nearest of the others, (M, D); shape (N,).
+    """Return the distance from every point, (N, D), to the nearest of the others, (M, D); (N,), at least float32.
 
     Among many others SciPy's k-d tree finds it, as in `nearest_neighbors`; else all distances are computed.
 
@@ -112,6 +113,7 @@ def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
     if points.ndim != 2 or others.ndim != 2 or points.shape[1] != others.shape[1] or len(others) < 1:
         shapes = f"{tuple(points.shape)} and {tuple(others.shape)}"
         raise ValueError(f"expected points (N, D) and at least one other, (M, D), got {shapes}.")
+    points, others = (x.to(torch.promote_types(x.dtype, torch.float32)) for x in (points, others))
     if len(others) >= TREE_FROM:
         with suppress(ImportError):
             from scipy.spatial import cKDTree
@@ -123,7 +125,7 @@ def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
 
 
 def rms_neighbor_distance(positions: Tensor) -> Tensor:
-    """Return the root mean squared distance of each point to its three nearest others.
+    """Return the root mean squared distance of each point to its three nearest others, at least float32.
 
     Convention: the INRIA code takes the logarithm of this as the initial scale of a Gaussian. Coinciding points get
     sqrt(1e-7) instead of 0. With fewer than three other points, all others count. Shapes (N, 3) and (N,).

@@ -139,7 +139,7 @@ class CAPenalty(Scheduled):
                 raise TypeError(f"the multiplier callable must return a Multiplier, got {type(multiplier).__name__}.")
         moments = read_moments(self.moments_fn(opacity, view, multiplier, background), layout=self.layout)
         # In a graph the weight is a float64 scalar, which would promote the product to float64.
-        penalty = (self._rate_at(self.step) * moments.variance.mean()).to(moments.variance.dtype)
+        penalty = (self.rate_at(self.step) * moments.variance.mean()).to(moments.variance.dtype)
         return PenalizedRender(moments.mean, moments.variance, penalty)
 
     def extra_repr(self) -> str:

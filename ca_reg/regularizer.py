@@ -36,6 +36,9 @@ class Regularizer(Scheduled):
     splatfacto-ca, a :class:`~ca_reg.Chain`, and as the masks of a :class:`~ca_reg.CAScore`. To drop Gaussians
     independently of each other, subclass :class:`~ca_reg.IndependentDropout` and define the rates only.
 
+    A rate of at least 0, or a schedule of it, goes to ``super().__init__``, and ``self.rate_at(x.step)`` is the rate of
+    a draw; with a schedule ``state_dict`` saves the step.
+
     Called as a module it takes activated opacities, (N,) or (N, 1), or :class:`~ca_reg.Params`, and returns the same
     type: under a new draw in ``train()``, the test-time value in ``eval()``.
 
@@ -44,6 +47,7 @@ class Regularizer(Scheduled):
         learns: what it learns per Gaussian, by name; supported by the bundled trainer only.
         drops: whether it may set opacities to 0.
         renders_mean: whether its test-time value is the mean of its draws.
+        rate_name: name of the argument that may follow a schedule, for errors and ``print``.
         last: the last draw; None if there was none, in evaluation, and in a copy.
         step: the training step, set with :meth:`set_step`.
 
@@ -119,7 +123,7 @@ class Regularizer(Scheduled):
 
         Args:
             x: activated opacities in [0, 1], shape (N,) or (N, 1), or all parameters with such opacities. If these have
-                no step, i.e. 0, that of :meth:`set_step` counts.
+                no step, i.e. 0, that of :meth:`set_step` counts; inside ``torch.compile`` only for :meth:`rate_at`.
             drawn: an earlier draw to replay instead of a new one; in training only.
             generator: source of the draw; the global random state is then untouched.
 

@@ -13,7 +13,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ca_reg._accumulate import Deviations, RenderMoments
-from ca_reg._check import check_callable, check_count, check_finite, check_opacity, check_opacity_range, check_rate
+from ca_reg._check import check_callable, check_count, check_opacity, check_opacity_range, check_rate
 from ca_reg._random import seeded
 from ca_reg._settings import GROUPS, LEAST, ROUND, make_settings
 from ca_reg.functional import Multiplier
@@ -156,7 +156,6 @@ class CAScore:
         if exact is not None and alpha_fn is not None:
             raise ValueError("alpha_fn does not apply to an exact score, whose moments hold the expected alpha.")
         check_layout(layout)
-        check_finite(p, "p")
         check_rate(p)
         if not (regularizer is None or isinstance(regularizer, Regularizer)):
             raise TypeError(

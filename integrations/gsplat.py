@@ -132,11 +132,6 @@ class Regularized:
             Regularized._eager = torch.compiler.disable(Regularized._rasterize)  # type: ignore[no-untyped-call]
         functools.update_wrapper(self, rasterization)
 
-    @property
-    def trained(self) -> int:
-        """Number of training calls that were regularized, without those at a rate of 0."""
-        return self.tally.regularized
-
     def __call__(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Rasterize with regularized Gaussians; takes and returns what ``rasterization`` does."""
         out: tuple[Any, ...] = self._eager(args, kwargs, trains=self.regularizer.training)
@@ -235,11 +230,6 @@ class Installation(Hook):
         self._watch()
         return self
 
-    @property
-    def trained(self) -> int:
-        """Number of training calls, of all functions, that were regularized, without those at a rate of 0."""
-        return self.tally.regularized
-
     def uninstall(self) -> None:
         """Restore the original functions; a second call does nothing."""
         self._unwatch()
@@ -280,7 +270,7 @@ def install(regularizer: nn.Module, *, generator: torch.Generator | None = None,
         >>> from ca_reg import GaussianDropout
         >>> with install(GaussianDropout(0.2)) as installation:  # doctest: +SKIP
         ...     runpy.run_path("simple_trainer.py", run_name="__main__")
-        >>> installation.trained  # doctest: +SKIP
+        >>> installation.tally.regularized  # doctest: +SKIP
         30000
     """
     return Installation(regularizer, generator=generator, patience=patience).install()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ca_reg._check import Rate, check_count, check_opacity, check_per_gaussian, check_rate, is_zero, rate_like
+from ca_reg._check import Rate, check_count, check_opacity, check_per_gaussian, check_rates, is_zero, rate_like
 from ca_reg._random import draw_numbers
 
 __all__ = ["apply_dropout", "draw_keep_mask", "gaussian_dropout"]
@@ -41,7 +41,7 @@ def draw_keep_mask(
         (torch.bool, tensor(True))
     """
     check_count(n, "n", minimum=0)
-    check_rate(p)
+    check_rates(p)
     uniform = draw_numbers(torch.rand, n, generator, device)
     if isinstance(p, Tensor) and p.ndim:
         check_per_gaussian(p, uniform, "p")
@@ -81,7 +81,7 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: b
     """
     check_opacity(opacity)
     check_per_gaussian(keep, opacity, "keep")
-    check_rate(p)
+    check_rates(p)
     if keep.dtype != torch.bool:
         raise TypeError(f"keep must be a bool tensor, got {keep.dtype}; compare with a threshold to get a mask.")
     # Not a product: 0 * inf and 0 * nan would put nan where Gaussians are dropped, forward and backward.
@@ -103,7 +103,7 @@ def gaussian_dropout(
         (torch.Size([4, 1]), torch.Size([4]))
     """
     check_opacity(opacity)
-    check_rate(p)
+    check_rates(p)
     if is_zero(p):
         return opacity, None
     keep = draw_keep_mask(opacity.shape[0], p, generator=generator, device=opacity.device)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ca_reg._check import Rate, check_finite, check_opacity_range, check_rate
+from ca_reg._check import Rate, check_finite, check_opacity_range, check_rates
 
 __all__ = ["Multiplier"]
 
@@ -81,7 +81,7 @@ class Multiplier:
             TypeError: if ``p`` is neither a number nor a tensor.
             ValueError: if ``p`` is outside [0, 1), or a tensor not of shape (N,).
         """
-        check_rate(p)
+        check_rates(p)
         return cls(1.0, p / (1.0 - p)) if compensate else cls(1.0 - p, p * (1.0 - p))
 
     @classmethod

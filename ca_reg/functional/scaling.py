@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ca_reg._check import Rate, check_finite, check_opacity, check_opacity_range, check_rate, is_zero, rate_like
+from ca_reg._check import Rate, check_finite, check_opacity, check_opacity_range, check_rates, is_zero, rate_like
 from ca_reg.functional.multipliers import Multiplier
 
 __all__ = ["expected_opacity", "scale_opacity"]
@@ -31,7 +31,7 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
         tensor([0.4000, 0.8000])
     """
     check_opacity(opacity)
-    check_rate(p)
+    check_rates(p)
     return opacity if is_zero(p) else opacity * (1.0 - rate_like(p, opacity))
 
 

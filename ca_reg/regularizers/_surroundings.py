@@ -82,9 +82,9 @@ class SurroundingsDropout(IndependentDropout):
     needs: ClassVar[tuple[str, ...]] = ("means",)
 
     def __init__(
-        self, schedule: float | Schedule | None = None, *, every: int, compensate: bool = False, scale: bool = True
+        self, rate: float | Schedule | None = None, *, every: int, compensate: bool = False, scale: bool = True
     ) -> None:
-        super().__init__(schedule, compensate=compensate, scale=scale)
+        super().__init__(rate, compensate=compensate, scale=scale)
         self.trained, self.tested = Refreshed(every), Refreshed(1)
 
     def measure(self, means: Tensor) -> Tensor:
@@ -165,11 +165,12 @@ def relative_ranks(values: Tensor) -> Tensor:
 
 
 def camera_depths(x: Params) -> Tensor:
-    """Return the depths of the centers along the camera's z axis, (N,), negative behind the camera.
+    """Return the depths of the centers along the camera's z axis, (N,), at least float32, negative behind the camera.
 
     Convention: the view matrix is world to camera, for column vectors: its third row is the viewing direction.
     """
     assert x.means is not None
     assert x.view_matrix is not None
-    row = x.view_matrix.detach()[2].to(x.means)
-    return x.means.detach() @ row[:3] + row[3]
+    means = x.means.detach().to(torch.promote_types(x.means.dtype, torch.float32))
+    row = x.view_matrix.detach()[2].to(means)
+    return means @ row[:3] + row[3]

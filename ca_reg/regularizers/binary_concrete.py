@@ -72,7 +72,7 @@ class BinaryConcrete(Regularizer):
 
     def expected(self, x: Params) -> Params:
         """Multiply by the mean of the soft mask."""
-        return x._replace(opacities=x.opacities * self.multiplied(x)[1].mean)
+        return x._replace(opacities=(x.opacities * self.multiplied(x)[1].mean).to(x.opacities.dtype))
 
     def multiplied(self, x: Params) -> tuple[Params, Multiplier]:
         """Return ``x`` and the moments of the soft mask; exact up to the renderer's clamp and cut-off of alphas."""

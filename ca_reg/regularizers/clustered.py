@@ -72,7 +72,7 @@ class ClusteredDropout(Regularizer):
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw anchors, to be dropped with their neighbors."""
-        rate, count = self._rate_at(x.step), len(x.opacities)
+        rate, count = self.rate_at(x.step), len(x.opacities)
         if is_zero(rate) or not count:
             return Draw()
         neighbors = self.neighbors(x, lambda means: neighbors_of(means, self.k)[1])

@@ -94,7 +94,7 @@ class D2GSDropout(SurroundingsDropout):
 
     def rates_from(self, x: Params, look: Callable[[], Tensor]) -> Rate:
         """Return the rates; 0 while the schedule is 0."""
-        rate = self._rate_at(x.step)
+        rate = self.rate_at(x.step)
         if is_zero(rate) or not len(x.opacities):
             return 0.0
         if self.literal:

@@ -55,7 +55,7 @@ class DepthDropout(IndependentDropout):
 
     def rates(self, x: Params) -> Rate:
         """Return the rates; 0 while the schedule is 0."""
-        rate = self._rate_at(x.step)
+        rate = self.rate_at(x.step)
         if is_zero(rate):
             return 0.0
         return rate * (self.near + (self.far - self.near) * relative_ranks(camera_depths(x)))

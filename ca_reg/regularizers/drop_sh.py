@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Sequence
 
 import torch
@@ -56,7 +55,9 @@ class SHDropout(Regularizer):
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw which Gaussians keep all degrees, (N,) bool, and note how many coefficients the others keep."""
         assert x.sh is not None
-        rate, degree = self._rate_at(x.step), bisect_right(self.until, x.step)
+        step = x.step or self.step  # in a compiled graph the former is 0
+        degree = sum(step >= start for start in self.until)
+        rate = self.rate_at(x.step)
         count = (degree + 1) ** 2
         if is_zero(rate) or degree == len(self.until) or count >= x.sh.shape[1]:
             return Draw()

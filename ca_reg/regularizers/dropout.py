@@ -26,9 +26,10 @@ class GaussianDropout(IndependentDropout):
     Dropped Gaussians must leave no trace in density control: pass the radii through
     :meth:`~ca_reg.Regularizer.mask_radii`.
 
-    Inside ``torch.compile`` one graph serves all steps, even with ``fullgraph=True``: the values of the opacities are
-    then not checked, and a schedule draws even where its rate is 0. Inside ``torch.utils.checkpoint`` draw without
-    ``generator``, or draw outside and pass ``keep``. The same holds for :class:`OpacityNoise`.
+    Inside ``torch.compile`` one graph serves all steps, even with ``fullgraph=True``, and the next all numbers of
+    Gaussians: the values of the opacities are then not checked, and a schedule draws even where its rate is 0. Inside
+    ``torch.utils.checkpoint`` draw without ``generator``, or draw outside and pass ``keep``. The same holds for
+    :class:`OpacityNoise`.
 
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call rejects negative ones as logits.
 
@@ -79,4 +80,4 @@ class GaussianDropout(IndependentDropout):
 
     def rates(self, x: Params) -> Rate:
         """Return the rate at the step."""
-        return self._rate_at(x.step)
+        return self.rate_at(x.step)

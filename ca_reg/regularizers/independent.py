@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ca_reg import functional
-from ca_reg._check import Rate, check_rate, is_zero
+from ca_reg._check import Rate, check_rate, is_zero, rate_like
 from ca_reg.functional import Multiplier
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Regularizer
@@ -21,22 +21,22 @@ class IndependentDropout(Regularizer):
     ``opacity * (1 - p)``, the mean over all masks; otherwise, and with ``compensate``, the opacities unchanged.
 
     Args:
-        schedule: a rate, or a schedule of one, for subclasses to build on; with a schedule the step is saved.
+        rate: in [0, 1), or a schedule of it, which ``self.rate_at(x.step)`` reads, for subclasses whose rates build on
+            one.
         compensate: scale the survivors in training rather than all opacities in evaluation.
         scale: scale the opacities in evaluation, as the paper does; most published schemes do not.
 
     Example:
         >>> class DropFaint(IndependentDropout):
+        ...     rate_name = "rate"
         ...     def rates(self, x):
-        ...         return 0.4 * (1 - x.opacities.detach())
-        >>> DropFaint().eval()(torch.tensor([0.5, 1.0]))
+        ...         return self.rate_at(x.step) * (1 - x.opacities.detach())
+        >>> DropFaint(0.4).eval()(torch.tensor([0.5, 1.0]))
         tensor([0.4000, 1.0000])
     """
 
-    def __init__(
-        self, schedule: float | Schedule | None = None, *, compensate: bool = False, scale: bool = True
-    ) -> None:
-        super().__init__(schedule)
+    def __init__(self, rate: float | Schedule | None = None, *, compensate: bool = False, scale: bool = True) -> None:
+        super().__init__(rate)
         self.compensate = compensate
         self.scale = scale
         self.renders_mean = compensate or scale
@@ -83,7 +83,7 @@ class IndependentDropout(Regularizer):
 
     def _multiplied(self, x: Params, rates: Rate) -> tuple[Params, Multiplier]:
         if self.compensate:
-            x = x._replace(opacities=x.opacities / (1.0 - rates))
+            x = x._replace(opacities=x.opacities / (1.0 - rate_like(rates, x.opacities)))
         return x, Multiplier.dropout(rates)
 
     def _check_rate(self, rate: float, name: str) -> None:

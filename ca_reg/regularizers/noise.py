@@ -81,7 +81,7 @@ class OpacityNoise(ParameterNoise):
 
     def expected(self, x: Params) -> Params:
         """Return the mean over all draws with ``scale``, else ``x`` itself."""
-        sigma = self._rate_at(x.step)
+        sigma = self.rate_at(x.step)
         if not self.scale or is_zero(sigma):
             return x
         return x._replace(opacities=functional.expected_opacity(x.opacities, float(sigma), clip=self.clip))
@@ -92,7 +92,7 @@ class OpacityNoise(ParameterNoise):
         The renderer's clamp and cut-off of the noisy alphas are not modeled, see
         :meth:`~ca_reg.functional.Multiplier.clamped_noise`.
         """
-        sigma = self._rate_at(x.step)
+        sigma = self.rate_at(x.step)
         if is_zero(sigma):
             return x, Multiplier(1.0, 0.0)
         multiplier = Multiplier.clamped_noise(x.opacities, float(sigma), clip=self.clip)

@@ -68,7 +68,7 @@ class ParameterNoise(Regularizer):
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw the relative noise."""
-        sigma = self._rate_at(x.step)
+        sigma = self.rate_at(x.step)
         if is_zero(sigma):
             return Draw()
         values: Tensor = getattr(x, self.field)

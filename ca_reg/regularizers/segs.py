@@ -59,7 +59,7 @@ class SEGSNoise(Regularizer):
     @torch.no_grad()
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw the noise of centers (N, 3), logits (N, 1), log-scales (N, 3) and rotations (N, 6), float32."""
-        ratio = self._rate_at(x.step)
+        ratio = self.rate_at(x.step)
         if is_zero(ratio):
             return Draw()
         means, scales, rows = _geometry(x)
@@ -75,7 +75,8 @@ class SEGSNoise(Regularizer):
         if draw.value is None:
             return x
         means, scales, rows = _geometry(x)
-        of_means, of_logits, of_scales, of_rows = (noise.to(x.opacities.dtype) for noise in draw.value)
+        given = (means, x.opacities, scales, rows)
+        of_means, of_logits, of_scales, of_rows = (n.to(of.dtype) for n, of in zip(draw.value, given, strict=True))
         raised = of_logits[:, 0].exp()  # sigmoid(logit o + n) without the logit, which is infinite at 0 and 1
         return x._replace(
             means=means + of_means,

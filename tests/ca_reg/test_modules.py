@@ -120,10 +120,14 @@ def test_rates_are_checked_at_construction(make):
         make()
 
 
-@pytest.mark.parametrize("kind", [GaussianDropout, OpacityNoise])
-def test_a_rate_that_is_missing_is_refused(kind):
-    with pytest.raises(TypeError, match="must be a real number, got NoneType"):
-        kind(None)
+@pytest.mark.parametrize("rate", [None, torch.tensor(0.2), torch.full((40,), 0.2)], ids=["none", "scalar", "(N,)"])
+def test_a_rate_that_is_no_number_is_refused(rate):
+    """One per Gaussian is for the functions; in a module a subclass of IndependentDropout defines them."""
+    for kind, name in ((GaussianDropout, "p"), (OpacityNoise, "sigma")):
+        with pytest.raises(TypeError, match=rf"^{name} must be a real number, got {type(rate).__name__}"):
+            kind(rate)
+        with pytest.raises(TypeError, match=rf"^{name} at step 3 must be a real number, got {type(rate).__name__}"):
+            kind(lambda step: rate).set_step(3)
 
 
 def test_a_schedule_that_leaves_the_range_is_refused_with_its_step():

@@ -148,6 +148,25 @@ def test_one_graph_serves_all_steps_and_does_what_the_module_does(make, argument
 
 
 @pytest.mark.slow  # loads torch's tracer
+@pytest.mark.parametrize("dynamic", [None, True], ids=["found out", "asked for"])
+@pytest.mark.parametrize(
+    "module", [GaussianDropout(0.2), OpacityNoise(0.8), Chain(GaussianDropout(RAMP))], ids=["dropout", "noise", "chain"]
+)
+def test_a_compiled_module_serves_gaussians_whose_number_changes(module, dynamic):
+    """Densification changes it; the first change may take a second graph, one for any number."""
+    torch._dynamo.reset()
+    backend = Counting()
+    module.set_step(20)
+    compiled = torch.compile(module, backend=backend, fullgraph=True, dynamic=dynamic)
+    for count in (9, 10, 7, 30, 31):
+        torch.manual_seed(count)
+        found = compiled(torch.full((count,), 0.5))
+        torch.manual_seed(count)
+        torch.testing.assert_close(found, module(torch.full((count,), 0.5)), rtol=1e-6, atol=0.0)
+    assert backend.graphs <= 2
+
+
+@pytest.mark.slow  # loads torch's tracer
 def test_one_graph_serves_all_weights_of_a_penalty():
     torch._dynamo.reset()
     module, backend = penalty(RAMP), Counting()

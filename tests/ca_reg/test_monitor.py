@@ -68,6 +68,14 @@ def test_psnr_gets_the_opacities_of_the_test_and_is_averaged_over_views(tmp_path
     assert record["psnr/test"] == 30.0
 
 
+def test_views_may_come_from_any_iterable(tmp_path):
+    (expected,) = run(make(tmp_path / "lists"), 10, 11)
+    views = {name: (view for view in group) for name, group in VIEWS.items()}
+    assert run(make(tmp_path / "iterators", views=views), 10, 21)[0] == expected
+    with pytest.raises(ValueError, match=r"got \{'test': 0\}; leave out groups without views"):
+        make(tmp_path, views={"test": iter(())})
+
+
 @pytest.mark.parametrize("step", [10.0, -10, True])
 def test_a_step_that_is_none_is_refused_before_it_is_logged(tmp_path, step):
     with make(tmp_path) as monitor:

@@ -44,7 +44,7 @@ def _check(found, numbers, points, count):
     # Ties may be told apart either way: the neighbors' distances count, not their numbers.
     torch.testing.assert_close(squares.gather(1, numbers), expected, rtol=1e-5, atol=1e-12)
     assert all(len(set(row)) == count for row in numbers.tolist())
-    assert found.dtype == points.dtype
+    assert found.dtype == torch.promote_types(points.dtype, torch.float32)
 
 
 @CASES
@@ -64,6 +64,17 @@ def test_without_scipy_equal_to_the_full_matrix(monkeypatch, kind, n, count, chu
     monkeypatch.setattr(neighbors, "CHUNK_ELEMENTS", chunk)  # the last is one point at a time, as from 2 million on
     points = _points(kind, n)
     _check(*nearest_neighbors(points, count), points, count)
+
+
+@pytest.mark.parametrize("tree_from", [0, 10**9], ids=["tree", "axis"])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_searched_in_single(monkeypatch, dtype, tree_from):
+    """Squares beyond the range of half precision in both directions: distances from 1e-4 to 5e4."""
+    monkeypatch.setattr(neighbors, "TREE_FROM", tree_from)
+    points = torch.cat([1e-4 * _points("spread", 50), 2e4 + 5e3 * _points("spread", 40)]).to(dtype)
+    _check(*nearest_neighbors(points, 3), points, 3)
+    expected = (points.double()[:, None] - points[::2].double()).square().sum(-1).amin(1).sqrt()
+    torch.testing.assert_close(nearest_distance(points, points[::2]).double(), expected, rtol=1e-5, atol=0)
 
 
 def test_on_any_device(device):

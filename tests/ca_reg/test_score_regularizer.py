@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from ca_reg import (
+    CAMonitor,
     CAScore,
     Chain,
     Draw,
@@ -93,6 +94,21 @@ def test_a_score_is_taken_at_the_step_of_the_regularizer(given):
     score = CAScore(exact=ListMoments(lists), regularizer=dropout, threshold=0.1)
     assert score(given, None).value == expected
     assert score(Params(OPACITY, step=1), None).value < expected  # a step that is given counts
+
+
+def test_a_monitor_takes_what_its_score_takes(tmp_path):
+    score = CAScore(exact=ListMoments(lists), regularizer=ByDepth(), threshold=0.1)
+    x = Params(OPACITY.clone().requires_grad_(), means=MEANS)
+
+    def psnr(opacity, view):
+        torch.testing.assert_close(opacity, OPACITY)  # not scaled: p does not apply
+        return 30.0
+
+    with CAMonitor(score, tmp_path, views={"test": [None]}, every=1, psnr=psnr) as monitor:
+        record = monitor(1, x)
+        assert (record["ca/test"], record["psnr/test"], record["gaussians"]) == (score(x, None).value, 30.0, 3)
+        with pytest.raises(ValueError, match=r"ByDepth needs means.*pass Params\(opacities"):
+            monitor(2, OPACITY)
 
 
 def test_a_score_does_not_ask_for_the_mode_of_the_regularizer():

@@ -172,4 +172,4 @@ def test_a_training_call_during_an_evaluation_in_another_thread_is_regularized()
     assert (image == 0).any()
     assert torch.equal(info["radii"][0] > 0, image > 0)
     torch.testing.assert_close(seen[0], 0.5 * OPACITY)
-    assert wrapped.trained == 1
+    assert wrapped.tally.regularized == 1

@@ -207,7 +207,7 @@ def test_training_is_told_by_mode_and_by_gradient(params, cameras):
     dropout.train()
     wrapped(**splats, **cameras)
     assert dropout.keep is not None
-    assert (wrapped.trained, wrapped.tally.scaled) == (1, 3)
+    assert (wrapped.tally.regularized, wrapped.tally.scaled) == (1, 3)
 
 
 def test_the_modes_of_the_parts_survive_an_evaluation(params, cameras):
@@ -294,7 +294,7 @@ def test_install_reaches_an_unedited_script_and_restores_exactly(fake_gsplat, pa
         with pytest.raises(ValueError, match="dropped twice"):
             install(dropout)
     assert fake_gsplat.rasterization is fake_gsplat.rendering.rasterization is rasterization
-    assert installation.trained == installation.rasterization.trained == 1
+    assert installation.tally.regularized == installation.rasterization.tally.regularized == 1
     assert installation.tally.skipped[Skip.RATE_ZERO] == 2
     installation.uninstall()
     assert fake_gsplat.rasterization is rasterization
@@ -309,7 +309,7 @@ def test_install_reaches_2dgs_and_refuses_what_returns_no_radii(fake_gsplat, par
         assert dropout.step == 1  # one count for all functions
         with pytest.raises(RuntimeError, match=r"returns no radii, .* train with gsplat\.rasterization"):
             fake_gsplat.rendering.rasterization_inria_wrapper(**activated(params), **cameras)
-    assert installation.trained == 3
+    assert installation.tally.regularized == 3
     assert set(installation.functions) == {"rasterization", "rasterization_2dgs", "rasterization_inria_wrapper"}
     assert fake_gsplat.rasterization_2dgs is rasterization_that_culls_nothing
 
@@ -372,7 +372,7 @@ def test_a_compiled_call_is_regularized(params, cameras):
         expected.append(plain.item())
         assert value.item() == pytest.approx(plain.item(), rel=1e-5)
     assert expected[0] != expected[1]
-    assert wrapped.trained == 2
+    assert wrapped.tally.regularized == 2
 
 
 def test_the_package_is_replaced_and_restored():
@@ -425,7 +425,7 @@ colors, alphas, info = rasterization(means, quats, scales, opacities, colors, vi
 def test_a_users_file_takes_three_added_lines(fake_gsplat, params, cameras):
     names = activated(params) | cameras
     exec(AFTER, names)
-    assert names["rasterization"].trained == 1
+    assert names["rasterization"].tally.regularized == 1
     added = [line for line in AFTER.splitlines() if line not in BEFORE.splitlines()]
     assert len(added) <= 3
     assert [line for line in AFTER.splitlines() if line not in added] == BEFORE.splitlines()

@@ -50,7 +50,7 @@ def test_render_is_what_a_score_takes_and_is_not_regularized(package):
         ours = render(*scene[:4], scene.camera, colors=scene.colors, background=BACKGROUND)
     torch.testing.assert_close(image, ours.image)
     torch.testing.assert_close(alpha, ours.alpha.clamp(max=0.99))
-    assert package.rasterization.trained == package.rasterization.tally.scaled == 0
+    assert package.rasterization.tally.regularized == package.rasterization.tally.scaled == 0
     result = CAScore(model.render, threshold=0.3)(scene.opacities, view)
     assert result.value > 0
 

@@ -8,7 +8,7 @@ from oracles import random_scene
 from stand_ins.gsplat import intrinsics, rasterization
 from stand_ins.inria import PIPE, Model, make_render, settings_of
 
-from ca_reg import Chain, Draw, IndependentDropout, Learned, Params, Regularizer
+from ca_reg import Chain, Draw, IndependentDropout, Learned, LinearRamp, Params, Regularizer
 from ca_reg.integrations._rasterizer import ForwardCall, forward_signature
 from ca_reg.integrations.gsplat import regularized
 from ca_reg.integrations.inria import RasterizerHook
@@ -72,6 +72,19 @@ def test_rates_by_depth_in_the_inria_hook(rasterizer, my_module):
     torch.testing.assert_close(trained["render"], dropped["render"], rtol=1e-6, atol=1e-6)
     assert torch.equal(trained["radii"], dropped["radii"] * keep)
     assert (hook.tally.regularized, hook.tally.scaled) == (1, 1)
+
+
+def test_its_rate_may_follow_a_schedule(rasterizer, my_module):
+    model, render = Model(), make_render(rasterizer)
+    with RasterizerHook(my_module.MyDropout(LinearRamp(0.0, 0.8, 0, 100)), rasterizer=rasterizer) as hook:
+        for step, p in ((25, 0.2), (100, 0.8)):
+            hook.step(step)
+            render(model.camera, model, PIPE, BLACK)
+            with torch.no_grad():
+                tested = render(model.camera, model, PIPE, BLACK)
+            rates = literal_rates(model.get_xyz, model.camera.world_to_camera, p)
+            expected = render(model.camera, model, PIPE, BLACK, opacities=model.get_opacity * (1 - rates)[:, None])
+            torch.testing.assert_close(tested["render"], expected["render"], rtol=1e-5, atol=1e-6)
 
 
 def test_the_draws_of_the_hook_follow_the_rates(my_module):

@@ -1,4 +1,4 @@
-"""Every registered regularizer wherever the Gaussians are: the draw is the generator's, the result theirs."""
+"""Every registered regularizer on the device and in the precision of the Gaussians, whatever the draw's."""
 
 import itertools
 
@@ -50,3 +50,37 @@ def test_another_default_device_changes_nothing(name, n, card):
                 found.append(chain(x, generator=torch.Generator("cpu").manual_seed(1)).opacities)
             assert found[-1].device == x.opacities.device
         assert torch.equal(*found)
+
+
+TYPES = [(torch.float16, torch.float32), (torch.float32, torch.float16), (torch.bfloat16, torch.bfloat16)]
+
+
+@pytest.mark.parametrize(("of_opacities", "of_others"), TYPES, ids=str)
+@pytest.mark.parametrize(
+    "name", [*REGULARIZERS, "density(compensate=True)", "concrete + density + noise(0.5, scale=True)"]
+)
+def test_precisions_are_kept_and_nothing_is_measured_in_half(name, of_opacities, of_others):
+    """As in float32 with the same, rounded values; the centers are so far apart that squares would overflow in half."""
+    chain = parse(name + ARGUMENTS.get(name, ""))
+    x = params(chain, "cpu")
+    x = x._replace(means=(x.means - 0.5) * 3_000, opacities=x.opacities.to(of_opacities))
+    fields = ("means", "scales", "quaternions", "sh", "view_matrix")
+    rough = x._replace(
+        **{field: getattr(x, field).to(of_others) for field in fields},
+        learned={key: value.to(of_others) for key, value in x.learned.items()},
+    )
+    wide = x._replace(
+        **{field: getattr(rough, field).float() for field in ("opacities", *fields)},
+        learned={key: value.float() for key, value in rough.learned.items()},
+    )
+    for training in (True, False):
+        chain.train(training)
+        found, expected = (chain(x, generator=torch.Generator().manual_seed(1)) for x in (rough, wide))
+        for field in ("opacities", *fields):
+            got = getattr(found, field)
+            assert got.dtype == getattr(rough, field).dtype, field
+            rounding = 8 * max(torch.finfo(dtype).eps for dtype in (of_opacities, of_others))
+            scale = float(getattr(expected, field).abs().max())
+            torch.testing.assert_close(got.float(), getattr(expected, field), rtol=0, atol=rounding * scale)
+        if (multiplied := chain.multiplied(rough)) is not None:
+            assert multiplied[0].opacities.dtype == of_opacities

@@ -47,6 +47,6 @@ def test_rates_of_single_gaussians_and_their_correlation():
 def test_the_rate_rises_to_theirs_and_nothing_is_scaled():
     x = params(cloud("spread"))
     rule = AnchorDropout()
-    assert [rule._rate_at(step) for step in (0, 5_000, 10_000, 30_000)] == [0.0, 0.01, 0.02, 0.02]
+    assert [rule.rate_at(step) for step in (0, 5_000, 10_000, 30_000)] == [0.0, 0.01, 0.02, 0.02]
     assert rule.eval()(x) is x
     assert rule.multiplied(x) is None

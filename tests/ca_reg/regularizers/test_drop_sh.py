@@ -4,6 +4,7 @@ import pytest
 import torch
 from clouds import cloud, params
 
+from ca_reg import Params
 from ca_reg.regularizers.drop_sh import SHDropout
 
 
@@ -54,3 +55,17 @@ def test_what_is_refused():
         SHDropout(1.0)
     with pytest.raises(ValueError, match="in rising order"):
         SHDropout(until=(4_000, 2_000))
+
+
+@pytest.mark.slow  # loads torch's tracer
+def test_compiled_the_degree_follows_the_step():
+    torch._dynamo.reset()
+    dropout = SHDropout(0.5, until=(2, 4))
+    compiled = torch.compile(dropout, backend="eager")
+    x = Params(torch.ones(60), sh=torch.ones(60, 9, 3))
+    kept = []
+    for step in (1, 2, 3, 4, 5):
+        dropout.set_step(step)
+        kept.append(set(compiled(x).sh.sum((1, 2)).tolist()))
+    # False alarm 2^-59 each: that all 60 are cut, or none.
+    assert kept == [{3.0, 27.0}, {12.0, 27.0}, {12.0, 27.0}, {27.0}, {27.0}]
