@@ -31,6 +31,8 @@ from reference_trainer.threads import threads_for
 
 __all__ = ["Cell", "Grid", "declared", "estimate", "is_done", "listing", "rows_of", "run_cells"]
 
+EXTRAS = frozenset({"path", "renders", "depth"})
+"""What a training can be measured for beyond the usual."""
 SIXTHS = 6
 OPAQUE = 0.8
 DENSER = 2
@@ -102,6 +104,8 @@ def declared(grid: Grid) -> list[Cell]:
 def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
     """Run what is missing of a grid; every finished training is measured and kept before another one starts.
 
+    A training of which something else is kept is made again, and measured for that as well: nothing is lost.
+
     Args:
         grid: what to run.
         running: where and how; its ``monitor_every`` is replaced.
@@ -114,7 +118,11 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
         FileNotFoundError: if there is no such scene.
     """
     rows = rows_of(grid)
-    left = [cell for cell in declared(grid) if not is_done(cell, rows)]
+    left = [
+        replace(cell, needs=cell.needs | EXTRAS & (_kept(cell, rows) or {}).keys())
+        for cell in declared(grid)
+        if not is_done(cell, rows)
+    ]
     for name in dict.fromkeys(cell.scene for cell in left):
         folder = grid.scenes[name].options.path
         if folder != "synthetic" and not Path(folder).is_dir():
@@ -168,7 +176,7 @@ def rows_of(grid: Grid) -> dict[str, Rows]:
 
 def is_done(cell: Cell, rows: Mapping[str, Rows]) -> bool:
     """Return whether everything that is needed from a training is kept."""
-    return (row := rows[cell.scene].of(cell.setting).get(cell.seed)) is not None and cell.needs <= row.keys()
+    return (row := _kept(cell, rows)) is not None and cell.needs <= row.keys()
 
 
 def estimate(cell: Cell, rows: Mapping[str, Rows]) -> float:
@@ -254,6 +262,11 @@ def depths(model: TrainedModel, view: View, truth: TrainedModel | None) -> dict[
     assert known is not None
     known = known if view.mask is None else known * (view.mask > 0.5)
     return depth_errors(depth(model)[0], known)._asdict()
+
+
+def _kept(cell: Cell, rows: Mapping[str, Rows]) -> Row | None:
+    """Return the row of a training, if there is one."""
+    return rows[cell.scene].of(cell.setting).get(cell.seed)
 
 
 def _folder(grid: Grid, cell: Cell) -> Path:

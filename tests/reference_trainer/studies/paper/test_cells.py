@@ -232,6 +232,23 @@ def test_a_training_that_fails_stops_no_other(tmp_path, monkeypatch):
     assert only["test"] == {"psnr": 20.1235}
 
 
+def test_a_training_that_is_made_again_for_another_claim_is_measured_for_the_first_one_as_well(tmp_path, monkeypatch):
+    scenes = chosen_scenes([], tmp_path, SceneOptions("synthetic", downscale=8))
+    made = []
+
+    def measured(cell, *_):
+        made.append((cell.name, cell.needs))
+        return {"setting": dict(cell.setting), "seed": cell.seed} | {need: {} for need in cell.needs}
+
+    monkeypatch.setattr(grid_module, "train_run", lambda *_: {"mean": {"test": {"psnr": 20.0}}, "seconds": 1.0})
+    monkeypatch.setattr(cells_module, "measured", measured)
+    for claim in ("5", "9"):
+        claims = chosen([claim], [*scenes])
+        assert not run_cells(Grid(claims, scenes, "3dgs", 20, 1, tmp_path / "out", tmp_path / "rows"), Running(Here()))
+    assert len(made) == 4
+    assert made[3] == ("synthetic, 3dgs, dropout(0.2), seed 0", {"path", "renders"})
+
+
 @pytest.mark.slow
 @pytest.mark.data
 def test_where_depth_is_not_known_a_model_of_all_photographs_comes_first(data_root, tmp_path, monkeypatch):
