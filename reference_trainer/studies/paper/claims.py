@@ -237,6 +237,9 @@ _TRUE_DEPTH = replace(  # of evaluations, which know it of a scene that has it
 )
 CLAIMS |= {
     "3-binocular": _with_recipe("binocular", CLAIMS["3"], "synthetic"),
+    "7-binocular": _with_recipe("binocular", CLAIMS["7"], "synthetic"),
+    "8-binocular": _with_recipe("binocular", CLAIMS["8"], "synthetic"),
+    "9-binocular": _with_recipe("binocular", CLAIMS["9"], "synthetic"),
     "10-binocular": _with_recipe("binocular", CLAIMS["10"], "synthetic"),
     "13-binocular": _with_recipe("binocular", CLAIMS["13"], "synthetic", "fern", "herz-jesu"),
     "14-binocular": _with_recipe("binocular", _TRUE_DEPTH, "synthetic"),
