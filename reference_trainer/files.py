@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     the move before this returns: a power cut leaves the old file or the new one, and no later write without this one.
 
     Raises:
-        OSError: if the file cannot be written, as on a full disk; the error names ``path``.
+        OSError: if the file cannot be written, as on a full disk, or is a folder; the error names ``path``.
 
     Example:
         >>> import tempfile
@@ -31,6 +32,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
         ['note.txt']
     """
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "this is a folder: expected the name of a file to write", str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}{_PART}")
     try:

@@ -38,6 +38,14 @@ def test_writing_nothing_is_an_error(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_folder_is_no_file_to_write(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder in (tmp_path, "."):
+        with pytest.raises(IsADirectoryError, match="this is a folder: expected the name of a file"), replacing(folder):
+            pass
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_full_disk_is_named_and_keeps_what_was_there(tmp_path, full_disk):
     file = tmp_path / "note.txt"
     file.write_text("old")
