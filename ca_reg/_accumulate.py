@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from ca_reg._precision import at_least_single
+
 __all__ = ["Deviations", "RenderMoments"]
 
 
@@ -31,7 +33,7 @@ class RenderMoments:
     def add(self, image: Tensor) -> None:
         """Take in one render (3, H, W)."""
         if self.count == 0:
-            self._first = image.to(torch.promote_types(image.dtype, torch.float32), copy=True)
+            self._first = at_least_single(image, copy=True)
             self._scratch = torch.empty_like(self._first)
             self._sums = self._first.new_zeros(self._groups, *image.shape)
             self._squares = self._first.new_zeros(self._groups, *image.shape[1:])
@@ -80,7 +82,7 @@ class Deviations:
 
     def __init__(self, expected: Tensor, visible: Tensor) -> None:
         """Take the expected image (3, H, W) and the visible pixels (H, W)."""
-        self._expected = expected.to(torch.promote_types(expected.dtype, torch.float32), copy=True)
+        self._expected = at_least_single(expected, copy=True)
         self._visible = visible
         self._last: Tensor | None = None
         self._squares: list[Tensor] = []

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ca_reg._precision import at_least_single
+
 __all__ = ["nearest_distance", "nearest_neighbors", "rms_neighbor_distance"]
 
 SMALLEST_SQUARED_DISTANCE = 1e-7  # INRIA's clamp: coinciding points still get a Gaussian of some size
@@ -43,7 +45,7 @@ def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     n = points.shape[0]
     if points.ndim != 2 or points.shape[1] != 3 or n <= count:
         raise ValueError(f"points must have shape (N, 3) with N > {count}, got {tuple(points.shape)}.")
-    points = points.to(torch.promote_types(points.dtype, torch.float32))
+    points = at_least_single(points)
     if n >= TREE_FROM:
         with suppress(ImportError):
             return _by_tree(points, count)
@@ -113,7 +115,7 @@ def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
     if points.ndim != 2 or others.ndim != 2 or points.shape[1] != others.shape[1] or len(others) < 1:
         shapes = f"{tuple(points.shape)} and {tuple(others.shape)}"
         raise ValueError(f"expected points (N, D) and at least one other, (M, D), got {shapes}.")
-    points, others = (x.to(torch.promote_types(x.dtype, torch.float32)) for x in (points, others))
+    points, others = at_least_single(points), at_least_single(others)
     if len(others) >= TREE_FROM:
         with suppress(ImportError):
             from scipy.spatial import cKDTree

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ca_reg._check import Rate, check_count, check_rate
+from ca_reg._precision import at_least_single
 from ca_reg.neighbors import nearest_neighbors
 from ca_reg.params import Params
 from ca_reg.regularizers.independent import IndependentDropout
@@ -171,6 +172,6 @@ def camera_depths(x: Params) -> Tensor:
     """
     assert x.means is not None
     assert x.view_matrix is not None
-    means = x.means.detach().to(torch.promote_types(x.means.dtype, torch.float32))
+    means = at_least_single(x.means.detach())
     row = x.view_matrix.detach()[2].to(means)
     return means @ row[:3] + row[3]

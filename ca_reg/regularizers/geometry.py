@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ca_reg._precision import at_least_single
 from ca_reg.regularizers._surroundings import RankedDropout, neighbors_of, relative_ranks
 
 __all__ = ["GeometryDropout", "surface_variation"]
@@ -64,7 +65,7 @@ def surface_variation(means: Tensor, k: int) -> Tensor:
     The definition is that of Pauly, Gross and Kobbelt, "Efficient simplification of point-sampled surfaces" (2002). In
     [0, 1/3], (N,): 0 on a plane or a line or if all points coincide, 1/3 if the covariance is isotropic.
     """
-    means = means.to(torch.promote_types(means.dtype, torch.float32))
+    means = at_least_single(means)
     _, numbers = neighbors_of(means, k)
     # Sorted by index: Gaussians with the same members then get exactly the same value, and the same rank.
     members = torch.cat([torch.arange(len(means), device=means.device)[:, None], numbers], dim=1).sort(dim=1).values

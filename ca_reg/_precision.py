@@ -1,0 +1,13 @@
+"""The least precision in which distances and moments are computed."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["at_least_single"]
+
+
+def at_least_single(x: Tensor, *, copy: bool = False) -> Tensor:
+    """Return a tensor in float32, or in its own dtype if that is wider."""
+    return x.to(torch.promote_types(x.dtype, torch.float32), copy=copy)
