@@ -231,7 +231,7 @@ CLAIMS = {
 }  # fmt: skip
 _TRUE_DEPTH = replace(  # of evaluations, which know it of a scene that has it
     CLAIMS["14"],
-    checks=tuple(replace(check, of=f"test {check.of.replace(' ', '_')}") for check in CLAIMS["14"].checks),
+    checks=tuple(_lower("test depth_abs_rel", each, _PLAIN) for each in (_DROPOUT, _NOISE)),
     shows=("test depth_abs_rel", "test depth_rmse"),
     needs=frozenset(),
 )
