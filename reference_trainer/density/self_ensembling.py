@@ -16,8 +16,8 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import arguments, render_gaussians
 from reference_trainer.render import splat
 from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
-from reference_trainer.scenes.pseudo import pseudo_cameras
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.virtual_cameras import pseudo_cameras
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.field import Field
 from reference_trainer.training.randomness import stream

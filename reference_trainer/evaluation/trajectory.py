@@ -9,8 +9,8 @@ import torch
 
 from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.camera import Camera
-from reference_trainer.scenes.pseudo import camera_between
 from reference_trainer.scenes.scene import Scene, Viewpoint
+from reference_trainer.scenes.virtual_cameras import camera_between
 
 __all__ = ["interpolate_cameras", "measured_views"]
 

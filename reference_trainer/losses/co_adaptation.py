@@ -8,8 +8,8 @@ from ca_reg._check import check_count
 from ca_reg.functional import Multiplier
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.term import WeightedTerm
-from reference_trainer.scenes.pseudo import VIRTUAL_VIEWS
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.virtual_cameras import VIRTUAL_VIEWS
 from reference_trainer.training.step import Step
 
 __all__ = ["CoAdaptation"]

@@ -9,8 +9,8 @@ from torch import Tensor
 from ca_reg.schedules import Schedule
 from reference_trainer.losses.photometric import check_lambda, photometric_loss
 from reference_trainer.losses.term import WeightedTerm
-from reference_trainer.scenes.pseudo import pseudo_cameras
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.virtual_cameras import pseudo_cameras
 from reference_trainer.training.step import Step
 
 __all__ = ["CoRegularization"]

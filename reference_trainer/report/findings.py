@@ -20,8 +20,8 @@ from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.report.packing import jpeg, numbers
 from reference_trainer.rotations import rotation_matrices
 from reference_trainer.runs.measure import of_run
+from reference_trainer.scenes.load import evenly_spaced
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
-from reference_trainer.scenes.splits import evenly_spaced
 
 __all__ = ["Findings", "find"]
 

@@ -11,6 +11,7 @@ from reference_trainer.runs.compare_report import Comparison, save
 from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.runs.folder import RESULTS, folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
+from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 
@@ -131,7 +132,7 @@ def compare(
     terms = [term for config in configs.values() for term in config.make_losses()]
     if looking := [term for term in terms if type(term).begin is not LossTerm.begin]:
         for options in {run.options for run in runs if not (run.out / RESULTS).exists()}:
-            scene = options.load()
+            scene = load_scene(options)
             for term in looking:
                 term.begin(scene)
     comparisons = {folder: Comparison({}, {}) for folder in scenes}

@@ -11,13 +11,14 @@ if TYPE_CHECKING:
     from reference_trainer.scenes.formats import Capture, SceneFormat, register_format
     from reference_trainer.scenes.frames import Frame
     from reference_trainer.scenes.load import load_scene
+    from reference_trainer.scenes.options import SceneOptions
     from reference_trainer.scenes.points import check_no_leak
     from reference_trainer.scenes.scene import PointCloud, Scene, View
     from reference_trainer.scenes.synthetic import synthetic_scene
 
 __all__ = [
-    "Capture", "Frame", "PointCloud", "Scene", "SceneFormat", "View", "check_no_leak", "load_scene", "register_format",
-    "synthetic_scene",
+    "Capture", "Frame", "PointCloud", "Scene", "SceneFormat", "SceneOptions", "View", "check_no_leak", "load_scene",
+    "register_format", "synthetic_scene",
 ]  # fmt: skip
 
 _MODULES = {
@@ -26,6 +27,7 @@ _MODULES = {
     "register_format": "formats",
     "Frame": "frames",
     "load_scene": "load",
+    "SceneOptions": "options",
     "check_no_leak": "points",
     "PointCloud": "scene",
     "Scene": "scene",

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from reference_trainer.scenes.colmap_files import READERS
-from reference_trainer.scenes.colmap_model import ColmapModel, PointRecords
+from reference_trainer.scenes._colmap_model import READERS, ColmapModel, PointRecords
 from reference_trainer.scenes.formats import Capture, SceneFormat
 from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.images import match_images, picture_folder

@@ -23,8 +23,8 @@ from reference_trainer.files import is_ply
 from reference_trainer.render.engine import drawn_by, engines_on
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.score_ply import of_plain_ply
-from reference_trainer.scenes.orbit import orbit_views
 from reference_trainer.scenes.scene import Viewpoint
+from reference_trainer.scenes.virtual_cameras import orbit_views
 from reference_trainer.studies.clocks import in_turns, now
 from reference_trainer.studies.study import Record, Records, Study, checkpoints
 

@@ -10,8 +10,8 @@ from scipy.interpolate import NearestNDInterpolator
 from scipy.spatial.transform import Rotation
 
 from reference_trainer.scenes.depth import point_prior
-from reference_trainer.scenes.pseudo import depth_bounds
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.virtual_cameras import depth_bounds
 
 __all__ = ["write_scene"]
 

@@ -27,6 +27,7 @@ from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import format_mean_std, markdown_table, mean_std
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.study import Record, Records, Study, run_study
@@ -107,11 +108,11 @@ def held_out(options: SceneOptions, seed: int) -> Scene:
     of the way from each training view to the next. Where there are none, such as in lego, two of the training views are
     held out, others for every seed.
     """
-    scene = options.load(seed=seed)
+    scene = load_scene(options, seed=seed)
     if options.path == "synthetic":
         return replace(scene, test=synthetic_scene(test_views=5, points=1).test[:-1])
     used = {view.name for view in (*scene.train, *scene.test)}
-    everything = replace(options, split="auto", test="none").load(seed=seed).train
+    everything = load_scene(replace(options, split="auto", test="none"), seed=seed).train
     if others := tuple(view for view in everything if view.name not in used):
         return replace(scene, test=others)
     half = len(scene.train) // 2
@@ -153,7 +154,7 @@ def remedy_study(
 def _measure(views: _Views, scene: str, options: dict[str, Any], seed: int, settings: str) -> Record:
     """Train, and measure every view."""
     chosen = SceneOptions(**options)
-    loaded = held_out(chosen, seed) if views == "choose" else chosen.load(seed=seed)
+    loaded = held_out(chosen, seed) if views == "choose" else load_scene(chosen, seed=seed)
     trainer = Trainer(loaded, TrainConfig(**COMMON | arm(settings), seed=seed))
     trainer.train()
     model = model_of(trainer)

@@ -26,6 +26,7 @@ from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.rendering import render_moments_of
 from reference_trainer.runs.folder import CHECKPOINT
 from reference_trainer.runs.folder import CONFIG as RUN_CONFIG
+from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.study import run_study
@@ -322,7 +323,7 @@ OPTIONS = SceneOptions("synthetic", views=2, downscale=8)
 def trainer() -> Trainer:
     """Two views, and noise and inverted dropout, which the study leaves out."""
     config = TrainConfig(regularizer="dropout(0.4, compensate=True)", noise=0.3, seed=5)
-    return Trainer(OPTIONS.load(seed=5), config)
+    return Trainer(load_scene(OPTIONS, seed=5), config)
 
 
 @pytest.fixture(scope="module")

@@ -17,13 +17,11 @@ from reference_trainer.evaluation.tables import comparison_table, evaluation_tab
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import read_results, read_run_settings
 from reference_trainer.runs.grid import _line
-from reference_trainer.scenes.arrays import read_arrays
 from reference_trainer.scenes.colmap import read_colmap
-from reference_trainer.scenes.idr import read_idr
 from reference_trainer.scenes.images import LARGEST_IMAGE, read_image
-from reference_trainer.scenes.llff import read_llff
+from reference_trainer.scenes.load import file_split
+from reference_trainer.scenes.numpy_formats import read_arrays, read_idr, read_llff
 from reference_trainer.scenes.points import ply_points
-from reference_trainer.scenes.splits import file_split
 from reference_trainer.scenes.transforms import read_transforms
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.errors import TrainingStoppedError

@@ -12,12 +12,12 @@ from fuzz import samples
 
 from ca_reg import CAMonitor, CAScore
 from reference_trainer.model.ply import load_ply
+from reference_trainer.scenes._colmap_model import view_matrix_from_quaternion
 from reference_trainer.scenes.colmap import read_colmap
-from reference_trainer.scenes.colmap_model import view_matrix_from_quaternion
 from reference_trainer.scenes.images import LARGEST_IMAGE, read_image
-from reference_trainer.scenes.llff import read_llff
+from reference_trainer.scenes.load import file_split
+from reference_trainer.scenes.numpy_formats import read_llff
 from reference_trainer.scenes.points import ply_points
-from reference_trainer.scenes.splits import file_split
 from reference_trainer.scenes.transforms import read_transforms
 from reference_trainer.tensor_files import load_tensors
 

@@ -16,8 +16,9 @@ from PIL import EpsImagePlugin, Image
 from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
 from reference_trainer.scenes.images import image_size, read_image
-from reference_trainer.scenes.llff import read_llff
 from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes.numpy_formats import read_llff
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.transforms import read_transforms
 from reference_trainer.tensor_files import load_tensors
 from reference_trainer.training.checkpoint import load_checkpoint
@@ -197,7 +198,7 @@ def test_points_stay_in_the_scene_folder(tmp_path, points):
     samples.write_llff(folder)
     samples.write_points(tmp_path)
     with pytest.raises(ValueError, match="leads out of the scene folder"):
-        load_scene(folder, points=points, views=1)
+        load_scene(SceneOptions(folder, points=points, views=1))
 
 
 def test_links_that_the_user_made_are_followed(tmp_path):

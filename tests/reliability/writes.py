@@ -8,33 +8,21 @@ import shutil
 import sys
 import tempfile
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 
 from reliability.harness import Outcome, Settings, differences, inspect, run, start
 from reliability.operations import listed, perform
 
-from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["SHORT", "Miniature", "campaign", "main"]
+__all__ = ["SHORT", "campaign", "main"]
 
 _RECOVERY = 30  # operations, about what a continued run does before its first step
 
 
-@dataclass(frozen=True)
-class Miniature(SceneOptions):
-    """The built-in scene with three views of 16x12 pixels and few points: a run of a second."""
-
-    def load(self, *, seed: int = 0) -> Scene:
-        """Make the scene."""
-        return synthetic_scene(16, 12, train_views=2, test_views=1, points=150, seed=seed)
-
-
 SHORT = Settings(
-    Miniature(),
+    SceneOptions("synthetic", downscale=10, views=2),  # 16x12 pixels: a run of a second
     TrainConfig(
         iterations=5, dropout=0.2, noise=0.3, sh_every=2, densify_from=1, densify_every=2, densify_gradient=2e-3
     ),

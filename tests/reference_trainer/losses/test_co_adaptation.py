@@ -9,8 +9,8 @@ import torch
 from reference_trainer.losses import LOSSES
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.scenes.pseudo import VIRTUAL_VIEWS
 from reference_trainer.scenes.scene import PointCloud
+from reference_trainer.scenes.virtual_cameras import VIRTUAL_VIEWS
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.step import Step
 from reference_trainer.training.trainer import Trainer

@@ -9,8 +9,8 @@ import torch
 from reference_trainer.camera import Camera
 from reference_trainer.evaluation.metrics import ssim
 from reference_trainer.losses import LOSSES
-from reference_trainer.scenes.pseudo import depth_bounds, pseudo_cameras
 from reference_trainer.scenes.scene import PointCloud
+from reference_trainer.scenes.virtual_cameras import depth_bounds, pseudo_cameras
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 

@@ -139,7 +139,7 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
 def test_what_a_scene_lacks_is_said_once_before_any_run(changes, lacking, tmp_path, monkeypatch):
     nothing = PointCloud(torch.empty(0, 3), torch.empty(0, 3), "nowhere")
     scene = dataclasses.replace(synthetic_scene(width=32, height=24, points=9), points=nothing)
-    monkeypatch.setattr(SceneOptions, "load", lambda self: scene)
+    monkeypatch.setattr("reference_trainer.runs.compare.load_scene", lambda _: scene)
     engine = Here()
     with pytest.raises(ValueError, match=lacking):
         compare({tmp_path: SceneOptions()}, {"a": TrainConfig(**changes)}, [0, 1], Running(engine))
@@ -157,8 +157,7 @@ def test_failed_runs_are_listed_at_the_end(tmp_path):
 
 def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch):
     """Nothing is held out: exact CA is reported at the training views, between them and around them."""
-    load = SceneOptions.load
-    monkeypatch.setattr(SceneOptions, "load", lambda *a, **named: dataclasses.replace(load(*a, **named), test=()))
+    options = dataclasses.replace(options, test="none")
     said: list[str] = []
     results = run_experiment(options, short, tmp_path / "a" / "seed_0", say=said.append)
     assert sum(line.startswith("No test views") for line in said) == 1

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from reference_trainer.scenes import load_scene
-from reference_trainer.scenes.arrays import MOST_POINTS, read_arrays
+from reference_trainer.scenes.numpy_formats import MOST_POINTS, read_arrays
+from reference_trainer.scenes.options import SceneOptions
 
 NAMES = ("a.png", "b.png", "c.png")
 # Cameras 2 units to the right of each other; the last is turned by 90 degrees: its forward is the world's x.
@@ -58,7 +59,7 @@ def points_of(root):
 @pytest.mark.parametrize("one", [True, False])
 def test_the_name_tells_which_way_the_poses_go(scene, poses, one):
     k = INTRINSICS if one else np.stack([INTRINSICS] * 3)
-    loaded = load_scene(scene(**poses, intrinsics=k, points=np.ones((1, 3))))
+    loaded = load_scene(SceneOptions(scene(**poses, intrinsics=k, points=np.ones((1, 3)))))
     assert [view.name for view in loaded.train] == list(NAMES)
     for view, center, axes in zip(loaded.train, CENTERS, AXES, strict=True):
         assert view.camera.position.numpy() == pytest.approx(center, abs=1e-6)
@@ -153,11 +154,11 @@ def test_few_of_many_points(scene):
 )  # fmt: skip
 def test_what_is_wrong_is_said(scene, arrays, message):
     with pytest.raises(ValueError, match=message):
-        load_scene(scene(**arrays))
+        load_scene(SceneOptions(scene(**arrays)))
 
 
 def test_two_files(scene):
     root = scene(extrinsic=to_camera(), intrinsic=INTRINSICS)
     np.savez(root / "other.npz", a=np.ones(1))
     with pytest.raises(ValueError, match=r"must hold one \.npz with the poses, got \['other.npz', 'predictions.npz'\]"):
-        load_scene(root)
+        load_scene(SceneOptions(root))

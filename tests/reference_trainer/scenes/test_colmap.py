@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from reference_trainer.scenes._colmap_model import CAMERA_MODELS, READERS, view_matrix_from_quaternion
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
-from reference_trainer.scenes.colmap_files import READERS
-from reference_trainer.scenes.colmap_model import CAMERA_MODELS, view_matrix_from_quaternion
 
 
 def test_text_and_binary_hold_the_same_model(tmp_path, colmap_binary, colmap_text):

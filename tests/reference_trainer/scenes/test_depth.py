@@ -10,6 +10,7 @@ from PIL import Image
 from reference_trainer.camera import Camera
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.depth import point_prior, read_depth
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud, View
 
 
@@ -33,7 +34,7 @@ SMOOTH = np.round((RAMP[::2, ::2] - RAMP.min()) * 255 / np.ptp(RAMP[::2, ::2])).
 
 
 def load(root, **options):
-    return load_scene(root, points="random:5", undistort=False, **options)
+    return load_scene(SceneOptions(root, points="random:5", undistort=False, **options))
 
 
 def test_training_views_get_the_depth_of_their_name_at_their_size(scene):
@@ -70,7 +71,8 @@ def bent_scene(scene):
 def test_the_depth_is_undistorted_as_the_photograph_is(bent_scene):
     """The photograph's red is made the depth: after both went through the lens they still agree."""
     straight, bent = (
-        load_scene(bent_scene, points="random:5", depth="mono", undistort=on).train[0] for on in (True, False)
+        load_scene(SceneOptions(bent_scene, points="random:5", depth="mono", undistort=on)).train[0]
+        for on in (True, False)
     )
     assert (straight.image - bent.image).abs().max() > 0.01
     torch.testing.assert_close(straight.depth_prior / 255, straight.image[0], atol=1e-5, rtol=0)
@@ -94,7 +96,9 @@ def test_of_a_map_with_holes_the_known_values_count(scene, share, scale):
 def test_holes_go_through_the_lens(bent_scene):
     holes = np.where(np.random.default_rng(0).random((48, 64)) < 0.95, SMOOTH, np.nan)
     np.save(bent_scene / "mono" / "b.npy", holes)
-    found, whole = (view.depth_prior for view in load_scene(bent_scene, points="random:5", depth="mono").train)
+    found, whole = (
+        view.depth_prior for view in load_scene(SceneOptions(bent_scene, points="random:5", depth="mono")).train
+    )
     known = found.isfinite()
     assert 0.95 < known.float().mean() < 1
     step = SMOOTH[1, 1] - SMOOTH[0, 0]
@@ -103,7 +107,7 @@ def test_holes_go_through_the_lens(bent_scene):
     edge[23:25, 0] = 1.0, 2.0  # which the undistorted photograph no longer shows
     np.save(bent_scene / "mono" / "b.npy", edge)
     with pytest.raises(ValueError, match=r"b\.npy holds no depth: .* unknown everywhere"):
-        load_scene(bent_scene, points="random:5", depth="mono")
+        load_scene(SceneOptions(bent_scene, points="random:5", depth="mono"))
 
 
 def test_kinds_of_files(tmp_path):
@@ -150,13 +154,13 @@ def test_missing_and_mismatched_files_are_named(scene):
 
 
 def test_the_built_in_scene_has_its_true_depth():
-    scene = load_scene("synthetic", downscale=8, depth="true")
+    scene = load_scene(SceneOptions("synthetic", downscale=8, depth="true"))
     for view in scene.train:
         hit = view.depth > 0
         assert torch.equal(view.depth_prior[hit], view.depth[hit])
         assert view.depth_prior[~hit].isnan().all()
     with pytest.raises(ValueError, match='must be "true" or "points", got \'mono\''):
-        load_scene("synthetic", downscale=8, depth="mono")
+        load_scene(SceneOptions("synthetic", downscale=8, depth="mono"))
 
 
 def test_between_points_on_a_plane_the_prior_is_the_plane_and_what_is_behind_it_hides():
@@ -189,7 +193,7 @@ def test_between_points_on_a_plane_the_prior_is_the_plane_and_what_is_behind_it_
 
 def test_the_built_in_scene_has_points_to_make_a_prior_of():
     """Triangles that span an edge of an object are off; half of the pixels are within five percent of the truth."""
-    for view in load_scene("synthetic", downscale=2, depth="points").train:
+    for view in load_scene(SceneOptions("synthetic", downscale=2, depth="points")).train:
         known = view.depth_prior.isfinite() & (view.depth > 0)
         assert known.float().mean() > 0.5
         assert (view.depth_prior / view.depth - 1)[known].abs().median() < 0.05

@@ -13,7 +13,8 @@ import torch
 from reference_trainer.cli import main
 from reference_trainer.scenes import SceneFormat, formats, load_scene, register_format
 from reference_trainer.scenes.formats import find_format
-from reference_trainer.scenes.idr import read_idr
+from reference_trainer.scenes.numpy_formats import read_idr
+from reference_trainer.scenes.options import SceneOptions
 
 PICTURES = ("a b.png", "b.png", "c.png")
 
@@ -67,9 +68,9 @@ def test_a_format_of_the_users_own_trains(photographs, tmp_path, monkeypatch, ho
 
 def test_a_format_that_is_not_there(photographs):
     with pytest.raises(ValueError, match="must name a function"):
-        load_scene(photographs, format="toy_scenes:read")
+        load_scene(SceneOptions(photographs, format="toy_scenes:read"))
     with pytest.raises(ValueError, match=r"the photographs in .* have no cameras yet: `ca-reg poses "):
-        load_scene(photographs)
+        load_scene(SceneOptions(photographs))
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", ".", "sparse_3/0"])
@@ -77,17 +78,17 @@ def test_few_photographs_all_train_from_whatever_points_there_are(photographs, c
     # VGGT writes sparse/ without 0 and without tracks, InstantSplat sparse_3/0.
     colmap_text(photographs / place)
     (photographs / place / "points3D.txt").write_text("10 0.5 -1.5 2.25 255 0 17 0.5\n11 -4 8 0.125 1 2 3 0.25\n")
-    scene = load_scene(photographs)
+    scene = load_scene(SceneOptions(photographs))
     assert [view.name for view in scene.train] == list(PICTURES)
     assert scene.test == ()
     assert scene.points.positions[:2].tolist() == [[0.5, -1.5, 2.25], [-4, 8, 0.125]]
-    every = load_scene(photographs, views=3)  # as many as there are: none is left to hold out
+    every = load_scene(SceneOptions(photographs, views=3))  # as many as there are: none is left to hold out
     assert ([view.name for view in every.train], every.test) == (list(PICTURES), ())
-    held_out = load_scene(photographs, views=2)
+    held_out = load_scene(SceneOptions(photographs, views=2))
     assert (len(held_out.train), len(held_out.test)) == (2, 1)
     assert held_out.points.source == "random"
     assert "have seen views that do not train" in str(held_out)
-    assert len(load_scene(photographs, views=2, test="none").train) == 2
+    assert len(load_scene(SceneOptions(photographs, views=2, test="none")).train) == 2
 
 
 @pytest.mark.parametrize(
@@ -109,7 +110,7 @@ def test_instantsplat_and_the_colors_of_point_clouds(photographs, colmap_text, k
     head = "".join(f"property {each} {name}\n" for name, each in kinds.items())
     row = " ".join(map(str, (1, 2, 3, *values)))
     (folder / "points3D.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 2\n{head}end_header\n{row}\n{row}\n")
-    points = load_scene(photographs).points
+    points = load_scene(SceneOptions(photographs)).points
     assert points.seen_by == set(PICTURES)
     assert points.positions[:2].tolist() == [[1, 2, 3]] * 2
     torch.testing.assert_close(points.colors[:2], torch.tensor([colors] * 2))
@@ -144,15 +145,17 @@ def nerfstudio(photographs):
 
 
 def test_nerfstudio(nerfstudio):
-    scene = load_scene(nerfstudio, undistort=False)
+    scene = load_scene(SceneOptions(nerfstudio, undistort=False))
     assert [view.name for view in scene.train] == ["images/a b", "images/b", "images/c"]
     assert [view.camera.position.tolist() for view in scene.train] == [[0, 0, 0], [1, 0, 0], [2, 0, 0]]
     assert scene.train[2].camera.forward.tolist() == [0, 0, 1]
     assert [view.camera.fx for view in scene.train] == [50, 60, 50]
     torch.testing.assert_close(scene.points.positions, torch.tensor([[1.0, 2, 3]] * 2))
-    named = load_scene(nerfstudio, points="./sparse_pc.ply").points  # in the world of the cameras, not of the file
+    named = load_scene(
+        SceneOptions(nerfstudio, points="./sparse_pc.ply")
+    ).points  # in the world of the cameras, not of the file
     torch.testing.assert_close(named.positions, scene.points.positions)
-    straight = load_scene(nerfstudio)
+    straight = load_scene(SceneOptions(nerfstudio))
     assert "lens distortion, up to" in str(straight)
     assert straight.train[0].camera.fx > 50
     assert not torch.equal(straight.train[0].image, scene.train[0].image)
@@ -167,18 +170,18 @@ def test_the_lists_of_nerfstudio_split_its_scene(nerfstudio):
     path = nerfstudio / "transforms.json"
     _change(path, train_filenames=["images/c.png", "./images/a b.png"], val_filenames=["images/b.png"])
     with pytest.raises(ValueError, match=r"the points from .*sparse_pc\.ply have seen 1 image outside .*: images/b\."):
-        load_scene(nerfstudio, points="sparse_pc.ply")
+        load_scene(SceneOptions(nerfstudio, points="sparse_pc.ply"))
     options = {"points": "sparse_pc.ply", "allow_test_points": True}
-    scene = load_scene(nerfstudio, **options)
+    scene = load_scene(SceneOptions(nerfstudio, **options))
     assert [view.name for view in scene.train] == ["images/a b", "images/c"]
     assert [view.name for view in scene.test] == ["images/b"]
-    assert [view.name for view in load_scene(nerfstudio, views=1, **options).train] == ["images/a b"]
-    assert len(load_scene(nerfstudio, test="none").train) == 3
+    assert [view.name for view in load_scene(SceneOptions(nerfstudio, views=1, **options)).train] == ["images/a b"]
+    assert len(load_scene(SceneOptions(nerfstudio, test="none")).train) == 3
     _change(path, test_filenames=["images/c.png"])
     with pytest.raises(ValueError, match=r"transforms\.json uses \['images/c'\] both .* --test none"):
-        load_scene(nerfstudio)
+        load_scene(SceneOptions(nerfstudio))
     (nerfstudio / "split.json").write_text('{"train": ["a b", "b"], "test": ["c"]}')  # one's own file counts first
-    assert [view.name for view in load_scene(nerfstudio, **options).test] == ["images/c"]
+    assert [view.name for view in load_scene(SceneOptions(nerfstudio, **options)).test] == ["images/c"]
 
 
 def test_pictures_of_one_name_in_two_folders_are_told_apart(nerfstudio):
@@ -190,7 +193,7 @@ def test_pictures_of_one_name_in_two_folders_are_told_apart(nerfstudio):
         (nerfstudio / "images" / name).rename(nerfstudio / place)
         frame["file_path"] = place
     _change(path, **content | {"train_filenames": places[:2], "test_filenames": places[2:]})
-    scene = load_scene(nerfstudio, points="sparse_pc.ply", allow_test_points=True)
+    scene = load_scene(SceneOptions(nerfstudio, points="sparse_pc.ply", allow_test_points=True))
     assert [view.name for view in scene.train] == ["images/left/1.0", "images/left/1.1"]
     assert [view.name for view in scene.test] == ["images/right/1.0"]
 
@@ -202,9 +205,9 @@ def test_masks_of_nerfstudio(nerfstudio, save_image):
     content["frames"][0]["mask_path"] = "masks\\c.png"
     _change(path, frames=content["frames"])
     with pytest.raises(FileNotFoundError, match=r"masks/c\.png"):
-        load_scene(nerfstudio)
+        load_scene(SceneOptions(nerfstudio))
     save_image(nerfstudio / "masks" / "c.png", np.repeat(np.uint8([[255, 0]]), 32, axis=1).repeat(48, axis=0))
-    scene = load_scene(nerfstudio, undistort=False)
+    scene = load_scene(SceneOptions(nerfstudio, undistort=False))
     assert [view.mask is None for view in scene.train] == [True, True, False]
     assert scene.train[2].mask.equal((torch.arange(64) < 32).float().expand(48, 64))
     assert "masks: scores count what is white in them" in str(scene)
@@ -216,14 +219,14 @@ def test_masks_of_nerfstudio(nerfstudio, save_image):
 def test_what_no_pinhole_stands_for_is_refused(nerfstudio, change):
     _change(nerfstudio / "transforms.json", **change)
     with pytest.raises(ValueError, match=r"transforms\.json"):
-        load_scene(nerfstudio)
+        load_scene(SceneOptions(nerfstudio))
 
 
 def test_all_missing_pictures_are_counted(nerfstudio):
     for name in PICTURES[:2]:
         (nerfstudio / "images" / name).unlink()
     with pytest.raises(FileNotFoundError, match=r"names 2 images that are not there"):
-        load_scene(nerfstudio)
+        load_scene(SceneOptions(nerfstudio))
 
 
 def test_no_folder_of_pictures(nerfstudio, colmap_text):
@@ -231,8 +234,8 @@ def test_no_folder_of_pictures(nerfstudio, colmap_text):
     colmap_text(nerfstudio / "sparse")
     (nerfstudio / "images").rename(nerfstudio / "photos")
     with pytest.raises(FileNotFoundError, match=r"with pictures are \['photos'\]: name one with --images"):
-        load_scene(nerfstudio)
-    assert len(load_scene(nerfstudio, images="photos").train) == 3
+        load_scene(SceneOptions(nerfstudio))
+    assert len(load_scene(SceneOptions(nerfstudio, images="photos")).train) == 3
 
 
 @pytest.mark.parametrize("subset", [False, True])
@@ -263,7 +266,7 @@ def test_idr(photographs, save_image, subset):
         camera = frame.camera
         assert np.allclose([camera.fx, camera.fy, camera.cx, camera.cy], [60, 62, 30.5, 25])
         assert frame.bounds == pytest.approx((translation[2] - 2, translation[2] + 2))
-    scene = load_scene(photographs)
+    scene = load_scene(SceneOptions(photographs))
     assert [float(view.mask.mean()) for view in scene.train] == ([0, 1] if subset else [0, 0, 1])
     assert scene.test == ()
 
@@ -272,39 +275,39 @@ def test_idr(photographs, save_image, subset):
 def test_bad_npz(photographs, bad):
     (photographs / "cameras_sphere.npz").write_bytes(bad)
     with pytest.raises(ValueError, match=r"cameras_sphere\.npz is not an \.npz file"):
-        load_scene(photographs)
+        load_scene(SceneOptions(photographs))
 
 
 def test_large_photographs_are_reduced_and_it_is_said(photographs, colmap_text, save_image):
     colmap_text(photographs / "sparse")
     for name in PICTURES:
         save_image(photographs / "images" / name, np.zeros((900, 1200, 3), np.uint8))
-    scene = load_scene(photographs, points="random:5")
+    scene = load_scene(SceneOptions(photographs, points="random:5"))
     assert 490_000 < scene.pixels < 510_000
     assert "1200x900 are made smaller by 1.47" in str(scene)
-    assert load_scene(photographs, points="random:5", downscale=1).pixels == 1_080_000
+    assert load_scene(SceneOptions(photographs, points="random:5", downscale=1)).pixels == 1_080_000
     for name in PICTURES:
         save_image(photographs / "images_2" / name, np.zeros((450, 600, 3), np.uint8))
-    beside = load_scene(photographs, points="random:5")
+    beside = load_scene(SceneOptions(photographs, points="random:5"))
     assert (beside.pixels, beside.source) == (270_000, str(photographs / "images_2"))
 
 
 def test_nothing_held_out_of_any_format(blender_scene):
-    assert load_scene("synthetic", downscale=8, test="none").test == ()
-    scene = load_scene(blender_scene, test="none")
+    assert load_scene(SceneOptions("synthetic", downscale=8, test="none")).test == ()
+    scene = load_scene(SceneOptions(blender_scene, test="none"))
     assert (len(scene.train), scene.test) == (3, ())
     with pytest.raises(ValueError, match="test must be auto or none"):
-        load_scene(blender_scene, test="some")
+        load_scene(SceneOptions(blender_scene, test="some"))
 
 
 @pytest.mark.data
 @pytest.mark.parametrize("scan", ["dtu-scan65", "dtu-scan24"])
 def test_dtu(data_root, scan):
-    scene = load_scene(data_root / scan, downscale=4)
+    scene = load_scene(SceneOptions(data_root / scan, downscale=4))
     assert [view.name for view in scene.train] == ["000022.png", "000025.png", "000028.png"]
-    by_rule = load_scene(data_root / scan, downscale=4, split="dtu", points="random:10")
+    by_rule = load_scene(SceneOptions(data_root / scan, downscale=4, split="dtu", points="random:10"))
     assert [view.name for view in by_rule.test] == [view.name for view in scene.test]
-    colmap = load_scene(data_root / scan, downscale=4, format="colmap", images="image")
+    colmap = load_scene(SceneOptions(data_root / scan, downscale=4, format="colmap", images="image"))
     for one, other in zip(scene.test, colmap.test, strict=True):
         torch.testing.assert_close(one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-3, rtol=1e-5)
         assert one.camera.fx == pytest.approx(other.camera.fx, abs=1e-2)

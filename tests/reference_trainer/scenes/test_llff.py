@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
-from reference_trainer.scenes.llff import read_llff
+from reference_trainer.scenes.numpy_formats import read_llff
 
 
 def rows_of(camera_to_world_opencv, near=1.0, far=9.0):

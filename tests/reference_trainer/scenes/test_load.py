@@ -11,6 +11,7 @@ from PIL import Image
 
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.formats import find_format
+from reference_trainer.scenes.options import SceneOptions
 
 
 @pytest.fixture
@@ -28,7 +29,7 @@ def photo_scene(tmp_path, colmap_text, save_image):
 
 
 def test_colmap_scene(photo_scene):
-    scene = load_scene(photo_scene, points="sparse/0", undistort=False)
+    scene = load_scene(SceneOptions(photo_scene, points="sparse/0", undistort=False))
     assert "is left in, as asked" in str(scene)
     assert scene.name == "garden"
     assert [view.name for view in scene.train] == ["b.png", "c.png"]
@@ -45,44 +46,44 @@ def test_colmap_scene(photo_scene):
 
 
 def test_image_folder_and_downscale(photo_scene):
-    quarter = load_scene(photo_scene, images="images_4", points="random:5").train[0]
+    quarter = load_scene(SceneOptions(photo_scene, images="images_4", points="random:5")).train[0]
     assert quarter.image.shape == (3, 12, 16)
     assert quarter.camera.fx == pytest.approx(50.5 / 4)
-    half = load_scene(photo_scene, downscale=2, points="random:5").train[0]
+    half = load_scene(SceneOptions(photo_scene, downscale=2, points="random:5")).train[0]
     assert half.image.shape == (3, 24, 32)
     assert half.camera.fx == pytest.approx(50.5 / 2)
     for file in (photo_scene / "images").iterdir():
         file.unlink()
     (photo_scene / "images").rmdir()
-    assert load_scene(photo_scene, points="random:5").train[0].image.shape == (3, 12, 16)
+    assert load_scene(SceneOptions(photo_scene, points="random:5")).train[0].image.shape == (3, 12, 16)
 
 
 @pytest.mark.parametrize("place", ["sparse", "."])
 @pytest.mark.parametrize("format", ["auto", "colmap"])
 def test_a_reconstruction_beside_its_usual_place(photo_scene, place, format):
-    expected = load_scene(photo_scene, points="random:5")
+    expected = load_scene(SceneOptions(photo_scene, points="random:5"))
     for file in (photo_scene / "sparse" / "0").iterdir():
         file.rename(photo_scene / place / file.name)
     (photo_scene / "sparse" / "0").rmdir()
-    found = load_scene(photo_scene, format=format, points="random:5")
+    found = load_scene(SceneOptions(photo_scene, format=format, points="random:5"))
     assert [view.name for view in found.train] == [view.name for view in expected.train]
     assert torch.equal(found.test[0].camera.world_to_camera, expected.test[0].camera.world_to_camera)
     with pytest.raises(ValueError, match="have seen"):
-        load_scene(photo_scene, points=place, views=1, split="llff")
+        load_scene(SceneOptions(photo_scene, points=place, views=1, split="llff"))
 
 
 def test_a_folder_of_pictures_that_is_not_there(photo_scene):
     with pytest.raises(FileNotFoundError, match=r"no folder .*images_8; .*with pictures are \['images', 'images_4'\]"):
-        load_scene(photo_scene, images="images_8")
+        load_scene(SceneOptions(photo_scene, images="images_8"))
 
 
 def test_a_scene_says_what_a_user_checks_first(photo_scene, blender_scene):
-    assert str(load_scene(photo_scene, images="images_4", points="random:5")).splitlines()[:3] == [
+    assert str(load_scene(SceneOptions(photo_scene, images="images_4", points="random:5"))).splitlines()[:3] == [
         f"photographs: {photo_scene / 'images_4'}, used at 16x12 pixels",
         "2 training views: b.png, c.png",
         "1 test view: a b.png",
     ]
-    scene = load_scene(blender_scene)
+    scene = load_scene(SceneOptions(blender_scene))
     assert str(scene).startswith(
         f"photographs: {blender_scene / 'test'}, {blender_scene / 'train'}, used at 8x6 pixels"
     )
@@ -94,27 +95,32 @@ def test_a_scene_says_what_a_user_checks_first(photo_scene, blender_scene):
 def test_points_that_saw_test_views_are_refused(photo_scene):
     (photo_scene / "split.json").write_text(json.dumps({"train": ["a b.png", "b.png"], "test": ["c.png"]}))
     with pytest.raises(ValueError, match=r"seen 1 image outside the training split: c\.png"):
-        load_scene(photo_scene, points="sparse/0")
-    assert load_scene(photo_scene, points="sparse/0", allow_test_points=True).points.seen_by == {"b.png", "c.png"}
+        load_scene(SceneOptions(photo_scene, points="sparse/0"))
+    assert load_scene(SceneOptions(photo_scene, points="sparse/0", allow_test_points=True)).points.seen_by == {
+        "b.png",
+        "c.png",
+    }
 
 
 def test_auto_points_come_from_training_views_or_are_random(photo_scene, colmap_binary):
     colmap_binary(photo_scene / "sparse_2views" / "0")
-    cloud = load_scene(photo_scene).points
+    cloud = load_scene(SceneOptions(photo_scene)).points
     assert cloud.source.endswith("sparse_2views/0")
     (photo_scene / "split.json").write_text(json.dumps({"train": ["a b.png", "b.png"], "test": ["c.png"]}))
-    assert load_scene(photo_scene, points="auto").points.source == "random"
+    assert load_scene(SceneOptions(photo_scene, points="auto")).points.source == "random"
 
 
 def test_random_points_follow_the_seed(photo_scene):
-    one, two, three = (load_scene(photo_scene, points="random:7", seed=seed).points.positions for seed in (0, 0, 1))
+    one, two, three = (
+        load_scene(SceneOptions(photo_scene, points="random:7"), seed=seed).points.positions for seed in (0, 0, 1)
+    )
     assert one.shape == (7, 3)
     assert torch.equal(one, two)
     assert not torch.equal(one, three)
 
 
 def test_blender_scene_is_composited_before_resizing(blender_scene):
-    scene = load_scene(blender_scene, downscale=2)
+    scene = load_scene(SceneOptions(blender_scene, downscale=2))
     assert [view.name for view in scene.train] == ["train/r_0", "train/r_1", "train/r_2"]
     assert [view.name for view in scene.test] == ["test/r_0", "test/r_1"]
     assert scene.background.tolist() == [1, 1, 1]
@@ -127,14 +133,14 @@ def test_blender_scene_is_composited_before_resizing(blender_scene):
         expected = np.stack(
             [np.asarray(Image.fromarray(composed[..., i]).resize((4, 3), Image.Resampling.BICUBIC)) for i in range(3)]
         )
-        got = load_scene(blender_scene, downscale=2, background=background).train[0].image
+        got = load_scene(SceneOptions(blender_scene, downscale=2, background=background)).train[0].image
         assert np.abs(got.numpy() - expected.clip(0, 1)).max() < 1e-6
     alpha = np.asarray(Image.fromarray(pixels[..., 3]).resize((4, 3), Image.Resampling.BICUBIC))
     assert np.abs(view.alpha.numpy() - alpha.clip(0, 1)).max() < 1e-6
 
 
 def test_blender_random_points_fill_the_box(blender_scene):
-    positions = load_scene(blender_scene, points="random:2000").points.positions
+    positions = load_scene(SceneOptions(blender_scene, points="random:2000")).points.positions
     assert positions.abs().max() <= 1.3
     assert positions.abs().amax(0).min() > 1.25
 
@@ -148,7 +154,7 @@ def test_llff_scene(photo_scene):
         matrix[:, 4] = [480, 640, 500]
         rows.append([*matrix.ravel(), 2.0, 10.0])
     np.save(photo_scene / "poses_bounds.npy", np.array(rows))
-    scene = load_scene(photo_scene, format="llff", points="random:1000", split="split")
+    scene = load_scene(SceneOptions(photo_scene, format="llff", points="random:1000", split="split"))
     assert scene.train[0].camera.fx == pytest.approx(50)
     assert scene.train[1].camera.position.tolist() == [2, 0, 0]
     depth = scene.points.positions[:, 2]
@@ -159,7 +165,7 @@ def test_llff_scene(photo_scene):
 
 
 def test_synthetic_scene_by_name():
-    scene = load_scene("synthetic", downscale=8, views=4)
+    scene = load_scene(SceneOptions("synthetic", downscale=8, views=4))
     assert scene.name == "synthetic"
     assert len(scene.train) == 4
     assert scene.train[0].image.shape == (3, 15, 20)
@@ -197,26 +203,26 @@ def test_detect_format(photo_scene, blender_scene, tmp_path):
 )
 def test_options_that_make_no_sense(photo_scene, options, reason):
     with pytest.raises((ValueError, FileNotFoundError), match=reason):
-        load_scene(photo_scene, **{"points": "sparse/0"} | options)
+        load_scene(SceneOptions(photo_scene, **{"points": "sparse/0"} | options))
 
 
 def test_options_without_use_are_refused(blender_scene):
     with pytest.raises(ValueError, match=r"no use for \{'images': 'x'\}"):
-        load_scene(blender_scene, images="x")
+        load_scene(SceneOptions(blender_scene, images="x"))
     with pytest.raises(ValueError, match=r"no use for \{'split': 'llff'\}"):
-        load_scene("synthetic", split="llff")
+        load_scene(SceneOptions("synthetic", split="llff"))
 
 
 def test_pictures_of_another_shape_are_refused(photo_scene, save_image):
     for name in ("a b", "b", "c"):
         save_image(photo_scene / "images_3" / f"{name}.png", np.zeros((40, 40, 3), np.uint8))
     with pytest.raises(ValueError, match="40x40 but its camera is for 64x48"):
-        load_scene(photo_scene, images="images_3", points="sparse/0")
+        load_scene(SceneOptions(photo_scene, images="images_3", points="sparse/0"))
 
 
 @pytest.mark.data
 def test_fern(data_root):
-    scene = load_scene(data_root / "fern", images="images_16")
+    scene = load_scene(SceneOptions(data_root / "fern", images="images_16"))
     assert [view.name for view in scene.train] == ["image001.png", "image010.png", "image019.png"]
     assert [view.name for view in scene.test] == ["image000.png", "image008.png", "image016.png"]
     camera = scene.train[0].camera
@@ -224,8 +230,8 @@ def test_fern(data_root):
     assert scene.points.source.endswith("sparse_3views_dense/0")
     assert len(scene.points.positions) == 15_000
     with pytest.raises(ValueError, match="outside the training split"):
-        load_scene(data_root / "fern", images="images_16", points="sparse/0")
-    by_rule = load_scene(data_root / "fern", images="images_16", split="llff", format="llff")
+        load_scene(SceneOptions(data_root / "fern", images="images_16", points="sparse/0"))
+    by_rule = load_scene(SceneOptions(data_root / "fern", images="images_16", split="llff", format="llff"))
     assert [view.name for view in by_rule.train] == [view.name for view in scene.train]
 
 
@@ -240,7 +246,7 @@ def test_fern(data_root):
     ],
 )
 def test_splits_find_their_own_points(data_root, scene, split, train, points):
-    loaded = load_scene(data_root / scene, images="images_2", split=split)
+    loaded = load_scene(SceneOptions(data_root / scene, images="images_2", split=split))
     assert [view.name for view in loaded.train] == train
     assert loaded.points.source.endswith(points)
 
@@ -248,7 +254,7 @@ def test_splits_find_their_own_points(data_root, scene, split, train, points):
 @pytest.mark.data
 def test_points_have_the_colors_of_the_pictures(data_root):
     """Independent of any file but the photographs: projected points fall on pixels of their own color."""
-    scene = load_scene(data_root / "fern", images="images_16")
+    scene = load_scene(SceneOptions(data_root / "fern", images="images_16"))
     view = scene.train[1]
     camera, points = view.camera, scene.points
     x, y, z = (points.positions @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
@@ -267,7 +273,7 @@ def test_points_have_the_colors_of_the_pictures(data_root):
 
 @pytest.mark.data
 def test_lego(data_root):
-    scene = load_scene(data_root / "lego", downscale=4)
+    scene = load_scene(SceneOptions(data_root / "lego", downscale=4))
     assert [view.name for view in scene.train] == [f"train/r_{i}" for i in (2, 16, 26, 55, 73, 76, 86, 93)]
     assert [view.name for view in scene.test] == [f"test/r_{i}" for i in range(0, 200, 8)]
     view = scene.train[0]

@@ -7,7 +7,7 @@ import torch
 
 from reference_trainer.model.ply import load_ply
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.scenes.orbit import bounding_sphere, orbit_views
+from reference_trainer.scenes.virtual_cameras import bounding_sphere, orbit_views
 
 CENTER = torch.tensor([3.0, -2.0, 5.0])
 

@@ -13,8 +13,8 @@ from reference_trainer.scenes.points import (
     choose_points,
     colmap_points,
     filled,
+    random_points,
 )
-from reference_trainer.scenes.random_points import random_points
 from reference_trainer.scenes.scene import PointCloud
 
 

@@ -16,6 +16,7 @@ from PIL import Image
 from reference_trainer.cli import main
 from reference_trainer.scenes import load_scene, poses
 from reference_trainer.scenes.colmap import read_colmap
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.poses import _write, find_poses
 
 
@@ -66,8 +67,8 @@ def test_three_photographs_of_fern(data_root, tmp_path, capsys):
     assert "3 of 3 photographs registered: image001.png, image010.png, image019.png" in said
     assert f"ca-reg train {photos}" in said
 
-    loaded = load_scene(photos)
-    true = {view.name: view.camera for view in load_scene(fern, images="images_8", test="none").train}
+    loaded = load_scene(SceneOptions(photos))
+    true = {view.name: view.camera for view in load_scene(SceneOptions(fern, images="images_8", test="none")).train}
     rotation, center = errors([view.camera for view in loaded.train], [true[view.name] for view in loaded.train])
     # What COLMAP found of all 20 photographs is the truth here; one pixel is 0.14 degrees. Three photographs determine
     # the focal length poorly, and a wrong one turns the cameras.

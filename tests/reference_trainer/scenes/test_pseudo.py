@@ -7,8 +7,7 @@ import torch
 from scipy.linalg import fractional_matrix_power
 
 from reference_trainer.camera import Camera
-from reference_trainer.scenes.orbit import look_at
-from reference_trainer.scenes.pseudo import camera_between, cameras_between
+from reference_trainer.scenes.virtual_cameras import camera_between, cameras_between, look_at
 
 DOWN = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from reference_trainer.camera import Camera
-from reference_trainer.scenes.raytrace import AMBIENT, GAMMA, Box, Round, nearest_hit, render_solids
+from reference_trainer.scenes.synthetic import AMBIENT, GAMMA, Box, Round, nearest_hit, render_solids
 
 
 def white(points):

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import pytest
 
-from reference_trainer.scenes.splits import blender_split, evenly_spaced, file_split, llff_split
+from reference_trainer.scenes.load import blender_split, evenly_spaced, file_split, llff_split
 
 # Number of images, training views, number of test views of the eight LLFF scenes, as the published code chooses them.
 LLFF = {

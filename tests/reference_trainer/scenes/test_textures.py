@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from reference_trainer.scenes.textures import Noise, checker, color_ramp
+from reference_trainer.scenes.synthetic import Noise, checker, color_ramp
 
 
 @pytest.fixture

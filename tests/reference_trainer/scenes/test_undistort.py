@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from reference_trainer.camera import Camera
-from reference_trainer.scenes.undistort import corner_displacement, undistort
+from reference_trainer.scenes.frames import corner_displacement, undistort
 
 CAMERA = Camera(torch.eye(4), fx=120.0, fy=110.0, cx=78.5, cy=62.0, width=160, height=120)
 LENSES = {

@@ -7,8 +7,8 @@ import pytest
 import torch
 from pages import ROOT
 
-from reference_trainer.scenes.orbit import look_at
 from reference_trainer.scenes.scene import PointCloud, Scene
+from reference_trainer.scenes.virtual_cameras import look_at
 from reference_trainer.studies.paper.claims import Check
 from reference_trainer.studies.paper.comparison import Kept, differences
 from reference_trainer.training import step as step_module

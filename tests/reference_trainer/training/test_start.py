@@ -13,6 +13,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes import load_scene
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
@@ -21,7 +22,7 @@ from reference_trainer.training.trainer import Trainer
 def model(degree: int = 2, **learned: torch.Tensor) -> Gaussians:
     """Gaussians of all sizes, orientations, opacities and colors, in front of the cameras of the built-in scene."""
     draw = torch.Generator().manual_seed(degree)
-    start = load_scene("synthetic", downscale=5).points.positions[:60]
+    start = load_scene(SceneOptions("synthetic", downscale=5)).points.positions[:60]
     normal = lambda *shape: torch.randn(*shape, generator=draw)  # noqa: E731
     bands = (degree + 1) ** 2 - 1
     return Gaussians(
@@ -38,7 +39,7 @@ def ply(tmp_path):
 
 
 def scene_with(ply):
-    return load_scene("synthetic", downscale=5, init=str(ply))
+    return load_scene(SceneOptions("synthetic", downscale=5, init=str(ply)))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -148,4 +149,4 @@ def test_no_file_and_two_starts(ply):
     with pytest.raises(FileNotFoundError, match=r"there is no model nowhere\.ply to start from"):
         scene_with("nowhere.ply")
     with pytest.raises(ValueError, match="init takes the place of points: leave out one of"):
-        load_scene("synthetic", init=str(ply), points="random")
+        load_scene(SceneOptions("synthetic", init=str(ply), points="random"))

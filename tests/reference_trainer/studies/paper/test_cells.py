@@ -19,6 +19,7 @@ from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.runs import grid as grid_module
 from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.runs.grid import Running
+from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.paper import cells as cells_module
@@ -72,7 +73,7 @@ def test_the_schemes_are_those_of_the_registry():
 def test_the_declared_scenes_start_without_their_test_views(data_root):
     widths, views = {}, {}
     for name, scene in chosen_scenes((), data_root, SceneOptions("")).items():
-        loaded = scene.options.load()
+        loaded = load_scene(scene.options)
         widths[name] = loaded.train[0].camera.width
         views[name] = len(loaded.train), len(loaded.test)
         seen = loaded.points.seen_by or frozenset()

@@ -1,4 +1,4 @@
-"""Scenes from a single ``.npz`` of predictions, as scripts around VGGT, DUSt3R, MapAnything or Depth Anything save."""
+"""Formats whose cameras are NumPy files: LLFF, IDR (most of them DTU scans), and an ``.npz`` of predicted poses."""
 
 from __future__ import annotations
 
@@ -12,15 +12,136 @@ import torch
 from numpy.typing import NDArray
 
 from reference_trainer.camera import Camera
-from reference_trainer.npy_files import read_npz
+from reference_trainer.npy_files import read_npy, read_npz
 from reference_trainer.scenes.formats import Capture, SceneFormat
 from reference_trainer.scenes.frames import Frame, view_matrix
-from reference_trainer.scenes.idr import IDR
 from reference_trainer.scenes.images import image_size, list_images, match_images, picture_folder
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["ARRAYS", "read_arrays"]
+__all__ = ["ARRAYS", "IDR", "LLFF", "read_arrays", "read_idr", "read_llff"]
+
+
+def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
+    """Read the cameras of ``poses_bounds.npy`` and pair them with the images of a folder in sorted order.
+
+    Convention: each row holds a (3, 5) matrix, row-major, and the nearest and farthest depth. The matrix is
+    [R | t | (height, width, focal length)], camera to world, with the camera's axes down, right, back. The principal
+    point is the center of the picture. The frames' cameras are OpenCV and world to camera.
+
+    Raises:
+        FileNotFoundError: if the file or the folder is missing.
+        ValueError: if the file does not hold (N, 17) finite numbers with valid rotations, or there are not N images.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}.")
+    rows = read_npy(path.read_bytes(), path)
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise ValueError(f"{path} must hold floats of shape (N, 17), got shape {rows.shape}.")
+    files = list_images(folder)
+    if len(files) != len(rows):
+        raise ValueError(f"{path} has {len(rows)} poses but {folder} has {len(files)} images; each needs one.")
+    frames = []
+    for file, row in zip(files, rows, strict=True):
+        try:
+            frames.append(Frame(file.name, file, _llff_camera(row), bounds=(float(row[15]), float(row[16]))))
+        except ValueError as error:
+            raise ValueError(f"{path}: the row of {file.name} is no camera: {error}") from error
+    return frames
+
+
+def _llff_camera(row: NDArray[np.float64]) -> Camera:
+    """Build the camera of one row."""
+    matrix = row[:15].reshape(3, 5)
+    height, width, focal = matrix[:, 4].tolist()
+    down, right, back = matrix[:, 0], matrix[:, 1], matrix[:, 2]
+    pose = view_matrix(np.stack([right, down, -back]), matrix[:, 3])
+    return Camera(pose, focal, focal, width / 2, height / 2, width=round(width), height=round(height))
+
+
+def _read_llff_scene(root: Path, options: SceneOptions) -> Capture:
+    """Read a scene folder."""
+    return Capture(read_llff(root / "poses_bounds.npy", picture_folder(root, options.images)))
+
+
+LLFF = SceneFormat("llff", "poses_bounds.npy", lambda root: (root / "poses_bounds.npy").is_file(), _read_llff_scene)
+
+
+IDR_FILES = ("cameras_sphere.npz", "cameras.npz")
+DTU_PICTURES = (49, 64)
+
+
+def read_idr(path: str | Path, folder: str | Path) -> list[Frame]:
+    """Read the cameras of ``cameras_sphere.npz`` and pair them with the images of a folder, sorted by name.
+
+    Convention: ``world_mat_<i>`` is K [R | t], world to pixels of the pictures on disk, with OpenCV axes and the
+    pictures' own pixel centers. ``scale_mat_<i>`` maps the unit sphere onto the one around the object. World
+    coordinates (millimeters for DTU) are kept, so that COLMAP files beside it still fit; the sphere gives the depth
+    bounds. Images are matched to cameras in sorted order if there are as many, else by their names, which must be
+    numbers. A folder ``mask`` beside the file holds the masks.
+
+    Raises:
+        FileNotFoundError: if the file or the folder is missing.
+        ValueError: if a matrix is missing or makes no camera.
+    """
+    path, folder = Path(path), Path(folder)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}.")
+    arrays, files = read_npz(path), [file for file in list_images(folder) if not file.stem.endswith("_normal")]
+    cameras = sum(name.startswith("world_mat_") and not name.startswith("world_mat_inv") for name in arrays)
+    by_name = cameras != len(files) and all(file.stem.isdecimal() for file in files)
+    masks = {mask.stem: mask for mask in list_images(path.parent / "mask")} if (path.parent / "mask").is_dir() else {}
+    frames = []
+    for order, file in enumerate(files):
+        number = int(file.stem) if by_name else order
+        world, sphere = (arrays.get(f"{kind}_mat_{number}", np.eye(4)) for kind in ("world", "scale"))
+        if f"world_mat_{number}" not in arrays or not (by_name or cameras == len(files)):
+            raise ValueError(f"{path} has {cameras} cameras, none for {file.name}; {folder} has {len(files)} images.")
+        try:
+            camera = _idr_camera(world, *image_size(file))
+            bounds = _sphere_bounds(camera, sphere)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise ValueError(f"{path}: world_mat_{number}, scale_mat_{number} are no camera: {error}") from error
+        mask = masks.get(file.stem, masks.get(f"{number:03}"))
+        frames.append(Frame(file.name, file, camera, bounds=bounds, mask=mask))
+    return frames
+
+
+def _idr_camera(world: NDArray[np.float64], width: int, height: int) -> Camera:
+    """Decompose K [R | t]: the RQ decomposition of K R, by the QR decomposition of its inverse."""
+    if world.shape not in ((4, 4), (3, 4)):
+        raise ValueError(f"expected shape (4, 4), got {world.shape}.")
+    projection = world[:3] * np.sign(np.linalg.det(world[:3, :3]))
+    turned, upper = np.linalg.qr(np.linalg.inv(projection[:, :3]))
+    signs = np.sign(np.diag(upper))
+    intrinsics, rotation = np.linalg.inv(upper) * signs, signs[:, None] * turned.T
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, np.linalg.solve(intrinsics, projection[:, 3])
+    k = intrinsics / intrinsics[2, 2]
+    if abs(k[0, 1]) > 1e-3 * k[0, 0]:
+        raise ValueError(f"its pixels are skewed: K is {k.tolist()}.")
+    fx, fy, cx, cy = (float(k[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return Camera(torch.from_numpy(pose), fx, fy, cx, cy, width, height)
+
+
+def _sphere_bounds(camera: Camera, sphere: NDArray[np.float64]) -> tuple[float, float] | None:
+    """Return the nearest and farthest depth of the sphere around the object, None if it lies behind the camera."""
+    center, radius = torch.from_numpy(sphere[:3, 3].copy()), float(abs(sphere[0, 0]))
+    depth = float(camera.forward @ (center - camera.position))
+    return (max(depth - radius, depth / 10), depth + radius) if depth > 0 else None
+
+
+def _read_idr_scene(root: Path, options: SceneOptions) -> Capture:
+    """Read a scene folder."""
+    path = next((root / name for name in IDR_FILES if (root / name).is_file()), root / IDR_FILES[0])
+    usual = "image" if (root / "image").is_dir() or not (root / "images").is_dir() else "images"
+    frames = read_idr(path, picture_folder(root, options.images, usual))
+    return Capture(frames, split="dtu" if len(frames) in DTU_PICTURES else "llff")
+
+
+IDR = SceneFormat("idr", IDR_FILES[0], lambda root: any((root / name).is_file() for name in IDR_FILES), _read_idr_scene)
+
 
 TO_CAMERA = ("extrinsic", "extrinsics", "world_to_camera", "w2c", "cam_from_world", "viewmats")
 TO_WORLD = ("camera_poses", "camera_to_world", "cam2world", "c2w", "poses")
@@ -29,7 +150,7 @@ POINTS = ("points", "points3d", "pts3d", "world_points", "world_points_from_dept
 COLORS = ("colors", "rgb", "images", "image")
 CONFIDENCE = ("confidence", "conf", "world_points_conf", "depth_conf")
 NAMES = ("image_names", "names", "image_paths")
-LARGEST = 2**30  # bytes per array
+LARGEST_ARRAY = 2**30  # bytes per array
 MOST_POINTS = 50_000  # networks predict one point per pixel
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -54,7 +175,7 @@ def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], Poin
     """
     path, folder = Path(path), Path(folder)
     asked = (*TO_CAMERA, *TO_WORLD, *INTRINSICS, *POINTS, *COLORS, *CONFIDENCE, *NAMES, "depth")
-    arrays = read_npz(path, largest=LARGEST, names=asked)
+    arrays = read_npz(path, largest=LARGEST_ARRAY, names=asked)
     arrays = {name: x for name, x in arrays.items() if (x.dtype.kind == "U") == (name in NAMES)}
     poses, k = _first(arrays, (*TO_CAMERA, *TO_WORLD)), _first(arrays, INTRINSICS)
     if poses is None or k is None:
@@ -69,7 +190,7 @@ def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], Poin
             f"{path}: poses must have shape (S, 3, 4) or (S, 4, 4) and intrinsics (S, 3, 3), got {poses.shape} and "
             f"{k.shape}."
         )
-    files, size, frames = _files(path, folder, _first(arrays, NAMES), len(poses)), _map_size(arrays), []
+    files, size, frames = _npz_pictures(path, folder, _first(arrays, NAMES), len(poses)), _map_size(arrays), []
     to_camera = not arrays.keys().isdisjoint(TO_CAMERA)
     for file, pose, of in zip(files, poses, k, strict=True):
         axes, at = (pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]) if to_camera else (pose[:3, :3].T, pose[:3, 3])
@@ -79,7 +200,7 @@ def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], Poin
         except ValueError as error:
             raise ValueError(f"{path}: the camera of {file.name}: {error}") from error
         frames.append(Frame(file.name, file, camera))
-    return frames, _points(path, arrays, frames)
+    return frames, _npz_points(path, arrays, frames)
 
 
 def _first(arrays: Arrays, names: Sequence[str]) -> NDArray[Any] | None:
@@ -87,7 +208,7 @@ def _first(arrays: Arrays, names: Sequence[str]) -> NDArray[Any] | None:
     return next((arrays[name] for name in names if name in arrays), None)
 
 
-def _files(path: Path, folder: Path, names: NDArray[Any] | None, count: int) -> list[Path]:
+def _npz_pictures(path: Path, folder: Path, names: NDArray[Any] | None, count: int) -> list[Path]:
     """Return the image file of each camera."""
     if names is None:
         files = list_images(folder)
@@ -110,7 +231,7 @@ def _map_size(arrays: Arrays) -> tuple[int, int] | None:
     return width, height
 
 
-def _points(path: Path, arrays: Arrays, frames: Sequence[Frame]) -> PointCloud | None:
+def _npz_points(path: Path, arrays: Arrays, frames: Sequence[Frame]) -> PointCloud | None:
     """Return the points, None if there are none."""
     found = _first(arrays, POINTS)
     if found is None and "depth" in arrays:
@@ -151,18 +272,18 @@ def _lifted(depth: NDArray[Any], camera: Camera) -> NDArray[Any]:
     return camera.lift(pixels, depths.where(depths > 0, torch.nan)).numpy()
 
 
-def _files_of(root: Path) -> list[Path]:
+def _npz_files(root: Path) -> list[Path]:
     """Return the ``.npz`` files of a folder, none if it is an IDR scene."""
     return [] if IDR.found(root) else sorted(root.glob("*.npz"))
 
 
-def _read(root: Path, options: SceneOptions) -> Capture:
+def _read_npz_scene(root: Path, options: SceneOptions) -> Capture:
     """Read a scene folder."""
-    files = _files_of(root)
+    files = _npz_files(root)
     if len(files) != 1:
         raise ValueError(f"{root} must hold one .npz with the poses, got {[file.name for file in files]}.")
     frames, points = read_arrays(files[0], picture_folder(root, options.images))
     return Capture(sorted(frames, key=lambda frame: frame.name), points=points)
 
 
-ARRAYS = SceneFormat("npz", "an .npz of poses", lambda root: bool(_files_of(root)), _read)
+ARRAYS = SceneFormat("npz", "an .npz of poses", lambda root: bool(_npz_files(root)), _read_npz_scene)
