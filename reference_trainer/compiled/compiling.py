@@ -1,4 +1,4 @@
-"""Compiling the loops: once per machine, cached on disk where possible."""
+"""Compiling the loops: once per machine, cached in the user's cache folder where that can be written."""
 
 from __future__ import annotations
 
@@ -14,8 +14,15 @@ import numba
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.caching import FunctionCache, NullCache
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    NullCache,
+    UserProvidedCacheLocator,
+    UserWideCacheLocator,
+)
 from numba.extending import intrinsic
+from numba.misc.appdirs import AppDirs
 from numba.np.arrayobj import make_array
 
 __all__ = ["KERNELS", "describe_compilation", "inlined", "kernel", "prefetch", "reported_to"]
@@ -82,8 +89,27 @@ def _name(function: Callable[..., Any]) -> str:
     return f"{function.__module__.rpartition('.')[2]}.{function.__name__.lstrip('_')}"
 
 
+class _UserCache(UserWideCacheLocator):  # type: ignore[misc]
+    """The folder ``ca_reg`` of the user's cache, with one folder in it for each folder of sources.
+
+    numba's own default is ``__pycache__`` beside the source. pip does not remove what it did not install: after an
+    uninstall, such files keep a folder without modules alive, a namespace package that hides an editable installation.
+    """
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        super().__init__(function, file)
+        of_user = AppDirs("ca_reg", appauthor=False).user_cache_dir
+        self._cache_path = str(Path(of_user, self.get_suitable_cache_subpath(file)))
+
+
+class _UserCacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = (UserProvidedCacheLocator, _UserCache)  # the first is NUMBA_CACHE_DIR
+
+
 class _Kept(FunctionCache):
     """Machine code on disk; a fault of the disk costs the time to compile, not the run."""
+
+    _impl_class = _UserCacheFiles
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         return (*super()._index_key(sig, codegen), _DIGEST)
@@ -121,13 +147,13 @@ class _NotKept(NullCache):
 def kernel(function: F) -> F:
     """Compile a loop over NumPy arrays; it runs without the GIL, so that threads run in parallel.
 
-    The machine code is cached beside the source, or in the user's cache folder if that cannot be written, or nowhere if
-    neither can: then every process compiles anew. ``NUMBA_CACHE_DIR`` takes precedence over both.
+    The machine code is cached in the user's cache folder (``$XDG_CACHE_HOME/ca_reg`` or ``~/.cache/ca_reg`` on Linux),
+    or in ``NUMBA_CACHE_DIR``, never among the installed files. Where it cannot be written, every process compiles anew.
     """
     compiled: Any = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy")(function)
     try:
         compiled._cache = _Kept(function)
-    except RuntimeError:  # "no locator available": neither the package nor the home can be written
+    except RuntimeError:  # "no locator available": the home cannot be written
         compiled._cache = _NotKept(function)
     KERNELS.append(compiled)
     result: F = compiled

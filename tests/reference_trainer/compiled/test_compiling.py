@@ -93,6 +93,16 @@ def test_a_full_disk_costs_the_time_to_compile(folder, loaded, full_disk):
     assert loaded() == []
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="XDG_CACHE_HOME is Linux's")
+def test_it_is_kept_in_the_users_cache_and_not_among_the_installed_files(tmp_path, folder, loaded, monkeypatch):
+    """pip does not remove what it did not install, and the folder that stays hides an editable installation."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    assert loaded() == [("doubling.double", True)]
+    assert loaded() == []
+    assert {path.relative_to(tmp_path).parts[:2] for path in tmp_path.rglob("*.nb?")} == {("home", "ca_reg")}
+
+
 def test_a_machine_on_which_nothing_can_be_written(tmp_path, folder, loaded, monkeypatch):
     file = tmp_path / "file"
     file.touch()  # nobody makes a folder below a file, not even root

@@ -144,13 +144,13 @@ def test_what_another_process_finished_while_the_scene_was_read_is_not_trained_a
 ):
     scene, results = load_scene(options, seed=0), []
 
-    def load(self, seed):
+    def load(_, seed):
         with monkeypatch.context() as patch:
-            patch.setattr(type(options), "load", lambda self, seed: scene)
+            patch.setattr("reference_trainer.runs.run.load_scene", lambda _, seed: scene)
             results.append(run_experiment(options, short, tmp_path, monitor_every=0))
         return scene
 
-    monkeypatch.setattr(type(options), "load", load)
+    monkeypatch.setattr("reference_trainer.runs.run.load_scene", load)
     monkeypatch.setattr("reference_trainer.runs.run._train", train_once(monkeypatch))
     assert run_experiment(options, short, tmp_path, monitor_every=0) == results[0]
 
