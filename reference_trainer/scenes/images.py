@@ -14,11 +14,15 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "composite", "image_size", "is_image", "list_images", "match_images", "path_inside", "picture_folder", "read_image",
-    "resize_image",
+    "check_image", "composite", "image_size", "is_image", "list_images", "match_images", "path_inside",
+    "picture_folder", "read_image", "resize_image", "unreadable_photographs",
 ]  # fmt: skip
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
+OTHER_PHOTOGRAPHS = frozenset(
+    {".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+)
+"""What cameras and phones write too, and nothing here reads."""
 # Otherwise Pillow tries every format it knows, whatever the file's name, and hands PostScript to Ghostscript.
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 LARGEST_IMAGE = 100_000_000  # pixels: a header can announce any number, and each takes 25 bytes of memory
@@ -44,6 +48,27 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
         ValueError: if the file is not an image, is damaged, has more than 8 bits per channel or more than 100 million
             pixels.
     """
+    picture = _decoded(path)
+    width, height, has_alpha = picture.width, picture.height, picture.mode == "RGBA"
+    image = torch.empty(3, height, width)
+    alpha = torch.empty(height, width) if has_alpha else None
+    rows = max(1, _BAND // width)
+    for top in range(0, height, rows):
+        band = np.array(picture.crop((0, top, width, min(top + rows, height))))
+        channels = torch.from_numpy(band).permute(2, 0, 1).to(torch.float32) / 255
+        image[:, top : top + rows] = channels[:3]
+        if alpha is not None:
+            alpha[top : top + rows] = channels[3]
+    return image, alpha
+
+
+def check_image(path: str | Path) -> None:
+    """Decode an image file to its end, for those who hand it to another program; errors as for `read_image`."""
+    _decoded(path)
+
+
+def _decoded(path: str | Path) -> Any:
+    """Return the picture of an image file, RGBA if it has transparency, else RGB; errors as for `read_image`."""
     with _opened(path) as file:
         mode, width, height = file.mode, file.width, file.height
         file.verify()  # checks a PNG's checksums, which decoding does not
@@ -55,18 +80,7 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
         if file.format == "TIFF":
             _check_strips(file)
         has_alpha = mode in ("RGBA", "LA", "PA") or "transparency" in file.info
-        picture = file.convert("RGBA" if has_alpha else "RGB")
-    del file  # frees the decoder's buffers before the result is allocated
-    image = torch.empty(3, height, width)
-    alpha = torch.empty(height, width) if has_alpha else None
-    rows = max(1, _BAND // width)
-    for top in range(0, height, rows):
-        band = np.array(picture.crop((0, top, width, min(top + rows, height))))
-        channels = torch.from_numpy(band).permute(2, 0, 1).to(torch.float32) / 255
-        image[:, top : top + rows] = channels[:3]
-        if alpha is not None:
-            alpha[top : top + rows] = channels[3]
-    return image, alpha
+        return file.convert("RGBA" if has_alpha else "RGB")
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
@@ -134,6 +148,13 @@ def list_images(folder: str | Path) -> list[Path]:
 def is_image(path: Path) -> bool:
     """Whether a file is a picture by its name; ``._a.jpg``, which macOS leaves on other file systems, is not."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def unreadable_photographs(folder: Path) -> list[str]:
+    """Return the names of photographs in formats that are not read, such as HEIC, unless a readable copy is beside."""
+    read = {file.stem for file in folder.iterdir() if is_image(file)}
+    others = [file for file in folder.iterdir() if file.suffix.lower() in OTHER_PHOTOGRAPHS]
+    return sorted(file.name for file in others if file.stem not in read and not file.name.startswith("."))
 
 
 def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:

@@ -17,7 +17,7 @@ from reference_trainer.scenes.colmap import COLMAP
 from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
 from reference_trainer.scenes.formats import Capture, find_format, only_default, register_format
 from reference_trainer.scenes.frames import Frame, corner_displacement, load_view
-from reference_trainer.scenes.images import LARGE_PICTURE, image_size
+from reference_trainer.scenes.images import LARGE_PICTURE, image_size, unreadable_photographs
 from reference_trainer.scenes.numpy_formats import ARRAYS, IDR, LLFF
 from reference_trainer.scenes.options import BACKGROUNDS, SceneOptions
 from reference_trainer.scenes.points import check_no_leak, choose_points, filled, model_start
@@ -73,13 +73,15 @@ def load_scene(options: SceneOptions, *, seed: int = 0) -> Scene:
     _, read = find_format(root, options.format)
     capture = read(root, options)
     train, test = _split(root, capture, options)
+    trained = [frame.name for frame in train]
+    held_out = {frame.name for frame in [*capture.frames, *(capture.test or [])]} - set(trained)
     generator = torch.Generator().manual_seed(seed)
     start = None
     if options.init is None:
-        cloud, about_points = choose_points(root, options.points, train, generator, own=capture.points)
+        cloud, about_points = choose_points(root, options.points, train, held_out, generator, own=capture.points)
     else:
         start, cloud, about_points = model_start(options.init)
-    check_no_leak(cloud, [frame.name for frame in train], allow=options.allow_test_points)
+    check_no_leak(cloud, trained, held_out, allow=options.allow_test_points)
     chosen = capture.background if options.background == "auto" else options.background
     color: Tensor = torch.tensor(BACKGROUNDS[chosen])
     downscale, about_size = _downscale([*train, *test], options.downscale)
@@ -97,6 +99,9 @@ def load_scene(options: SceneOptions, *, seed: int = 0) -> Scene:
     if any(frame.mask is not None for frame in [*train, *test]):
         about_masks = "masks: scores count what is white in them, training uses the whole photographs"
     about_lenses = _about_lenses([*train, *test], options)
+    folders = sorted({frame.path.parent for frame in capture.frames})
+    unread = [name for folder in folders for name in unreadable_photographs(folder)]
+    about_unread = f"not read: {', '.join(unread)}. Save them as JPEG or PNG, and find their cameras" * bool(unread)
     return Scene(
         name=root.resolve().name,
         **views,
@@ -104,7 +109,7 @@ def load_scene(options: SceneOptions, *, seed: int = 0) -> Scene:
         start=start,
         background=color,
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
-        notes=tuple(filter(None, (about_size, about_lenses, about_masks, about_points, about_more))),
+        notes=tuple(filter(None, (about_unread, about_size, about_lenses, about_masks, about_points, about_more))),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from reference_trainer.model.ply import load_ply
 from reference_trainer.ply_files import PlyVertices, read_ply
 from reference_trainer.scenes.colmap import colmap_folders, read_colmap
 from reference_trainer.scenes.frames import Frame
-from reference_trainer.scenes.images import path_inside
+from reference_trainer.scenes.images import is_image, path_inside
 from reference_trainer.scenes.scene import PointCloud
 
 __all__ = [
@@ -32,12 +32,18 @@ OPAQUE = 13.0  # replaces an infinite logit, which cannot be trained
 
 
 def choose_points(
-    root: Path, points: str, train: Sequence[Frame], generator: torch.Generator, *, own: PointCloud | None = None
+    root: Path,
+    points: str,
+    train: Sequence[Frame],
+    held_out: Iterable[str],
+    generator: torch.Generator,
+    *,
+    own: PointCloud | None = None,
 ) -> tuple[PointCloud, str]:
     """Return the initial points that the option ``points`` asks for, and a note on the choice.
 
-    It is ``"auto"``, ``"random"``, ``"random:<count>"``, or a ``.ply`` file or COLMAP folder within the scene; ``own``
-    are the points that the scene file names.
+    It is ``"auto"``, ``"random"``, ``"random:<count>"``, or a ``.ply`` file or COLMAP folder within the scene;
+    ``held_out`` names the photographs that do not train; ``own`` are the points that the scene file names.
 
     Raises:
         FileNotFoundError: if the file or folder is missing.
@@ -48,8 +54,8 @@ def choose_points(
     if points == "auto":
         offered = [own] if own is not None else []
         offered += [cloud for folder in colmap_folders(root) if (cloud := colmap_points(folder)) is not None]
-        names = {frame.name for frame in train}
-        honest = [cloud for cloud in offered if (cloud.seen_by or frozenset()) <= names]
+        names, held_out = [frame.name for frame in train], list(held_out)
+        honest = [cloud for cloud in offered if not _seen_outside(cloud, names, held_out)]
         if honest:
             best = max(reversed(honest), key=lambda cloud: len(cloud.positions))
             return best, f"initial points: {len(best.positions):,} from {best.source}"
@@ -183,10 +189,14 @@ def model_start(path: str | Path) -> tuple[Gaussians, PointCloud, str]:
     return start, cloud, f"starts from the {len(start):,} Gaussians of degree {start.sh_degree} in {path}{trained}"
 
 
-def check_no_leak(points: PointCloud, train_names: Iterable[str], *, allow: bool = False) -> None:
+def check_no_leak(
+    points: PointCloud, train_names: Iterable[str], held_out: Iterable[str] = (), *, allow: bool = False
+) -> None:
     """Refuse points that were triangulated from images outside the training split, unless allowed.
 
     Such points leak the geometry of test views into training. A cloud of unknown origin (``seen_by`` is None) passes.
+    Formats name one photograph in two ways, COLMAP ``5923.jpg`` and transforms.json ``images/5923``: names that agree
+    without extension and leading folders are the same, unless one of ``held_out``, the other images, agrees as well.
 
     Raises:
         ValueError: if the points have seen other images and ``allow`` is False.
@@ -199,7 +209,7 @@ def check_no_leak(points: PointCloud, train_names: Iterable[str], *, allow: bool
         ...
         ValueError: the points from sparse/0 have seen 1 image outside the training split: b.png. ...
     """
-    outside = sorted((points.seen_by or frozenset()) - set(train_names))
+    outside = _seen_outside(points, train_names, held_out)
     if outside and not allow:
         shown = ", ".join(outside[:8]) + (", ..." if len(outside) > 8 else "")
         raise ValueError(
@@ -210,6 +220,29 @@ def check_no_leak(points: PointCloud, train_names: Iterable[str], *, allow: bool
 
 
 BLENDER_BOX = 1.3  # half the edge of the box that holds every NeRF-synthetic object, as in the INRIA code
+
+
+def _seen_outside(points: PointCloud, train: Iterable[str], held_out: Iterable[str]) -> list[str]:
+    """Return the names of images that the points have seen and that are none of the training images, sorted."""
+    known = set(train)
+    ours, others = list(map(_parts, known)), list(map(_parts, held_out))
+
+    def trains(name: str) -> bool:
+        tail = _parts(name)
+        return any(_agree(tail, each) for each in ours) and not any(_agree(tail, each) for each in others)
+
+    return sorted(name for name in (points.seen_by or frozenset()) - known if not trains(name))
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """Return the parts of an image's path from its end on, without extension."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    return (path.with_suffix("") if is_image(Path(name)) else path).parts[::-1]
+
+
+def _agree(one: tuple[str, ...], other: tuple[str, ...]) -> bool:
+    """Whether one of two reversed paths ends the other."""
+    return bool(one and other) and all(a == b for a, b in zip(one, other, strict=False))
 
 
 def random_points(train: Sequence[Frame], count: int, generator: torch.Generator) -> PointCloud:

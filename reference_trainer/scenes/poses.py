@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from reference_trainer.scenes.colmap import colmap_folders
-from reference_trainer.scenes.images import image_size, list_images
+from reference_trainer.scenes.images import check_image, image_size, list_images, unreadable_photographs
 
 __all__ = ["FoundPoses", "find_poses"]
 
@@ -34,6 +34,7 @@ class FoundPoses:
         folder: of the COLMAP model, ``sparse/0`` in the scene.
         registered: names of the photographs that now have a camera.
         left_out: names of the others.
+        unread: names of photographs in a format that is not read, such as HEIC.
         points: number of points.
         error: mean reprojection error of their features, pixels of the photographs.
         focal: focal lengths of the cameras, pixels, sorted.
@@ -42,6 +43,7 @@ class FoundPoses:
     folder: Path
     registered: tuple[str, ...]
     left_out: tuple[str, ...]
+    unread: tuple[str, ...]
     points: int
     error: float
     focal: tuple[float, ...]
@@ -49,7 +51,7 @@ class FoundPoses:
     def __str__(self) -> str:
         """Describe what was found, and what to do about photographs left out."""
         lengths = " to ".join(f"{x:.0f}" for x in dict.fromkeys((self.focal[0], self.focal[-1])))
-        every = len(self.registered) + len(self.left_out)
+        every = len(self.registered) + len(self.left_out) + len(self.unread)
         lines = [
             f"{len(self.registered)} of {every} photographs registered: {', '.join(self.registered)}",
             f"{self.points:,} points, reprojection error {self.error:.2f} pixels, focal length {lengths} pixels",
@@ -59,6 +61,8 @@ class FoundPoses:
                 f"left out: {', '.join(self.left_out)}. They share too little with the others: add a photograph from "
                 "in between, or go on without them"
             )
+        if self.unread:
+            lines.append(f"not read: {', '.join(self.unread)}. Save them as JPEG or PNG, and run this again")
         return "\n".join(lines)
 
 
@@ -88,8 +92,8 @@ def find_poses(
     Raises:
         ImportError: if pycolmap is missing.
         FileNotFoundError: if there is no such folder.
-        ValueError: if it holds fewer than two photographs, COLMAP cannot read one, or they show too little in common
-            for any camera.
+        ValueError: if it holds fewer than two photographs, one is damaged or unknown to COLMAP, or they show too little
+            in common for any camera.
         FileExistsError: if the scene has cameras already.
         OSError: if it cannot be written.
     """
@@ -100,6 +104,8 @@ def find_poses(
         raise ValueError(f"{photos[0].parent} holds 1 photograph, and depth needs at least 2: take another one.")
     if found := colmap_folders(out):
         raise FileExistsError(f"{out} has cameras already, in {found[0]}: train on it, or delete them to find others.")
+    for photo in photos:
+        check_image(photo)  # COLMAP takes what is left of a truncated one
     with tempfile.TemporaryDirectory() as work:
         model = _reconstruct(photos, Path(work), camera, seed, progress)
         if model is None:
@@ -118,6 +124,7 @@ def find_poses(
         out / "sparse" / "0",
         tuple(photo.name for photo in photos if photo.name in registered),
         tuple(photo.name for photo in photos if photo.name not in registered),
+        tuple(unreadable_photographs(photos[0].parent)),
         model.num_points3D(),
         model.compute_mean_reprojection_error(),
         tuple(sorted(camera.mean_focal_length() for camera in model.cameras.values())),

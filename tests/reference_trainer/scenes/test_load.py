@@ -10,8 +10,11 @@ import torch
 from PIL import Image
 
 from reference_trainer.scenes import load_scene
+from reference_trainer.scenes.colmap import colmap_frames, read_colmap
 from reference_trainer.scenes.formats import find_format
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.plan import make_plan
 
 
 @pytest.fixture
@@ -220,6 +223,17 @@ def test_pictures_of_another_shape_are_refused(photo_scene, save_image):
         load_scene(SceneOptions(photo_scene, images="images_3", points="sparse/0"))
 
 
+def test_photographs_that_cannot_be_read_are_named(photo_scene):
+    """`plan` prints the notes, and loads what `train` would."""
+    (photo_scene / "images" / "d.heic").write_bytes(b"ftypheic")
+    assert any("not read: d.heic" in note for note in load_scene(SceneOptions(photo_scene, points="random:5")).notes)
+    cut = photo_scene / "images" / "b.png"
+    Image.open(cut).save(cut, "JPEG")
+    cut.write_bytes(cut.read_bytes()[:-200])
+    with pytest.raises(ValueError, match=r"b\.png is not a readable image"):
+        load_scene(SceneOptions(photo_scene, points="random:5"))
+
+
 @pytest.mark.data
 def test_fern(data_root):
     scene = load_scene(SceneOptions(data_root / "fern", images="images_16"))
@@ -243,12 +257,60 @@ def test_fern(data_root):
         ("fountain", "split_near", ["0001.jpg", "0003.jpg", "0005.jpg"], "sparse_3near/0"),
         ("herz-jesu", "auto", ["0001.jpg", "0004.jpg", "0007.jpg"], "sparse_3views/0"),
         ("herz-jesu", "split_near", ["0002.jpg", "0004.jpg", "0006.jpg"], "sparse_3near/0"),
+        ("sceaux", "auto", ["7102.jpg", "7104.jpg", "7106.jpg"], "sparse_3views_dense/0"),
+        ("cape", "auto", ["5923.jpg", "5929.jpg", "5934.jpg"], "sparse_3views_dense/0"),
     ],
 )
 def test_splits_find_their_own_points(data_root, scene, split, train, points):
-    loaded = load_scene(SceneOptions(data_root / scene, images="images_2", split=split))
+    images = "images_2" if (data_root / scene / "images_2").is_dir() else None
+    loaded = load_scene(SceneOptions(data_root / scene, images=images, split=split))
     assert [view.name for view in loaded.train] == train
     assert loaded.points.source.endswith(points)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["sceaux", "cape"])
+def test_a_scene_goes_through_plan_without_a_word_of_explanation(data_root, name):
+    scene = load_scene(SceneOptions(data_root / name))
+    assert len(scene.points.positions) == 10_000
+    assert make_plan(scene, TrainConfig(dropout=0.2)).rows()
+    masks = [view.mask for view in (*scene.train, *scene.test)]
+    if name == "sceaux":
+        assert [view.name for view in scene.test] == [f"{i}.jpg" for i in (7101, 7103, 7105, 7108)]
+        assert masks == [None] * 7
+    else:
+        assert len(scene.test) == 8
+        assert all(0.01 < float(mask.mean()) < 0.9 for mask in masks)
+        assert any("scores count what is white" in note for note in scene.notes)
+
+
+@pytest.fixture
+def cape(data_root, tmp_path):
+    """The cape as transforms.json says it, whose names are paths without extension."""
+    source, root = data_root / "cape", tmp_path / "cape"
+    root.mkdir()
+    for name in ("images", "split.json", "sparse", "sparse_3views_dense"):
+        (root / name).symlink_to(source / name)
+    entries = []
+    for frame in colmap_frames(read_colmap(source / "sparse" / "0"), source / "images"):
+        pose, camera = np.linalg.inv(frame.camera.world_to_camera.numpy()), frame.camera
+        pose[:, 1:3] *= -1  # OpenCV's axes to OpenGL's
+        entries.append(
+            {"file_path": f"images/{frame.name}", "transform_matrix": pose.tolist(), "fl_x": camera.fx,
+             "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height}
+        )  # fmt: skip
+    (root / "transforms.json").write_text(json.dumps({"frames": entries}))
+    return root
+
+
+@pytest.mark.data
+def test_the_honest_points_of_a_scene_are_honest_in_every_format(cape):
+    scene = load_scene(SceneOptions(cape, format="transforms"))
+    assert [view.name for view in scene.train] == ["images/5923", "images/5929", "images/5934"]
+    assert scene.points.source.endswith("sparse_3views_dense/0")
+    assert len(scene.points.positions) == 10_000
+    with pytest.raises(ValueError, match="outside the training split"):
+        load_scene(SceneOptions(cape, format="transforms", points="sparse/0"))
 
 
 @pytest.mark.data

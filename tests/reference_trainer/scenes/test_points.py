@@ -36,6 +36,29 @@ def test_no_leak_passes():
     check_no_leak(cloud(frozenset("abcd")), ["a"], allow=True)
 
 
+@pytest.mark.parametrize("train", ["images/5923", "5923", "a/b/images/5923.png", r"images\5923.jpg"])
+def test_one_photograph_has_a_name_in_every_format(train):
+    """COLMAP names files within the image folder, transforms.json paths within the scene, often without extension."""
+    check_no_leak(cloud(frozenset({"5923.jpg"})), [train], ["images/5924", "images/15923"])
+
+
+@pytest.mark.parametrize(
+    ("seen", "train", "held_out"),
+    [
+        ("5924.jpg", ["images/5923"], ["images/5924"]),
+        ("15923.jpg", ["images/5923"], []),  # names that end alike are not paths that do
+        ("0001.jpg", ["left/0001"], ["right/0001"]),  # which of the two cannot be told
+        ("right/0001.jpg", ["left/0001"], ["right/0001"]),
+        ("a.png", ["a.jpg"], ["a.png"]),
+        ("5923.5.jpg", ["images/5923"], []),
+        ("", ["a.jpg"], []),
+    ],
+)
+def test_another_photograph_is_not_taken_for_one_that_trains(seen, train, held_out):
+    with pytest.raises(ValueError, match="have seen 1 image outside the training split"):
+        check_no_leak(cloud(frozenset({seen})), train, held_out)
+
+
 def test_colmap_points(tmp_path, colmap_binary):
     colmap_binary(tmp_path)
     points = colmap_points(tmp_path)
@@ -46,7 +69,7 @@ def test_colmap_points(tmp_path, colmap_binary):
     (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 0))
     assert colmap_points(tmp_path) is None
     with pytest.raises(ValueError, match="no points to start from"):
-        choose_points(tmp_path, ".", [], torch.Generator())
+        choose_points(tmp_path, ".", [], [], torch.Generator())
 
 
 def looking(position, target):

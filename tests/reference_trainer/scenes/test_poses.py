@@ -137,6 +137,35 @@ def test_a_photograph_that_cannot_be_read_is_named(noise, kind, error):
         find_poses(noise)
 
 
+def cut_off(path):
+    """Write a JPEG that ends in the middle, as an interrupted copy does; its header is whole."""
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)).save(path, "JPEG")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def test_a_truncated_photograph_is_named_before_colmap_works(noise, monkeypatch):
+    cut_off(noise / "3.jpg")
+    monkeypatch.setattr(poses, "_reconstruct", lambda *_: pytest.fail("COLMAP was started"))
+    with pytest.raises(ValueError, match=r"3\.jpg is not a readable image: .*truncated"):
+        find_poses(noise)
+
+
+def test_a_photograph_of_another_format_is_not_passed_over_in_silence(noise, monkeypatch):
+    (noise / "IMG_3.HEIC").write_bytes(b"ftypheic")
+    (noise / "1.heic").write_bytes(b"ftypheic")  # 1.png is the same photograph, exported
+    found = SimpleNamespace(
+        images={i: SimpleNamespace(name=f"{i}.png", has_pose=True) for i in range(3)},
+        cameras={0: SimpleNamespace(mean_focal_length=lambda: 50.0)},
+        num_points3D=lambda: 3,
+        compute_mean_reprojection_error=lambda: 0.5,
+        write_binary=lambda folder: None,
+    )
+    monkeypatch.setattr(poses, "_reconstruct", lambda *_: found)
+    said = str(find_poses(noise))
+    assert "3 of 4 photographs registered" in said
+    assert "not read: IMG_3.HEIC. Save them as JPEG or PNG" in said
+
+
 def test_too_few_photographs_and_cameras_that_are_there(noise, colmap_text):
     (noise / "0.png").unlink()
     (noise / "1.png").unlink()

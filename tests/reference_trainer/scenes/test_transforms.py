@@ -31,6 +31,13 @@ def test_frames_follow_the_file(blender_scene):
     assert camera.forward.tolist() == [0, 0, -1]
 
 
+def test_a_byte_order_mark_is_no_part_of_the_file(blender_scene):
+    path = blender_scene / "transforms_train.json"
+    expected = read_transforms(path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert [frame.name for frame in read_transforms(path)] == [frame.name for frame in expected]
+
+
 def test_opengl_points_land_where_they_should(blender_scene):
     # A point to the right of and above the optical axis, in OpenGL terms, is in the upper right quarter of the picture.
     camera = read_transforms(blender_scene / "transforms_train.json")[0].camera
