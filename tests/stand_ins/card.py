@@ -1,8 +1,9 @@
 """A graphics card that is none: tensors on the device "card" compute on the processor and refuse what CUDA refuses.
 
-It shows without a card that code is written for one. Mixing devices, a generator of another device, a factory function
-that forgot the device, `numpy()`, an operation that cannot repeat itself where that is asked for: each fails here as it
-would on CUDA. What it does not show is CUDA's rounding, memory and speed.
+It shows without a card that code is written for one. Mixing devices, or two cards, products of whole numbers, a
+generator of another device, a factory function that forgot the device, `numpy()`, an operation that cannot repeat
+itself where that is asked for: each fails here as it would on CUDA, and what makes the host wait for the card can be
+counted. What it does not show is CUDA's rounding, memory and speed.
 
 Two things it cannot do while PyTorch computes gradients: make tensors of Python numbers (`torch.tensor`, `new_tensor`),
 and say what was refused in a gradient that PyTorch computes itself (`SystemError: ... returned NULL`).
@@ -10,6 +11,7 @@ and say what was refused in a gradient that PyTorch computes itself (`SystemErro
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
@@ -17,14 +19,21 @@ from typing import Any
 
 import pytest
 import torch
-from stand_ins.cuda_rules import check_determinism, check_devices, check_generator, shuffled_additions
+from stand_ins.cuda_rules import (
+    SYNCHRONIZES,
+    check_determinism,
+    check_devices,
+    check_generator,
+    check_supported,
+    shuffled_additions,
+)
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree as pytree
 from torch.utils import backend_registration
 from torch.utils._python_dispatch import return_and_correct_aliasing
 
-__all__ = ["CARD", "pretended_card", "register_card"]
+__all__ = ["CARD", "counted_synchronizations", "pretended_card", "register_card"]
 
 CARD = "card"
 
@@ -33,6 +42,7 @@ _SIZED_LATER = ("arange", "arange.start", "arange.start_step", "eye", "eye.m", "
 
 _generators: dict[int, torch.device] = {}  # by address: a generator comes back from C++ as another object
 _order: torch.Generator | None = None
+_counted: list[Counter[str]] = []
 _libraries: list[torch.library.Library] = []
 
 
@@ -42,14 +52,14 @@ class CardTensor(Tensor):
     numbers: Tensor
 
     @staticmethod
-    def __new__(cls, numbers: Tensor) -> CardTensor:
+    def __new__(cls, numbers: Tensor, index: int = 0) -> CardTensor:
         out = Tensor._make_wrapper_subclass(
             cls,
             numbers.size(),
             strides=numbers.stride(),
             storage_offset=numbers.storage_offset(),
             dtype=numbers.dtype,
-            device=torch.device(CARD, 0),
+            device=torch.device(CARD, index),
         )
         out.numbers = numbers
         return out
@@ -86,12 +96,13 @@ class _FromNumbers(TorchFunctionMode):
         kwargs = kwargs or {}
         ours = bool(args) and isinstance(args[0], CardTensor)
         if func in (torch.tensor, torch.as_tensor, torch.asarray) and _is_card(kwargs.get("device")):
-            return args[0] if ours else func(*args, **{**kwargs, "device": "cpu"}).to(CARD)
+            return args[0] if ours else func(*args, **{**kwargs, "device": "cpu"}).to(kwargs["device"])
         if func is Tensor.new_tensor and ours:
-            return torch.tensor(args[1], **{"dtype": args[0].dtype, **kwargs}).to(CARD)
+            return torch.tensor(args[1], **{"dtype": args[0].dtype, **kwargs}).to(args[0].device)
         if func is Tensor.__getitem__ and ours and isinstance(args[1], tuple):
             args = args[0], tuple(torch.tensor(i) if isinstance(i, list) else i for i in args[1])
         if func is Tensor.tolist and ours:
+            _count("aten::_local_scalar_dense")
             return args[0].detach().numbers.tolist()
         if func is Tensor.numpy and ours:
             raise TypeError("can't convert a tensor on the card to numpy. Use Tensor.cpu() first.")
@@ -104,7 +115,7 @@ class _Module:
     """What PyTorch asks the module of a device."""
 
     is_initialized = is_available = staticmethod(lambda: True)
-    device_count = staticmethod(lambda: 1)
+    device_count = staticmethod(lambda: 2)
     current_device = staticmethod(lambda: 0)
     manual_seed_all = staticmethod(lambda seed: None)
     _is_in_bad_fork = staticmethod(lambda: False)
@@ -134,6 +145,17 @@ def pretended_card(*, order: int | None = None) -> Iterator[torch.device]:
     finally:
         torch.Generator = generator  # type: ignore[misc]
         _order = None
+
+
+@contextmanager
+def counted_synchronizations() -> Iterator[Counter[str]]:
+    """Count what makes the host wait for the card, by operation."""
+    found: Counter[str] = Counter()
+    _counted.append(found)
+    try:
+        yield found
+    finally:
+        _counted.remove(found)
 
 
 @cache
@@ -179,7 +201,9 @@ def _compute(op: Any, *args: Any, **kwargs: Any) -> Any:
         raise NotImplementedError(f"the pretended card cannot follow {name}, which changes the shape of a tensor")
     on_card = isinstance(args[0], CardTensor) if name == "aten::copy_" else bool(ours)
     if on_card if device is None else _is_card(device):
-        out = pytree.tree_map(lambda x: CardTensor(x) if isinstance(x, Tensor) else x, out)
+        # As CUDA does without a number: what is made is on the first card.
+        index = (torch.device(device).index or 0) if device is not None else _card_of(args, ours)
+        out = pytree.tree_map(lambda x: CardTensor(x, index) if isinstance(x, Tensor) else x, out)
     return return_and_correct_aliasing(op, args, kwargs, out) if ours else out
 
 
@@ -188,10 +212,40 @@ def _check(name: str, args: Sequence[Any], leaves: Sequence[Any], ours: Sequence
     for x in leaves:
         if isinstance(x, torch._C.Generator):
             check_generator(_generators.get(x._cdata, torch.device("cpu")), torch.device(device))
+    if ours and (name in SYNCHRONIZES or _leaves(name, args, device) or _indexes_by_mask(name, args)):
+        _count(name)
     if ours:
+        check_supported(name, ours)
         foreign = [x for x in leaves if isinstance(x, Tensor) and not isinstance(x, CardTensor)]
-        check_devices(name, args, foreign)
+        check_devices(name, args, ours, foreign)
         check_determinism(name, args, ours)
+
+
+def _count(name: str) -> None:
+    for found in _counted:
+        found[name] += 1
+
+
+def _leaves(name: str, args: Sequence[Any], device: Any) -> bool:
+    """Whether this is a copy from the card to the processor."""
+    if name == "aten::copy_":
+        return not isinstance(args[0], CardTensor)
+    return name == "aten::_to_copy" and not _is_card(device)
+
+
+def _indexes_by_mask(name: str, args: Sequence[Any]) -> bool:
+    """Whether an operation must know how many entries of a mask are set."""
+    if name not in ("aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"):
+        return False
+    if name != "aten::index" and args[2].numel() == 1 and not any(args[3:4]):
+        return False  # the card fills where the mask is set
+    return any(isinstance(x, Tensor) and x.dtype in (torch.bool, torch.uint8) for x in args[1])
+
+
+def _card_of(args: Sequence[Any], ours: Sequence[Tensor]) -> int:
+    """Return the number of the card that a result is on: the target's of a copy, else the arguments'."""
+    target = args[0] if args and isinstance(args[0], CardTensor) else ours[0]
+    return target.device.index or 0
 
 
 def _is_card(device: Any) -> bool:

@@ -8,8 +8,28 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["check_determinism", "check_devices", "check_generator", "shuffled_additions"]
+__all__ = [
+    "SYNCHRONIZES",
+    "check_determinism",
+    "check_devices",
+    "check_generator",
+    "check_supported",
+    "shuffled_additions",
+]
 
+SYNCHRONIZES = frozenset(
+    f"aten::{name}"
+    for name in (
+        "_local_scalar_dense", "equal", "is_nonzero", "masked_select", "nonzero", "unique_dim",
+        "_unique", "_unique2", "unique_consecutive", "repeat_interleave", "bincount",
+    )
+)  # fmt: skip
+"""What makes the host wait for the card: a number is read, or the shape of a result depends on numbers."""
+LARGEST_EIGH_BATCH = 32_768
+"""cuSOLVER's batched solver fails beyond some tens of thousands of 3x3 matrices, with an internal error."""
+
+_PRODUCTS = {f"aten::{name}" for name in ("mm", "bmm", "addmm", "baddbmm", "mv", "addmv", "dot", "vdot", "addbmm")}
+_EIGEN = {f"aten::{name}" for name in ("linalg_eigh", "_linalg_eigh", "_linalg_eigh.eigenvalues")}
 _CROSSING = {"aten::copy_", "aten::_to_copy"}
 _INDEXING = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"}
 _NO_NUMBERS_FROM_ELSEWHERE = {"aten::cat", "aten::stack", "aten::_fused_adam_"}
@@ -33,21 +53,42 @@ _NEVER_THE_SAME_WITH_A_DIMENSION = {"aten::median", "aten::nanmedian"}
 _ATOMIC = {"aten::index_add", "aten::index_add_"}  # with (self, dimension, index, source) as arguments
 
 
-def check_devices(name: str, args: Sequence[Any], foreign: Sequence[Tensor]) -> None:
+def check_devices(name: str, args: Sequence[Any], ours: Sequence[Tensor], foreign: Sequence[Tensor]) -> None:
     """Refuse to mix devices, but for what CUDA takes from the processor: copies, indices and single numbers.
 
     Args:
         name: of the operation.
         args: its positional arguments.
+        ours: the tensors on the card among its arguments.
         foreign: tensors among its arguments that are not on the card, while others are.
     """
     if name in _CROSSING:
         return
+    if len(cards := {x.device.index for x in ours}) > 1:
+        raise RuntimeError(f"{name}: expected all tensors to be on the same device, found cards {sorted(cards)}")
     indices = args[1] if name in _INDEXING else ()
     for x in foreign:
         single = x.dim() == 0 and name not in _NO_NUMBERS_FROM_ELSEWHERE
         if not single and not any(x is index for index in indices):
             raise RuntimeError(f"{name}: expected all tensors to be on the same device, found the card and {x.device}")
+
+
+def check_supported(name: str, ours: Sequence[Tensor]) -> None:
+    """Refuse what CUDA has no kernel for: products of whole numbers, and eigenvalues of very many matrices.
+
+    Args:
+        name: of the operation.
+        ours: the tensors on the card among its arguments.
+    """
+    if name in _PRODUCTS and not (ours[0].is_floating_point() or ours[0].is_complex()):
+        raise RuntimeError(f'"addmm_cuda" not implemented for {ours[0].dtype}')
+    if name in _EIGEN:
+        if ours[0].dtype in (torch.float16, torch.bfloat16):
+            raise RuntimeError(f'"linalg_eigh_cuda" not implemented for {ours[0].dtype}')
+        if ours[0].shape[:-2].numel() > LARGEST_EIGH_BATCH:
+            raise RuntimeError(
+                f"cusolver error: CUSOLVER_STATUS_INVALID_VALUE, for a batch of {ours[0].shape[:-2].numel()}"
+            )
 
 
 def check_generator(where: torch.device, device: torch.device) -> None:

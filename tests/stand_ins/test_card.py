@@ -2,8 +2,9 @@
 
 import pytest
 import torch
-from stand_ins.card import pretended_card
+from stand_ins.card import counted_synchronizations, pretended_card
 
+from ca_reg import GaussianDropout, OpacityNoise
 from reference_trainer.training.determinism import deterministic
 
 
@@ -41,6 +42,75 @@ def test_views_share_their_numbers(card):
 def test_devices_do_not_mix(card, mix):
     with pytest.raises(RuntimeError, match="expected all tensors to be on the same device"):
         mix(on(card, 2))
+
+
+def test_a_second_card_is_another_device(card):
+    one, other = on(card, 3), on("card:1", 3)
+    assert (other.device.index, (2 * other).device.index, other.new_tensor([1.0]).device.index) == (1, 1, 1)
+    with pytest.raises(RuntimeError, match=r"same device, found cards \[0, 1\]"):
+        one + other
+    assert (one + other.to(card)).tolist() == [2, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("call", "refusal"),
+    [
+        (lambda x: x.int() @ x.int(), "addmm_cuda"),
+        (lambda x: x.long()[None] @ x.long()[None], "addmm_cuda"),
+        (lambda x: torch.linalg.eigvalsh(x.expand(40_000, 3, 3).contiguous()), "CUSOLVER"),
+        (lambda x: torch.linalg.eigh(x.half()), "linalg_eigh_cuda"),
+    ],
+)
+def test_what_has_no_kernel_is_refused(card, call, refusal):
+    with pytest.raises(RuntimeError, match=refusal):
+        call(torch.eye(3, device=card))
+
+
+def test_eigenvalues_are_there_for_batches_that_cusolver_takes(card):
+    assert torch.linalg.eigvalsh(torch.eye(3, device=card).expand(100, 3, 3).contiguous()).sum().item() == 300
+
+
+@pytest.mark.parametrize(
+    ("call", "waits"),
+    [
+        (lambda x: x.sum().item(), 1),
+        (lambda x: bool(x.any()), 1),
+        (lambda x: x.tolist(), 1),
+        (lambda x: x.cpu(), 1),
+        (lambda x: torch.ones(3).copy_(x), 1),
+        (lambda x: x.nonzero(), 1),
+        (lambda x: x[x > 0], 1),
+        (lambda x: x.unique(), 1),
+        (lambda x: torch.equal(x, x), 1),
+        (lambda x: x.masked_fill(x > 0, 0), 0),
+        (lambda x: x.__setitem__(x > 0, 0), 0),
+        (lambda x: (x * 2).where(x > 0, x).to(torch.float64).sum(), 0),
+        (lambda x: x[torch.zeros(2, dtype=torch.long, device=x.device)], 0),
+    ],
+)
+def test_waiting_for_the_card_is_counted(card, call, waits):
+    x = on(card, 3)
+    with counted_synchronizations() as found:
+        call(x)
+    assert found.total() == waits, found
+    call(x)
+    assert found.total() == waits
+
+
+@pytest.mark.parametrize("make", [lambda: GaussianDropout(0.2), lambda: OpacityNoise(0.8)])
+def test_a_warm_step_of_a_regularizer_does_not_wait_for_the_card(card, make):
+    module, opacity, radii = make(), torch.full((50, 1), 0.5, device=card), on(card, 50)
+
+    def step():
+        out = module(opacity.clone().requires_grad_())
+        out.sum().backward()
+        if isinstance(module, GaussianDropout):
+            module.mask_radii(radii)
+
+    step()
+    with counted_synchronizations() as found:
+        step()
+    assert not found, found
 
 
 def test_what_cuda_takes_from_the_processor(card):
