@@ -1,29 +1,171 @@
-"""What the README promises exists."""
+"""The examples of the README run in the form in which they stand there.
 
-import ast
+Its two commands at the top are what `.ci/run` begins with.
+"""
 
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+import textwrap
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
+import torch
+from launched import FILES
 from pages import ROOT, blocks
+from PIL import Image
+from stand_ins import gsplat as gsplat_stand_in
+from subprocesses import subprocess_environment
+
+from reference_trainer.cli import main
+from reference_trainer.scenes import synthetic_scene
 
 README = ROOT / "README.md"
+PYTHON = dict(zip(("two lines", "chain", "gsplat", "score"), blocks(README, "python"), strict=True))
+COMMANDS = [
+    shlex.split(line, comments=True)
+    for block in blocks(README, "bash")
+    for line in block.splitlines()
+    if line.startswith(("ca-reg", "python"))
+]
+QUICK = {
+    "train": ["--iterations", "4", "--images", "images"],
+    "compare": ["--iterations", "2", "--images", "images"],
+}
 
 
-@pytest.mark.parametrize("code", blocks(README, "python"))
-def test_python_blocks_parse_and_their_imports_work(code):
-    tree = ast.parse(code)
-    imports = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
-    assert imports
-    exec(compile(ast.Module(imports, type_ignores=[]), "README.md", "exec"), {})
+def run(example, **names):
+    """Run a block of Python, with the reader's own names; return all names."""
+    exec(compile(PYTHON[example], f"README.md, {example}", "exec"), names)
+    return SimpleNamespace(**names)
 
 
-def test_two_lines_do_what_the_readme_says():
-    import torch
+@pytest.fixture
+def gaussians():
+    return SimpleNamespace(get_opacity=torch.full((1000, 1), 0.5, requires_grad=True))
 
-    from ca_reg import GaussianDropout
 
-    dropout = GaussianDropout(p=0.2)
-    opacity = dropout(torch.full((1000, 1), 0.5))
-    radii = dropout.mask_radii(torch.ones(1000, dtype=torch.int32))
-    assert torch.equal(radii == 0, opacity.squeeze(1) == 0)
-    assert 0 < (radii == 0).sum() < 1000
-    assert torch.equal(dropout.eval()(torch.full((1000, 1), 0.5)), torch.full((1000, 1), 0.4))
+def test_two_lines(gaussians):
+    found = run("two lines", gaussians=gaussians, radii=torch.ones(1000, dtype=torch.int32))
+    assert torch.equal(found.radii == 0, found.opacity.squeeze(1) == 0)
+    assert 0 < (found.radii == 0).sum() < 1000
+    scaled = found.dropout.eval()(gaussians.get_opacity)
+    assert torch.equal(scaled, torch.full((1000, 1), 0.4))
+
+
+def test_the_chain_drops_and_leaves_the_global_random_state_alone(gaussians):
+    before = torch.random.get_rng_state()
+    generator = torch.Generator().manual_seed(0)
+    found = run("chain", gaussians=gaussians, radii=torch.ones(1000), step=5_000, generator=generator)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    dropped = found.opacity.squeeze(1) == 0
+    assert torch.equal(found.radii == 0, dropped)
+    assert dropped.float().mean() == pytest.approx(0.1, abs=0.05)  # half-way up the ramp
+    assert found.opacity[~dropped].unique().numel() > 800  # and noise on the others
+
+
+def test_gsplat(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", gsplat_stand_in)
+    rasterization = run("gsplat").rasterization
+    means, opacities = torch.rand(400, 3), torch.full((400,), 0.5, requires_grad=True)
+    view, k = torch.eye(4)[None], torch.tensor([[[32.0, 0, 16], [0, 32, 16], [0, 0, 1]]])
+    view[0, 2, 3] = 2
+    scales, quats = torch.full((400, 3), 0.05), torch.tensor([[1.0, 0, 0, 0]]).expand(400, 4)
+    _, _, info = rasterization(means, quats, scales, opacities, torch.rand(400, 3), view, k, 32, 32, packed=False)
+    bare = gsplat_stand_in.rasterization(
+        means, quats, scales, opacities, torch.rand(400, 3), view, k, 32, 32, packed=False
+    )[2]
+    shown, all_shown = ((x["radii"][0] > 0).all(-1) for x in (info, bare))
+    assert 0 < (all_shown & ~shown).sum() < 0.5 * all_shown.sum()
+
+
+def test_the_score(gaussians, capsys):
+    """One pixel behind each Gaussian: with half of them left out, its variance is on average (0.5 / 2)^2."""
+
+    def rasterize(of, opacity, view):
+        assert of is gaussians
+        return opacity.view(1, 25, 40).expand(3, -1, -1), opacity.view(25, 40)
+
+    found = run("score", gaussians=gaussians, rasterize=rasterize, view=None)
+    value, std_error = (float(x) for x in capsys.readouterr().out.split()[:2])
+    assert (value, std_error) == pytest.approx((found.result.value, found.result.std_error))
+    assert value > 0
+
+
+def camera_file(scene):
+    """Write the cameras of views as transforms.json has them, OpenGL and camera to world."""
+    frames = []
+    for view in scene.train:
+        pose, camera = np.linalg.inv(view.camera.world_to_camera.double().numpy()), view.camera
+        pose[:, 1:3] *= -1
+        frames.append({"file_path": f"images/{view.name}.png", "transform_matrix": pose.tolist(), "fl_x": camera.fx,
+                       "w": camera.width, "h": camera.height})  # fmt: skip
+    return json.dumps({"frames": frames})
+
+
+@pytest.fixture(params=["built in", pytest.param("fern", marks=pytest.mark.data)])
+def my_photos(request, tmp_path, monkeypatch):
+    """A folder of three photographs: with cameras, or real ones without."""
+    folder = tmp_path / "my_photos" / "images"
+    folder.mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    if request.param == "fern":
+        pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
+        source = request.getfixturevalue("data_root") / "fern" / "images_8"
+        for name in ("image001.png", "image010.png", "image019.png"):
+            shutil.copy(source / name, folder)
+        return tmp_path
+    scene = synthetic_scene(width=48, height=36)
+    for view in scene.train:
+        pixels = (view.image.permute(1, 2, 0) * 255).round().byte().numpy()
+        Image.fromarray(pixels).save(folder / f"{view.name}.png")
+    (folder.parent / "transforms.json").write_text(camera_file(scene))
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_from_photographs_to_a_page(my_photos, capsys):
+    """Every command for photographs, one after the other, with few steps; what waits for a browser is left out."""
+    for _, *arguments in (command for command in COMMANDS if command[0] == "ca-reg"):
+        name = arguments[0]
+        if name == "view" or (name == "poses" and (my_photos / "my_photos/transforms.json").exists()):
+            continue
+        if name == "evaluate":  # a model trained without dropout, for `clean` too
+            shutil.copy(my_photos / "runs/compare/baseline/seed_0/point_cloud.ply", my_photos)
+        main([*arguments, *QUICK.get(name, [])])
+    assert (my_photos / "runs/mine/point_cloud.ply").is_file()
+    assert list((my_photos / "runs/mine").glob("*.html"))
+    assert "dropout" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_launcher(tmp_path):
+    """The line for the INRIA family, on a code base with its layout."""
+    (_, *arguments), *_ = [command for command in COMMANDS if "train.py" in command]
+    for name, text in FILES.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(textwrap.dedent(text).replace("int(sys.argv[1])", "3"))
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=tmp_path, env=subprocess_environment(), capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "argv ['-s', 'my_scene']" in done.stdout
+    assert "GaussianDropout" in done.stderr
+
+
+def test_the_citation_is_that_of_the_package():
+    import ca_reg
+
+    text = (ROOT / "CITATION.cff").read_text("utf-8")
+    assert f"\nversion: {ca_reg.__version__}\n" in text
+    (bibtex,) = blocks(README, "bibtex")
+    title = "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian Splatting"
+    assert title in text
+    assert title in bibtex
+    authors = ("Chen, Kangjie", "Zhong", "Li, Z", "Lin, J", "Chen, Youyu", "Qin", "Wang")
+    assert sorted(authors, key=bibtex.index) == list(authors)
