@@ -17,7 +17,7 @@ from torch import nn
 
 from ca_reg import GaussianDropout, OpacityNoise
 from ca_reg.functional import apply_dropout
-from ca_reg.integrations._tally import Skip
+from ca_reg.integrations._report import Skip
 from ca_reg.integrations.gsplat import Installation, install, regularized, unregularized
 from ca_reg.schedules import StartStop
 

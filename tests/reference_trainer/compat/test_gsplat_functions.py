@@ -8,7 +8,7 @@ from oracles import random_scene
 from stand_ins.gsplat import intrinsics
 
 from reference_trainer.compat import stand_in
-from reference_trainer.compat.gsplat_functions import quat_scale_to_covar_preci
+from reference_trainer.compat.gsplat import quat_scale_to_covar_preci
 
 gsplat = pytest.importorskip("gsplat")
 N, WIDTH, HEIGHT = 80, 24, 18
