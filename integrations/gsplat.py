@@ -14,15 +14,17 @@ import functools
 import importlib
 import inspect
 import itertools
+import re
 from collections.abc import Callable, MutableMapping
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
-from ._call import Call, chain_of
-from ._hook import Hook
-from ._tally import Tally
+from ca_reg._random import seeded
+
+from ._calls import Call, chain_of
+from ._report import Hook, Tally
 
 __all__ = ["Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized"]
 
@@ -30,6 +32,8 @@ Rasterization = Callable[..., tuple[Any, ...]]
 """``gsplat.rasterization``, or a function with its arguments that returns its ``info`` last."""
 
 _HOLDERS = ("gsplat", "gsplat.rendering")  # the public modules that scripts import the functions from
+_OLDEST = (1, 4)
+_EVIDENCE = 10.0  # expected number of dropped Gaussians in a list, of which none was there; e^-10 by chance
 
 
 def regularized(
@@ -77,7 +81,7 @@ def regularized(
     return Regularized(rasterization, regularizer, generator)
 
 
-class _Call(Call):
+class _GsplatCall(Call):
     """A call of ``gsplat.rasterization``."""
 
     names: ClassVar = {"quaternions": "quats", "sh": "colors"}
@@ -114,19 +118,19 @@ class Regularized:
         if isinstance(rasterization, Regularized):
             raise ValueError(
                 "this rasterization is regularized already, and opacities would be dropped twice: compose regularizers "
-                "with nn.Sequential, or take its .rasterization."
+                "with Chain, or take its .rasterization."
             )
         self.chain = chain_of(regularizer)
         self._signature = inspect.signature(rasterization)
         if "opacities" not in self._signature.parameters:
             raise TypeError(f"expected gsplat.rasterization, got {rasterization!r}, which has no argument opacities.")
-        _Call.check(self.chain, self._signature)
+        _GsplatCall.check(self.chain, self._signature)
         self.rasterization = rasterization
         self.regularizer = regularizer
         self.tally = Tally() if hook is None else hook.tally
         self._generator = generator
         self._hook = hook
-        self._packed_is_safe = False
+        self._missed = 0.0  # dropped Gaussians that a packed list could have held, and did not
         # Graph break in compiled callers. On the class, so that instances can be pickled; here, as it imports dynamo.
         if Regularized._eager is None:
             Regularized._eager = torch.compiler.disable(Regularized._rasterize)  # type: ignore[no-untyped-call]
@@ -144,7 +148,7 @@ class Regularized:
 
     def _rasterize(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, trains: bool) -> tuple[Any, ...]:
         """Rasterize in training mode if ``trains`` and gradients reach the opacities, else in evaluation mode."""
-        call = _Call(self.rasterization, self._signature.bind(*args, **kwargs))
+        call = _GsplatCall(self.rasterization, self._signature.bind(*args, **kwargs))
         opacities: Tensor = call.arguments["opacities"]
         trains = trains and torch.is_grad_enabled() and opacities.requires_grad
         keep = None
@@ -153,12 +157,12 @@ class Regularized:
         else:
             if self._hook is not None:
                 self.chain.set_step(next(self._hook.steps))
-            keep = call.train(self.chain, self.chain.step, self.tally, self._generator)
+            generator = self._generator if self._hook is None else self._hook.generator(opacities.device)
+            keep = call.train(self.chain, self.chain.step, self.tally, generator)
             if self._hook is not None:
                 self._hook.note_regularized()
         *images, info = call()
-        # Distributed calls exchange Gaussians between ranks, after gsplat (from 1.5 on) has culled those of opacity 0.
-        if keep is not None and not call.arguments.get("distributed"):
+        if keep is not None:  # on several GPUs, too: info holds this rank's Gaussians, in the cameras of all ranks
             self._hide_dropped(info, keep.view(opacities.shape))
         return (*images, info)
 
@@ -174,17 +178,19 @@ class Regularized:
         if gaussians is None:
             per_camera = keep.unsqueeze(-2)  # [..., 1, N]
             info["radii"] = radii * (per_camera if radii.ndim == per_camera.ndim else per_camera.unsqueeze(-1))
-        elif not self._packed_is_safe:
-            # Checked once: the check synchronizes a GPU, and its outcome depends on the version of gsplat only.
+        elif self._missed < _EVIDENCE:
+            # A matter of gsplat's version alone. The check synchronizes a GPU, so it ends once draws have dropped so
+            # many Gaussians that some would have been listed; a draw that drops none says nothing.
             batches = info.get("batch_ids")
-            listed = gaussians if batches is None else batches * keep.shape[-1] + gaussians
-            if not bool(keep.reshape(-1)[listed.long()].all()):
+            listed = (gaussians if batches is None else batches * keep.shape[-1] + gaussians).long()
+            kept, share = int(keep.reshape(-1)[listed].sum()), float(keep.float().mean())
+            if kept < len(listed):
                 raise RuntimeError(
                     "this rasterization lists Gaussians of opacity 0 in packed mode, as gsplat before 1.5 and "
                     "rasterization_2dgs do, and density control would count them as seen: pass packed=False, or, for "
                     "gsplat.rasterization, install gsplat>=1.5."
                 )
-            self._packed_is_safe = True
+            self._missed += kept * (1 - share) / max(share, 1e-6)
 
 
 class Installation(Hook):
@@ -211,9 +217,6 @@ class Installation(Hook):
     def install(self) -> Self:
         """Replace the functions, as :func:`install`."""
         load_gsplat()
-        if self._seed is not None:
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-            self._generator = torch.Generator(device).manual_seed(self._seed)
         found = {
             (holder, name): function
             for holder in _HOLDERS
@@ -229,6 +232,17 @@ class Installation(Hook):
         self._replaced, self.rasterization = found, self.functions["rasterization"]
         self._watch()
         return self
+
+    def generator(self, device: torch.device) -> torch.Generator | None:
+        """Return the source of the draws, made at the first call: by then it is known which rank this is."""
+        if self._generator is None and self._seed is not None:
+            distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
+            rank = torch.distributed.get_rank() if distributed else 0
+            # Each rank trains Gaussians of its own, so it needs masks of its own.
+            self._generator = (
+                seeded(self._seed, rank, device=device) if rank else torch.Generator(device).manual_seed(self._seed)
+            )
+        return self._generator
 
     def uninstall(self) -> None:
         """Restore the original functions; a second call does nothing."""
@@ -277,13 +291,21 @@ def install(regularizer: nn.Module, *, generator: torch.Generator | None = None,
 
 
 def load_gsplat(device: torch.device | None = None) -> Any:
-    """Return the module ``gsplat``; raise ImportError without it, RuntimeError if it cannot render on ``device``."""
+    """Return the module ``gsplat``; raise ImportError without one of 1.4 or newer, RuntimeError on another device."""
     if device is not None and device.type != "cuda":
         raise RuntimeError(f"gsplat renders on CUDA devices only, and the Gaussians are on {device}: move them there.")
     try:
-        return importlib.import_module("gsplat")
+        gsplat = importlib.import_module("gsplat")
     except ModuleNotFoundError as error:
         raise ImportError("this needs gsplat: pip install 'ca_reg[gsplat]' (and a CUDA device to run it).") from error
+    version = str(getattr(gsplat, "__version__", ""))
+    number = [int(part) for part in re.findall(r"\d+", version)[:2]]
+    if not hasattr(gsplat, "rasterization") or (number and number < [*_OLDEST]):
+        raise ImportError(
+            f"gsplat {version} is too old: 1.4 was the first whose rasterization can be regularized. Install "
+            "gsplat>=1.4; a script that was written for an older one may need changes of its own."
+        )
+    return gsplat
 
 
 def unregularized(rasterization: Rasterization) -> Rasterization:

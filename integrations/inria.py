@@ -1,15 +1,15 @@
-"""Regularize code bases derived from the INRIA 3DGS code: one hook on their rasterizer, no edits.
+"""Code bases derived from the INRIA 3DGS code: one hook on their rasterizer regularizes them, with no edits.
 
 3DGS, DNGaussian, FSGS, CoR-GS, Binocular3DGS, MVGS, AbsGS, DropGaussian and the paper's own code have one thing in
 common: they pass activated opacities to ``GaussianRasterizer``, and derive visibility from the radii it returns.
-:class:`RasterizerHook` wraps its ``forward``. :func:`ca_reg.integrations.inria_score.render_fn` makes such models
-scorable, and ``python -m ca_reg.integrations.run`` hooks a training script without editing it.
+:class:`RasterizerHook` wraps its ``forward``. :func:`render_fn` makes such models scorable, and ``python -m
+ca_reg.integrations.run`` hooks a training script without editing it.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, Literal, Self, get_args
 
 import torch
@@ -18,17 +18,23 @@ from torch import Tensor, nn
 from ca_reg._check import check_count
 from ca_reg._random import seeded
 from ca_reg.chain import Foreign
+from ca_reg.types import RenderFn, Rendering, read_rendering
 
-from ._call import chain_of
-from ._caller import calling_render, find_instance, is_viewer, refuse_a_second_regularizer
-from ._hook import Hook
-from ._iterations import Field, Iterations, Steps, leaf_of
-from ._override import is_overridden
-from ._rasterizer import RASTERIZERS, ForwardCall, check_installed, hide_dropped
-from ._tally import Skip
-from ._wrapped import Wrapped
+from ._calls import (
+    RASTERIZERS,
+    CallSite,
+    RasterizerCall,
+    chain_of,
+    check_installed,
+    hide_dropped,
+    rasterizer_classes,
+    white_alpha,
+)
+from ._patching import PatchedClasses, is_overridden, override
+from ._report import Hook, Skip
+from ._steps import Iterations, ModelSteps, Steps, leaf_of
 
-__all__ = ["DEFAULT_MODEL", "RasterizerHook", "Scope", "Steps"]
+__all__ = ["DEFAULT_MODEL", "RasterizerHook", "Scope", "Steps", "render_fn"]
 
 Scope = Literal["main", "all"]
 """Which training renders of an iteration are regularized: the first of every model and further ones from the same place
@@ -36,6 +42,7 @@ in the script (a batch), or all; always with the same mask."""
 
 DEFAULT_MODEL = "scene.gaussian_model:GaussianModel"
 _MANY_ZEROS = 1e-3  # share of zero opacities beyond what rounding explains
+_ZEROS_EVERY = 128  # renders on a GPU after which that share is read
 
 
 class RasterizerHook(Hook):
@@ -128,8 +135,10 @@ class RasterizerHook(Hook):
         self._viewer = viewer
         self._allow_zeros = allow_zeros
         self._iterations = Iterations(steps, self.note_lost)
-        self._wrapped: Wrapped | None = None
+        self._patched: PatchedClasses | None = None
         self._hooked: list[str] = []  # names of the classes, for messages
+        self._zeros: Tensor | None = None  # largest share of zero opacities since it was last read
+        self._counted = 0  # renders whose zeros were counted
 
     def install(self) -> Self:
         """Wrap the rasterizers, now or once they are imported; return the hook.
@@ -140,20 +149,20 @@ class RasterizerHook(Hook):
             TypeError: if the rasterizer is not of the INRIA family.
             ValueError: if it does not take what the regularizer needs.
         """
-        if self._wrapped is not None:
+        if self._patched is not None:
             raise RuntimeError("this hook is installed already; uninstall it first.")
         if self._rasterizer is None:
             check_installed((*self._rasterizers, *self._candidates))
-        self._wrapped = Wrapped(
+        self._patched = PatchedClasses(
             self._rasterizers,
             self._candidates,
             self._models,
             rasterize=self._rasterize,
             update=self._iterations.update,
-            check=functools.partial(ForwardCall.check, self._chain),
+            check=functools.partial(RasterizerCall.check, self._chain),
         )
         try:
-            self._wrapped.start()
+            self._patched.start()
             self._watch()
         except BaseException:
             self.uninstall()
@@ -166,20 +175,24 @@ class RasterizerHook(Hook):
         Raises:
             RuntimeError: if the hook is not installed, or the classes were wrapped again since; nothing changes then.
         """
-        if self._wrapped is None:
+        if self._patched is None:
             raise RuntimeError("this hook is not installed.")
-        self._wrapped.check_removable()
-        self._hooked = self._wrapped.names
+        self._patched.check_removable()
+        self._hooked = self._patched.names
         self._unwatch()
-        self._wrapped.stop()
-        self._wrapped = None
+        self._patched.stop()
+        self._patched = None
 
     def step(self, step: int) -> None:
         """Begin a training step, counted from 1; from then on ``update_learning_rate`` is ignored."""
         self._iterations.step(step)
 
+    def problem(self) -> str | None:
+        """Describe a failure to regularize and its remedy, as every hook does, or a second dropout; else None."""
+        return self._double_dropout() or super().problem()
+
     def _explain(self) -> str:
-        names = self._hooked if self._wrapped is None else self._wrapped.names
+        names = self._hooked if self._patched is None else self._patched.names
         hooked = " and ".join(names) or "nothing, because no known rasterizer was imported"
         return (
             f"Hooked is {hooked}; so far: {'; '.join(self.tally.lines())}. If the training renders with another class, "
@@ -188,35 +201,37 @@ class RasterizerHook(Hook):
             "meant, raise patience (--patience; 0 for any number). Without --dropout and --noise the script runs plain."
         )
 
-    def _rasterize(self, call: ForwardCall) -> Any:
+    def _rasterize(self, call: RasterizerCall) -> Any:
         """Classify a call of the rasterizer, and make it accordingly."""
         if is_overridden():
             return self._leave(call, Skip.SCORE)
         means, opacities = call.arguments["means3D"], call.arguments["opacities"]
-        render, place = calling_render()
-        model = None if self._wrapped is None else find_instance(render, self._wrapped.models)
-        if not torch.is_grad_enabled() or is_viewer(render, self._viewer):
-            refuse_a_second_regularizer(render, self._chain)
+        site = CallSite.find()
+        model = None if self._patched is None else site.find_instance(self._patched.models)
+        if not torch.is_grad_enabled() or site.is_viewer(self._viewer):
+            site.refuse_a_second_regularizer(self._chain)
             return self._evaluate(call, self._iterations.evaluation_step(means if model is None else model))
         if not opacities.requires_grad:
             return self._leave(call, Skip.CONSTANT_OPACITY)
         if not means.requires_grad:
             return self._leave(call, Skip.DETACHED_MEANS)
         parameters = tuple(x for x in (means if means.is_leaf else None, leaf_of(opacities)) if x is not None)
-        # Without a model, a parameter identifies the field; without either, all calls belong to one field.
-        field = self._iterations.field(model if model is not None else parameters[0] if parameters else self)
-        if not field.count_render(parameters, place) and self._scope == "main":
+        # Without a model, a parameter takes its place; without either, all calls belong to one model.
+        steps = self._iterations.steps_of(model if model is not None else parameters[0] if parameters else self)
+        if not steps.count_render(parameters, site.place) and self._scope == "main":
             return self._leave(call, Skip.FURTHER_VIEW)
-        refuse_a_second_regularizer(render, self._chain)
-        self._refuse_zeros(opacities)
-        return self._train(call, field)
+        site.refuse_a_second_regularizer(self._chain)
+        del site  # holds the variables of the caller
+        if self._chain.drops and not self._allow_zeros:
+            self._count_zeros(opacities)
+        return self._train(call, steps)
 
-    def _leave(self, call: ForwardCall, reason: Skip) -> Any:
+    def _leave(self, call: RasterizerCall, reason: Skip) -> Any:
         """Make a call unchanged."""
         self.tally.skipped[reason] += 1
         return call()
 
-    def _evaluate(self, call: ForwardCall, step: int) -> Any:
+    def _evaluate(self, call: RasterizerCall, step: int) -> Any:
         """Make a call with the test-time values."""
         call.evaluate(self._chain, step, self.tally)
         opacities: Tensor = call.arguments["opacities"]
@@ -225,29 +240,39 @@ class RasterizerHook(Hook):
             opacities.register_hook(self._refuse_to_train_on_a_viewer)  # type: ignore[no-untyped-call]
         return call()
 
-    def _train(self, call: ForwardCall, field: Field) -> Any:
+    def _train(self, call: RasterizerCall, steps: ModelSteps) -> Any:
         """Make a call with regularized Gaussians, and hide the dropped ones from densification."""
-        step = field.training_step
+        step = steps.training_step
         # The same seed for every render of an iteration, so that all drop the same Gaussians.
-        generator = seeded(self._seed, field.index, step, device=call.arguments["opacities"].device)
+        generator = seeded(self._seed, steps.index, step, device=call.arguments["opacities"].device)
         self._chain.train().set_step(step)
         keep = call.train(self._chain, step, self.tally, generator)
         self.note_regularized()
         returned = call()
         return returned if keep is None else hide_dropped(returned, keep)
 
-    def _refuse_zeros(self, opacities: Tensor) -> None:
-        """Raise if Gaussians arrive dropped: activated opacities are above 0."""
-        if self._allow_zeros or not self._chain.drops:
-            return
-        zeros = int((opacities.detach() == 0).sum())
-        if zeros > _MANY_ZEROS * opacities.numel():
-            raise RuntimeError(
-                f"Gaussians would be dropped twice: {zeros} of {opacities.numel()} opacities of a training render are "
-                "0 already, which is a dropout of the code base's own (DropGaussian has one that cannot be switched "
-                "off). Switch it off, or leave out GaussianDropout (--dropout) here. If these zeros are something "
-                "else: allow_zeros=True, in the launcher --allow-zeros."
-            )
+    def _count_zeros(self, opacities: Tensor) -> None:
+        """Note the share of Gaussians that arrive dropped; activated opacities are above 0."""
+        zeros = (opacities.detach() == 0).float().mean()
+        self._zeros = zeros if self._zeros is None else torch.maximum(self._zeros, zeros.to(self._zeros.device))
+        self._counted += 1
+        # Reading it waits for the device. A dropout of the code base's own may begin late and with a small rate
+        # (DropGaussian), so the first renders are not enough.
+        due = self._counted.bit_count() == 1 or self._counted % _ZEROS_EVERY == 0
+        if (due or zeros.device.type == "cpu") and (problem := self._double_dropout()):
+            raise RuntimeError(problem)
+
+    def _double_dropout(self) -> str | None:
+        """Describe a dropout of the code base's own, if too many opacities were 0 since the last call; else None."""
+        share, self._zeros = 0.0 if self._zeros is None else float(self._zeros), None
+        if share <= _MANY_ZEROS:
+            return None
+        return (
+            f"Gaussians would be dropped twice: {share:.2%} of the opacities of a training render are 0 already, which "
+            "is a dropout of the code base's own (DropGaussian has one that cannot be switched off). Switch it off, or "
+            "leave out GaussianDropout (--dropout) here. If these zeros are something else: allow_zeros=True, in the "
+            "launcher --allow-zeros."
+        )
 
     def _refuse_to_train_on_a_viewer(self, gradient: Tensor) -> None:
         """Raise: a gradient arrived from a render taken for a viewer's."""
@@ -256,3 +281,58 @@ class RasterizerHook(Hook):
             "viewer, so that it was scaled and not regularized. If the training views are of this class, say that "
             "there is no viewer: viewer=None, in the launcher --viewer none."
         )
+
+
+def render_fn(
+    render: Callable[..., Any], gaussians: Any, pipe: Any, background: Tensor, *, rasterizer: type | None = None
+) -> RenderFn:
+    """Turn the ``render`` of an INRIA-style code base into a render callable for :class:`ca_reg.CAScore`.
+
+    The opacities are replaced on their way into the rasterizer, so neither the model nor ``render`` is modified, and a
+    :class:`RasterizerHook` leaves these renders alone. Image and alpha are those that
+    ``render`` returns, the alpha if it is named (the paper's code, Binocular3DGS, CoR-GS, DNGaussian). Else a second
+    pass with the same opacities measures it, white on black: a depth is never mistaken for an alpha.
+
+    Args:
+        render: ``render(view, gaussians, pipe, background)`` of the code base.
+        gaussians: its model.
+        pipe: its pipeline settings.
+        background: color, shape (3,).
+        rasterizer: the class that ``render`` uses; by default the installed ones.
+
+    Returns:
+        A callable ``(opacity, view) -> Rendering(image (3, H, W), alpha (H, W))``.
+
+    Raises:
+        ImportError: when called, if no rasterizer is installed and none was given.
+        RuntimeError: when called, if ``render`` does not call the rasterizer exactly once.
+        ValueError: when called, if ``render`` does not rasterize as many Gaussians as there are opacities, or returns
+            no alpha and the rasterizer takes no ``colors_precomp``.
+
+    Example:
+        >>> from ca_reg import CAScore
+        >>> class GaussianRasterizer(torch.nn.Module):
+        ...     def forward(self, means3D, means2D, opacities):
+        ...         return opacities.mean().expand(3, 4, 5), torch.ones(len(means3D), dtype=torch.int32)
+        >>> def render(view, gaussians, pipe, background):
+        ...     image, radii = GaussianRasterizer()(gaussians, None, torch.full((9, 1), 0.5))
+        ...     return {"render": image, "alpha": image[:1]}
+        >>> fn = render_fn(render, torch.zeros(9, 3), None, torch.zeros(3), rasterizer=GaussianRasterizer)
+        >>> fn(torch.full((9, 1), 0.9), "a view").alpha.mean().item()
+        0.899...
+        >>> result = CAScore(fn, threshold=0.0)(torch.full((9, 1), 0.9), "a view")
+    """
+
+    def overridden(opacity: Tensor, view: Any) -> Rendering:
+        rasterizers = rasterizer_classes() if rasterizer is None else [rasterizer]
+        with override(rasterizers, opacity) as calls:
+            image, alpha = read_rendering(render(view, gaussians, pipe, background))
+            if len(calls) != 1:
+                names = ", ".join(rasterizer.__qualname__ for rasterizer in rasterizers)
+                raise RuntimeError(
+                    f"render called {names} {len(calls)} times, expected once; pass the class it uses as "
+                    "rasterizer=..., and a render function that makes one picture."
+                )
+            return Rendering(image, white_alpha(calls[0]) if alpha is None else alpha)
+
+    return overridden

@@ -8,14 +8,16 @@ imports gsplat, with :func:`~ca_reg.integrations.gsplat.install`, and reports wh
 whatever way. The options of the launcher come before the script, everything after it belongs to the script; ``-m module
 arguments...`` runs a module instead.
 
-The exit code is that of the script, or 1 if the script succeeded but was not regularized; training that turns out not
-to be regularized is aborted.
+Python processes that the script starts are hooked, too. The exit code is that of the script, or 1 if the script
+succeeded but was not regularized; training that turns out not to be regularized is aborted.
 """
 
 from __future__ import annotations
 
 import argparse
+import atexit
 import json
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -27,10 +29,10 @@ from ca_reg import Chain, GaussianDropout, OpacityNoise
 from ca_reg.regularizers import parse
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
-from ._hook import Hook
-from ._rasterizer import MODULES
-from ._script import find_script, run_script, set_command_line
-from ._sources import read_script
+from ._calls import MODULES
+from ._environment import Watch, explain_download, folder_of_reports, in_children, old_aliases, reports_of_children
+from ._report import Hook, Tally
+from ._sources import find_script, read_script, run_script, set_command_line
 from .gsplat import Installation
 from .inria import DEFAULT_MODEL, RasterizerHook, Scope, Steps
 
@@ -46,10 +48,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: launcher options, script and script arguments; by default those of the process.
     """
+    arguments = sys.argv[1:] if arguments is None else arguments
     options = _parse(arguments)
     hook: Hook | None = options.hook
     set_command_line(options.script, options.arguments)
-    with _reported(options, hook), ExitStack() as undo:
+    with ExitStack() as undo:
+        if hook is not None:
+            # Entered before the report, which reads what these processes have left.
+            name = ["-m", options.script] if options.module else [str(options.script.resolve())]
+            own = arguments[: len(arguments) - len(options.arguments) - (2 if options.module else 1)]
+            undo.enter_context(in_children(f"{__package__}.run:resume", own, name))
+        watch = undo.enter_context(Watch())
+        undo.enter_context(old_aliases())
+        undo.enter_context(_reported(options, hook, watch))
         if options.cpu:
             from reference_trainer.compat import stand_in
 
@@ -59,6 +70,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
             hook.install()
             undo.callback(_uninstall, hook)
         run_script(options.script)
+
+
+def resume(arguments: Sequence[str], script: Sequence[str]) -> None:
+    """Hook a process that a launched script has started, and report to the launcher when it ends.
+
+    Args:
+        arguments: options of the launcher.
+        script: the launched script, or ``-m`` and its module; that of this process, if it has one, takes its place.
+    """
+    own = Path(sys.argv[0])
+    hook: Hook = _parse([*arguments, *([str(own)] if own.suffix == ".py" and own.is_file() else script)]).hook
+    hook.install()
+    folder = folder_of_reports()
+
+    def report() -> None:
+        if hook.used:  # data loaders, say, render nothing
+            found = {"script": own.name, "renders": hook.tally.as_dict(), "problem": hook.problem()}
+            Path(folder, f"{os.getpid()}.json").write_text(json.dumps(found), encoding="utf-8")
+
+    atexit.register(report)
 
 
 def _uninstall(hook: Hook) -> None:
@@ -112,7 +143,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         options.script = script
     options.sources = sources = read_script(options.script)
     of_inria = sources.rasterizers or not sources.packages.isdisjoint(MODULES)
-    options.gsplat = not of_inria and sources.need("gsplat")
+    # A rasterizer by name is one of INRIA's: gsplat may be another, optional back end.
+    options.gsplat = not of_inria and options.rasterizer is None and sources.need("gsplat")
     meaningless = [name for name in _OF_INRIA if getattr(options, name) != parser.get_default(name)]
     if options.gsplat and meaningless:
         parser.error(f"{options.script} is one of gsplat's, for which there is no --{meaningless[0].replace('_', '-')}")
@@ -167,37 +199,64 @@ def _hook(options: argparse.Namespace) -> Hook | None:
 
 
 @contextmanager
-def _reported(options: argparse.Namespace, hook: Hook | None) -> Iterator[None]:
+def _reported(options: argparse.Namespace, hook: Hook | None, watch: Watch) -> Iterator[None]:
     """Report what was done, however the script ends; exit with 1 if that is not what was asked for."""
     ended, problem = "finished", None
     try:
         yield
-        problem = hook and hook.problem()
+        problem = _problem(hook)
     except SystemExit as error:
         ended = f"exit {error.code or 0}"
-        problem = None if error.code else hook and hook.problem()
+        problem = None if error.code else _problem(hook)
         if not problem:
             raise
     except BaseException as error:
         ended = f"{type(error).__name__}: {error}".rstrip(": ")
-        if options.cpu and isinstance(error, ModuleNotFoundError):
-            problem = (
-                f"There is no module {error.name}: install it, name its class if it rasterizes (--rasterizer "
-                f"{error.name}:CLASS), or put a file in its place, beside the script, with what that calls of it"
-            )
+        problem = _explain_failure(error, options, watch)
         raise
     finally:
+        started = reports_of_children()
         report: dict[str, Any] = {name: getattr(options, name) for name in _REPORTED}
         report |= {"script": str(options.script), "ended": ended, "problem": problem}
-        report["renders"] = None if hook is None else hook.tally.as_dict()
-        lines = ["no regularization was asked for; the script ran plain"] if hook is None else hook.tally.lines()
+        report |= {"renders": None if hook is None else hook.tally.as_dict(), "started": started}
         name = options.script.name if isinstance(options.script, Path) else options.script
-        for line in [f"{name}: {ended}", *lines, *([f"ERROR: {problem}"] if problem else [])]:
+        lines = [f"{name}: {ended}"]
+        if hook is None:
+            lines.append("no regularization was asked for; the script ran plain")
+        elif hook.used or not started:
+            lines += hook.tally.lines()
+        for child in started:
+            done = Tally.from_dict(child["renders"] or {}).lines()
+            lines.append(f"{child['script']}, a process that it started: {'; '.join(done)}")
+        lines += [f"WARNING: a process that it started was not hooked: {command}" for command in watch.missed]
+        for line in [*lines, *([f"ERROR: {problem}"] if problem else [])]:
             print(f"[ca_reg] {line}", file=sys.stderr)
         if options.report is not None:
             options.report.write_text(json.dumps(report, indent=2) + "\n")
     if problem:
         raise SystemExit(1)
+
+
+def _problem(hook: Hook | None) -> str | None:
+    """Describe a failure to regularize, in this process or in one that it started; None if there was none."""
+    if hook is None:
+        return None
+    children = reports_of_children()
+    own = hook.problem() if hook.used or not any(child["renders"] for child in children) else None
+    return own or next((f"{child['script']}: {child['problem']}" for child in children if child["problem"]), None)
+
+
+def _explain_failure(error: BaseException, options: argparse.Namespace, watch: Watch) -> str | None:
+    """Say what to do about an exception of the script, where the launcher knows."""
+    if isinstance(error, ModuleNotFoundError) and options.cpu:
+        name = str(error.name)
+        renders = name in options.sources.rasterizers or "raster" in name
+        named = f"name its class (--rasterizer {name}:CLASS), " if renders else ""
+        return (
+            f"There is no module {name}: install it, {named}or put a file in its place, beside the script, with what "
+            "that calls of it"
+        )
+    return explain_download(error, options.sources.root.resolve(), watch.saved)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -15,8 +16,11 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
+from ca_reg.integrations._patching import AfterImport
+
 __all__ = ["MEMORY", "cuda_on_cpu"]
 
+_REGISTRATIONS = "torchvision._meta_registrations"
 MEMORY = 2**34  # bytes, all of them free
 
 
@@ -29,6 +33,7 @@ def cuda_on_cpu() -> Iterator[None]:
     and ``torch.Generator("cuda")`` mean the CPU. In ``torch.cuda``, ``Event``, ``Stream``, ``stream``, ``synchronize``,
     ``set_device``, ``current_device``, ``current_stream``, ``reset_peak_memory_stats`` and ``nvtx`` run without effect,
     and ``mem_get_info``, ``get_device_properties`` and ``get_device_name`` report a device with `MEMORY` bytes.
+    A torchvision built for CUDA can be imported, without its own kernels.
     Everything is restored at the end. ``torch.cuda.is_available()`` stays False.
 
     A tensor moved to "cuda" stays the same tensor, as if it were there already: in-place writes affect both.
@@ -49,7 +54,16 @@ def cuda_on_cpu() -> Iterator[None]:
         undo.enter_context(patch.object(torch, "Generator", _Generator))
         undo.enter_context(patch.object(threading.Thread, "start", _start_on_cpu(threading.Thread.start)))
         undo.enter_context(_CudaMeansCpu())
+        torchvision = AfterImport({"torchvision.extension": _without_kernels})
+        torchvision.start()
+        undo.callback(torchvision.stop)
         yield
+
+
+def _without_kernels(extension: ModuleType) -> None:
+    """Let a torchvision that was built for CUDA be imported beside a torch without: what it lacks is not registered."""
+    if not extension._has_ops():
+        sys.modules.setdefault(_REGISTRATIONS, ModuleType(_REGISTRATIONS))
 
 
 class _CudaMeansCpu(TorchFunctionMode):

@@ -4,36 +4,37 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
-from typing import NamedTuple
 from unittest.mock import patch
 
-from ca_reg.integrations._sources import read_folder
+from ca_reg.integrations._environment import in_children
+from ca_reg.integrations._sources import Sources, read_folder
 from reference_trainer.compat.cuda import cuda_on_cpu
-from reference_trainer.compat.encoders import FreqEncoder, GridEncoder, SHEncoder
-from reference_trainer.compat.extensions import distCUDA2, fused_ssim, make_module
-from reference_trainer.compat.gsplat_functions import gsplat_functions
+from reference_trainer.compat.extensions import (
+    FreqEncoder,
+    GridEncoder,
+    Refusing,
+    SHEncoder,
+    distCUDA2,
+    fused_ssim,
+    make_module,
+)
+from reference_trainer.compat.gsplat import gsplat_functions
 from reference_trainer.compat.rasterizer import rasterizer_module
 
-__all__ = ["install_in_worker", "stand_in"]
+__all__ = ["install_in_child", "stand_in"]
 
 NVIDIA_SMI = """#!/bin/sh
 printf 'GPU 00000000:00:00.0\\n    FB Memory Usage\\n'
 for line in Total Reserved Used Free; do printf '        %s : 0 MiB\\n' $line; done
 """
 
-_in_worker = ExitStack()
-
-
-class Rasterizers(NamedTuple):
-    """The rasterizers that a repository expects: names by module, and what they return, if specified."""
-
-    modules: dict[str, set[str]]
-    outputs: tuple[str, ...] | None
+_in_child = ExitStack()
 
 
 @contextmanager
@@ -44,10 +45,11 @@ def stand_in(
 
     The extensions of the INRIA family are ``diff_gaussian_rasterization``, the other modules that the repository
     imports a ``...Rasterizer`` from, unless they are its own, ``simple_knn``, ``fused_ssim``, and the encoders
-    ``gridencoder``, ``shencoder`` and ``freqencoder``. For gsplat its functions are replaced (`gsplat_functions`), and
+    ``gridencoder``, ``shencoder`` and ``freqencoder``, also within another package. Further compiled code may be
+    imported, and raises once it is called. For gsplat its functions are replaced (`gsplat_functions`), and
     ``fused_ssim``, which its trainer imports. "cuda" is mapped to the CPU unless there is a CUDA device. Modules that
-    were imported within the block keep the stand-ins. Worker processes that start afresh, such as those of data loaders
-    on macOS, find the extensions as well: in a temporary folder at the end of the search path, which they inherit.
+    were imported within the block keep the stand-ins. Processes that start within it, such as workers of data loaders
+    on macOS, have them as well.
 
     Args:
         repository: its root folder, whose sources are read; None for gsplat.
@@ -70,15 +72,31 @@ def stand_in(
         >>> with stand_in():  # doctest: +SKIP
         ...     import simple_trainer  # gsplat's
     """
-    expected = None if repository is None else _expected(Path(repository), outputs, rasterizer)
-    modules = _modules(expected)
+    given = (None if repository is None else str(Path(repository).resolve()), outputs, rasterizer)
+    with in_children(f"{__name__}:install_in_child", *given), _nvidia_smi(), _installed(*given) as names:
+        yield names
+
+
+def install_in_child(repository: str | None, outputs: Sequence[str] | None, rasterizer: str | None) -> None:
+    """Install the stand-ins, with the arguments of `stand_in`, in a process that was started with them."""
+    _in_child.enter_context(_installed(repository, outputs, rasterizer))
+
+
+@contextmanager
+def _installed(
+    repository: str | None, outputs: Sequence[str] | None, rasterizer: str | None
+) -> Iterator[tuple[str, ...]]:
+    """Install the stand-ins in this process."""
+    modules = {"fused_ssim": make_module("fused_ssim", fused_ssim=fused_ssim)}
+    if repository is not None:
+        modules = _modules(read_folder(Path(repository)), None if outputs is None else tuple(outputs), rasterizer)
     present = [name for name in modules if name in sys.modules]
     if present:
         raise RuntimeError(
             f"{', '.join(present)} {'is' if len(present) == 1 else 'are'} imported already: start a new process, and "
             "install the stand-in before the repository is imported; or end an earlier one."
         )
-    with cuda_on_cpu(), _importable(modules, expected), nullcontext() if expected else gsplat_functions():
+    with cuda_on_cpu(), gsplat_functions() if repository is None else nullcontext():
         sys.modules.update(modules)
         try:
             yield tuple(modules)
@@ -87,59 +105,40 @@ def stand_in(
                 sys.modules.pop(name, None)
 
 
-def install_in_worker(modules: dict[str, set[str]] | None, outputs: tuple[str, ...] | None) -> None:
-    """Install the stand-ins in a worker process for its lifetime; arguments as in `Rasterizers`, None for gsplat."""
-    _in_worker.enter_context(cuda_on_cpu())
-    sys.modules.update(_modules(None if modules is None else Rasterizers(modules, outputs)))
-
-
-def _expected(repository: Path, outputs: Sequence[str] | None, rasterizer: str | None) -> Rasterizers:
-    """Read which rasterizers a repository imports."""
-    found = {"diff_gaussian_rasterization": set[str](), **read_folder(repository).rasterizers}
-    modules = {name: names for name, names in found.items() if "." not in name}
+def _modules(sources: Sources, outputs: tuple[str, ...] | None, rasterizer: str | None) -> dict[str, ModuleType]:
+    """Make the modules that a repository imports, by name."""
+    rasterizers = {"diff_gaussian_rasterization": set[str](), **sources.rasterizers}
     if rasterizer is not None:
         module, _, name = rasterizer.partition(":")
-        modules.setdefault(module, set()).add(name)
-    return Rasterizers(modules, None if outputs is None else tuple(outputs))
-
-
-def _modules(expected: Rasterizers | None) -> dict[str, ModuleType]:
-    """Make the modules that are imported, by name; for gsplat if no rasterizers are expected."""
-    ssim = {"fused_ssim": make_module("fused_ssim", fused_ssim=fused_ssim)}
-    if expected is None:
-        return ssim
+        rasterizers.setdefault(module, set()).add(name)
     neighbors = make_module("simple_knn._C", distCUDA2=distCUDA2)
-    return {
-        **{name: rasterizer_module(name, names, expected.outputs) for name, names in expected.modules.items()},
+    extensions = {
         "simple_knn": make_module("simple_knn", _C=neighbors),
         "simple_knn._C": neighbors,
-        **ssim,
+        "fused_ssim": make_module("fused_ssim", fused_ssim=fused_ssim),
         "gridencoder": make_module("gridencoder", GridEncoder=GridEncoder),
         "shencoder": make_module("shencoder", SHEncoder=SHEncoder),
         "freqencoder": make_module("freqencoder", FreqEncoder=FreqEncoder),
     }
+    modules = {name: rasterizer_module(name, names, outputs) for name, names in rasterizers.items()} | extensions
+    for name in sorted(sources.imports - modules.keys()):
+        package, compiled, _ = f"{name}.".partition("._C.")
+        if compiled and "." not in package and package not in modules and find_spec(package) is None:
+            inner = make_module(f"{package}._C", __getattr__=Refusing(f"{package}._C").__getattr__)
+            modules |= {package: make_module(package, _C=inner), f"{package}._C": inner}
+        # Built within a package of the repository, such as gaussian_splatting.simple_knn.
+        within = next((module for own, module in extensions.items() if name.endswith(f".{own}")), None)
+        if within is not None and not sources.is_own(name):
+            modules[name] = within
+    return modules
 
 
 @contextmanager
-def _importable(modules: Iterable[str], expected: Rasterizers | None) -> Iterator[None]:
-    """Let processes that inherit the search paths import the stand-ins, but not their parent's objects.
-
-    They also find a stand-in for a missing ``nvidia-smi``, with which scripts choose a GPU (Scaffold-GS).
-    """
+def _nvidia_smi() -> Iterator[None]:
+    """Let scripts find a stand-in for a missing ``nvidia-smi``, with which some choose a GPU (Scaffold-GS)."""
     with TemporaryDirectory(prefix="ca_reg_stand_in_") as folder:
-        # The import system returns what is in sys.modules once the file has run.
-        arguments = ", ".join(map(repr, expected or (None, None)))
-        text = f"from {__name__} import install_in_worker\n\ninstall_in_worker({arguments})\n"
-        for name in modules:
-            if "." not in name:
-                (Path(folder) / f"{name}.py").write_text(text, encoding="utf-8")
         program = Path(folder) / "nvidia-smi"
         program.write_text(NVIDIA_SMI, encoding="utf-8")
         program.chmod(0o755)
-        sys.path.append(folder)
-        try:
-            with patch.dict(os.environ, PATH=os.pathsep.join([os.environ.get("PATH", ""), folder])):
-                yield
-        finally:
-            if folder in sys.path:
-                sys.path.remove(folder)
+        with patch.dict(os.environ, PATH=os.pathsep.join([os.environ.get("PATH", ""), folder])):
+            yield

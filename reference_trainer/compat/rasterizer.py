@@ -2,27 +2,124 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
 from collections.abc import Iterable
 from types import ModuleType
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
-from reference_trainer.compat.antialiasing import filtered
-from reference_trainer.compat.contributions import contributions
-from reference_trainer.compat.extensions import make_module
-from reference_trainer.compat.outputs import Picture, Unknown, kinds_of
-from reference_trainer.compat.settings import GaussianRasterizationSettings, camera_of, warn_of_ignored
-from reference_trainer.compat.surfels import surface_planes
-from reference_trainer.compat.unpacking import names_of_results
+from reference_trainer.camera import Camera
+from reference_trainer.compat.extensions import Refusing, make_module
+from reference_trainer.compat.outputs import Picture, Unknown, kinds_of, names_of_results
+from reference_trainer.compat.planes import contributions, filtered, heaviest, surface_planes
 from reference_trainer.model.relocation import compute_relocation
 from reference_trainer.render import draw, splat
 from reference_trainer.render.absolute import splat_weights, with_absolute_gradients
 from reference_trainer.render.constants import DILATION
 from reference_trainer.render.radii import in_front, visible_radii
 
-__all__ = ["GaussianRasterizer", "rasterizer_module"]
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "camera_of", "rasterizer_module"]
+
+TOLERANCE = 1e-3  # of the entries of a projection matrix that went through single precision twice
+
+
+class _Fields(NamedTuple):
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool = False
+    debug: bool = False
+    confidence: Tensor | None = None
+    antialiasing: bool | None = None
+    pixel_weights: Tensor | None = None
+    kernel_size: float | None = None
+    get_flag: bool | None = None
+    metric_map: Tensor | None = None
+
+
+class GaussianRasterizationSettings(_Fields):
+    """What the rasterizers of the INRIA family are told about a view: the fields of several variants.
+
+    Convention: matrices act on row vectors (``x_world @ viewmatrix``), so they are the transposes of the textbook's.
+    ``viewmatrix`` is world to camera, ``projmatrix`` world to clip space, both (4, 4); sizes are in pixels, ``tanfovx``
+    and ``tanfovy`` tangents of half the fields of view. ``confidence`` (N, 1) is a factor on the gradients of every
+    Gaussian (FSGS, CoR-GS), ``antialiasing`` that of INRIA since October 2024, ``pixel_weights`` (H, W) asks for the
+    scores of Taming 3DGS, ``kernel_size`` is the blur of Mip-Splatting, square pixels, and with ``get_flag`` the
+    pixels at which ``metric_map`` (H W,) is 1 are counted (FastGS). ``campos``, which the view
+    matrix tells as well, ``prefiltered`` and ``debug`` are ignored; so are further fields, with a warning unless they
+    are None, False or zeros.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, *values: Any, **fields: Any) -> Self:
+        """Take the fields that the stand-in knows."""
+        further = {name: fields.pop(name) for name in fields.keys() - set(cls._fields)}
+        warn_of_ignored("setting", further)
+        return super().__new__(cls, *values, **fields)
+
+
+def warn_of_ignored(kind: str, values: dict[str, Any]) -> None:
+    """Warn, once per name, of values that the stand-in ignores; not of None, False or zeros without a gradient."""
+    for name, value in sorted(values.items()):
+        if (value.requires_grad or value.any()) if isinstance(value, Tensor) else value not in (None, False):
+            _warn(kind, name)
+
+
+@functools.cache
+def _warn(kind: str, name: str) -> None:
+    warnings.warn(
+        f"the stand-in rasterizer does not know the {kind} {name}, and ignores it: what it does on a GPU is missing.",
+        stacklevel=3,
+    )
+
+
+def camera_of(settings: GaussianRasterizationSettings) -> Camera:
+    """Return the camera of a rasterizer call.
+
+    The principal point is the projection matrix's: the picture's center in the INRIA code, elsewhere in some forks.
+
+    Raises:
+        ValueError: if the projection matrix is not that of a pinhole camera with the settings' fields of view.
+
+    Example:
+        >>> projection = torch.tensor([[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 1, 1], [0, 0, -0.01, 0]])
+        >>> camera = camera_of(GaussianRasterizationSettings(
+        ...     24, 32, 0.5, 0.5, torch.zeros(3), 1.0, torch.eye(4), projection, 0, torch.zeros(3)))
+        >>> camera.fx, camera.fy, camera.cx, camera.cy
+        (32.0, 24.0, 16.0, 12.0)
+    """
+    width, height = int(settings.image_width), int(settings.image_height)
+    view = settings.viewmatrix.detach().double()
+    projection = torch.linalg.solve(view, settings.projmatrix.detach().double())[:, [0, 1, 3]]
+    shift_x, shift_y = projection[2, :2].tolist()
+    expected = view.new_tensor([[1 / settings.tanfovx, 0, 0], [0, 1 / settings.tanfovy, 0], [shift_x, shift_y, 1]])
+    if not torch.allclose(projection, torch.nn.functional.pad(expected, (0, 0, 0, 1)), rtol=TOLERANCE, atol=TOLERANCE):
+        raise ValueError(
+            "viewmatrix^-1 projmatrix must be a pinhole camera with the fields of view tanfovx="
+            f"{settings.tanfovx} and tanfovy={settings.tanfovy}; its columns x, y and w are {projection.tolist()}. "
+            "Both matrices must be transposed (for row vectors), as the INRIA code passes them."
+        )
+    return Camera(
+        world_to_camera=settings.viewmatrix.detach().T,
+        fx=width / (2 * settings.tanfovx),
+        fy=height / (2 * settings.tanfovy),
+        cx=0.5 * width * (1 + shift_x),
+        cy=0.5 * height * (1 + shift_y),
+        width=width,
+        height=height,
+    )
+
 
 FIELDS = ("antialiasing", "confidence", "pixel_weights")  # of the settings, which tell what the outputs are
 SCORES = ("accum_weights", "accum_count", "accum_blend", "accum_dist", "depths")
@@ -74,22 +171,25 @@ class GaussianRasterizer(nn.Module):
         rotations: Tensor | None = None,
         cov3D_precomp: Tensor | None = None,
         dc: Tensor | None = None,
+        means2D_densify: Tensor | None = None,
         **further: Any,
     ) -> tuple[Any, ...]:
         """Render Gaussians: world coordinates (N, 3), opacities (N, 1) or (N,), scales (N, 3), rotations wxyz (N, 4).
 
-        ``means2D`` (N, 3), or (N, 4) for AbsGS, receives the screen-space gradients. Colors are spherical-harmonic
-        coefficients ``shs`` (N, K, 3), whose first band may stand apart in ``dc`` (N, 1, 3), or ``colors_precomp`` (N,
-        3). Scales (N, 2) are those of surfels (2DGS), which are drawn as flat Gaussians. Further arguments are
-        ignored, with a warning unless they are None, False or zeros.
+        ``means2D`` (N, 3) receives the screen-space gradients, the last columns of (N, 4) the sums of their absolute
+        values over the pixels (AbsGS), as do the first two of ``means2D_densify`` (Deformable-3D-Gaussians).
+        Colors are spherical-harmonic coefficients ``shs`` (N, K, 3), whose first band may stand apart in ``dc`` (N, 1,
+        3), or ``colors_precomp`` (N, 3). Scales (N, 2) are those of surfels (2DGS), which are drawn as flat Gaussians.
+        Further arguments are ignored, with a warning unless they are None, False or zeros.
 
         Returns:
             The values that the caller unpacks, told by its names, see `kinds_of`; by default first the image (3, H, W),
             not clamped, and radii in pixels, (N,) int32, 0 for what is out of view. Depth and inverse depth are sums
             of weight times (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's
             sum of weights over the pixels, shape (N,), pixels (N, 1) the number of those at which it is drawn, both
-            without a gradient; so are the scores of Taming 3DGS, see `contributions`. Normals, mean depth and
-            distortion are those of `surface_planes`.
+            without a gradient; so are the scores of Taming 3DGS, see `contributions`, the counts of FastGS (N,), and
+            for every pixel the Gaussian of the largest weight, -1 for none, and that weight (1, H, W). Normals, mean
+            depth and distortion are those of `surface_planes`.
 
         Raises:
             ValueError: if ``means2D`` has another shape, a covariance is given, the outputs cannot be told, or a
@@ -142,7 +242,10 @@ class GaussianRasterizer(nn.Module):
             background=settings.bg,
             depth=inverse or true_depth,
         )
-        if columns == 4:
+        if means2D_densify is not None:
+            absolute = means2D_densify.index_select(0, splats.indices)[:, :2] * means2D.new_tensor(half[:2])
+            rendering = with_absolute_gradients(rendering, absolute, settings.bg)
+        elif columns == 4:
             rendering = with_absolute_gradients(rendering, sink[:, 2:], settings.bg)
         found: dict[str, Tensor] = {"image": rendering.image, "alpha": rendering.alpha[None]}
         if rendering.depth is not None:
@@ -162,6 +265,14 @@ class GaussianRasterizer(nn.Module):
             table = torch.stack([*contributions(splats, image), projection.depths.detach()])
             table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
             found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": found["radii"], "pixels": table[1, :, None]}
+        if "metric_counts" in parts:
+            chosen = torch.zeros_like(drawn) if settings.metric_map is None else settings.metric_map == 1
+            count = contributions(splats, (chosen.view_as(drawn) & bool(settings.get_flag)).to(means3D))[0]
+            found["metric_counts"] = means3D.new_zeros(n).index_copy(0, splats.indices, count).int()
+        if not parts.isdisjoint(("heaviest", "largest_weight")):
+            index, weight = heaviest(splats)
+            index = torch.cat([splats.indices, splats.indices.new_tensor([-1])])[index]  # -1 stays -1
+            found |= {"heaviest": index[None].int(), "largest_weight": weight[None]}
         labels = (*(names or kinds), "radii")  # for a caller that names only one value
         return tuple(_output(kind, label, found, drawn) for kind, label in zip(kinds, labels, strict=False))
 
@@ -214,9 +325,11 @@ def rasterizer_module(name: str, names: Iterable[str] = (), outputs: tuple[str, 
         ('image_height', 'image_width')
     """
 
-    def refuse(attribute: str) -> NoReturn:
+    def refuse(attribute: str) -> Refusing:
         if attribute.startswith("__"):
             raise AttributeError(attribute)
+        if attribute == "_C":  # imported by some, and used by fewer
+            return Refusing(f"{name}._C")
         raise ImportError(f"the stand-in for {name} has no {attribute}, which needs CUDA.")
 
     own = {"outputs": outputs, "forward": GaussianRasterizer.forward, "__module__": name}

@@ -17,9 +17,9 @@ from torch import nn
 
 from ca_reg import GaussianDropout, OpacityNoise
 from ca_reg.functional import apply_dropout
-from ca_reg.integrations._tally import Skip
+from ca_reg.integrations._report import Skip
 from ca_reg.integrations.gsplat import Installation, install, regularized, unregularized
-from ca_reg.schedules import StartStop
+from ca_reg.schedules import LinearRamp, StartStop
 
 N, WIDTH, HEIGHT = 60, 24, 16
 
@@ -460,3 +460,30 @@ def test_gsplat_itself_draws_and_counts_as_without_the_dropped_gaussians(packed,
         assert torch.equal(info["radii"][:, kept], plain["radii"])
         assert not info["radii"][:, ~dropout.keep].any()
         torch.testing.assert_close(info["means2d"].grad[:, kept], plain["means2d"].grad, rtol=1e-3, atol=1e-4)
+
+
+def test_a_draw_that_drops_nothing_does_not_vouch_for_packed_mode(params, cameras):
+    """The Gaussians of opacity 0 are looked for until enough were dropped that some would have been listed."""
+    dropout = GaussianDropout(LinearRamp(1e-9, 0.4, 2, 3))
+    wrapped = regularized(rasterization_1_4, dropout)
+    for _ in range(3):
+        wrapped(**activated(params), **cameras)
+        assert dropout.keep.all()
+    dropout.set_step(3)
+    with pytest.raises(RuntimeError, match="pass packed=False"):
+        wrapped(**activated(params), **cameras)
+
+
+def test_dropped_gaussians_are_hidden_on_several_gpus_too(params, cameras):
+    """gsplat's info holds the Gaussians of the rank, before they are exchanged."""
+
+    @functools.wraps(rasterization)
+    def over_ranks(*args, distributed=False, **kwargs):
+        assert distributed
+        return rasterization_that_culls_nothing(*args, **kwargs)
+
+    dropout = GaussianDropout(0.4)
+    info = regularized(over_ranks, dropout)(**activated(params), **cameras, packed=False, distributed=True)[2]
+    assert 0 < dropout.keep.sum() < N
+    assert info["radii"][:, dropout.keep].any()
+    assert not info["radii"][:, ~dropout.keep].any()

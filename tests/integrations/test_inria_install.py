@@ -13,7 +13,7 @@ from stand_ins.inria import PIPE, Model, make_render
 from torch import nn
 
 from ca_reg import GaussianDropout
-from ca_reg.integrations._rasterizer import hide_dropped
+from ca_reg.integrations._calls import hide_dropped
 from ca_reg.integrations.inria import RasterizerHook
 
 BLACK = torch.zeros(3)

@@ -11,8 +11,7 @@ from stand_ins.inria import PIPE, Model, make_rasterizer, make_render
 from torch import nn
 
 from ca_reg import CAScore, GaussianDropout
-from ca_reg.integrations.inria import RasterizerHook
-from ca_reg.integrations.inria_score import render_fn
+from ca_reg.integrations.inria import RasterizerHook, render_fn
 from reference_trainer.render import render as reference_render
 
 FORMS = ["plain", "inverse-depth", "weights", "depth-alpha"]

@@ -9,7 +9,7 @@ from stand_ins.gsplat import intrinsics, rasterization
 from stand_ins.inria import PIPE, Model, make_render, settings_of
 
 from ca_reg import Chain, Draw, IndependentDropout, Learned, LinearRamp, Params, Regularizer
-from ca_reg.integrations._rasterizer import ForwardCall, forward_signature
+from ca_reg.integrations._calls import RasterizerCall, forward_signature
 from ca_reg.integrations.gsplat import regularized
 from ca_reg.integrations.inria import RasterizerHook
 
@@ -161,7 +161,7 @@ def test_every_field_reaches_the_rasterizer_changed(split):
     sh = torch.rand(5, 4, 3)
     shs = {"dc": sh[:, :1], "shs": sh[:, 1:]} if split else {"shs": sh}
     bound = forward_signature(kind).bind(kind(), means2D=None, opacities=torch.rand(5, 1), **given, **shs)
-    call, chain = ForwardCall(kind.forward, bound), Chain(Move())
+    call, chain = RasterizerCall(kind.forward, bound), Chain(Move())
     before = call.params(chain, 3)
     assert call._replace(before, chain(before))
     for factor, (was, now) in enumerate(zip([*given.values(), sh], call(), strict=True), start=2):
@@ -179,7 +179,7 @@ def test_a_regularizer_of_opacities_touches_nothing_else():
     other = Untouchable()
     rasterizer = type("GaussianRasterizer", (), {"forward": forward})
     bound = forward_signature(rasterizer).bind(other, other, other, torch.rand(5, 1), other, other, other)
-    call = ForwardCall(forward, bound)
+    call = RasterizerCall(forward, bound)
     assert call.params(Chain(IndependentDropout()), 3)[1:] == (None,) * 6 + (3,)
 
 

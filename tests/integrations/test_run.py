@@ -15,7 +15,7 @@ from launched import draws, launch, seen
 from stand_ins.inria import Model, make_rasterizer, make_render
 
 from ca_reg import Chain
-from ca_reg.integrations._script import find_script
+from ca_reg.integrations._sources import find_script
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.integrations.run import main
 
@@ -93,13 +93,14 @@ def test_the_report_comes_however_the_script_ends(repository, tmp_path, capsys, 
     assert "1 renders regularized" in capsys.readouterr().err
 
 
-def test_a_missing_extension_is_named_with_the_ways_out(repository, capsys):
-    (repository / "train.py").write_text("import an_extension._C\n")
+@pytest.mark.parametrize(("name", "offered"), [("my_rasterization", True), ("websockets_of_mine", False)])
+def test_a_missing_extension_is_named_with_the_ways_out(repository, capsys, name, offered):
+    (repository / "train.py").write_text(f"import {name}._C\n")
     with pytest.raises(ModuleNotFoundError):
         main(["--cpu", str(repository / "train.py")])
-    assert re.search(
-        r"ERROR: There is no module an_extension: install.*--rasterizer an_extension:CLASS", capsys.readouterr().err
-    )
+    problem = capsys.readouterr().err.partition("ERROR: ")[2]
+    assert f"no module {name}: install it" in problem
+    assert (f"--rasterizer {name}:CLASS" in problem) == offered  # for what may rasterize
 
 
 def test_a_script_that_does_not_render_is_an_error(repository, tmp_path, capsys):

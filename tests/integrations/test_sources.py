@@ -34,7 +34,7 @@ def test_a_script_that_reaches_above_its_folder_is_read_with_what_lies_there(rep
 
 def test_a_package_that_is_built_on_another_needs_it():
     """torchmetrics requires torch, and tells so in what is installed with it."""
-    assert Sources({"torchmetrics", "nowhere"}).need("torch")
+    assert Sources({"torchmetrics.image", "nowhere"}).need("torch")
     assert Sources({"gsplat"}).need("gsplat")
     assert not Sources({"torchmetrics"}).need("gsplat")
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import torch
 
-from reference_trainer.compat.rasterization import make_rasterization
+from reference_trainer.compat.gsplat import make_rasterization
 
 MIN_ALPHA = 1 / 255
 

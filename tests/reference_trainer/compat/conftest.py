@@ -8,7 +8,7 @@ from oracles import GaussianScene, brute_force
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.compat.settings import GaussianRasterizationSettings
+from reference_trainer.compat.rasterizer import GaussianRasterizationSettings
 
 
 def _settings_of(camera: Camera, **changes) -> GaussianRasterizationSettings:

@@ -49,3 +49,22 @@ def test_a_dropped_gaussian_gets_nothing(settings_of):
     assert (screen.grad[~keep] == 0).all()
     assert (weights[~keep] == 0).all()
     assert screen.grad[keep].any()
+
+
+def test_they_may_be_asked_for_in_an_argument_of_their_own(settings_of):
+    """As the rasterizer of Deformable-3D-Gaussians: the same sums as those of AbsGS, in the first two columns."""
+    scene = random_scene(30, 20, 15, seed=3)
+    four = torch.zeros(30, 4).double().requires_grad_()
+    _call(settings_of(scene.camera), scene, four)[0].square().sum().backward()
+    signed, absolute = (torch.zeros(30, 3).double().requires_grad_() for _ in range(2))
+    rasterizer = rasterizer_module("diff_gaussian_rasterization").GaussianRasterizer(settings_of(scene.camera))
+    image, radii, depth = rasterizer(
+        means3D=scene.means, means2D=signed, means2D_densify=absolute, opacities=scene.opacities,
+        colors_precomp=scene.colors, scales=scene.scales, rotations=scene.quaternions,
+    )  # fmt: skip
+    image.square().sum().backward()
+    assert radii.shape == (30,)
+    assert depth.shape == (1, 15, 20)
+    torch.testing.assert_close(signed.grad[:, :2], four.grad[:, :2], rtol=1e-12, atol=0)
+    torch.testing.assert_close(absolute.grad[:, :2], four.grad[:, 2:], rtol=1e-12, atol=0)
+    assert (absolute.grad[:, :2] > signed.grad[:, :2].abs()).any()

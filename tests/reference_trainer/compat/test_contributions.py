@@ -45,3 +45,38 @@ def test_pixels_are_those_at_which_a_gaussian_is_drawn(settings_of):
     )  # fmt: skip
     weights, _ = brute_force(*scene[:4], torch.eye(30).double(), scene.camera)
     assert torch.equal(pixels, (weights > 0).sum((1, 2))[:, None].double())
+
+
+def _weights(scene):
+    return brute_force(*scene[:4], torch.eye(30).double(), scene.camera)[0]
+
+
+def test_pixels_of_a_map_are_counted_where_a_gaussian_is_drawn(settings_of):
+    """As FastGS does, if its flag is set."""
+    scene = random_scene(30, 21, 17, seed=11, size=0.05)
+    chosen = torch.rand(17, 21, generator=torch.Generator().manual_seed(3)) > 0.6
+    for flag in (True, None):
+        settings = settings_of(scene.camera, get_flag=flag, metric_map=chosen.int().flatten())
+        rasterizer = rasterizer_module("diff_gaussian_rasterization_fastgs").GaussianRasterizer(settings)
+        _, _, accum_metric_counts = rasterizer(
+            means3D=scene.means, means2D=torch.zeros(30, 4), opacities=scene.opacities[:, None],
+            colors_precomp=scene.colors, scales=scene.scales, rotations=scene.quaternions,
+        )  # fmt: skip
+        expected = ((_weights(scene) > 0) & chosen).sum((1, 2)) if flag else torch.zeros(30)
+        assert torch.equal(accum_metric_counts, expected.int())
+    assert ((_weights(scene) > 0) & chosen).any()
+
+
+def test_every_pixel_names_the_gaussian_of_the_largest_weight(settings_of):
+    """As LoopSparseGS asks; some pixels show none."""
+    scene = random_scene(30, 21, 17, seed=11, size=0.05)
+    rasterizer = rasterizer_module("diff_gaussian_rasterization_weights").GaussianRasterizer(settings_of(scene.camera))
+    _, _, _, _, max_weights_idx, max_weights = rasterizer(
+        means3D=scene.means, means2D=torch.zeros_like(scene.means), opacities=scene.opacities[:, None],
+        colors_precomp=scene.colors, scales=scene.scales, rotations=scene.quaternions,
+    )  # fmt: skip
+    largest, index = _weights(scene).max(0)
+    torch.testing.assert_close(max_weights[0], largest, rtol=1e-9, atol=1e-12)
+    assert torch.equal(max_weights_idx[0], torch.where(largest > 0, index, -1).int())
+    assert (largest > 0).any()
+    assert not (largest > 0).all()

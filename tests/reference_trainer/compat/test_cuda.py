@@ -1,5 +1,7 @@
 """Code that says "cuda", on a machine without."""
 
+import importlib
+import sys
 import threading
 
 import pytest
@@ -142,3 +144,21 @@ def test_what_scripts_ask_a_device_has_an_answer():
             torch.cuda.nvtx.range_pop()
             assert torch.ones(2, device="cuda").sum() == 2
         side.synchronize()
+
+
+@pytest.mark.parametrize("kernels", [False, True])
+def test_a_torchvision_without_kernels_can_be_imported(tmp_path, monkeypatch, kernels):
+    """As its wheels for CUDA are beside a torch without: registering operators that do not exist fails."""
+    package = tmp_path / "torchvision"
+    package.mkdir()
+    (package / "__init__.py").write_text("from .extension import _has_ops\nfrom . import _meta_registrations\n")
+    (package / "extension.py").write_text(f"def _has_ops():\n    return {kernels}\n")
+    (package / "_meta_registrations.py").write_text(f"registered = True\nassert {kernels}, 'torchvision::nms'\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
+        monkeypatch.delitem(sys.modules, name)
+    with cuda_on_cpu():
+        module = importlib.import_module("torchvision")
+        assert hasattr(module._meta_registrations, "registered") == kernels
+    for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
+        del sys.modules[name]

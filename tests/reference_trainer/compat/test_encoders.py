@@ -7,7 +7,7 @@ import pytest
 import torch
 from oracles import spherical_harmonics
 
-from reference_trainer.compat.encoders import FreqEncoder, GridEncoder, SHEncoder
+from reference_trainer.compat.extensions import FreqEncoder, GridEncoder, SHEncoder
 
 
 def _literal(encoder, position, kind, corners, smooth):

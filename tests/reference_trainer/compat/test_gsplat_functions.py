@@ -1,6 +1,7 @@
 """gsplat itself, its strategies and its launcher of processes, with the stand-ins in place."""
 
 import sys
+from types import ModuleType
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from oracles import random_scene
 from stand_ins.gsplat import intrinsics
 
 from reference_trainer.compat import stand_in
-from reference_trainer.compat.gsplat_functions import quat_scale_to_covar_preci
+from reference_trainer.compat.gsplat import quat_scale_to_covar_preci
 
 gsplat = pytest.importorskip("gsplat")
 N, WIDTH, HEIGHT = 80, 24, 18
@@ -89,7 +90,7 @@ def test_what_needs_cuda_says_so_by_its_name():
 
 def test_without_gsplat_its_name_is_in_the_message(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(ImportError, match="pip install gsplat"), stand_in():
+    with pytest.raises(ImportError, match="this needs gsplat: pip install"), stand_in():
         pass
 
 
@@ -108,3 +109,11 @@ def test_covariances_are_gsplats(triu):
     ):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
     assert quat_scale_to_covar_preci(quats, scales, compute_preci=False)[1] is None
+
+
+def test_an_old_gsplat_is_told_from_a_missing_one(monkeypatch):
+    old = ModuleType("gsplat")
+    old.__version__ = "0.1.12"
+    monkeypatch.setitem(sys.modules, "gsplat", old)
+    with pytest.raises(ImportError, match=r"gsplat 0\.1\.12 is too old.*gsplat>=1\.4"), stand_in():
+        pass

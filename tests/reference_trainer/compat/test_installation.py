@@ -181,3 +181,33 @@ def test_the_modules_are_found_like_installed_ones(repository):
 
     with stand_in(repository):
         assert all(find_spec(name).name == name for name in NAMES)
+
+
+def test_extensions_within_packages_and_unused_compiled_code(repository):
+    """As yindaheng98/gaussian-splatting builds its own, and hierarchical-3d-gaussians imports more than it calls."""
+    text = (repository / "gaussian_renderer" / "__init__.py").read_text()
+    within = text.replace("from diff_gaussian_rasterization", "from inner.diff_gaussian_rasterization")
+    (repository / "gaussian_renderer" / "__init__.py").write_text(
+        "from diff_gaussian_rasterization import _C\n"
+        "from gaussian_tree._C import load\n"
+        "from inner.simple_knn._C import distCUDA2 as neighbors\n"
+        "from submodules.a.diff_gaussian_rasterization import GaussianRasterizer as Other\n" + within
+    )
+    (repository / "inner").mkdir()
+    (repository / "inner" / "__init__.py").touch()
+    (repository / "submodules" / "a").mkdir(parents=True)
+    with stand_in(repository):
+        import gaussian_renderer
+
+        assert gaussian_renderer.neighbors is sys.modules["simple_knn._C"].distCUDA2
+        assert {cls.__module__ for cls in (gaussian_renderer.GaussianRasterizer, gaussian_renderer.Other)} == {
+            "inner.diff_gaussian_rasterization",
+            "submodules.a.diff_gaussian_rasterization",
+        }
+        for use, name in (
+            (lambda: gaussian_renderer._C.rasterize(1), "diff_gaussian_rasterization._C.rasterize"),
+            (lambda: gaussian_renderer.load("file"), "gaussian_tree._C.load"),
+        ):
+            with pytest.raises(RuntimeError, match=f"{name} is compiled code.*without --cpu"):
+                use()
+    assert not {"gaussian_tree", "inner.simple_knn._C"} & set(sys.modules)

@@ -8,7 +8,7 @@ import torch
 from oracles import random_scene
 from stand_ins.gsplat import centered, intrinsics
 
-from reference_trainer.compat.rasterization import make_rasterization
+from reference_trainer.compat.gsplat import make_rasterization
 
 rendering = pytest.importorskip("gsplat.rendering")
 own = pytest.importorskip("gsplat.cuda._torch_impl")

@@ -8,8 +8,7 @@ from oracles import GaussianScene, brute_force, random_scene
 from scipy.spatial.transform import Rotation
 
 from reference_trainer.camera import Camera
-from reference_trainer.compat.rasterizer import rasterizer_module
-from reference_trainer.compat.settings import camera_of
+from reference_trainer.compat.rasterizer import camera_of, rasterizer_module
 from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
 
 NAME = "diff_gaussian_rasterization"

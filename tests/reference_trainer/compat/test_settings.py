@@ -6,7 +6,7 @@ import pytest
 import torch
 from oracles import random_scene
 
-from reference_trainer.compat.settings import camera_of
+from reference_trainer.compat.rasterizer import camera_of
 
 
 def test_the_camera_takes_points_where_the_matrices_take_them(settings_of):

@@ -5,7 +5,7 @@ import types
 
 import pytest
 
-from reference_trainer.compat.unpacking import names_of_results
+from reference_trainer.compat.outputs import names_of_results
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Track the training step of every field, one set of Gaussians each, and its renders in that step."""
+"""Track the training step of every model, one set of Gaussians each, and its renders in that step."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-__all__ = ["Field", "Iterations", "Steps", "leaf_of"]
+__all__ = ["Iterations", "ModelSteps", "Steps", "leaf_of"]
 
 Steps = Literal["updates", "parameters"]
 """What marks a new step: a call of ``update_learning_rate``, or a change of the parameters."""
 
-_FINISHED = 2**31  # the step of a field that is only evaluated: past the end of every schedule
-_RENDERS_WITHOUT_STEP = 256  # of one field; no code base renders so many views in one step
+_FINISHED = 2**31  # the step of a model that is only evaluated: past the end of every schedule
+_RENDERS_WITHOUT_STEP = 256  # of one model; no code base renders so many views in one step
 _NODES = 1000  # largest number of autograd nodes to search for a parameter
 
 
-class Field:
+class ModelSteps:
     """One set of Gaussians in training: its index, from 0, its step, 0 if unknown, and its renders in that step."""
 
     def __init__(self, index: int, step: int, steps: Steps) -> None:
@@ -80,52 +80,52 @@ class Field:
 
 
 class Iterations:
-    """The fields of one training, identified by their model or, where that is unknown, by a parameter.
+    """The models of one training, each identified by itself or, where it is unknown, by a parameter.
 
-    ``lose_step`` is called when a step of a field ends without a training render.
+    ``lose_step`` is called when a step of a model ends without a training render.
     """
 
     def __init__(self, steps: Steps, lose_step: Callable[[], None]) -> None:
         self._steps = steps
-        self._fields: list[tuple[weakref.ref[Any], Field]] = []
-        self._vacant: list[Field] = []
+        self._models: list[tuple[weakref.ref[Any], ModelSteps]] = []
+        self._vacant: list[ModelSteps] = []
         self._step: int | None = None
         self._lose_step = lose_step
 
-    def field(self, owner: Any) -> Field:
-        """Return the field of a model or of a parameter; a new one if it was not seen before."""
-        # Densification replaces parameters: a new one takes over the field of one that is gone, one step later.
-        self._vacant += [field for ref, field in self._fields if ref() is None]
-        self._fields = [(ref, field) for ref, field in self._fields if ref() is not None]
-        for ref, field in self._fields:
+    def steps_of(self, owner: Any) -> ModelSteps:
+        """Return the steps of a model or of a parameter; new ones if it was not seen before."""
+        # Densification replaces parameters: a new one takes over the steps of one that is gone, one step later.
+        self._vacant += [steps for ref, steps in self._models if ref() is None]
+        self._models = [(ref, steps) for ref, steps in self._models if ref() is not None]
+        for ref, steps in self._models:
             if ref() is owner:
-                return field
+                return steps
         if self._vacant:
             gone = self._vacant.pop(0)
             index, step = gone.index, gone.step + (gone.renders > 0)
         else:
-            index, step = len(self._fields), max((field.step for _, field in self._fields), default=0)
-        field = Field(index, step if self._step is None else self._step, self._steps)
-        self._fields.append((weakref.ref(owner), field))
-        return field
+            index, step = len(self._models), max((steps.step for _, steps in self._models), default=0)
+        steps = ModelSteps(index, step if self._step is None else self._step, self._steps)
+        self._models.append((weakref.ref(owner), steps))
+        return steps
 
     def evaluation_step(self, owner: Any) -> int:
         """Return the step of a model or parameter, else the latest of any; past all schedules if none was trained."""
-        trained = [(ref(), field.training_step) for ref, field in self._fields if field.step or field.renders]
-        steps = [step for known, step in trained if known is owner] or [step for _, step in trained]
-        return max(steps, default=_FINISHED)
+        trained = [(ref(), steps.training_step) for ref, steps in self._models if steps.step or steps.renders]
+        own = [step for known, step in trained if known is owner]
+        return max(own or (step for _, step in trained), default=_FINISHED)
 
     def update(self, model: Any, iteration: int) -> None:
         """Process a call of update_learning_rate, unless steps are set explicitly."""
-        if self._step is None and not self.field(model).update(iteration):
+        if self._step is None and not self.steps_of(model).update(iteration):
             self._lose_step()
 
     def step(self, step: int) -> None:
-        """Begin a step of all fields."""
-        rendered = self._step is None or any(field.renders for _, field in self._fields)
+        """Begin a step of all models."""
+        rendered = self._step is None or any(steps.renders for _, steps in self._models)
         self._step = step
-        for _, field in self._fields:
-            field.begin(step)
+        for _, steps in self._models:
+            steps.begin(step)
         if not rendered:
             self._lose_step()
 

@@ -1,0 +1,346 @@
+"""Calls of a rasterizer: their arguments, their results, and the function that makes them."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from traceback import walk_stack
+from types import CodeType, FrameType, ModuleType
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ca_reg import Chain, OpacityNoise, Params
+
+from ._report import Skip, Tally
+
+__all__ = [
+    "MODULES", "RASTERIZERS", "Call", "CallSite", "RasterizerCall", "chain_of", "check_installed", "class_in",
+    "forward_signature", "hide_dropped", "rasterizer_classes", "white_alpha",
+]  # fmt: skip
+
+_OF_CALL = ("view_matrix", "step")  # fields that are not per Gaussian
+
+
+def chain_of(regularizer: nn.Module) -> Chain:
+    """Wrap a user's regularizer in a chain; TypeError if it is not a module, ValueError if it learns per Gaussian."""
+    chain = Chain(regularizer)
+    if chain.learns:
+        raise ValueError(
+            f"{_who(chain, 'learns', *chain.learns)} learns {', '.join(chain.learns)} for each Gaussian, which only "
+            "the bundled trainer (ca-reg train) can keep with the Gaussians: train there, or leave it out."
+        )
+    return chain
+
+
+class Call:
+    """A call of a rasterizer whose bound arguments may be changed before it is made.
+
+    Attributes:
+        arguments: the bound arguments by name.
+        names: argument names by field of :class:`~ca_reg.Params`, where the two differ.
+        instead: which arguments replace these in some calls, for messages.
+    """
+
+    names: ClassVar[Mapping[str, str]] = {}
+    instead: ClassVar[str] = ""
+
+    def __init__(self, function: Callable[..., Any], bound: inspect.BoundArguments) -> None:
+        self.function = function
+        self.arguments = bound.arguments
+        self._bound = bound
+
+    def __call__(self) -> Any:
+        """Rasterize."""
+        return self.function(*self._bound.args, **self._bound.kwargs)
+
+    def takes(self, name: str) -> bool:
+        """Whether the function has an argument of this name, given or not."""
+        return name in self._bound.signature.parameters
+
+    @classmethod
+    def check(cls, chain: Chain, signature: inspect.Signature) -> None:
+        """Raise a ValueError if a regularizer needs a field that no call with this signature can supply."""
+        for name in chain.needs:
+            if name not in Params._fields or cls.names.get(name, name) not in (*signature.parameters, *_OF_CALL):
+                raise ValueError(
+                    f"{_who(chain, 'needs', name)} needs {name}, which this rasterizer does not take; it takes "
+                    f"{', '.join(signature.parameters)}."
+                )
+
+    def get(self, field: str) -> Tensor | None:
+        """Return a field as the rasterizer takes it; None if this call does not have it."""
+        value: Tensor | None = self.arguments.get(self.names.get(field, field))
+        return value
+
+    def put(self, field: str, value: Tensor) -> None:
+        """Replace a field."""
+        if field in _OF_CALL:
+            raise ValueError(
+                f"a regularizer changed {field}, which belongs to the call and is no field of the Gaussians."
+            )
+        name = self.names.get(field, field)
+        self.arguments[name] = value.reshape(self.arguments[name].shape)
+
+    def params(self, chain: Chain, step: int) -> Params:
+        """Return the opacities (N,) and the other needed fields, batches flattened; ValueError if one is missing."""
+        opacities = self.arguments["opacities"].reshape(-1)
+        found: dict[str, Any] = {}
+        for name in chain.needs:
+            if name in ("opacities", "step"):
+                continue
+            value = self.get(name)
+            if value is not None and name != "view_matrix":
+                value = value.flatten(0, -3 if name == "sh" else -2)
+            if value is None or (name != "view_matrix" and len(value) != len(opacities)):
+                raise ValueError(
+                    f"{_who(chain, 'needs', name)} needs {name}, which this call of the rasterizer does not have for "
+                    f"every Gaussian: {self.instead}."
+                )
+            found[name] = value
+        return Params(opacities, step=step, **found)
+
+    def train(self, chain: Chain, step: int, tally: Tally, generator: torch.Generator | None) -> Tensor | None:
+        """Apply a draw to the arguments; return which Gaussians it kept, None if it dropped none."""
+        given = self.params(chain, step)
+        if self._replace(given, chain(given, generator=generator)):
+            tally.count_regularized(step)
+        else:
+            tally.skipped[Skip.RATE_ZERO] += 1
+        return chain.keep
+
+    def evaluate(self, chain: Chain, step: int, tally: Tally) -> None:
+        """Apply the test-time values to the arguments."""
+        given = self.params(chain, step)
+        if self._replace(given, chain.expected(given)):
+            tally.scaled += 1
+        else:
+            tally.skipped[Skip.NOTHING_TO_SCALE] += 1
+
+    def _replace(self, before: Params, after: Params) -> bool:
+        """Put the changed fields into the arguments; return whether there were any."""
+        changed = [name for name in Params._fields if getattr(after, name) is not getattr(before, name)]
+        for name in changed:
+            self.put(name, getattr(after, name))
+        return bool(changed)
+
+
+def _who(chain: Chain, attribute: str, *names: str) -> str:
+    """Return the type names of the members that need, or learn, one of these names."""
+    return ", ".join(type(member).__name__ for member in chain if set(names) & set(getattr(member, attribute)))
+
+
+MODULES = ("diff_gaussian_rasterization", "diff_gaussian_rasterization_abs")
+RASTERIZERS = tuple(f"{module}:GaussianRasterizer" for module in MODULES)
+
+
+class RasterizerCall(Call):
+    """One call of ``GaussianRasterizer.forward``.
+
+    Convention: its settings hold the view matrix transposed, for row vectors; ``viewmatrix.T`` is world to camera.
+    """
+
+    names: ClassVar = {"means": "means3D", "quaternions": "rotations", "sh": "shs"}
+    instead = (
+        "cov3D_precomp takes the place of scales and rotations (switch off compute_cov3D_python), colors_precomp that "
+        "of shs (convert_SHs_python, override_color)"
+    )
+
+    @property
+    def rasterizer(self) -> Any:
+        """The rasterizer itself."""
+        return next(iter(self.arguments.values()))
+
+    def get(self, field: str) -> Tensor | None:
+        """Return a field; "dc", where a rasterizer takes the first band separately, is prepended to ``sh``."""
+        if field == "view_matrix":
+            matrix = getattr(getattr(self.rasterizer, "raster_settings", None), "viewmatrix", None)
+            return None if matrix is None else matrix.T
+        value = super().get(field)
+        first = self.arguments.get("dc") if field == "sh" else None
+        return value if value is None or first is None else torch.cat([first, value], 1)
+
+    def put(self, field: str, value: Tensor) -> None:
+        """Replace a field."""
+        if field == "sh" and self.arguments.get("dc") is not None:
+            self.arguments["dc"], value = value[:, :1], value[:, 1:]
+        super().put(field, value)
+
+
+def check_installed(rasterizers: Iterable[str]) -> None:
+    """Raise ImportError unless the module of one, ``module:Class``, can be found; does not import it."""
+    if not _installed(rasterizers):
+        raise ImportError(
+            f"none of the rasterizers {', '.join(rasterizers)} is installed. Install the one in the submodules of your "
+            "code base (it needs CUDA), pass your own class as rasterizer=..., in the launcher --rasterizer "
+            "module:Class, or run the code base without CUDA: python -m ca_reg.integrations.run --cpu train.py ..."
+        )
+
+
+def _installed(rasterizers: Iterable[str]) -> list[str]:
+    """Return the modules of rasterizers that can be found."""
+    modules = dict.fromkeys(rasterizer.partition(":")[0] for rasterizer in rasterizers)
+    return [name for name in modules if name in sys.modules or find_spec(name.partition(".")[0]) is not None]
+
+
+def class_in(module: ModuleType, name: str) -> type | None:
+    """Return a class of a module by name, None if there is none."""
+    found = getattr(module, name, None)
+    return found if isinstance(found, type) else None
+
+
+def rasterizer_classes() -> list[type]:
+    """Import the installed rasterizers and return their classes; raise ImportError if there are none."""
+    check_installed(RASTERIZERS)
+    name = RASTERIZERS[0].partition(":")[2]
+    found = [class_in(import_module(module), name) for module in _installed(RASTERIZERS)]
+    return list(dict.fromkeys(cls for cls in found if cls is not None))
+
+
+def forward_signature(rasterizer: type) -> inspect.Signature:
+    """Return the signature of a rasterizer's forward; raise TypeError if it lacks the family's arguments."""
+    forward = getattr(rasterizer, "forward", None)
+    signature = inspect.signature(forward) if callable(forward) else inspect.Signature()
+    missing = [name for name in ("means3D", "opacities") if name not in signature.parameters]
+    if missing:
+        raise TypeError(
+            f"{rasterizer.__qualname__}.forward{signature} has no argument {' or '.join(missing)}, so it is no "
+            "GaussianRasterizer of the INRIA family; pass the class of your code base as rasterizer=..."
+        )
+    return signature
+
+
+def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
+    """Zero the radii of dropped Gaussians, and all other integers that a rasterizer returned per Gaussian.
+
+    Densification derives visibility from these. Besides the radii some rasterizers return flags (3dgs-mcmc) or counts
+    (taming-3dgs); floating-point sums of a Gaussian of opacity 0 are 0 already. Zeroes integers and bools of shape
+    (N,), (N, 1) or (N, 2) where ``keep``, (N,) bool, is False, and returns the tuple.
+
+    Raises:
+        TypeError: if ``returned`` is not a tuple.
+        ValueError: if no member is such a per-Gaussian tensor.
+    """
+    if not isinstance(returned, tuple):
+        raise TypeError(f"the rasterizer returned {type(returned).__name__}, expected a tuple with colors and radii.")
+    count = len(keep)
+    shapes = ((count,), (count, 1), (count, 2))
+    counts = [isinstance(x, Tensor) and not x.dtype.is_floating_point and x.shape in shapes for x in returned]
+    if not any(counts):
+        found = ", ".join(f"{x.dtype} {tuple(x.shape)}" if isinstance(x, Tensor) else str(type(x)) for x in returned)
+        raise ValueError(
+            f"the rasterizer returned ({found}) for {count} Gaussians, expected an integer tensor of shape ({count},), "
+            "the radii: without them dropped Gaussians cannot be hidden from densification."
+        )
+    members = [
+        x * keep.view(-1, *[1] * (x.ndim - 1)).to(x.device) if is_count else x
+        for x, is_count in zip(returned, counts, strict=True)
+    ]
+    # Keep named tuples.
+    made: tuple[Any, ...] = returned._make(members) if hasattr(returned, "_make") else tuple(members)
+    return made
+
+
+def white_alpha(call: RasterizerCall) -> Tensor:
+    """Measure the accumulated alpha (H, W) of a call by repeating it with all colors 1 over a background of 0."""
+    if not call.takes("colors_precomp"):
+        raise ValueError(
+            f"{type(call.rasterizer).__name__} takes no colors_precomp, by which its alpha could be measured in white: "
+            "return it from render, named alpha."
+        )
+    settings = call.rasterizer.raster_settings
+    opacities: Tensor = call.arguments["opacities"]
+    before = dict(call.arguments)
+    call.rasterizer.raster_settings = settings._replace(bg=torch.zeros_like(settings.bg))
+    # "dc" holds the first band where a rasterizer takes it separately.
+    call.arguments.update({name: None for name in ("shs", "dc") if name in before})
+    call.arguments["colors_precomp"] = opacities.new_ones(opacities.shape[0], 3)
+    try:
+        with torch.no_grad():
+            returned = call()
+    finally:
+        call.rasterizer.raster_settings = settings
+        call.arguments.clear()
+        call.arguments.update(before)
+    size = (3, settings.image_height, settings.image_width)
+    white = [x for x in returned if isinstance(x, Tensor) and tuple(x.shape) == size]
+    if len(white) != 1:
+        raise ValueError(f"the rasterizer returned {len(white)} images of shape {size} where one was expected.")
+    return white[0].mean(0)
+
+
+_OUTWARD = 8  # foreign frames to search for a render function
+
+
+class CallSite(NamedTuple):
+    """The function that asks for a render.
+
+    The tensors tell neither a viewer's render from a training render nor which model they belong to. The local
+    variables of the function do, in every code base of the family and in any import order; they are only read.
+
+    Args:
+        variables: its local variables.
+        place: code and instruction of each frame from it outward: the same for all renders of one call in a loop.
+    """
+
+    variables: Mapping[str, Any]
+    place: tuple[tuple[CodeType, int], ...]
+
+    @classmethod
+    def find(cls) -> CallSite:
+        """Return the nearest caller named render..., else the nearest outside of this package and torch."""
+        found, foreign = None, 0
+        frame: FrameType | None = sys._getframe(1)
+        while frame is not None and foreign < _OUTWARD:
+            if _is_foreign(frame.f_globals.get("__name__", "")):
+                foreign += 1
+                found = found or frame
+                if frame.f_code.co_name.startswith("render"):
+                    found = frame
+                    break
+            frame = frame.f_back
+        if found is None:
+            return cls({}, ())
+        place = tuple((frame.f_code, frame.f_lasti) for frame, _ in walk_stack(found))
+        variables = found.f_locals
+        site = cls(dict(variables), place)
+        # Before Python 3.13 a function's frame keeps this snapshot, and with it all tensors that the function deletes
+        # or replaces, until it returns. The variables themselves are elsewhere; those of a module are this dict.
+        if isinstance(variables, dict) and found.f_code.co_flags & inspect.CO_OPTIMIZED:
+            variables.clear()
+        return site
+
+    def find_instance(self, classes: tuple[type, ...]) -> Any:
+        """Return the first variable that is an instance of one of the classes, else None."""
+        return next((x for x in self.variables.values() if isinstance(x, classes)), None)
+
+    def is_viewer(self, camera: str | None) -> bool:
+        """Whether a viewer asked for the render; it does so with gradients enabled, before the training render.
+
+        ``camera`` is the class name of the viewer's cameras, None if there is no viewer.
+        """
+        return camera is not None and any(type(x).__name__ == camera for x in self.variables.values())
+
+    def refuse_a_second_regularizer(self, chain: Chain) -> None:
+        """Raise a RuntimeError if the calling render, as in the paper's code, already does what the chain does."""
+        perturbs = any(isinstance(member, OpacityNoise) for member in chain) and self.variables.get("train", True)
+        for name, kind, applies in (
+            ("dropout_factor", "GaussianDropout", chain.drops),
+            ("sigma_noise", "OpacityNoise", perturbs),
+        ):
+            value = self.variables.get(name)
+            if applies and isinstance(value, (int, float)) and value > 0:
+                raise RuntimeError(
+                    f"{kind} would be applied twice: the calling render has {name}={value:g}; switch it off with "
+                    f"--{name} 0."
+                )
+
+
+@functools.lru_cache(maxsize=1024)
+def _is_foreign(module: str) -> bool:
+    return module.rpartition(".")[0] != __package__ and module.partition(".")[0] != "torch"

@@ -1,0 +1,322 @@
+"""Replace functions of a code base that is not edited: after an import, on a class, or in one thread."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ._calls import RasterizerCall, class_in, forward_signature
+
+__all__ = ["AfterImport", "ClassPatch", "PatchedClasses", "is_overridden", "override"]
+
+
+class AfterImport(MetaPathFinder):
+    """Call back with a module right after its import, by whomever; at :meth:`start` if it is imported already.
+
+    Example:
+        >>> import colorsys
+        >>> seen = []
+        >>> watch = AfterImport({"colorsys": lambda module: seen.append(module.__name__)})
+        >>> watch.start()
+        >>> watch.stop()
+        >>> seen
+        ['colorsys']
+    """
+
+    def __init__(self, callbacks: Mapping[str, Callable[[ModuleType], None]]) -> None:
+        self._callbacks = callbacks
+
+    def start(self) -> None:
+        """Call back with the modules that are imported already, and watch for the others."""
+        for name, callback in self._callbacks.items():
+            if name in sys.modules:
+                callback(sys.modules[name])
+        sys.meta_path.insert(0, self)
+
+    def stop(self) -> None:
+        """Stop watching; no effect if not watching."""
+        if self in sys.meta_path:
+            sys.meta_path.remove(self)
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Let the other finders find the module, and call back once its loader has executed it."""
+        callback = self._callbacks.get(fullname)
+        if callback is None:
+            return None
+        others = (finder for finder in sys.meta_path if finder is not self)
+        specs = (finder.find_spec(fullname, path, target) for finder in others)
+        spec = next((spec for spec in specs if spec is not None), None)
+        if spec is None or spec.loader is None:
+            return spec
+        run = spec.loader.exec_module
+
+        def exec_module(module: ModuleType) -> None:
+            run(module)
+            callback(module)
+
+        # On the instance, one per module, so that the loader keeps its type, which inspect and pickle look at.
+        spec.loader.exec_module = exec_module  # type: ignore[method-assign]
+        return spec
+
+
+_INHERITED = object()
+
+
+class ClassPatch:
+    """Replaces a method of a class, its own or inherited, by ``make(method)`` until :meth:`remove`.
+
+    Example:
+        >>> class Greeter:
+        ...     def greet(self):
+        ...         return "hello"
+        >>> before = vars(Greeter)["greet"]
+        >>> patch = ClassPatch(Greeter, "greet", lambda greet: lambda self: greet(self).upper())
+        >>> Greeter().greet()
+        'HELLO'
+        >>> patch.remove()
+        >>> vars(Greeter)["greet"] is before
+        True
+    """
+
+    def __init__(self, owner: type, name: str, make: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
+        self.owner = owner
+        self.name = name
+        # From the class dictionary: getattr would unwrap a staticmethod.
+        self._before = vars(owner).get(name, _INHERITED)
+        self._replacement = make(getattr(owner, name))
+        setattr(owner, name, self._replacement)
+
+    def check_removable(self) -> None:
+        """Raise RuntimeError if the method was replaced again since; that replacement would be lost."""
+        now = vars(self.owner).get(self.name, _INHERITED)
+        if now is not self._replacement:
+            raise RuntimeError(
+                f"{self.owner.__qualname__}.{self.name} was replaced again after ca_reg had wrapped it; it is now "
+                f"{'inherited' if now is _INHERITED else now}. Undo the replacements in the reverse order."
+            )
+
+    def remove(self) -> None:
+        """Restore the same object, or delete the attribute if it was inherited; raises as `check_removable`."""
+        self.check_removable()
+        if self._before is _INHERITED:
+            delattr(self.owner, self.name)
+        else:
+            setattr(self.owner, self.name, self._before)
+
+
+class PatchedClasses:
+    """Classes whose methods are wrapped from `start` to `stop`, those given as ``module:Class`` once imported.
+
+    Args:
+        rasterizers: classes or names, which must be of the INRIA family.
+        candidates: names of further rasterizers, left alone if they are not of the family.
+        models: names of classes with a method ``update_learning_rate``.
+        rasterize: handles every call of a rasterizer.
+        update: is called with a model and an iteration before its learning rate is updated.
+        check: is called with the signature of a rasterizer, and may raise.
+
+    Attributes:
+        models: the model classes wrapped so far.
+        names: names of the rasterizers wrapped so far, for messages.
+    """
+
+    def __init__(
+        self,
+        rasterizers: Iterable[type | str],
+        candidates: Iterable[str],
+        models: Iterable[str],
+        *,
+        rasterize: Callable[[RasterizerCall], Any],
+        update: Callable[[Any, int], None],
+        check: Callable[[Any], None],
+    ) -> None:
+        self.models: tuple[type, ...] = ()
+        self.names: list[str] = []
+        self._patches: list[ClassPatch] = []
+        self._rasterize, self._update, self._check = rasterize, update, check
+        self._updated: Any = None  # the model whose update_learning_rate is running
+        self._given = [x for x in rasterizers if isinstance(x, type)]
+        found: dict[str, Callable[[type], None]] = dict.fromkeys(candidates, self._wrap_candidate)
+        found |= dict.fromkeys((x for x in rasterizers if isinstance(x, str)), self._wrap_rasterizer)
+        found |= dict.fromkeys(models, self._wrap_model)
+        self._wanted: dict[str, list[tuple[str, Callable[[type], None]]]] = {}
+        for place, wrap in found.items():
+            module, _, name = place.partition(":")
+            self._wanted.setdefault(module, []).append((name, wrap))
+        self._imports = AfterImport(dict.fromkeys(self._wanted, self._imported))
+
+    def start(self) -> None:
+        """Wrap what is imported, and watch for the rest; raises if a class cannot be wrapped."""
+        for rasterizer in self._given:
+            self._wrap_rasterizer(rasterizer)
+        self._imports.start()
+
+    def check_removable(self) -> None:
+        """Raise RuntimeError if a method was wrapped again since."""
+        for patch in self._patches:
+            patch.check_removable()
+
+    def stop(self) -> None:
+        """Restore the classes, and stop watching."""
+        self._imports.stop()
+        while self._patches:
+            self._patches.pop().remove()
+
+    def _imported(self, module: ModuleType) -> None:
+        for name, wrap in self._wanted[module.__name__]:
+            found = class_in(module, name)
+            if found is not None and all(patch.owner is not found for patch in self._patches):
+                wrap(found)
+
+    def _wrap_candidate(self, rasterizer: type) -> None:
+        try:
+            forward_signature(rasterizer)
+        except TypeError:  # not of the family
+            return
+        self._wrap_rasterizer(rasterizer)
+
+    def _wrap_rasterizer(self, rasterizer: type) -> None:
+        """Wrap the forward of a rasterizer."""
+        signature = forward_signature(rasterizer)
+        self._check(signature)
+        function: Any = rasterizer.forward  # type: ignore[attr-defined]
+        while function is not None:
+            if "ca_reg_hook" in vars(function):
+                raise RuntimeError(
+                    f"{rasterizer.__qualname__} has a RasterizerHook already; Gaussians would be dropped twice. "
+                    "Uninstall that one first, or put both regularizers into one Chain."
+                )
+            function = getattr(function, "__wrapped__", None)
+
+        def make(forward: Callable[..., Any]) -> Callable[..., Any]:
+            @functools.wraps(forward)
+            def regularized_forward(*args: Any, **kwargs: Any) -> Any:
+                return self._rasterize(RasterizerCall(forward, signature.bind(*args, **kwargs)))
+
+            # Graph break in a compiled render: what follows reads the local variables of the caller.
+            eager: Callable[..., Any] = torch.compiler.disable(regularized_forward)  # type: ignore[no-untyped-call]
+            vars(eager)["ca_reg_hook"] = self
+            return eager
+
+        self._patches.append(ClassPatch(rasterizer, "forward", make))
+        self.names.append(f"{rasterizer.__module__}.{rasterizer.__qualname__}")
+
+    def _wrap_model(self, model: type) -> None:
+        """Intercept the learning rate updates of a model."""
+        if not _takes_a_step(getattr(model, "update_learning_rate", None)):
+            return
+
+        def make(update: Callable[..., Any]) -> Callable[..., Any]:
+            @functools.wraps(update)
+            def update_learning_rate(model: Any, iteration: int, *args: Any, **kwargs: Any) -> Any:
+                if self._updated is model:  # called by an override in a subclass
+                    return update(model, iteration, *args, **kwargs)
+                self._update(model, int(iteration))
+                self._updated = model
+                try:
+                    return update(model, iteration, *args, **kwargs)
+                finally:
+                    self._updated = None
+
+            return update_learning_rate
+
+        self.models += (model,)
+        self._patches.append(ClassPatch(model, "update_learning_rate", make))
+
+
+def _takes_a_step(method: Callable[..., Any] | None) -> bool:
+    """Whether a method takes an argument besides ``self``: without one it cannot tell the iteration."""
+    return method is not None and len(inspect.signature(method).parameters) > 1
+
+
+class _Override(NamedTuple):
+    """The override of one thread: its rasterizers, its opacities, and the calls so far."""
+
+    rasterizers: tuple[type, ...]
+    opacity: Tensor
+    calls: list[RasterizerCall]
+
+
+_current: ContextVar[_Override | None] = ContextVar("_current", default=None)
+_lock = threading.Lock()
+_patches: dict[type, tuple[ClassPatch, int]] = {}  # patch and number of active overrides of every class
+
+
+def is_overridden() -> bool:
+    """Whether this thread renders with overridden opacities, which regularizers must not change."""
+    return _current.get() is not None
+
+
+@contextmanager
+def override(rasterizers: Sequence[type], opacity: Tensor) -> Iterator[list[RasterizerCall]]:
+    """Replace the opacities that this thread passes to the rasterizers.
+
+    The classes are patched once for all threads, and restored when the last override ends; renders of other threads are
+    unchanged. The opacities are activated, of all Gaussians, (N,) or (N, 1). Yields the list of calls so far.
+    """
+    mine = _Override(tuple(rasterizers), opacity, [])
+    with ExitStack() as undo:
+        for rasterizer in mine.rasterizers:
+            _acquire(rasterizer)
+            undo.callback(_release, rasterizer)
+        token = _current.set(mine)
+        undo.callback(_current.reset, token)
+        yield mine.calls
+
+
+def _acquire(rasterizer: type) -> None:
+    """Patch a class unless an active override has."""
+    with _lock:
+        patch, users = _patches.get(rasterizer) or (ClassPatch(rasterizer, "forward", _make(rasterizer)), 0)
+        _patches[rasterizer] = patch, users + 1
+
+
+def _release(rasterizer: type) -> None:
+    """Restore a class unless another override needs the patch."""
+    with _lock:
+        patch, users = _patches[rasterizer]
+        if users > 1:
+            _patches[rasterizer] = patch, users - 1
+        else:
+            patch.remove()
+            del _patches[rasterizer]
+
+
+def _make(rasterizer: type) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return the function that wraps the forward of a class."""
+    signature = forward_signature(rasterizer)
+
+    def make(forward: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(forward)
+        def with_other_opacities(*args: Any, **kwargs: Any) -> Any:
+            mine = _current.get()
+            if mine is None or rasterizer not in mine.rasterizers:
+                return forward(*args, **kwargs)
+            call = RasterizerCall(forward, signature.bind(*args, **kwargs))
+            given = call.arguments["opacities"]
+            if given.numel() != mine.opacity.numel():
+                raise ValueError(
+                    f"render rasterizes {given.numel()} Gaussians, but {mine.opacity.numel()} opacities were given; "
+                    "give those of all Gaussians, and switch off any dropout of its own."
+                )
+            call.arguments["opacities"] = mine.opacity.reshape(given.shape)
+            mine.calls.append(call)
+            return call()
+
+        return with_other_opacities
+
+    return make

@@ -1,0 +1,195 @@
+"""What a hook did, and a watchdog for training that is not regularized."""
+
+from __future__ import annotations
+
+import abc
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import TracebackType
+from typing import Any, Self
+
+from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
+
+from ca_reg._check import check_count
+
+__all__ = ["Hook", "Skip", "Tally"]
+
+
+class Skip(StrEnum):
+    """Why a render was left alone."""
+
+    FURTHER_VIEW = (
+        "render of another place in the script, after the first of its iteration (scope main); if it is a training "
+        "view like the first: --scope all"
+    )
+    CONSTANT_OPACITY = "opacities that are not trained, such as a depth render with constant ones"
+    DETACHED_MEANS = "positions that are not trained, such as a depth render for the opacities"
+    RATE_ZERO = "training render at a step where the rate is 0"
+    NOTHING_TO_SCALE = "test render of a regularizer that scales nothing"
+    SCORE = "render of a co-adaptation score"
+
+
+@dataclass
+class Tally:
+    """Counts of rasterizer calls.
+
+    Args:
+        regularized: training renders whose Gaussians were dropped or perturbed.
+        scaled: renders without gradients, or for a viewer, with test-time values.
+        skipped: renders left alone, by reason.
+        first_step: step of the first regularized render; None if there was none.
+        last_step: step of the last regularized render; None if there was none.
+        lost: training steps without a render that could be regularized.
+    """
+
+    regularized: int = 0
+    scaled: int = 0
+    skipped: Counter[Skip] = field(default_factory=Counter)
+    first_step: int | None = None
+    last_step: int | None = None
+    lost: int = 0
+
+    def count_regularized(self, step: int) -> None:
+        """Count a regularized render."""
+        self.regularized += 1
+        self.first_step = step if self.first_step is None else self.first_step
+        self.last_step = step
+
+    @property
+    def used(self) -> bool:
+        """Whether anything was counted."""
+        return bool(self.regularized or self.scaled or self.skipped.total() or self.lost)
+
+    def shortfall(self, optimizer_steps: int) -> str | None:
+        """Describe how a run fell short of being regularized; None if it did not.
+
+        Training counts as regularized if some render was, and renders that were, or had a rate of 0, outnumber lost
+        steps nine to one. A script that only renders, without optimizer steps of Gaussians, needs a test render.
+        """
+        rendered = self.regularized + self.skipped[Skip.RATE_ZERO]
+        if not (rendered or optimizer_steps or self.lost):
+            tested = self.scaled or self.skipped[Skip.NOTHING_TO_SCALE]
+            return None if tested else "No render was regularized or scaled."
+        if not self.regularized:
+            return "The training was not regularized."
+        if self.lost > rendered / 9:
+            return f"{self.lost} training steps had no render that could be regularized."
+        return None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the counts for JSON."""
+        return vars(self) | {"skipped": {reason.name.lower(): count for reason, count in self.skipped.items()}}
+
+    @classmethod
+    def from_dict(cls, counts: dict[str, Any]) -> Tally:
+        """Restore counts from JSON."""
+        skipped = Counter({Skip[name.upper()]: count for name, count in counts.get("skipped", {}).items()})
+        return cls(**{**counts, "skipped": skipped})
+
+    def lines(self) -> list[str]:
+        """Return the counts in words, one per line."""
+        steps = "" if self.first_step is None else f", steps {self.first_step} to {self.last_step}"
+        lines = [f"{self.regularized} renders regularized{steps}", f"{self.scaled} renders scaled for evaluation"]
+        lines += [f"{count} renders left alone: {reason.value}" for reason, count in self.skipped.most_common()]
+        if self.lost:
+            lines.append(f"{self.lost} training steps without a render that could be regularized")
+        if not self.regularized + self.scaled:
+            lines.append("NOTHING was regularized or scaled")
+        return lines
+
+
+_NAMES = ("opacity", "opacities")  # parameter groups in the INRIA family and in gsplat's trainers
+
+
+class Hook(abc.ABC):
+    """Regularizes scripts without edits, from `install` to `uninstall`, or within a ``with`` block.
+
+    Optimizer steps count if a parameter group is named ``opacity`` or ``opacities``: other optimizers train networks,
+    poses or exposures.
+
+    Args:
+        patience: number of optimizer steps in a row without a regularized render, and total number of training steps
+            without a render, beyond which an error is raised; 0 for no limit.
+
+    Attributes:
+        tally: counts of what was done so far.
+
+    Raises:
+        TypeError: if ``patience`` is not an integer.
+        ValueError: if it is negative.
+    """
+
+    def __init__(self, patience: int) -> None:
+        check_count(patience, "patience", minimum=0)
+        self.tally = Tally()
+        self._patience = patience
+        self._optimized = self._idle = 0  # optimizer steps: all, and those since the last regularized render
+        self._handle: Any = None
+
+    @abc.abstractmethod
+    def install(self) -> Self:
+        """Install the hook, call `_watch`, and return the hook."""
+
+    @abc.abstractmethod
+    def uninstall(self) -> None:
+        """Restore the original state, and call `_unwatch`."""
+
+    @abc.abstractmethod
+    def _explain(self) -> str:
+        """Explain why training may not have been regularized, and what to do."""
+
+    @property
+    def used(self) -> bool:
+        """Whether Gaussians were rendered or trained in this process."""
+        return self.tally.used or self._optimized > 0
+
+    def problem(self) -> str | None:
+        """Describe a failure to regularize and its remedy; None if there was none, and with a patience of 0."""
+        shortfall = self._patience and self.tally.shortfall(self._optimized)
+        return f"{shortfall} {self._explain()}" if shortfall else None
+
+    def __enter__(self) -> Self:
+        """Install the hook unless it is installed."""
+        return self.install() if self._handle is None else self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Uninstall the hook.
+
+        Raises:
+            RuntimeError: if training ended without being regularized, see :meth:`problem`.
+        """
+        self.uninstall()
+        if error is None and self._optimized and (problem := self.problem()):
+            raise RuntimeError(problem)
+
+    def note_regularized(self) -> None:
+        """Record a training render that was regularized, or whose scheduled rate is 0."""
+        self._idle = 0
+
+    def note_lost(self) -> None:
+        """Record a training step without a render; raise RuntimeError if there are too many."""
+        self.tally.lost += 1
+        self._check(self.tally.lost, "training steps had no render that could be regularized")
+
+    def _watch(self) -> None:
+        """Start watching the steps of all optimizers."""
+        self._handle = register_optimizer_step_post_hook(self._stepped)
+
+    def _unwatch(self) -> None:
+        """Stop watching; no effect if not watching."""
+        if self._handle is not None:
+            self._handle.remove()
+            self._handle = None
+
+    def _stepped(self, optimizer: Optimizer, args: Any, kwargs: Any) -> None:
+        if any(group.get("name") in _NAMES for group in optimizer.param_groups):
+            self._optimized += 1
+            self._idle += 1
+            self._check(self._idle, "optimizer steps of the Gaussians in a row, and no render was regularized")
+
+    def _check(self, count: int, what: str) -> None:
+        if 0 < self._patience < count:
+            raise RuntimeError(f"{count} {what}. {self._explain()}")

@@ -1,0 +1,148 @@
+"""What a launched script starts and downloads: processes are hooked or named, and a failed download is explained."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+from urllib.error import URLError
+
+import numpy as np
+import pytest
+
+from ca_reg.integrations._environment import Watch, in_children
+from ca_reg.integrations.run import main
+
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path), "OMP_NUM_THREADS": "1"}
+
+
+def run(*arguments, cwd):
+    command = [sys.executable, "-m", "ca_reg.integrations.run", *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.slow
+def test_scripts_that_a_script_starts_are_hooked(repository, tmp_path):
+    text = (repository / "train.py").read_text()
+    (repository / "render.py").write_text(text.replace("range(1, iterations + 1)", "[]"))
+    start = """
+        import os, subprocess, sys
+        os.system(f"{sys.executable} render.py 0")
+        subprocess.run([sys.executable, "train.py", "2"], check=True)
+    """
+    (repository / "both.py").write_text(textwrap.dedent(start))
+    done = run("--dropout", 0.5, "--report", tmp_path / "report.json", "both.py", cwd=repository)
+    assert done.returncode == 0, done.stderr
+    assert "render.py, a process that it started: 0 renders regularized; 1 renders scaled" in done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    found = {child["script"]: child["renders"]["regularized"] for child in report["started"]}
+    assert found == {"render.py": 0, "train.py": 2}
+
+
+RANKS = """
+import torch
+import torch.distributed as distributed
+import torch.multiprocessing as multiprocessing
+from gsplat.rendering import rasterization
+from oracles import random_scene
+from stand_ins.gsplat import intrinsics
+
+def work(rank, address):
+    distributed.init_process_group("gloo", init_method=address, world_size=2, rank=rank)
+    scene = random_scene(40, 20, 16, seed=1).to(torch.float32)
+    camera = scene.camera.world_to_camera[None], intrinsics(scene.camera)[None], 20, 16
+    logits = torch.zeros(40, requires_grad=True)
+    info = rasterization(scene.means, scene.quaternions, scene.scales, logits.sigmoid(), scene.colors, *camera)[2]
+    print("seen", *sorted(info["gaussian_ids"].tolist()), flush=True)
+    distributed.destroy_process_group()
+
+if __name__ == "__main__":
+    multiprocessing.spawn(work, args=("file://PLACE",), nprocs=2)
+"""
+
+
+@pytest.mark.slow
+def test_every_rank_of_a_gsplat_trainer_draws_masks_of_its_own(tmp_path):
+    pytest.importorskip("gsplat")
+    (tmp_path / "trainer.py").write_text(RANKS.replace("PLACE", str(tmp_path / "meeting")))
+    plain = run("--cpu", "trainer.py", cwd=tmp_path)
+    (tmp_path / "meeting").unlink(missing_ok=True)
+    done = run("--cpu", "--dropout", 0.5, "--report", tmp_path / "report.json", "trainer.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    all_of_them, (first, second) = (
+        [set(line.split()[1:]) for line in out.splitlines() if line.startswith("seen")]
+        for out in (plain.stdout, done.stdout)
+    )
+    assert first != second
+    assert all(len(seen) < 0.8 * len(all_of_them[0]) for seen in (first, second))
+    started = json.loads((tmp_path / "report.json").read_text())["started"]
+    assert [child["renders"]["regularized"] for child in started] == [1, 1]
+
+
+@pytest.mark.slow
+def test_a_process_that_trains_past_the_hook_fails_the_run(repository):
+    start = 'import subprocess, sys\nsubprocess.run([sys.executable, "train.py", "2"])\n'
+    (repository / "both.py").write_text(start)
+    done = run("--dropout", 0.5, "--start", 9, "both.py", cwd=repository)
+    assert done.returncode == 1
+    assert "ERROR: train.py: The training was not regularized" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "changes", "named"),
+    [
+        (["-I", "-c", "0"], {}, True),
+        (["-c", "0"], {"PYTHONPATH": ""}, True),
+        (["-c", "0"], {}, False),
+        (["-m", "ca_reg.integrations.run", "--help"], {}, False),
+    ],
+)
+def test_a_process_that_cannot_be_hooked_is_named(command, changes, named):
+    with in_children("json:dumps", {}), Watch() as watch:
+        subprocess.run(
+            [sys.executable, *command], env={**os.environ, **changes}, check=False, stdout=subprocess.DEVNULL
+        )
+        subprocess.run(["true"], check=True)
+    assert watch.missed == ([" ".join([sys.executable, *command])] if named else [])
+
+
+def test_a_sitecustomize_of_ones_own_still_runs(tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.own = 'mine'\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with in_children("json:dumps", {}):
+        done = subprocess.run(
+            [sys.executable, "-c", "import sys; print(sys.own)"], capture_output=True, text=True, check=False
+        )
+    assert done.stdout == "mine\n", done.stderr
+    assert os.environ["PYTHONPATH"] == str(tmp_path)
+
+
+DOWNLOAD = """
+import urllib.error
+from pathlib import Path
+
+def load_weights(url):
+    raise urllib.error.URLError("no network")
+
+{save}
+load_weights(url="https://example.org/vgg16.pth")
+"""
+
+
+@pytest.mark.parametrize("saves", [True, False])
+def test_a_download_of_the_scripts_own_is_explained(repository, tmp_path, capsys, saves):
+    model = tmp_path / "point_cloud.ply"
+    save = f"Path({str(model)!r}).open('wb').close()" if saves else ""
+    (repository / "evaluate.py").write_text(DOWNLOAD.format(save=save))
+    with pytest.raises(URLError):
+        main([str(repository / "evaluate.py")])
+    problem = capsys.readouterr().err.partition("ERROR: ")[2]
+    assert "script's own evaluate.py downloads https://example.org/vgg16.pth" in problem
+    assert (str(model) in problem) == saves
+
+
+def test_old_names_of_libraries_are_there_for_a_script(repository):
+    text = "import matplotlib.cm, numpy as np\nassert np.zeros(2, np.int).dtype == int and np.float is float\n"
+    (repository / "old.py").write_text(text + "assert len(matplotlib.cm.get_cmap('viridis', 7).colors) == 7\n")
+    main([str(repository / "old.py")])
+    assert not {"int", "float"} & set(vars(np))
