@@ -38,6 +38,6 @@ def begun(expression: str, scene, count: int, **settings) -> DensityStrategy:
 
 
 def short(config: TrainConfig, expression: str, iterations: int) -> TrainConfig:
-    """Settings with this density control, and as many fields as it compares."""
-    fields = 2 if "fields" in DENSITY.make_one(expression).needs else 1
-    return dataclasses.replace(config, density=expression, iterations=iterations, prune_size=None, fields=fields)
+    """Settings with this density control, and as many models as it compares."""
+    models = 2 if "models" in DENSITY.make_one(expression).needs else 1
+    return dataclasses.replace(config, density=expression, iterations=iterations, prune_size=None, models=models)

@@ -137,7 +137,7 @@ class Train:
 
         if self.deterministic and self.config.renderer == "gsplat":
             raise ValueError(
-                "--deterministic needs --renderer torch: gsplat's kernels add gradients in whatever order they come, "
+                "--deterministic needs --renderer builtin: gsplat's kernels add gradients in whatever order they come, "
                 "which PyTorch cannot change."
             )
         between = min(self.monitor_every, self.config.iterations)
@@ -150,7 +150,7 @@ class Train:
                 viewer = stack.enter_context(Viewer(*self.viewer or (PORT,)))
                 watched = {"watch": viewer.follow}
                 print(viewer)
-            if self.config.renderer == "torch":
+            if self.config.renderer == "builtin":
                 self.drawing.begin(self.device, trains=True)
             if self.deterministic:
                 stack.enter_context(deterministic(self.device))
@@ -348,7 +348,7 @@ class Compare:
             lpips=self.lpips,
             say=print,
         )
-        if self.config.renderer == "torch":
+        if self.config.renderer == "builtin":
             self.drawing.begin(self.device, trains=True)
         comparisons = compare(scene_folders(paths, self.scene, self.out), chosen, range(self.seeds), running)
         report(comparisons, say=print)

@@ -1,4 +1,4 @@
-"""CoR-GS's density control: Gaussians without a counterpart in the other field are pruned."""
+"""CoR-GS's density control: Gaussians without a counterpart in the other model are pruned."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from ca_reg.neighbors import nearest_distance
 from reference_trainer.density.adaptive import AdaptiveDensity
 from reference_trainer.density.operations import refuse_not_finite
 from reference_trainer.training.errors import TrainingStoppedError
-from reference_trainer.training.field import Field
+from reference_trainer.training.model_state import ModelState
 
 __all__ = ["CoPruning"]
 
 
 class CoPruning(AdaptiveDensity):
-    """`AdaptiveDensity` that also prunes where the fields disagree (CoR-GS, Zhang et al. 2024, Sec. 3.3).
+    """`AdaptiveDensity` that also prunes where the models disagree (CoR-GS, Zhang et al. 2024, Sec. 3.3).
 
     Every ``every`` steps after ``densify_from``, to the end of the training, Gaussians that lack a neighbor nearer than
-    ``distance`` in any other field are pruned; all fields are compared before any is pruned. It needs ``fields=2``.
+    ``distance`` in any other model are pruned; all models are compared before any is pruned. It needs ``models=2``.
     Defaults are the source's for LLFF (jiaw-z/CoR-GS 1db13a4, train.py, lines 284-301).
 
     Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; neighbors are sought among all.
@@ -34,7 +34,7 @@ class CoPruning(AdaptiveDensity):
         ValueError: if one is out of range.
     """
 
-    needs = frozenset({"fields"})
+    needs = frozenset({"models"})
 
     def __init__(self, distance: float = 5.0, every: int = 500) -> None:
         if not distance > 0:
@@ -42,22 +42,22 @@ class CoPruning(AdaptiveDensity):
         check_count(every, "every", minimum=1, hint=": density control without it is 'adaptive'")
         self.distance, self.every = distance, every
 
-    def together(self, fields: Sequence[Field], step: int) -> None:
-        """Prune all fields."""
+    def together(self, models: Sequence[ModelState], step: int) -> None:
+        """Prune all models."""
         if not (step > self.config.densify_from and step % self.every == 0):
             return
-        for field in fields:
-            refuse_not_finite(field.optimizer, step)
-        means = [field.gaussians.means.detach() for field in fields]
+        for model in models:
+            refuse_not_finite(model.optimizer, step)
+        means = [model.gaussians.means.detach() for model in models]
         keeps = [
             torch.stack([nearest_distance(own, other) < self.distance for other in means if other is not own]).all(0)
             for own in means
         ]
-        for field, keep in zip(fields, keeps, strict=True):
+        for model, keep in zip(models, keeps, strict=True):
             if not bool(keep.any()):
                 raise TrainingStoppedError(
-                    f"no Gaussian has one of another field within {self.distance:g} after step {step}: raise distance, "
+                    f"no Gaussian has one of another model within {self.distance:g} after step {step}: raise distance, "
                     "which is in world units."
                 )
-            assert isinstance(field.density, AdaptiveDensity)
-            field.density.select(field.optimizer, keep)
+            assert isinstance(model.density, AdaptiveDensity)
+            model.density.select(model.optimizer, keep)

@@ -97,7 +97,7 @@ def shared(gaussians: Gaussians, drawn: Tensor) -> Gaussians:
 
     Args:
         gaussians: all N.
-        drawn: their numbers, shape (M,), repeated if drawn more than once.
+        drawn: their indices, shape (M,), repeated if drawn more than once.
     """
     table = [[math.comb(n, k) for k in range(_MOST)] for n in range(_MOST)]
     copies = gaussians[drawn]

@@ -1,4 +1,4 @@
-"""SE-GS's density control: the second field is perturbed where the first one's pictures change over time."""
+"""SE-GS's density control: the second model is perturbed where the first one's pictures change over time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
 from reference_trainer.scenes.pseudo import pseudo_cameras
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.field import Field
+from reference_trainer.training.model_state import ModelState
 from reference_trainer.training.randomness import stream
 
 __all__ = ["SelfEnsembling"]
@@ -28,11 +28,11 @@ _BOX = 5  # pixels, over which deviations are averaged
 
 
 class SelfEnsembling(CoPruning):
-    """`CoPruning` that perturbs the second field where the first is uncertain (SE-GS, Zhao et al., ICCV 2025).
+    """`CoPruning` that perturbs the second model where the first is uncertain (SE-GS, Zhao et al., ICCV 2025).
 
-    Every ``every`` steps the first field is rendered at the same `pseudo_cameras`. From ``start`` to ``stop`` it is
+    Every ``every`` steps the first model is rendered at the same `pseudo_cameras`. From ``start`` to ``stop`` it is
     uncertain where the standard deviation over the last three of these times, averaged over the channels and 5 x 5
-    pixels, exceeds ``least`` and is among the ``share`` of a picture's largest. The other field's Gaussians whose
+    pixels, exceeds ``least`` and is among the ``share`` of a picture's largest. The other model's Gaussians whose
     center lies within such a picture, nearer to an uncertain pixel than the root of their radius in pixels, get the
     noise of `SEGSNoise`, for good, and the optimizer state of all Gaussians' geometry is cleared. (The root, because
     the source compares a squared distance with a radius.) Two pictures of every view are kept, also in checkpoints.
@@ -79,34 +79,34 @@ class SelfEnsembling(CoPruning):
     def begin(self, config: TrainConfig, scene: Scene, device: torch.device, count: int) -> None:
         """Place the cameras."""
         super().begin(config, scene, device, count)
-        if self.field == 0:
+        if self.index == 0:
             draw = pseudo_cameras(scene)
             self.background = scene.background.to(device)
             self.cameras = [draw(stream(config.seed, i, "self_ensembling/view", device)) for i in range(self.views)]
-            self.pictures = torch.zeros(2, self.views, 3, self.cameras[0].height, self.cameras[0].width, device=device)
+            self.images = torch.zeros(2, self.views, 3, self.cameras[0].height, self.cameras[0].width, device=device)
 
     @torch.no_grad()
-    def together(self, fields: Sequence[Field], step: int) -> None:
-        """Prune all fields, render the first and perturb the others."""
-        super().together(fields, step)
+    def together(self, models: Sequence[ModelState], step: int) -> None:
+        """Prune all models, render the first and perturb the others."""
+        super().together(models, step)
         if step % self.every or not self.start - 2 * self.every <= step < self.stop:
             return
         degree = self.config.sh_degree_at(step)
         first = [
-            render_gaussians(fields[0].gaussians, camera, self.background, sh_degree=degree).image
+            render_gaussians(models[0].gaussians, camera, self.background, sh_degree=degree).image
             for camera in self.cameras
         ]
-        pictures = torch.cat([self.pictures, torch.stack(first)[None]])
-        self.pictures = pictures[1:].clone()
+        images = torch.cat([self.images, torch.stack(first)[None]])
+        self.images = images[1:].clone()
         if step >= self.start:
-            where = self.uncertain(pictures)
-            for number, field in enumerate(fields[1:]):
+            where = self.uncertain(images)
+            for number, model in enumerate(models[1:]):
                 generator = stream(self.config.seed, step, f"self_ensembling/{number}", self.device)
-                self.perturb(field, self.under(field.gaussians, where), step, generator)
+                self.perturb(model, self.under(model.gaussians, where), step, generator)
 
-    def uncertain(self, pictures: Tensor) -> Tensor:
-        """Return where pictures (T, V, 3, H, W) of V views at T times differ, shape (V, H, W), bool."""
-        deviation = avg_pool2d(pictures.std(0).mean(1), _BOX, stride=1, padding=_BOX // 2)
+    def uncertain(self, images: Tensor) -> Tensor:
+        """Return where images (T, V, 3, H, W) of V views at T times differ, shape (V, H, W), bool."""
+        deviation = avg_pool2d(images.std(0).mean(1), _BOX, stride=1, padding=_BOX // 2)
         pixels = deviation[0].numel()
         limit = deviation.flatten(1).kthvalue(pixels - int(self.share * pixels), dim=1).values
         return deviation > limit.clamp(min=self.least)[:, None, None]
@@ -124,9 +124,9 @@ class SelfEnsembling(CoPruning):
                 found[splats.indices[inside & near]] = True
         return found
 
-    def perturb(self, field: Field, chosen: Tensor, step: int, generator: torch.Generator) -> None:
-        """Add the noise of a step to the chosen Gaussians, (N,) bool, of a field."""
-        x = field.gaussians.params(step=step)
+    def perturb(self, model: ModelState, chosen: Tensor, step: int, generator: torch.Generator) -> None:
+        """Add the noise of a step to the chosen Gaussians, (N,) bool, of a model."""
+        x = model.gaussians.params(step=step)
         noisy = self.noise.replay(x, self.noise.draw(x, generator))
         assert noisy.means is not None
         assert noisy.scales is not None
@@ -137,16 +137,16 @@ class SelfEnsembling(CoPruning):
             "quaternions": noisy.quaternions,
             "opacity_logits": noisy.opacities.logit(eps=1e-6),
         }
-        every = dict(field.gaussians.named())
-        field.optimizer.relocate(chosen.nonzero()[:, 0], Gaussians.from_named(every | geometry)[chosen])
-        field.optimizer.forget(slice(None), *geometry)
+        every = dict(model.gaussians.named())
+        model.optimizer.relocate(chosen.nonzero()[:, 0], Gaussians.from_named(every | geometry)[chosen])
+        model.optimizer.forget(slice(None), *geometry)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the statistics, and the pictures if this is the first field."""
-        return super().state_dict() | ({} if self.field else {"pictures": self.pictures})
+        """Return the statistics, and the pictures if this is the first model."""
+        return super().state_dict() | ({} if self.index else {"pictures": self.images})
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore the statistics and pictures."""
         super().load_state_dict({name: x for name, x in state.items() if name != "pictures"})
-        if self.field == 0:
-            self.pictures = state["pictures"]
+        if self.index == 0:
+            self.images = state["pictures"]

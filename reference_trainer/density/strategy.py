@@ -16,7 +16,7 @@ from reference_trainer.render import Splats
 from reference_trainer.renderers.gsplat import GsplatSplats
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.field import Field
+from reference_trainer.training.model_state import ModelState
 
 __all__ = ["DensityStrategy"]
 
@@ -33,14 +33,14 @@ class DensityStrategy(abc.ABC):
 
     Attributes:
         needs: what it requires: ``"absgrad"`` of the renderer, for ``splats.projection.means.absgrad``, the sums of
-            absolute gradients; ``"fields"`` of the training, at least two.
+            absolute gradients; ``"models"`` of the training, at least two.
         resets: whether it obeys the ``opacity_reset`` settings.
-        field: the number of the field that it controls, if a training has several.
+        index: which of the training's models it controls, the first being 0.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset()
     resets: ClassVar[bool] = False
-    field: int = 0
+    index: int = 0
 
     config: TrainConfig
     scene: Scene
@@ -57,7 +57,7 @@ class DensityStrategy(abc.ABC):
             device: of the Gaussians.
             count: their number.
         """
-        self.config = replace(config, seed=config.seed + (self.field << 32))  # every field has its own random splits
+        self.config = replace(config, seed=config.seed + (self.index << 32))  # every model has its own random splits
         self.scene, self.extent, self.device = scene, scene.extent, device
         self.large = config.dense_fraction * self.extent  # what is larger is split, what is smaller cloned
         self.reset(count)
@@ -81,8 +81,8 @@ class DensityStrategy(abc.ABC):
             TrainingStoppedError: if the Gaussians are not finite, or none is left.
         """
 
-    def together(self, fields: Sequence[Field], step: int) -> None:  # noqa: B027 (most look at one field alone)
-        """Change what depends on several fields, after `before_step` of each; called on the first field's strategy."""
+    def together(self, models: Sequence[ModelState], step: int) -> None:  # noqa: B027 (most look at one model alone)
+        """Change what depends on several models, after `before_step` of each; called on the first model's strategy."""
 
     def observes(self, step: int) -> bool:
         """Whether `observe` is to be called at a step, with what the strategy needs of the renderer."""

@@ -1,4 +1,4 @@
-"""CoR-GS's comparison of a training's fields with each other, at views without a photograph."""
+"""CoR-GS's comparison of a training's models with each other, at views without a photograph."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ __all__ = ["CoRegularization"]
 
 
 class CoRegularization(WeightedTerm):
-    """``weight`` times the photometric loss between the renders of all fields, at a pseudo view (CoR-GS, 2024).
+    """``weight`` times the photometric loss between the renders of all models, at a pseudo view (CoR-GS, 2024).
 
-    At each step one of the `pseudo_cameras` is rendered with the plain model of every field, and each compared with the
+    At each step one of the `pseudo_cameras` is rendered with each of the models, plain, and each compared with the
     others as if they were photographs, mean over the others. Density control does not see these renders. It needs
-    ``fields=2``, and costs a render of every field.
+    ``models=2``, and costs a render of every model.
 
     Args:
         weight: at least 0, or a schedule. The source uses 1 from step 500 on with LLFF, from 2,000 on with DTU:
@@ -32,7 +32,7 @@ class CoRegularization(WeightedTerm):
         ValueError: if one is out of range, or the scene has no `pseudo_cameras`.
     """
 
-    needs = frozenset({"fields"})
+    needs = frozenset({"models"})
     analytic = True
 
     def __init__(self, weight: float | Schedule = 1.0, lambda_dssim: float = 0.2) -> None:
@@ -45,11 +45,11 @@ class CoRegularization(WeightedTerm):
         self.draw = pseudo_cameras(scene)
 
     def value(self, step: Step) -> Tensor:
-        """Compare all fields, once: at the step of the first."""
+        """Compare all models, once: at the step of the first."""
         zero = step.image.new_zeros(())
-        if step is not step.fields[0]:
+        if step is not step.siblings[0]:
             return zero
         camera = self.draw(step.generator("co_regularization"))
-        images = [each.render(camera).image for each in step.fields]
+        images = [each.render(camera).image for each in step.siblings]
         losses = [photometric_loss(own, other.detach(), self.lambda_dssim) for own, other in permutations(images, 2)]
         return sum(losses, start=zero) / (len(images) - 1)

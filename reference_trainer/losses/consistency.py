@@ -61,7 +61,7 @@ class Consistency(WeightedTerm):
     def value(self, step: Step) -> Tensor:
         """Compare the two renders."""
         camera = step.view.camera
-        untouched = step.rendering is not None and step.drawn is step.params
+        untouched = step.rendering is not None and step.rendered is step.params
         full = step.image if untouched else step.render(camera).image
         if self.exact:
             moments = step.moments(camera, Multiplier.dropout(self.p))

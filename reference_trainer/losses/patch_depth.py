@@ -113,9 +113,9 @@ def patch_error(depth: Tensor, prior: Tensor, side: int, tolerance: float, *, ov
     whole = unfold(known[None, None].to(depth), side, stride=side)[0].amin(0) > 0
     if not bool(whole.any()):
         return depth.sum() * 0
-    for picture in (depth, prior):
-        patches = unfold(picture[None, None], side, stride=side)[0].T[whole]
-        spread = picture[known].std().detach() if overall else patches.std(dim=1, keepdim=True)
+    for image in (depth, prior):
+        patches = unfold(image[None, None], side, stride=side)[0].T[whole]
+        spread = image[known].std().detach() if overall else patches.std(dim=1, keepdim=True)
         flat.append((patches - patches.mean(dim=1, keepdim=True)) / (spread + 0.01 * patches.std()).clamp_min(1e-12))
     difference = flat[0] - flat[1]
     beyond = difference.abs() > tolerance

@@ -198,7 +198,7 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         blurred: x, y, x y and x^2 + y^2, shape (4, C, H, W).
     """
-    if engine_for(blurred.device, blurred.dtype).name == "loops":
+    if engine_for(blurred.device, blurred.dtype).name == "numba":
         from reference_trainer.losses.ssim_loops import similarity
 
         return similarity(blurred, _C1, _C2)
@@ -214,7 +214,7 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
 
 def _blur(maps: Tensor) -> Tensor:
     """Blur maps (..., H, W) with the zero-padded window."""
-    if engine_for(maps.device, maps.dtype).name == "loops":
+    if engine_for(maps.device, maps.dtype).name == "numba":
         from reference_trainer.losses.ssim_loops import blur
 
         return blur(maps, _WEIGHTS)

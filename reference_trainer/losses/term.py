@@ -19,7 +19,7 @@ class LossTerm(abc.ABC):
 
     Attributes:
         needs: what it requires besides image and alpha: ``"depth"`` of the renderer, which the step's render then has,
-            or ``"moments"``; ``"fields"`` of the training, at least two.
+            or ``"moments"``; ``"models"`` of the training, at least two.
         analytic: whether the term works with an expected image and its variance, without a draw.
     """
 

@@ -90,7 +90,7 @@ def edge_aware_smoothness(disparity: Tensor, image: Tensor) -> Tensor:
         >>> edge_aware_smoothness(torch.arange(5.0).expand(4, 5), torch.zeros(3, 4, 5)).item()
         1.0
     """
-    pictures = torch.stack([image.sum(0), disparity])
-    edges, steps = spatial_gradient(pictures[None], mode="diff")[0, :, :, 1:-1, 1:-1]
+    images = torch.stack([image.sum(0), disparity])
+    edges, steps = spatial_gradient(images[None], mode="diff")[0, :, :, 1:-1, 1:-1]
     smoothness: Tensor = (torch.exp(-0.33 * edges.abs()) * steps).abs().mean((-2, -1)).sum()
     return smoothness

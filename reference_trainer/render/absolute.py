@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from reference_trainer.render.renderer import draw
+from reference_trainer.render.renderer import rasterize
 from reference_trainer.render.splats import Rendering, Splats
 
 __all__ = ["absgrad_sink", "splat_weights", "with_absolute_gradients"]
@@ -18,7 +18,7 @@ def splat_weights(splats: Splats) -> Tensor:
     """Sum every splat's blend weight, alpha times transmittance, over the pixels of the picture; shape (M,)."""
     colors = torch.zeros_like(splats.colors).requires_grad_()
     with torch.enable_grad():
-        red = draw(splats._replace(colors=colors)).image[0].sum()
+        red = rasterize(splats._replace(colors=colors)).image[0].sum()
     return torch.autograd.grad(red, colors)[0][:, 0]
 
 
@@ -56,7 +56,7 @@ def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tens
     default.
     """
     depth = torch.zeros_like(rendering.alpha) if rendering.depth is None else rendering.depth
-    behind = rendering.image.new_zeros(3) if background is None else background.detach().to(rendering.image)
+    background = rendering.image.new_zeros(3) if background is None else background.detach().to(rendering.image)
     drawn = torch.cat([rendering.image, depth[None], rendering.alpha[None]])
-    drawn = _AbsoluteGradients.apply(drawn, sink, rendering.splats, behind)  # type: ignore[no-untyped-call]
+    drawn = _AbsoluteGradients.apply(drawn, sink, rendering.splats, background)  # type: ignore[no-untyped-call]
     return rendering._replace(image=drawn[:3], alpha=drawn[4], depth=None if rendering.depth is None else drawn[3])

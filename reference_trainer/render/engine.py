@@ -16,14 +16,22 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.eager.engine import TorchEngine
 from reference_trainer.render.splats import MomentImages, Projection, Splats, TileLists
+from reference_trainer.render.torch.engine import TorchEngine
 
 __all__ = [
-    "ENGINES", "Engine", "chosen_engine", "describe_engine", "drawn_by", "engine_for", "engines_on", "use_engine"
+    "ENGINES",
+    "Engine",
+    "chosen_engine",
+    "describe_engine",
+    "engine_for",
+    "engines_on",
+    "use_engine",
+    "using_engine"
 ]  # fmt: skip
 
-ENGINES = ("auto", "torch", "loops")
+ENGINES = ("auto", "torch", "numba")
+_RENAMED = {"loops": "numba"}
 _VARIABLE = "CA_REG_ENGINE"
 _TORCH = TorchEngine()
 
@@ -70,13 +78,13 @@ class Engine(Protocol):
         with respect to it.
         """
 
-    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
+    def moments(self, splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
         """Return mean and variance of every pixel under random factors on the alphas of the full model.
 
-        ``multiplier`` (M, 2) holds mean and variance of every splat's factor, ``behind`` (3, H, W) the background.
+        ``multiplier`` (M, 2) holds mean and variance of every splat's factor, the background is (3, H, W).
         """
 
-    def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
+    def shares(self, splats: Splats, multiplier: Tensor, background: Tensor, weights: Tensor) -> Tensor:
         """Return every splat's share of the variance, (M,), float64, for weights of the pixels (H, W)."""
 
 
@@ -84,11 +92,11 @@ def use_engine(name: str) -> None:
     """Choose the engine of this process and of those that it starts (through the environment, ``CA_REG_ENGINE``).
 
     Args:
-        name: ``torch``, ``loops``, or ``auto``, the default: the loops for float32 on a CPU where numba is installed.
+        name: ``torch``, ``numba``, or ``auto``, the default: numba for float32 on a CPU where it is installed.
 
     Raises:
         ValueError: if there is no such engine.
-        ImportError: if loops are asked for and numba is missing.
+        ImportError: if numba is asked for and missing.
 
     Example:
         >>> use_engine("torch")
@@ -96,10 +104,9 @@ def use_engine(name: str) -> None:
         'torch'
         >>> use_engine("auto")
     """
-    if name not in ENGINES:
-        raise ValueError(f"there is no engine {name!r}; choose one of {', '.join(ENGINES)}.")
-    if name == "loops" and _loop_engine() is None:
-        raise ImportError("the compiled loops need numba: pip install 'ca_reg[trainer]', or use the engine torch.")
+    _check_name(name, "there is no engine {name!r}")
+    if name == "numba" and _numba_engine() is None:
+        raise ImportError("the engine numba needs numba: pip install 'ca_reg[trainer]', or use the engine torch.")
     os.environ[_VARIABLE] = name
 
 
@@ -110,29 +117,35 @@ def chosen_engine() -> str:
         ValueError: if the environment names an engine that does not exist.
     """
     chosen = os.environ.get(_VARIABLE, "auto")
-    if chosen not in ENGINES:
-        raise ValueError(f"{_VARIABLE} names the engine {chosen!r}; choose one of {', '.join(ENGINES)}.")
+    _check_name(chosen, f"{_VARIABLE} names the engine {{name!r}}")
     return chosen
 
 
+def _check_name(name: str, complaint: str) -> None:
+    """Raise a ValueError that begins with the complaint unless there is such an engine."""
+    if name not in ENGINES:
+        hint = f"it is called {_RENAMED[name]} now" if name in _RENAMED else f"choose one of {', '.join(ENGINES)}"
+        raise ValueError(f"{complaint.format(name=name)}; {hint}.")
+
+
 def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engine:
-    """Return the loops for float32 on a CPU, if chosen and available, else torch; errors are `chosen_engine`'s."""
+    """Return numba for float32 on a CPU, if chosen and available, else torch; errors are `chosen_engine`'s."""
     if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
         return _TORCH
-    return _loop_engine() or _TORCH
+    return _numba_engine() or _TORCH
 
 
 def engines_on(device: torch.device) -> tuple[str, ...]:
-    """Return the engines that draw float32 on a device: "loops" only on a CPU, and where numba works."""
-    return ("loops", "torch") if device.type == "cpu" and _loop_engine() is not None else ("torch",)
+    """Return the engines that draw float32 on a device: "numba" only on a CPU, and where numba works."""
+    return ("numba", "torch") if device.type == "cpu" and _numba_engine() is not None else ("torch",)
 
 
 @contextmanager
-def drawn_by(engine: str) -> Iterator[None]:
-    """Draw with an engine within a block; errors are those of `use_engine`.
+def using_engine(engine: str) -> Iterator[None]:
+    """Render with an engine within a block; errors are those of `use_engine`.
 
     Example:
-        >>> with drawn_by("torch"):
+        >>> with using_engine("torch"):
         ...     describe_engine("cpu")
         'torch'
     """
@@ -146,17 +159,17 @@ def describe_engine(device: torch.device | str) -> str:
     if engine_for(torch.device(device)).name == "torch":
         return "torch"
     count = torch.get_num_threads()
-    return f"loops (numba {version('numba')}, {count} thread{'s' if count > 1 else ''})"
+    return f"numba ({version('numba')}, {count} thread{'s' if count > 1 else ''})"
 
 
 @functools.cache
-def _loop_engine() -> Engine | None:
-    """Return the loops, or None if numba is missing or does not work."""
+def _numba_engine() -> Engine | None:
+    """Return the engine of compiled loops, or None if numba is missing or does not work."""
     if importlib.util.find_spec("numba") is None:
         return None
     try:
-        from reference_trainer.render.loops.engine import LoopEngine
+        from reference_trainer.render.numba.engine import NumbaEngine
     except ImportError as error:  # such as a NumPy that is too new for it
         warnings.warn(f"numba is installed but cannot be imported ({error}): the engine torch draws.", stacklevel=2)
         return None
-    return LoopEngine()
+    return NumbaEngine()

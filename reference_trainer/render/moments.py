@@ -37,7 +37,7 @@ def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor
         (0.4, 0.16)
     """
     with torch.autocast(splats.colors.device.type, enabled=False):
-        return splats.engine.moments(splats, _factors(multiplier, splats), _behind(background, splats))
+        return splats.engine.moments(splats, _factors(multiplier, splats), _background_image(background, splats))
 
 
 @torch.no_grad()
@@ -71,12 +71,12 @@ def variance_shares(
         raise ValueError(f"weights must have one value per pixel, shape {shape}, got {tuple(weights.shape)}.")
     with torch.autocast(splats.colors.device.type, enabled=False):
         return splats.engine.shares(
-            splats, _factors(multiplier, splats), _behind(background, splats), weights.to(splats.colors)
+            splats, _factors(multiplier, splats), _background_image(background, splats), weights.to(splats.colors)
         )
 
 
-def _behind(background: Tensor | None, splats: Splats) -> Tensor:
-    """Return what is behind the last splat, (3, H, W)."""
+def _background_image(background: Tensor | None, splats: Splats) -> Tensor:
+    """Return the background of every pixel, (3, H, W)."""
     shape = (3, splats.lists.height, splats.lists.width)
     found = checked_background(background, splats, (3,), shape)
     return (found if found.ndim == 3 else found[:, None, None]).expand(shape)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, NEAR_PLANE
-from reference_trainer.render.eager.projection import project
+from reference_trainer.render.torch.projection import project
 
 __all__ = ["SMALLEST_SPREAD", "in_front", "longer_radii", "visible_radii"]
 

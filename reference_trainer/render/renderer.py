@@ -11,7 +11,7 @@ from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.engine import engine_for
 from reference_trainer.render.splats import Rendering, Splats
 
-__all__ = ["draw", "draw_masks", "render", "splat"]
+__all__ = ["rasterize", "render", "render_masks", "splat"]
 
 
 def splat(
@@ -114,10 +114,10 @@ def render(
         (torch.Size([3, 32, 32]), 0.8)
     """
     splats = splat(means, quaternions, scales, opacities, camera, sh=sh, sh_degree=sh_degree, colors=colors)
-    return draw(splats, background=background, depth=depth)
+    return rasterize(splats, background=background, depth=depth)
 
 
-def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = False) -> Rendering:
+def rasterize(splats: Splats, *, background: Tensor | None = None, depth: bool = False) -> Rendering:
     """Composite the splats of `splat`; other arguments and errors are those of `render`."""
     if splats.projection.means.requires_grad:
         splats.projection.means.retain_grad()
@@ -129,8 +129,8 @@ def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = Fals
 
 
 @torch.no_grad()
-def draw_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Draw the same Gaussians K times with lower opacities, without projecting and sorting them again.
+def render_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Render the same Gaussians K times with lower opacities, without projecting and sorting them again.
 
     Args:
         splats: of a view.

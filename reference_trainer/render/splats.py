@@ -44,7 +44,7 @@ class TileLists:
         width: image width, pixels.
         height: image height, pixels.
         starts: where each tile's list starts, row by row over the image, and where the last ends, shape (tiles + 1,).
-        gaussians: the numbers of the listed Gaussians, tile after tile, shape (P,).
+        gaussians: the indices of the listed Gaussians, tile after tile, shape (P,).
         touched: whether a Gaussian is in any list, shape (M,) bool.
         slots: a unique number for every entry, consecutive for each Gaussian, shape (P,); the loops need them.
         offsets: each Gaussian's first slot, and the number of all, shape (M + 1,); likewise.

@@ -65,15 +65,15 @@ def load_gsplat_render(device: torch.device | str) -> Callable[..., GsplatRender
     if torch.device(device).type != "cuda":
         raise RuntimeError(
             f"the gsplat renderer draws on CUDA devices only, and the device is {str(device)!r}: train with --device "
-            "cuda, or with --renderer torch, which runs anywhere."
+            "cuda, or with --renderer builtin, which runs anywhere."
         )
     if not torch.cuda.is_available():
-        raise RuntimeError("the gsplat renderer needs a CUDA device, and torch finds none: use --renderer torch.")
+        raise RuntimeError("the gsplat renderer needs a CUDA device, and torch finds none: use --renderer builtin.")
     try:
         import gsplat
     except ModuleNotFoundError as error:
         raise ImportError(
-            "the gsplat renderer needs gsplat: pip install 'ca_reg[gsplat]', or use --renderer torch."
+            "the gsplat renderer needs gsplat: pip install 'ca_reg[gsplat]', or use --renderer builtin."
         ) from error
     return functools.partial(render_by, gsplat.rasterization)
 
@@ -104,7 +104,7 @@ def render_by(
     """
     values, degree = checked_colors(sh, sh_degree, colors)
     if means.dtype != torch.float32:
-        raise TypeError(f"the gsplat renderer knows float32 only, got {means.dtype}: use the torch renderer.")
+        raise TypeError(f"the gsplat renderer knows float32 only, got {means.dtype}: use the builtin one.")
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
     images, alphas, info = rasterization(
         means=means,

@@ -8,13 +8,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+from reference_trainer.json_files import settings_from
+
 if TYPE_CHECKING:
     from ca_reg import Chain
     from reference_trainer.density import DensityStrategy
     from reference_trainer.losses import LossTerm
     from reference_trainer.renderers import Renderer
 
-__all__ = ["TrainConfig"]
+__all__ = ["TrainConfig", "saved_config"]
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class TrainConfig:
     """Settings of one training run. The defaults are those of the recipe ``3dgs``, but 3,000 iterations.
 
     Raises:
-        TypeError: if a number of steps, fields, Gaussians or bands, or the seed, is no integer.
+        TypeError: if a number of steps, models, Gaussians or bands, or the seed, is no integer.
         ValueError: if a setting is out of range, or two contradict each other.
     """
 
@@ -47,12 +49,12 @@ class TrainConfig:
     density: str = "adaptive"
     """Density control, such as "absgrad" or "share_pruning(every=500)", or "my_module:MyStrategy"; `ca-reg names` lists
     them."""
-    fields: int = 1
+    models: int = 1
     """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
     random_background: bool = False
     """Train over a background color drawn anew at each step, which penalizes transparency (CoR-GS, SE-GS)."""
-    renderer: str = "torch"
-    """Renderer of the training: "torch", this package's own, "gsplat", which needs gsplat and a CUDA device, or
+    renderer: str = "builtin"
+    """Renderer of the training: "builtin", this package's own, "gsplat", which needs gsplat and a CUDA device, or
     "my_module:MyRenderer"."""
 
     sh_degree: int = 3
@@ -120,6 +122,8 @@ class TrainConfig:
             for name in names:
                 if not right(getattr(self, name)):
                     raise ValueError(f"{name} must be {rule}, got {getattr(self, name)!r}{hint}.")
+        if self.renderer in _RENAMED_RENDERERS:
+            raise ValueError(f"the renderer {self.renderer!r} is called {_RENAMED_RENDERERS[self.renderer]!r} now.")
         if self.analytic and not self.regularizers:
             raise ValueError("analytic training needs something to average over: set dropout, noise or regularizer.")
         if self.regularize_from >= self.iterations and self.regularizers:
@@ -167,12 +171,12 @@ class TrainConfig:
 
         return LOSSES.make(self.loss)
 
-    def make_density(self, field: int = 0) -> DensityStrategy:
-        """Make the density control of a field."""
+    def make_density(self, index: int = 0) -> DensityStrategy:
+        """Make the density control of one of the models."""
         from reference_trainer.density import DENSITY
 
         density = DENSITY.make_one(self.density)
-        density.field = field
+        density.index = index
         return density
 
     def make_renderer(self) -> Renderer:
@@ -189,14 +193,14 @@ class TrainConfig:
         if not terms:
             raise ValueError("loss needs at least one term, such as photometric.")
         of_terms = frozenset[str]().union(*(term.needs for term in terms))
-        if self.fields < 2 and "fields" in density.needs | of_terms:
-            raise ValueError(f"{self.loss} with {self.density} compares fields, of which there is one: set fields=2.")
+        if self.models < 2 and "models" in density.needs | of_terms:
+            raise ValueError(f"{self.loss} with {self.density} compares models, of which there is one: set models=2.")
         if self.analytic and "moments" not in renderer.capabilities:
-            raise ValueError("analytic training needs the moments of the torch renderer: leave out renderer.")
+            raise ValueError("analytic training needs the moments of the builtin renderer: leave out renderer.")
         if self.analytic and "absgrad" in density.needs:
             raise ValueError(f"analytic training has no absolute gradients, which {self.density} needs: leave it out.")
         for what, needs in ((self.density, density.needs), ("the loss", of_terms)):
-            if lacking := ", ".join(sorted(needs - renderer.capabilities - {"fields"})):
+            if lacking := ", ".join(sorted(needs - renderer.capabilities - {"models"})):
                 raise ValueError(f"{what} needs {lacking}, which the renderer {self.renderer} lacks.")
         if self.analytic and (drawn := [type(term).__name__ for term in terms if not term.analytic]):
             raise ValueError(
@@ -204,11 +208,28 @@ class TrainConfig:
             )
 
 
+def saved_config(values: Any, where: str) -> TrainConfig:
+    """Read settings from JSON, as `settings_from` does, also those that a version before 0.2 has written.
+
+    Example:
+        >>> saved_config({"fields": 2, "renderer": "torch"}, "config.json") == TrainConfig(models=2)
+        True
+    """
+    if isinstance(values, dict):
+        values = {_RENAMED_SETTINGS.get(name, name): value for name, value in values.items()}
+        if isinstance(name := values.get("renderer"), str):
+            values["renderer"] = _RENAMED_RENDERERS.get(name, name)
+    return settings_from(TrainConfig, values, where)
+
+
+_RENAMED_RENDERERS = {"torch": "builtin"}
+_RENAMED_SETTINGS = {"fields": "models"}
+
 _INTEGERS: dict[str, tuple[type, ...]] = {"int": (int,), "int | None": (int, type(None))}
 """Types of values by annotation; a bool is no number here."""
 
 _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
-    (("iterations", "fields"), lambda x: x >= 1, "at least 1", ""),
+    (("iterations", "models"), lambda x: x >= 1, "at least 1", ""),
     (("dropout",), lambda x: 0 <= x < 1, "in [0, 1)", ": 0 turns it off"),
     (("noise",), lambda x: x >= 0, "at least 0", ": 0 turns it off"),
     (("seed", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_from",

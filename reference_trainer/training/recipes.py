@@ -41,7 +41,7 @@ _INRIA = TrainConfig(
 )
 _CORGS = TrainConfig(
     iterations=10_000,
-    fields=2,
+    models=2,
     random_background=True,
     opacity_reset_from=501,
     loss="photometric + co_regularization(between(1.0, 500))",
@@ -107,7 +107,7 @@ RECIPES: dict[str, Recipe] = {
     "corgs": Recipe(
         _CORGS,
         "CoR-GS (ECCV 2024) on LLFF, jiaw-z/CoR-GS 1db13a4",
-        "pseudo views between near and far of the initial points, drawn at each step; the fields' splits are seeded "
+        "pseudo views between near and far of the initial points, drawn at each step; the models' splits are seeded "
         "apart",
         "initial points, cameras that look to one side, a world in LLFF's units",
     ),

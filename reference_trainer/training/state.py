@@ -11,16 +11,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from reference_trainer.json_files import settings_from
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.config import TrainConfig, saved_config
 
 __all__ = ["TrainingState", "read_state"]
 
 _TIMES = ("seconds", "processor_seconds")
 _ENTRIES = ("format", "config", "scene", "train_views", "step", *_TIMES)
-_OF_A_FIELD = ("statistics", "regularizer", "gaussians", "moments")
+_OF_A_MODEL = ("statistics", "regularizer", "gaussians", "moments")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
@@ -32,14 +31,14 @@ class TrainingState(NamedTuple):
         step: number of steps taken.
         seconds: wall-clock time that they took.
         processor_seconds: CPU time that all threads spent on them.
-        fields: the `Field.state_dict` of each field.
+        models: the `ModelState.state_dict` of each model.
     """
 
     config: TrainConfig
     step: int
     seconds: float
     processor_seconds: float
-    fields: list[dict[str, Any]]
+    models: list[dict[str, Any]]
 
 
 def read_state(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
@@ -63,7 +62,7 @@ def read_state(state: dict[str, Any], scene: Scene, where: Path) -> TrainingStat
 def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
     """Read a state; wrong types that are not checked for raise TypeError, AttributeError or LookupError."""
     others = ["others"] if "others" in state else []
-    _refuse_other_entries(state, (*_ENTRIES, *_OF_A_FIELD, *others), f"{where}")
+    _refuse_other_entries(state, (*_ENTRIES, *_OF_A_MODEL, *others), f"{where}")
     names = [view.name for view in scene.train]
     if state["scene"] != scene.name:
         raise ValueError(f"{where} was trained on the scene {state['scene']!r:.80}, this one is {scene.name!r}.")
@@ -75,21 +74,21 @@ def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
         raise ValueError(f"{where}: step must be a whole number from 0 to {config.iterations}, got {step!r:.80}.")
     if not all(type(x) is float and 0 <= x < math.inf for x in times):
         raise ValueError(f"{where}: {' and '.join(_TIMES)} must be positive numbers, got {times!r:.80}.")
-    fields = [{name: state[name] for name in _OF_A_FIELD}, *(state["others"] if others else ())]
-    if len(fields) != config.fields:
-        raise ValueError(f"{where}: expected {config.fields} fields, got {len(fields)}; the checkpoint is damaged.")
+    models = [{name: state[name] for name in _OF_A_MODEL}, *(state["others"] if others else ())]
+    if len(models) != config.models:
+        raise ValueError(f"{where}: expected {config.models} models, got {len(models)}; the checkpoint is damaged.")
     read = [
-        _read_field(field, config, scene, step, number, f"{where}{f', field {number}' if number else ''}")
-        for number, field in enumerate(fields)
+        _read_model(model, config, scene, step, number, f"{where}{f', model {number}' if number else ''}")
+        for number, model in enumerate(models)
     ]
     return TrainingState(config, step, *times, read)
 
 
-def _read_field(
+def _read_model(
     state: dict[str, Any], config: TrainConfig, scene: Scene, step: int, number: int, where: str
 ) -> dict[str, Any]:
-    """Read the state of one of the fields."""
-    _refuse_other_entries(state, _OF_A_FIELD, where)
+    """Read the state of one of the models."""
+    _refuse_other_entries(state, _OF_A_MODEL, where)
     tensors, moments = state["gaussians"], state["moments"]
     parameters = [*PARAMETERS, *config.make_regularizer().learns]
     _refuse_other_entries(tensors, parameters, f"{where}, gaussians")
@@ -129,7 +128,7 @@ def _config(text: Any, where: Path) -> TrainConfig:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{where} is a damaged checkpoint: config is not JSON: {error}") from error
-    return settings_from(TrainConfig, values, f"{where}, config")
+    return saved_config(values, f"{where}, config")
 
 
 def _refuse_other_entries(values: Any, names: Collection[str], what: str) -> None:

@@ -39,11 +39,11 @@ class Step:
         renderer: what draws.
         absgrad: whether density control is to see absolute gradients.
         label: prefix of the labels of the random streams.
-        fields: the steps of all fields at this view, the first one's first.
+        siblings: the steps of all models at this view, this one among them, the first model's first.
 
     Attributes:
         params: the activated parameters, with the view's camera, before any regularizer.
-        drawn: the same after the regularizer; in an analytic step, what the expectation was rendered with.
+        rendered: the same after the regularizer; in an analytic step, what the expectation was rendered with.
         image: the render, or in an analytic step its expectation, not clamped, shape (3, H, W).
         variance: of the colors in an analytic step, shape (3, H, W); None in others.
         rendering: the render with alpha, depth if a term needs it, and splats; None in an analytic step.
@@ -62,9 +62,9 @@ class Step:
     renderer: Callable[..., Any]
     absgrad: bool = False
     label: str = ""
-    fields: Sequence[Step] = ()
+    siblings: Sequence[Step] = ()
     image: Tensor = field(init=False)
-    drawn: Params = field(init=False)
+    rendered: Params = field(init=False)
     variance: Tensor | None = field(default=None, init=False)
     rendering: Rendering | None = field(default=None, init=False)
     observed: list[tuple[Splats | GsplatSplats, Camera]] = field(default_factory=list, init=False)
@@ -81,16 +81,16 @@ class Step:
 
     def sample(self, *, depth: bool) -> None:
         """Render the view with one draw of the regularizer."""
-        self.drawn = self.regularizer.regularize(self.params, self.generator("regularizer"))
-        self.rendering = self.render(self.view.camera, self.drawn, depth=depth, observed=True)
+        self.rendered = self.regularizer.regularize(self.params, self.generator("regularizer"))
+        self.rendering = self.render(self.view.camera, self.rendered, depth=depth, observed=True)
         self.image = self.rendering.image
 
     def expect(self) -> None:
         """Render the view in expectation over the draws of the regularizer."""
         multiplied = self.regularizer.multiplied(self.params)
         assert multiplied is not None, "the trainer has refused this"
-        self.drawn, multiplier = multiplied
-        moments = self.moments(self.view.camera, multiplier, self.drawn, observed=True)
+        self.rendered, multiplier = multiplied
+        moments = self.moments(self.view.camera, multiplier, self.rendered, observed=True)
         self.image, self.variance = moments.mean, moments.variance
 
     def at(self, view: View) -> Step:

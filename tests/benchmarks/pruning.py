@@ -122,7 +122,7 @@ def train_on(trainer: Trainer, steps: int) -> None:
     """
     config = trainer.config
     trainer.config = dataclasses.replace(config, iterations=trainer.step + steps, means_rate=config.means_rate_final)
-    trainer.fields[0].density = _LeftAlone()
+    trainer.models[0].density = _LeftAlone()
     trainer.train()
 
 

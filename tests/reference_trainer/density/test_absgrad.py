@@ -8,8 +8,8 @@ import torch
 from strategies import begun, some, stepped
 
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render.eager.engine import TorchEngine
 from reference_trainer.render.engine import engine_for
+from reference_trainer.render.torch.engine import TorchEngine
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 

@@ -42,7 +42,7 @@ def test_a_resumed_training_is_identical(tiny_scene, busy, tmp_path, expression)
         part.save(tmp_path / "checkpoint.pt")
         again = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
         again.train()
-        for one, other in zip(whole.fields, again.fields, strict=True):
+        for one, other in zip(whole.models, again.models, strict=True):
             torch.testing.assert_close(other.state_dict(), one.state_dict(), rtol=0, atol=0)
 
 
@@ -64,7 +64,7 @@ def test_gaussians_that_are_not_numbers_stop_the_training_and_are_said_to(tiny_s
     trainer = Trainer(tiny_scene, dataclasses.replace(short(busy, expression, 14), densify_every=5))
     trainer.train(until=6)
     with torch.no_grad():
-        getattr(trainer.fields[-1].gaussians, name)[0] = math.nan
+        getattr(trainer.models[-1].gaussians, name)[0] = math.nan
     with pytest.raises(TrainingStoppedError, match=r"finite|nan or infinite by step 6"):
         trainer.train()
 
@@ -92,7 +92,7 @@ def test_gaussians_that_are_not_numbers_stop_the_training_and_are_said_to(tiny_s
         ("self_ensembling(views=0)", "views must be at least 1, got 0"),
         ("self_ensembling(share=1.0)", "share in"),
         ("self_ensembling(least=-0.1)", "least >= 0"),
-        ("co_pruning", "compares fields, of which there is one: set fields=2"),
+        ("co_pruning", "compares models, of which there is one: set models=2"),
     ],
 )
 def test_bad_arguments_are_refused(expression, message):

@@ -1,4 +1,4 @@
-"""The comparison of fields against its formula, and the cameras that it is made from."""
+"""The comparison of models against its formula, and the cameras that it is made from."""
 
 import dataclasses
 
@@ -24,9 +24,9 @@ def scene(tiny_scene, three_views):
 
 
 def joined(*steps):
-    """Steps of the fields of one training."""
+    """Steps of the models of one training."""
     for step in steps:
-        step.fields = steps
+        step.siblings = steps
     return steps
 
 
@@ -49,7 +49,7 @@ def test_each_field_is_compared_with_the_mean_of_the_others(scene, six, take_ste
 
 
 def test_every_field_learns_as_if_the_other_were_a_photograph(scene, six, take_step):
-    """The loss is symmetric, so what a field is given is half of the derivative of the value."""
+    """The loss is symmetric, so what a model is given is half of the derivative of the value."""
     (term,) = LOSSES.make("co_regularization")
     term.begin(scene)
     leaves = [(six.sh_dc + i * BRIGHTER).requires_grad_() for i in range(2)]
@@ -75,11 +75,11 @@ def test_a_step_costs_one_more_render_of_every_field(tiny_scene):
             self.count += 1
             return render(**arguments)
 
-    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, loss="photometric + co_regularization", fields=2))
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, loss="photometric + co_regularization", models=2))
     render, trainer.renderer = trainer.renderer, Counting()
     trainer.train_step()
     assert trainer.renderer.count == 4
-    seen = [field.density.statistics.steps.max().item() for field in trainer.fields]
+    seen = [model.density.statistics.steps.max().item() for model in trainer.models]
     assert seen == [1, 1]
 
 

@@ -7,19 +7,19 @@ import pytest
 
 from reference_trainer.losses import LOSSES
 from reference_trainer.losses.term import WeightedTerm
-from reference_trainer.renderers import OwnRenderer
+from reference_trainer.renderers import BuiltinRenderer
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
 
 def test_a_weight_follows_its_schedule_and_idle_terms_are_not_met(tiny_scene, monkeypatch):
-    depths, draw = [], OwnRenderer.__call__
+    depths, draw = [], BuiltinRenderer.__call__
 
     def spied(self, **arguments):
         depths.append(arguments["depth"])
         return draw(self, **arguments)
 
-    monkeypatch.setattr(OwnRenderer, "__call__", spied)
+    monkeypatch.setattr(BuiltinRenderer, "__call__", spied)
     loss = "photometric + smooth_depth(between(0.1, 2, 3)) + warp(0.0) + opacity(0.01)"
     Trainer(tiny_scene, TrainConfig(iterations=4, loss=loss)).train()
     assert depths == [False, False, True, False]
@@ -56,7 +56,7 @@ def test_terms_look_at_the_photographs_before_the_first_step(tiny_scene):
 def test_analytic_training_refuses_what_needs_a_draw_and_nothing_else(name):
     needs_one = name in {"pearson", "patch_depth", "warp", "smooth_depth", "alpha", "straight_through"}
     with pytest.raises(ValueError, match="analytic training has no draw") if needs_one else nullcontext():
-        TrainConfig(dropout=0.2, analytic=True, fields=2, loss=f"photometric + {name}").check()
+        TrainConfig(dropout=0.2, analytic=True, models=2, loss=f"photometric + {name}").check()
 
 
 @pytest.mark.parametrize("name", ["photometric", "views", "consistency", "straight_through", "co_regularization"])

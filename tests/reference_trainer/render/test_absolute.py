@@ -3,7 +3,7 @@
 import torch
 from oracles import random_scene
 
-from reference_trainer.render import draw, render, splat
+from reference_trainer.render import rasterize, render, splat
 from reference_trainer.render.absolute import with_absolute_gradients
 
 WIDTH, HEIGHT = 13, 9  # more than one tile, not of whole tiles
@@ -20,7 +20,7 @@ def test_every_pixel_adds_the_absolute_value_of_its_gradient(case):
     splats = splat(*exact[:4], exact.camera, colors=exact.colors)
     means = splats.projection.means.detach().requires_grad_()
     moved = splats._replace(projection=splats.projection._replace(means=means))
-    of_pixels = (picture(draw(moved, background=background, depth=True)) * upstream).sum(0).flatten()
+    of_pixels = (picture(rasterize(moved, background=background, depth=True)) * upstream).sum(0).flatten()
     each = torch.stack([torch.autograd.grad(x, means, retain_graph=True)[0] for x in of_pixels])
 
     scene = exact.to(case.dtype)

@@ -17,15 +17,15 @@ def restored(monkeypatch):
 @pytest.mark.parametrize(
     ("chosen", "dtype", "name"),
     [
-        ("auto", torch.float32, "loops"),
-        ("loops", torch.float32, "loops"),
+        ("auto", torch.float32, "numba"),
+        ("numba", torch.float32, "numba"),
         ("torch", torch.float32, "torch"),
         ("auto", torch.float64, "torch"),
-        ("loops", torch.float64, "torch"),
-        ("auto", torch.bfloat16, "loops"),  # is drawn in float32
+        ("numba", torch.float64, "torch"),
+        ("auto", torch.bfloat16, "numba"),  # is drawn in float32
     ],
 )
-def test_loops_draw_float32_on_a_processor(chosen, dtype, name):
+def test_numba_renders_float32_on_a_processor(chosen, dtype, name):
     use_engine(chosen)
     scene = random_scene(3, 9, 7, seed=1).to(dtype)
     camera = scene.camera.to(dtype=torch.float64)
@@ -34,7 +34,7 @@ def test_loops_draw_float32_on_a_processor(chosen, dtype, name):
 
 def test_the_line_that_says_which():
     threads = torch.get_num_threads()
-    assert describe_engine("cpu").startswith("loops (numba ")
+    assert describe_engine("cpu").startswith("numba (")
     assert describe_engine("cpu").endswith(f", {threads} thread{'s' * (threads > 1)})")
     assert describe_engine("cuda") == "torch"  # also where there is no card, as before a sweep on other machines
     use_engine("torch")
@@ -42,8 +42,16 @@ def test_the_line_that_says_which():
 
 
 def test_an_engine_that_does_not_exist(monkeypatch):
-    with pytest.raises(ValueError, match="there is no engine 'metal'; choose one of auto, torch, loops"):
+    with pytest.raises(ValueError, match="there is no engine 'metal'; choose one of auto, torch, numba"):
         use_engine("metal")
     monkeypatch.setenv("CA_REG_ENGINE", "metal")
     with pytest.raises(ValueError, match="CA_REG_ENGINE names the engine 'metal'"):
+        describe_engine("cpu")
+
+
+def test_the_old_name_of_an_engine_is_refused_with_the_new_one(monkeypatch):
+    with pytest.raises(ValueError, match="no engine 'loops'; it is called numba now"):
+        use_engine("loops")
+    monkeypatch.setenv("CA_REG_ENGINE", "loops")
+    with pytest.raises(ValueError, match="CA_REG_ENGINE names the engine 'loops'; it is called numba now"):
         describe_engine("cpu")

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from reference_trainer.render import describe_engine
-from reference_trainer.render.engine import drawn_by, engines_on
+from reference_trainer.render.engine import engines_on, using_engine
 
 
 @pytest.mark.parametrize("chosen", [None, "auto", "torch"])
-@pytest.mark.parametrize("drawing", ["loops", "torch"])
+@pytest.mark.parametrize("drawing", ["numba", "torch"])
 def test_what_was_chosen_is_chosen_again(chosen, drawing, monkeypatch):
     if chosen is None:
         monkeypatch.delenv("CA_REG_ENGINE", raising=False)
@@ -18,7 +18,7 @@ def test_what_was_chosen_is_chosen_again(chosen, drawing, monkeypatch):
         monkeypatch.setenv("CA_REG_ENGINE", chosen)
 
     def interrupted():
-        with drawn_by(drawing):
+        with using_engine(drawing):
             assert describe_engine("cpu").startswith(drawing)
             raise KeyboardInterrupt
 
@@ -29,11 +29,11 @@ def test_what_was_chosen_is_chosen_again(chosen, drawing, monkeypatch):
 
 def test_an_engine_that_is_not_there_changes_nothing(monkeypatch):
     monkeypatch.setenv("CA_REG_ENGINE", "torch")
-    with pytest.raises(ValueError, match="no engine 'lasers'"), drawn_by("lasers"):
+    with pytest.raises(ValueError, match="no engine 'lasers'"), using_engine("lasers"):
         pass
     assert os.environ["CA_REG_ENGINE"] == "torch"
 
 
 def test_loops_draw_on_a_cpu_alone():
-    assert engines_on(torch.device("cpu")) == ("loops", "torch")
+    assert engines_on(torch.device("cpu")) == ("numba", "torch")
     assert engines_on(torch.device("cuda")) == ("torch",)

@@ -9,8 +9,8 @@ from oracles import random_scene
 
 from reference_trainer.camera import Camera
 from reference_trainer.render import splat
-from reference_trainer.render.eager.projection import project
 from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
+from reference_trainer.render.torch.projection import project
 from reference_trainer.rotations import rotation_matrices
 
 

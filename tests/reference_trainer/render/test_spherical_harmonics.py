@@ -4,7 +4,7 @@ import pytest
 import torch
 from oracles import spherical_harmonics
 
-from reference_trainer.render.eager.spherical_harmonics import evaluate_sh, sh_basis
+from reference_trainer.render.torch.spherical_harmonics import evaluate_sh, sh_basis
 
 
 def test_the_basis_is_scipys():

@@ -13,7 +13,7 @@ from stand_ins.gsplat import centered, rasterization
 
 from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.render import render
-from reference_trainer.renderers import OwnRenderer
+from reference_trainer.renderers import BuiltinRenderer
 from reference_trainer.renderers.gsplat import load_gsplat_render, render_by
 
 N, WIDTH, HEIGHT = 80, 40, 24
@@ -24,7 +24,7 @@ by_stand_in = functools.partial(render_by, rasterization)
 
 def own(means, quaternions, scales, opacities, camera, **options):
     given = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities, "camera": camera}
-    return OwnRenderer()(**given, **options)
+    return BuiltinRenderer()(**given, **options)
 
 
 def scene_of(device="cpu"):
@@ -133,7 +133,9 @@ def test_absolute_gradients_without_a_background_are_those_over_black():
 
 
 def test_what_is_missing_is_told(monkeypatch):
-    with pytest.raises(RuntimeError, match=r"the device is 'cpu': train with --device cuda, or with --renderer torch"):
+    with pytest.raises(
+        RuntimeError, match=r"the device is 'cpu': train with --device cuda, or with --renderer builtin"
+    ):
         load_gsplat_render("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(RuntimeError, match="torch finds none"):

@@ -4,7 +4,7 @@ import math
 import pytest
 
 from reference_trainer.density import DENSITY, AdaptiveDensity
-from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.config import TrainConfig, saved_config
 from reference_trainer.training.recipes import RECIPES, with_recipe
 
 
@@ -109,11 +109,11 @@ def test_expressions_are_read_before_anything_is_trained(settings, message):
 
 def test_only_what_the_renderer_lacks_is_named(monkeypatch):
     class Greedy(AdaptiveDensity):
-        needs = frozenset({"absgrad", "fields", "moments"})
+        needs = frozenset({"absgrad", "models", "moments"})
 
     monkeypatch.setitem(DENSITY._factories, "greedy", Greedy)
     with pytest.raises(ValueError, match="greedy needs moments, which the renderer gsplat lacks"):
-        TrainConfig(density="greedy", fields=2, renderer="gsplat").check()
+        TrainConfig(density="greedy", models=2, renderer="gsplat").check()
 
 
 @pytest.mark.parametrize("regularizer", [{"dropout": 0.2}, {"noise": 0.8}])
@@ -129,3 +129,11 @@ def test_an_expectation_needs_something_random():
     with pytest.raises(ValueError, match="set dropout, noise or regularizer"):
         TrainConfig(analytic=True)
     assert TrainConfig(analytic=True, noise=0.1, loss="photometric + co_adaptation(2.0)").analytic
+
+
+def test_settings_of_an_older_version_are_read_and_their_names_refused():
+    old = dataclasses.asdict(TrainConfig(dropout=0.2))
+    old |= {"renderer": "torch", "fields": old.pop("models") + 1}
+    assert saved_config(old, "config.json") == TrainConfig(dropout=0.2, models=2)
+    with pytest.raises(ValueError, match="the renderer 'torch' is called 'builtin' now"):
+        TrainConfig(renderer="torch")

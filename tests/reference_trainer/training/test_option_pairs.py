@@ -52,7 +52,7 @@ OPTIONS: dict[str, dict[str, object]] = {
 NEEDS = {"compensate": "dropout", "clip": "noise", "scale": "noise"}
 REFUSED = {
     ("analytic", "recipe binocular"): "analytic training has no draw, which Warp needs",
-    ("analytic", "renderer"): "analytic training needs the moments of the torch renderer",
+    ("analytic", "renderer"): "analytic training needs the moments of the builtin renderer",
     ("loss", "renderer"): "the loss needs moments, which the renderer gsplat lacks",
 }
 SCHEDULE = {  # what decides when and how fast, and enters no single step
@@ -66,7 +66,7 @@ SCHEDULE = {  # what decides when and how fast, and enters no single step
 
 def test_every_setting_is_an_option_here_or_a_matter_of_the_schedule():
     named = {field for settings in OPTIONS.values() for field in settings} - {"recipe"}
-    elsewhere = {"regularizer", "fields", "random_background"}  # test_every_regularizer.py, test_fields.py
+    elsewhere = {"regularizer", "models", "random_background"}  # test_every_regularizer.py, test_models.py
     assert named | SCHEDULE | elsewhere == {field.name for field in dataclasses.fields(TrainConfig)}
     assert not named & SCHEDULE
 

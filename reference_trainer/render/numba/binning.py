@@ -16,7 +16,7 @@ from torch import Tensor
 from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.constants import TILE
-from reference_trainer.render.loops.tiles import LEAST_ALPHA
+from reference_trainer.render.numba.tiles import LEAST_ALPHA
 from reference_trainer.render.splats import Projection, TileLists
 
 __all__ = ["bin_gaussians"]

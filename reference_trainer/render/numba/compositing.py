@@ -15,8 +15,8 @@ from torch.autograd.function import once_differentiable
 
 from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.render.constants import MIN_TRANSMITTANCE
-from reference_trainer.render.loops import tiles
-from reference_trainer.render.loops.tiles import CHUNK, LEAST_ALPHA, PIXELS
+from reference_trainer.render.numba import tiles
+from reference_trainer.render.numba.tiles import CHUNK, LEAST_ALPHA, PIXELS
 from reference_trainer.render.splats import Splats
 
 __all__ = ["absolute_gradients", "composite", "composite_masks"]
@@ -115,19 +115,19 @@ def _masked(
                 shape, of_entry = tiles.footprint_of(entries[k]), alphas[k]
                 for p in range(PIXELS):
                     of_entry[p] = tiles.alpha_at(shape, p)
-            for picture in range(count):
-                if ended[picture]:
+            for mask in range(count):
+                if ended[mask]:
                     continue
-                s, shown = states[picture], 0
+                s, shown = states[mask], 0
                 for k in range(last_entry):
                     kept[shown] = k
-                    shown += entries[k, 9 + picture] > _ZERO
+                    shown += entries[k, 9 + mask] > _ZERO
                 kept[shown] = last_entry  # an invisible one
                 for k in range(0, shown, 2):
                     a, b = entries[kept[k]], entries[kept[k + 1]]
                     alpha_a, alpha_b = alphas[kept[k]], alphas[kept[k + 1]]
                     red_a, green_a, blue_a, red_b, green_b, blue_b = a[6], a[7], a[8], b[6], b[7], b[8]
-                    factor_a, factor_b = a[9 + picture], b[9 + picture]
+                    factor_a, factor_b = a[9 + mask], b[9 + mask]
                     for p in range(PIXELS):
                         weight_a, between = _pass(_lowered(alpha_a[p], factor_a), s[_TRANSMITTANCE + p])
                         weight_b, rest = _pass(_lowered(alpha_b[p], factor_b), between)
@@ -135,9 +135,9 @@ def _masked(
                         s[_GREEN + p] += weight_a * green_a + weight_b * green_b
                         s[_BLUE + p] += weight_a * blue_a + weight_b * blue_b
                         s[_TRANSMITTANCE + p] = rest
-                ended[picture] = _have_ended(s)
-        for picture in range(count):
-            _finish(states[picture], background, transmittances[picture], images[picture], tile, columns)
+                ended[mask] = _have_ended(s)
+        for mask in range(count):
+            _finish(states[mask], background, transmittances[mask], images[mask], tile, columns)
 
 
 def _make_backward(absolute: bool) -> Any:

@@ -8,10 +8,10 @@ from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradie
 from reference_trainer.render.renderer import render
 from reference_trainer.renderers.renderer import Renderer
 
-__all__ = ["OwnRenderer"]
+__all__ = ["BuiltinRenderer"]
 
 
-class OwnRenderer(Renderer):
+class BuiltinRenderer(Renderer):
     """This package's renderer, with the chosen engine."""
 
     capabilities = frozenset({"depth", "moments", "absgrad"})

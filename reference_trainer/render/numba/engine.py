@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from reference_trainer.render.loops.binning import bin_gaussians
-from reference_trainer.render.loops.drawing import absolute_gradients, composite, composite_masks
-from reference_trainer.render.loops.moments import moments, shares
-from reference_trainer.render.loops.projection import project
+from reference_trainer.render.numba.binning import bin_gaussians
+from reference_trainer.render.numba.compositing import absolute_gradients, composite, composite_masks
+from reference_trainer.render.numba.moments import moments, shares
+from reference_trainer.render.numba.projection import project
 from reference_trainer.render.splats import Splats
 
-__all__ = ["LoopEngine"]
+__all__ = ["NumbaEngine"]
 
 
-class LoopEngine:
+class NumbaEngine:
     """See `Engine`."""
 
-    name = "loops"
+    name = "numba"
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
         """Keep the lists: the loops skip splats that are too faint."""

@@ -1,4 +1,4 @@
-"""What compares two fields, against a literal implementation of its source's rule."""
+"""What compares two models, against a literal implementation of its source's rule."""
 
 import math
 
@@ -16,8 +16,8 @@ GEOMETRY = ("means", "log_scales", "quaternions", "opacity_logits")
 
 
 def two(scene, density: str, **settings) -> Trainer:
-    """A training of two fields that has taken two steps and never densifies."""
-    trainer = Trainer(scene, TrainConfig(iterations=40, density=density, fields=2, densify_every=0, **settings))
+    """A training of two models that has taken two steps and never densifies."""
+    trainer = Trainer(scene, TrainConfig(iterations=40, density=density, models=2, densify_every=0, **settings))
     trainer.train(until=2)
     return trainer
 
@@ -26,29 +26,29 @@ def test_co_pruning_removes_what_has_no_counterpart(tiny_scene):
     trainer = two(tiny_scene, "co_pruning(0.4, every=5)", densify_from=5)
     g = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        for field in trainer.fields:
-            field.gaussians.means.copy_(torch.randn(150, 3, generator=g))
-    before = [field.gaussians.map(lambda x: x.detach().clone()) for field in trainer.fields]
-    counted = [field.density.statistics.steps.clone() for field in trainer.fields]
+        for model in trainer.models:
+            model.gaussians.means.copy_(torch.randn(150, 3, generator=g))
+    before = [model.gaussians.map(lambda x: x.detach().clone()) for model in trainer.models]
+    counted = [model.density.statistics.steps.clone() for model in trainer.models]
     for step in (0, 4, 5, 6, 9):  # not due, or not after densify_from
-        trainer.density.together(trainer.fields, step)
-    assert [len(field.gaussians) for field in trainer.fields] == [150, 150]
-    trainer.density.together(trainer.fields, 10)
-    for k, field in enumerate(trainer.fields):
+        trainer.density.together(trainer.models, step)
+    assert [len(model.gaussians) for model in trainer.models] == [150, 150]
+    trainer.density.together(trainer.models, 10)
+    for k, model in enumerate(trainer.models):
         own, other = (before[i].means.double().numpy() for i in (k, 1 - k))
         keep = np.array([min(math.dist(p, q) for q in other) < 0.4 for p in own])
         assert 20 < keep.sum() < 130
-        for (name, x), (_, y) in zip(before[k].named(), field.gaussians.named(), strict=True):
+        for (name, x), (_, y) in zip(before[k].named(), model.gaussians.named(), strict=True):
             assert torch.equal(x[torch.from_numpy(keep)], y), name
-        assert torch.equal(field.density.statistics.steps, counted[k][torch.from_numpy(keep)])
+        assert torch.equal(model.density.statistics.steps, counted[k][torch.from_numpy(keep)])
 
 
 def test_a_field_that_would_be_empty_stops_the_training(tiny_scene):
     trainer = two(tiny_scene, "co_pruning(0.4, every=5)", densify_from=0)
     with torch.no_grad():
-        trainer.fields[1].gaussians.means.add_(100)
+        trainer.models[1].gaussians.means.add_(100)
     with pytest.raises(TrainingStoppedError, match=r"within 0\.4 after step 5: raise distance"):
-        trainer.density.together(trainer.fields, 5)
+        trainer.density.together(trainer.models, 5)
 
 
 def literal_uncertain(pictures: np.ndarray, share: float, least: float) -> np.ndarray:
@@ -95,11 +95,11 @@ def literal_chosen(gaussians, cameras, uncertain: np.ndarray) -> np.ndarray:
 
 def test_self_ensembling_perturbs_the_second_field_where_the_first_changes(tiny_scene):
     trainer = two(tiny_scene, "self_ensembling(100.0, 5, start=10, stop=30, views=3, share=0.02)", seed=4)
-    strategy, (first, second) = trainer.density, trainer.fields
+    strategy, (first, second) = trainer.density, trainer.models
     g, pictures = torch.Generator().manual_seed(0), []
     for step in (3, 5, 10):  # steps 0 and 5 only look; those in between do nothing
         if step == 3:
-            strategy.together(trainer.fields, 0)
+            strategy.together(trainer.models, 0)
         with torch.no_grad():
             pictures.append(
                 torch.stack(
@@ -109,9 +109,9 @@ def test_self_ensembling_perturbs_the_second_field_where_the_first_changes(tiny_
                     ]
                 )
             )
-        before = [field.gaussians.map(lambda x: x.detach().clone()) for field in trainer.fields]
+        before = [model.gaussians.map(lambda x: x.detach().clone()) for model in trainer.models]
         moments = second.optimizer.state_dict()["moments"]
-        strategy.together(trainer.fields, step)
+        strategy.together(trainer.models, step)
         if step < 10:
             assert all(
                 torch.equal(x, y) for (_, x), (_, y) in zip(before[1].named(), second.gaussians.named(), strict=True)
@@ -142,8 +142,8 @@ def test_self_ensembling_perturbs_the_second_field_where_the_first_changes(tiny_
 def test_self_ensembling_ends(tiny_scene):
     trainer = two(tiny_scene, "self_ensembling(100.0, 5, start=10, stop=30, views=1)")
     for step in (20, 25):
-        trainer.density.together(trainer.fields, step)
-    before = trainer.density.pictures.clone(), trainer.fields[1].gaussians.means.detach().clone()
-    trainer.density.together(trainer.fields, 30)
-    assert torch.equal(trainer.density.pictures, before[0])
-    assert torch.equal(trainer.fields[1].gaussians.means, before[1])
+        trainer.density.together(trainer.models, step)
+    before = trainer.density.images.clone(), trainer.models[1].gaussians.means.detach().clone()
+    trainer.density.together(trainer.models, 30)
+    assert torch.equal(trainer.density.images, before[0])
+    assert torch.equal(trainer.models[1].gaussians.means, before[1])

@@ -19,8 +19,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from reference_trainer.compiled.compiling import inlined, kernel
-from reference_trainer.render.loops import tiles
-from reference_trainer.render.loops.tiles import CHUNK, PIXELS
+from reference_trainer.render.numba import tiles
+from reference_trainer.render.numba.tiles import CHUNK, PIXELS
 from reference_trainer.render.splats import MomentImages, Splats, TileLists
 
 __all__ = ["moments", "shares"]
@@ -60,14 +60,14 @@ def _over(alpha: Any, entry: Any, means: Any, variances: Any, transmittance: Any
 
 @kernel
 def _forward(
-    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, behind: Array, mean: Array,
+    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array, mean: Array,
     variance: Array, alpha: Array,
 ) -> None:  # fmt: skip
     s, entries = np.empty(7 * PIXELS, f4), np.empty((CHUNK + 1, 11), f4)
     for tile in range(first, last):
         s[_TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
         s[_VARIANCE:] = _ZERO
-        tiles.load(behind, tile, columns, s, _MEAN)
+        tiles.load(background, tile, columns, s, _MEAN)
         for begin in range(starts[tile + 1] - 1, starts[tile] - 1, -CHUNK):
             end = max(begin - CHUNK, starts[tile] - 1)
             for k in range(0, tiles.read_entries(gaussians, begin, end, -1, table, tile, columns, entries), 2):
@@ -100,7 +100,7 @@ def _make_backward(complete: bool) -> Any:
     @kernel
     def _backward(
         first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array,
-        behind: Array, to_mean: Array, to_variance: Array, to_alpha: Array, rows: Array, to_behind: Array,
+        background: Array, to_mean: Array, to_variance: Array, to_alpha: Array, rows: Array, to_background: Array,
     ) -> None:  # fmt: skip
         """Sum up, back to front, what is behind every splat; then carry gradients to the splats, front to back.
 
@@ -113,7 +113,7 @@ def _make_backward(complete: bool) -> Any:
             s[_TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
             s[_HIDDEN : _HIDDEN + PIXELS] = _ZERO
             s[_FRONT : _FRONT + PIXELS] = _ONE
-            tiles.load(behind, tile, columns, s, _MEAN)
+            tiles.load(background, tile, columns, s, _MEAN)
             tiles.load(to_mean, tile, columns, s, _TO_MEAN)
             tiles.load(to_variance, tile, columns, s, _VARIANCE)
             tiles.load(to_alpha[:1], tile, columns, s, _TO_TRANSMITTANCE)
@@ -178,7 +178,7 @@ def _make_backward(complete: bool) -> Any:
                 row[6], row[7], row[8] = to_r, to_g, to_b
                 if complete:
                     row[9], row[10], row[11] = to_factor, to_varies, share
-            tiles.store(s, _TO_MEAN, to_behind, tile, columns)
+            tiles.store(s, _TO_MEAN, to_background, tile, columns)
 
     return _backward
 
@@ -187,53 +187,53 @@ _backward, _complete_backward = _make_backward(False), _make_backward(True)
 
 
 def _gradients(
-    lists: TileLists, table: Tensor, behind: Tensor, upstream: Sequence[Tensor], complete: bool
+    lists: TileLists, table: Tensor, background: Tensor, upstream: Sequence[Tensor], complete: bool
 ) -> list[Tensor]:
-    """Return the gradients of the splats; of their multipliers, and the shares, (M, 3) or (M, 0); of what is behind."""
+    """Return the gradients of the splats; of their multipliers, and the shares, (M, 3) or (M, 0); of the background."""
     rows = table.new_empty(lists.gaussians.shape[0], 12 if complete else 9)
-    to_behind = torch.empty_like(behind)
+    to_background = torch.empty_like(background)
     assert lists.slots is not None
     kernel = _complete_backward if complete else _backward
-    tiles.over_tiles(kernel, lists, lists.slots, table, behind, *upstream, rows, to_behind)
-    return [*tiles.sum_rows(rows, table, lists), to_behind]
+    tiles.over_tiles(kernel, lists, lists.slots, table, background, *upstream, rows, to_background)
+    return [*tiles.sum_rows(rows, table, lists), to_background]
 
 
 class _Moments(torch.autograd.Function):
     """Mean and variance of the colors, and the expected accumulated alpha: 3, 3 and 1 channels, whole tiles."""
 
     @staticmethod
-    def forward(ctx: Any, splats: Splats, multiplier: Tensor, behind: Tensor, *_differentiable: Tensor) -> Any:
+    def forward(ctx: Any, splats: Splats, multiplier: Tensor, background: Tensor, *_differentiable: Tensor) -> Any:
         ctx.set_materialize_grads(False)
         table, ctx.lists = tiles.make_table(splats, multiplier), splats.lists
         images = tuple(tiles.whole_tiles(ctx.lists, channels) for channels in (3, 3, 1))
-        tiles.over_tiles(_forward, ctx.lists, table, behind, *images)
-        ctx.save_for_backward(table, behind)
+        tiles.over_tiles(_forward, ctx.lists, table, background, *images)
+        ctx.save_for_backward(table, background)
         return images
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        table, behind = ctx.saved_tensors
+        table, background = ctx.saved_tensors
         complete = gradients[2] is not None or ctx.needs_input_grad[1]
-        upstream = [torch.zeros_like(behind) if x is None else x for x in gradients]
-        *of_splats, more, to_behind = _gradients(ctx.lists, table, behind, upstream, complete)
-        return None, more[:, :2] if complete else None, to_behind, *of_splats
+        upstream = [torch.zeros_like(background) if x is None else x for x in gradients]
+        *of_splats, more, to_background = _gradients(ctx.lists, table, background, upstream, complete)
+        return None, more[:, :2] if complete else None, to_background, *of_splats
 
 
-def moments(splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
+def moments(splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
     """Composite mean and variance back to front, see `Engine.moments`."""
     p, lists = splats.projection, splats.lists
     images = _Moments.apply(  # type: ignore[no-untyped-call]
-        splats, multiplier, lists.padded(behind), p.means, p.factors, splats.opacities, splats.colors
+        splats, multiplier, lists.padded(background), p.means, p.factors, splats.opacities, splats.colors
     )
     mean, variance, alpha = (lists.cut(image) for image in images)
     return MomentImages(mean, variance, alpha[0])
 
 
-def shares(splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
+def shares(splats: Splats, multiplier: Tensor, background: Tensor, weights: Tensor) -> Tensor:
     """Return every splat's share of the weighted variance of the pixels, see `Engine.shares`."""
     lists, table = splats.lists, tiles.make_table(splats, multiplier)
     upstream = lists.padded((weights / 3).expand(3, -1, -1))
     nothing = torch.zeros_like(upstream)
-    *_, more, _ = _gradients(lists, table, lists.padded(behind), (nothing, upstream, nothing), complete=True)
+    *_, more, _ = _gradients(lists, table, lists.padded(background), (nothing, upstream, nothing), complete=True)
     return more[:, 2].double()

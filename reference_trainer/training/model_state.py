@@ -14,36 +14,36 @@ from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.initial import initial_gaussians
 
-__all__ = ["Field"]
+__all__ = ["ModelState"]
 
 
-class Field:
+class ModelState:
     """Gaussians with an optimizer, density control and regularizers of their own; a training has one, or several.
 
-    All fields of a training start from the same points and diverge by their random numbers: every field has its own for
+    All models of a training start from the same points and diverge by their random numbers: every model has its own for
     the splits of density control and for the draws of regularizers and loss terms.
 
     Args:
         scene: with the points to start from.
         config: all settings.
         device: where to train.
-        number: of the field; the first, 0, is the one that is measured and written.
+        number: of the model; the first, 0, is the one that is measured and written.
 
     Attributes:
-        label: prefix of the labels of the field's random streams.
+        label: prefix of the labels of the model's random streams.
 
     Raises:
         ValueError: as `initial_gaussians`.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
-        >>> field = Field(synthetic_scene(width=16, height=12, points=50), TrainConfig(), "cpu")
-        >>> len(field.gaussians)
+        >>> state = ModelState(synthetic_scene(width=16, height=12, points=50), TrainConfig(), "cpu")
+        >>> len(state.gaussians)
         50
     """
 
     def __init__(self, scene: Scene, config: TrainConfig, device: torch.device | str, number: int = 0) -> None:
-        self.label = f"field {number}/" if number else ""
+        self.label = f"field {number}/" if number else ""  # names random streams: another word would draw other numbers
         self.regularizer = config.make_regularizer()
         learns, start = self.regularizer.learns, initial_gaussians(scene, config)
         known = start.learned  # of a model with the same regularizers

@@ -30,7 +30,7 @@ class Block(NamedTuple):
     """Tiles whose lists are padded to one length.
 
     Args:
-        tiles: tile numbers, row by row over the image, shape (T,).
+        tiles: tile indices, row by row over the image, shape (T,).
         centers: of the tiles, pixels, shape (2, T, 1).
         gaussians: the Gaussian of every entry, nearest first, shape (T, L); M, the number of Gaussians, marks padding.
     """
@@ -81,28 +81,28 @@ def blocks(lists: TileLists, device: torch.device) -> Iterator[Block]:
     first = 0
     while first < end:
         last = min(end, first + max(1, pairs // (PIXELS * sizes[first])))
-        numbers = tiles[first:last]
+        indices = tiles[first:last]
         place = torch.arange(sizes[first], device=device)
-        where = (lists.starts[numbers, None] + place).clamp_(max=lists.gaussians.shape[0] - 1)
+        where = (lists.starts[indices, None] + place).clamp_(max=lists.gaussians.shape[0] - 1)
         gaussians = lists.gaussians[where].long()
         gaussians.masked_fill_(place >= lengths[first:last, None], lists.touched.shape[0])
-        corners = torch.stack([numbers % lists.columns, numbers.div(lists.columns, rounding_mode="floor")])
-        yield Block(numbers, (corners * TILE + TILE // 2)[..., None], gaussians)
+        corners = torch.stack([indices % lists.columns, indices.div(lists.columns, rounding_mode="floor")])
+        yield Block(indices, (corners * TILE + TILE // 2)[..., None], gaussians)
         first = last
 
 
-def walk(formula: Formula, rows: Tensor, behind: Tensor, lists: TileLists, *, extra: int) -> Tensor:
-    """Evaluate a formula on every tile's list and on what is behind the tile; differentiable in both.
+def walk(formula: Formula, rows: Tensor, background: Tensor, lists: TileLists, *, extra: int) -> Tensor:
+    """Evaluate a formula on every tile's list over a background; differentiable in both.
 
     Args:
-        formula: takes a block, the rows of its entries (R, T, L) and what is behind its tiles (T, C, 64); returns
-            (T, C + extra, 64), which without any splats is what is behind, followed by zeros.
+        formula: takes a block, the rows of its entries (R, T, L) and the background of its tiles (T, C, 64); returns
+            (T, C + extra, 64), which without any splats is the background, followed by zeros.
         rows: values of every splat, the first six those of `geometry_rows`, shape (R, M).
-        behind: images, shape (C, H, W).
+        background: images, shape (C, H, W).
         lists: the splats of every tile.
-        extra: channels of the result, images (C + extra, H, W), beyond those of ``behind``.
+        extra: channels of the result, images (C + extra, H, W), beyond those of ``background``.
     """
-    result: Tensor = _Walk.apply(formula, rows, behind, lists, extra)  # type: ignore[no-untyped-call]
+    result: Tensor = _Walk.apply(formula, rows, background, lists, extra)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -110,23 +110,23 @@ class _Walk(torch.autograd.Function):
     """Evaluates and differentiates a formula block by block."""
 
     @staticmethod
-    def forward(ctx: Any, formula: Formula, rows: Tensor, behind: Tensor, lists: TileLists, extra: int) -> Tensor:
-        entries, tiles = pad_entries(rows), tile(behind, lists)
+    def forward(ctx: Any, formula: Formula, rows: Tensor, background: Tensor, lists: TileLists, extra: int) -> Tensor:
+        entries, tiles = pad_entries(rows), tile(background, lists)
         result = torch.nn.functional.pad(tiles, (0, 0, 0, extra))
         ctx.blocks = list(blocks(lists, rows.device))
         for block in ctx.blocks:
             result[block.tiles] = formula(block, entries[:, block.gaussians], tiles[block.tiles])
         ctx.formula, ctx.lists = formula, lists
-        ctx.save_for_backward(rows, behind)
+        ctx.save_for_backward(rows, background)
         return untile(result, lists)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, Tensor, None, None]:
-        rows, behind = ctx.saved_tensors
+        rows, background = ctx.saved_tensors
         lists: TileLists = ctx.lists
-        entries, tiles, upstream = pad_entries(rows), tile(behind, lists), tile(gradients[0], lists)
-        to_entries, to_tiles = torch.zeros_like(entries), upstream[:, : behind.shape[0]].clone()
+        entries, tiles, upstream = pad_entries(rows), tile(background, lists), tile(gradients[0], lists)
+        to_entries, to_tiles = torch.zeros_like(entries), upstream[:, : background.shape[0]].clone()
         for block in ctx.blocks:
             inputs = [x.detach().requires_grad_() for x in (entries[:, block.gaussians], tiles[block.tiles])]
             # A backward() within torch.autocast would otherwise compute these products in 16 bits.

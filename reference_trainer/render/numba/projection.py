@@ -14,7 +14,7 @@ from reference_trainer.camera import Camera
 from reference_trainer.compiled.compiling import inlined, kernel
 from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
-from reference_trainer.render.loops.harmonics import basis, basis_gradient
+from reference_trainer.render.numba.harmonics import basis, basis_gradient
 from reference_trainer.render.splats import Projection
 
 __all__ = ["project"]

@@ -1,4 +1,4 @@
-"""A training of two fields: what they share, what is their own, and what is saved of them."""
+"""A training of two models: what they share, what is their own, and what is saved of them."""
 
 import dataclasses
 import gc
@@ -26,55 +26,55 @@ def test_the_first_of_two_that_are_not_compared_is_the_only_one(tiny_scene, busy
     config = dataclasses.replace(busy, iterations=14, loss="photometric + views(2) + consistency", **changes)
     if config.analytic:
         config = dataclasses.replace(config, loss="photometric + views(2)")
-    alone, both = (trained(tiny_scene, dataclasses.replace(config, fields=n)) for n in (1, 2))
-    torch.testing.assert_close(both.fields[0].state_dict(), alone.fields[0].state_dict(), rtol=0, atol=0)
-    assert model_of(both).gaussians.means.data_ptr() == both.fields[0].gaussians.means.data_ptr()
+    alone, both = (trained(tiny_scene, dataclasses.replace(config, models=n)) for n in (1, 2))
+    torch.testing.assert_close(both.models[0].state_dict(), alone.models[0].state_dict(), rtol=0, atol=0)
+    assert model_of(both).gaussians.means.data_ptr() == both.models[0].gaussians.means.data_ptr()
     for trainer in (alone, both):
         trainer.save(tmp_path / "checkpoint.pt")
-        assert len(load_checkpoint(tmp_path / "checkpoint.pt").get("others", [])) == len(trainer.fields) - 1
+        assert len(load_checkpoint(tmp_path / "checkpoint.pt").get("others", [])) == len(trainer.models) - 1
 
 
-def test_fields_start_alike_and_draw_on_their_own(tiny_scene):
-    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, dropout=0.3, fields=3))
-    starts = [field.gaussians for field in trainer.fields]
+def test_models_start_alike_and_draw_on_their_own(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, dropout=0.3, models=3))
+    starts = [model.gaussians for model in trainer.models]
     assert all(torch.equal(starts[0].means, each.means) for each in starts)
     assert len({each.means.data_ptr() for each in starts}) == 3
     steps = trainer._begin_steps()
     for step in steps:
         step.sample(depth=False)
     assert len({step.view.name for step in steps}) == 1
-    keeps = [field.regularizer.keep for field in trainer.fields]
+    keeps = [model.regularizer.keep for model in trainer.models]
     assert not torch.equal(keeps[0], keeps[1])
     assert not torch.equal(keeps[1], keeps[2])
-    random = [field.density.split_generator(7).initial_seed() for field in trainer.fields]
+    random = [model.density.split_generator(7).initial_seed() for model in trainer.models]
     assert len(set(random)) == 3
 
 
 def test_a_training_of_two_fields_is_resumed_to_the_identical_result(tiny_scene, busy, tmp_path):
     loss = "photometric + co_regularization(between(1.0, 4))"
-    config = dataclasses.replace(busy, iterations=16, loss=loss, density=SEGS, fields=2, regularizer="concrete")
+    config = dataclasses.replace(busy, iterations=16, loss=loss, density=SEGS, models=2, regularizer="concrete")
     whole = trained(tiny_scene, config)
-    assert len({len(field.gaussians) for field in whole.fields}) == 2
+    assert len({len(model.gaussians) for model in whole.models}) == 2
     for at in (5, 8, 12):
         part = trained(tiny_scene, config, until=at)
         part.save(tmp_path / "checkpoint.pt")
         again = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
         again.train()
-        for one, other in zip(whole.fields, again.fields, strict=True):
+        for one, other in zip(whole.models, again.models, strict=True):
             torch.testing.assert_close(other.state_dict(), one.state_dict(), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda s: s.pop("others"), "expected 2 fields, got 1"),
-        (lambda s: s["others"].clear(), "expected 2 fields, got 1"),
-        (lambda s: s["others"].append({}), "expected 2 fields, got 3"),
+        (lambda s: s.pop("others"), "expected 2 models, got 1"),
+        (lambda s: s["others"].clear(), "expected 2 models, got 1"),
+        (lambda s: s["others"].append({}), "expected 2 models, got 3"),
         (lambda s: s.update(others=3), "damaged checkpoint"),
-        (lambda s: s["others"][0].pop("moments"), "field 1: it lacks 'moments'"),
-        (lambda s: s["others"][0].update(step=3), "field 1: unknown entry 'step'"),
-        (lambda s: s["others"][0]["gaussians"]["means"].fill_(torch.nan), "field 1, means: holds nan"),
-        (lambda s: s["others"][0]["statistics"].update(pictures=torch.zeros(1)), "field 1, statistics: unknown entry"),
+        (lambda s: s["others"][0].pop("moments"), "model 1: it lacks 'moments'"),
+        (lambda s: s["others"][0].update(step=3), "model 1: unknown entry 'step'"),
+        (lambda s: s["others"][0]["gaussians"]["means"].fill_(torch.nan), "model 1, means: holds nan"),
+        (lambda s: s["others"][0]["statistics"].update(pictures=torch.zeros(1)), "model 1, statistics: unknown entry"),
         (
             lambda s: s["statistics"].update(pictures=torch.zeros(2, 3)),
             "pictures: expected float32 of shape",
@@ -84,7 +84,7 @@ def test_a_training_of_two_fields_is_resumed_to_the_identical_result(tiny_scene,
 )
 def test_a_damaged_second_field_is_refused(tiny_scene, tmp_path, change, said):
     path = tmp_path / "checkpoint.pt"
-    Trainer(tiny_scene, TrainConfig(iterations=30, density=SEGS, fields=2)).save(path)
+    Trainer(tiny_scene, TrainConfig(iterations=30, density=SEGS, models=2)).save(path)
     state = load_checkpoint(path)
     change(state)
     save_checkpoint(path, state)
@@ -94,15 +94,15 @@ def test_a_damaged_second_field_is_refused(tiny_scene, tmp_path, change, said):
 
 @pytest.mark.parametrize("settings", [{"loss": "photometric + co_regularization"}, {"density": "co_pruning"}])
 def test_what_compares_fields_needs_two(settings):
-    with pytest.raises(ValueError, match="compares fields, of which there is one: set fields=2"):
+    with pytest.raises(ValueError, match="compares models, of which there is one: set models=2"):
         TrainConfig(**settings).check()
-    TrainConfig(**settings, fields=2).check()
-    with pytest.raises(ValueError, match="fields must be at least 1, got 0"):
-        TrainConfig(fields=0)
+    TrainConfig(**settings, models=2).check()
+    with pytest.raises(ValueError, match="models must be at least 1, got 0"):
+        TrainConfig(models=0)
 
 
 def test_all_fields_train_over_one_random_background(tiny_scene):
-    trainer = Trainer(tiny_scene, TrainConfig(iterations=9, fields=2, random_background=True))
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=9, models=2, random_background=True))
     colors = []
     for _ in range(3):
         steps = trainer._begin_steps()
@@ -121,10 +121,10 @@ def test_all_fields_train_over_one_random_background(tiny_scene):
         Trainer(dataclasses.replace(tiny_scene, train=views), trainer.config)
 
 
-@pytest.mark.parametrize("fields", [1, 2])
-def test_nothing_of_a_step_outlives_it(tiny_scene, fields):
-    loss = "photometric + views(2)" + " + co_regularization" * (fields == 2)
-    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, fields=fields, loss=loss))
+@pytest.mark.parametrize("models", [1, 2])
+def test_nothing_of_a_step_outlives_it(tiny_scene, models):
+    loss = "photometric + views(2)" + " + co_regularization" * (models == 2)
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, models=models, loss=loss))
     gc.collect()
     gc.disable()
     try:

@@ -7,12 +7,12 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import MIN_ALPHA
-from reference_trainer.render.eager import formulas
-from reference_trainer.render.eager.binning import bin_gaussians
-from reference_trainer.render.eager.projection import project
-from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
-from reference_trainer.render.eager.walk import blocks, geometry_rows, pad_entries, pixel_offsets, tile, walk
 from reference_trainer.render.splats import MomentImages, Projection, Splats
+from reference_trainer.render.torch import formulas
+from reference_trainer.render.torch.binning import bin_gaussians
+from reference_trainer.render.torch.projection import project
+from reference_trainer.render.torch.spherical_harmonics import evaluate_sh
+from reference_trainer.render.torch.walk import blocks, geometry_rows, pad_entries, pixel_offsets, tile, walk
 
 __all__ = ["TorchEngine"]
 
@@ -46,9 +46,9 @@ class TorchEngine:
         """Draw splats front to back."""
         values = [splats.colors.T, splats.projection.depths[None]] if depth else [splats.colors.T]
         shape = (splats.lists.height, splats.lists.width)
-        behind = torch.nn.functional.pad(background, (0, len(values) - 1))[:, None, None].expand(-1, *shape)
+        background = torch.nn.functional.pad(background, (0, len(values) - 1))[:, None, None].expand(-1, *shape)
         rows = torch.cat([geometry_rows(splats), *values])
-        sums = walk(formulas.composite, rows, behind, splats.lists, extra=1)
+        sums = walk(formulas.composite, rows, background, splats.lists, extra=1)
         return sums[:3], sums[-1], sums[3] if depth else None
 
     def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,8 +65,8 @@ class TorchEngine:
             entries = rows[:, block.gaussians]
             raw = block.alphas(entries[:6]).requires_grad_()
             with torch.enable_grad():
-                picture = formulas.over(formulas.blend_weights(raw), entries[6:], rows.new_zeros(()))
-            (to_raw,) = torch.autograd.grad(picture, raw, upstream[block.tiles])
+                image = formulas.over(formulas.blend_weights(raw), entries[6:], rows.new_zeros(()))
+            (to_raw,) = torch.autograd.grad(image, raw, upstream[block.tiles])
             # ln alpha = ln o - |(l11 dx + l21 dy, l22 dy)|^2 / 2, and the gradient of alpha is alpha times that of it.
             x, y, l11, l21, l22 = entries[:5, :, None]
             dx, dy = pixels[0] + block.centers[0][..., None] - x, pixels[1] + block.centers[1][..., None] - y
@@ -75,20 +75,20 @@ class TorchEngine:
             total.index_add_(1, block.gaussians.flatten(), slopes.abs().sum(2).flatten(1))
         return total[:, :-1].T
 
-    def moments(self, splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
+    def moments(self, splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
         """Composite mean and variance back to front."""
         one = torch.ones_like(splats.opacities)[None]
-        return self._moments(splats, multiplier, behind, one)
+        return self._moments(splats, multiplier, background, one)
 
-    def shares(self, splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
+    def shares(self, splats: Splats, multiplier: Tensor, background: Tensor, weights: Tensor) -> Tensor:
         """Differentiate the variance with respect to factors on its summands."""
         with torch.enable_grad():
             factors = torch.ones_like(splats.opacities)[None].requires_grad_()
-            variance = self._moments(splats, multiplier, behind, factors).variance
+            variance = self._moments(splats, multiplier, background, factors).variance
             total = (variance.mean(0) * weights).sum()
         return torch.autograd.grad(total, factors)[0][0].double()
 
-    def _moments(self, splats: Splats, multiplier: Tensor, behind: Tensor, factors: Tensor) -> MomentImages:
+    def _moments(self, splats: Splats, multiplier: Tensor, background: Tensor, factors: Tensor) -> MomentImages:
         rows = torch.cat([geometry_rows(splats), multiplier.T, factors, splats.colors.T])
-        images = walk(formulas.moments, rows, behind, splats.lists, extra=4)
+        images = walk(formulas.moments, rows, background, splats.lists, extra=4)
         return MomentImages(images[:3], images[3:6], images[6])

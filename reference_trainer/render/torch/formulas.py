@@ -1,7 +1,7 @@
 """The compositing formulas: the picture, its exact moments, and their first order.
 
-Each takes a `Block`, the rows of its entries and what is behind its tiles, and is differentiable. A block has T tiles
-of 64 pixels, with L entries each, nearest first.
+Each takes a `Block`, the rows of its entries and the background of its tiles, and is differentiable. A block has T
+tiles of 64 pixels, with L entries each, nearest first.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from reference_trainer.render.constants import MAX_ALPHA, MIN_TRANSMITTANCE
-from reference_trainer.render.eager.walk import Block
+from reference_trainer.render.torch.walk import Block
 
 __all__ = ["blend_weights", "composite", "first_order", "moments", "over"]
 
@@ -72,25 +72,25 @@ def blend_weights(raw: Tensor) -> Tensor:
     return weights
 
 
-def composite(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
-    """Composite C values front to back over what is behind (T, C, 64); append the accumulated alpha, (T, C + 1, 64).
+def composite(block: Block, rows: Tensor, background: Tensor) -> Tensor:
+    """Composite C values front to back over a background (T, C, 64); append the accumulated alpha, (T, C + 1, 64).
 
     The rows are geometry and values of the entries, (6 + C, T, L).
     """
-    return over(blend_weights(block.alphas(rows[:6])), rows[6:], behind)
+    return over(blend_weights(block.alphas(rows[:6])), rows[6:], background)
 
 
-def over(weights: Tensor, values: Tensor, behind: Tensor) -> Tensor:
-    """Blend values over what is behind them; append the accumulated alpha, (T, C + 1, 64).
+def over(weights: Tensor, values: Tensor, background: Tensor) -> Tensor:
+    """Blend values over a background; append the accumulated alpha, (T, C + 1, 64).
 
-    Weights are (T, 64, L), values (C, T, L), and what is behind broadcasts to (T, C, 64).
+    Weights are (T, 64, L), values (C, T, L), and the background broadcasts to (T, C, 64).
     """
     alpha = weights.sum(-1)[:, None]
     shown = values.transpose(0, 1) @ weights.transpose(1, 2)
-    return torch.cat([shown + (1 - alpha) * behind, alpha], dim=1)
+    return torch.cat([shown + (1 - alpha) * background, alpha], dim=1)
 
 
-def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
+def moments(block: Block, rows: Tensor, background: Tensor) -> Tensor:
     """Return mean and variance of C values under random factors, and the expected alpha, (T, 2 C + 1, 64).
 
     The recursion of `ca_reg.functional.pixel_moments`, back to front: with d the contrast of a splat with the mean of
@@ -105,7 +105,7 @@ def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
     expected, spread = m * alpha, v * alpha.square()
     values = rows[9:].permute(2, 1, 0)[..., None]
     terms = expected, factor * spread, (1 - expected).square() + spread, values
-    mean, variance = behind, torch.zeros_like(behind)
+    mean, variance = background, torch.zeros_like(background)
     entries = zip(*(reversed(x.unbind(0)) for x in terms), strict=True)  # indexing would copy all in the backward pass
     for e, s, kept, value in entries:
         contrast = value - mean
@@ -114,6 +114,6 @@ def moments(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
     return torch.cat([mean, variance, 1 - (1 - expected).prod(0)], dim=1)
 
 
-def first_order(block: Block, rows: Tensor, behind: Tensor) -> Tensor:
-    """Return ``sum_i r_i alpha_i^2`` for C values r, (T, C, 64); what is behind is ignored."""
+def first_order(block: Block, rows: Tensor, background: Tensor) -> Tensor:
+    """Return ``sum_i r_i alpha_i^2`` for C values r, (T, C, 64); the background is ignored."""
     return rows[6:].transpose(0, 1) @ _clamped(block.alphas(rows[:6])).square().transpose(1, 2)
