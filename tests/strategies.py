@@ -5,10 +5,10 @@ import math
 
 import torch
 
-from reference_trainer.density import DENSITY, DensityStrategy
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.density import DENSITY, DensityStrategy
 
 __all__ = ["begun", "short", "some", "stepped"]
 

@@ -190,9 +190,10 @@ class Plan:
 
     def __call__(self) -> None:
         from reference_trainer.evaluation.results import markdown_table, write_json
+        from reference_trainer.scenes import load_scene
         from reference_trainer.training.plan import make_plan
 
-        scene = _chosen(self.scene, self.folder).load(seed=self.config.seed)
+        scene = load_scene(_chosen(self.scene, self.folder), seed=self.config.seed)
         plan = make_plan(scene, self.config, given=self.given)
         print(f"{scene}\n")
         print(markdown_table(plan.rows(), ["item", "decision", "change", "reason"]))

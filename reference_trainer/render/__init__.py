@@ -8,13 +8,14 @@ from reference_trainer.render.checks import NotFiniteError
 from reference_trainer.render.engine import chosen_engine, describe_engine, use_engine
 from reference_trainer.render.moments import render_moments, variance_shares
 from reference_trainer.render.renderer import rasterize, render, render_masks, splat
-from reference_trainer.render.splats import MomentImages, Rendering, Splats
+from reference_trainer.render.splats import MomentImages, Rendering, Splats, ViewSplats
 
 __all__ = [
     "MomentImages",
     "NotFiniteError",
     "Rendering",
     "Splats",
+    "ViewSplats",
     "chosen_engine",
     "describe_engine",
     "rasterize",

@@ -1,4 +1,4 @@
-"""The interface of rendering engines, and the choice of the one that draws."""
+"""The choice of the engine that renders."""
 
 from __future__ import annotations
 
@@ -9,14 +9,11 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
-from typing import Protocol
 from unittest.mock import patch
 
 import torch
-from torch import Tensor
 
-from reference_trainer.camera import Camera
-from reference_trainer.render.splats import MomentImages, Projection, Splats, TileLists
+from reference_trainer.render.splats import Engine
 from reference_trainer.render.torch.engine import TorchEngine
 
 __all__ = [
@@ -34,58 +31,6 @@ ENGINES = ("auto", "torch", "numba")
 _RENAMED = {"loops": "numba"}
 _VARIABLE = "CA_REG_ENGINE"
 _TORCH = TorchEngine()
-
-
-class Engine(Protocol):
-    """Turns Gaussians into pictures, and into the exact moments of pictures.
-
-    All tensors of a call share one dtype and one device, and have been checked (`reference_trainer.render.renderer`,
-    `reference_trainer.render.moments`); results are differentiable unless said otherwise. A new engine is to be added
-    to `engine_for`.
-    """
-
-    name: str
-
-    def project(
-        self, inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
-    ) -> tuple[Projection, Tensor]:
-        """Project M of N Gaussians, those at ``indices`` (M,), and evaluate their colors, (M, 3).
-
-        The inputs, by name, are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh
-        (N, K, 3), used up to band ``degree``, or colors (N, 3), whose ``degree`` is None.
-        """
-
-    def bin(self, projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
-        """List the Gaussians of every tile, given their activated opacities (M,).
-
-        A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the rectangle spanned by the
-        tile's pixel centers. The test is exact: within a row of tiles, an ellipse covers an interval of columns.
-        """
-
-    def masked(self, splats: Splats, opacities: Tensor) -> Splats:
-        """Return the splats with other opacities (M,), nowhere higher; those below `MIN_ALPHA` cost nothing."""
-
-    def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Draw splats front to back over a background (3,): image (3, H, W), alpha (H, W), depth (H, W) if asked."""
-
-    def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw K pictures with opacities (K, M), as in `masked`: images (K, 3, H, W), alphas (K, H, W); no graph."""
-
-    def absolute_gradients(self, splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
-        """Sum the absolute values of each pixel's gradient of the projected centers (AbsGS), (M, 2), without a graph.
-
-        ``drawn`` (5, H, W) holds colors and depth over black and the accumulated alpha, and ``gradient`` that of a loss
-        with respect to it.
-        """
-
-    def moments(self, splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
-        """Return mean and variance of every pixel under random factors on the alphas of the full model.
-
-        ``multiplier`` (M, 2) holds mean and variance of every splat's factor, the background is (3, H, W).
-        """
-
-    def shares(self, splats: Splats, multiplier: Tensor, background: Tensor, weights: Tensor) -> Tensor:
-        """Return every splat's share of the variance, (M,), float64, for weights of the pixels (H, W)."""
 
 
 def use_engine(name: str) -> None:

@@ -1,19 +1,17 @@
-"""What the engines produce: projected Gaussians, tile lists, and rendered views."""
+"""What engines are, and what they produce: projected Gaussians, tile lists, and rendered views."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from reference_trainer.camera import Camera
 from reference_trainer.render.constants import TILE
 
-if TYPE_CHECKING:
-    from reference_trainer.render.engine import Engine
-
-__all__ = ["MomentImages", "Projection", "Rendering", "Splats", "TileLists"]
+__all__ = ["Engine", "MomentImages", "Projection", "Rendering", "Splats", "TileLists", "ViewSplats"]
 
 
 class Projection(NamedTuple):
@@ -100,6 +98,32 @@ class Splats(NamedTuple):
     lists: TileLists
     engine: Engine  # what made them, and draws them
 
+    @property
+    def means(self) -> Tensor:
+        """Projected centers, see `ViewSplats`."""
+        return self.projection.means
+
+    @property
+    def touched(self) -> Tensor:
+        """Which of the M may have reached a pixel, see `ViewSplats`."""
+        return self.lists.touched
+
+
+class ViewSplats(Protocol):
+    """What density control reads of a render, whichever renderer made it."""
+
+    @property
+    def indices(self) -> Tensor:
+        """Which of the N Gaussians lie in view, shape (M,)."""
+
+    @property
+    def means(self) -> Tensor:
+        """Their projected centers, pixels, which keep their gradient, shape (M, 2)."""
+
+    @property
+    def touched(self) -> Tensor:
+        """Which of them were drawn, shape (M,) bool."""
+
 
 class Rendering(NamedTuple):
     """A rendered view.
@@ -123,3 +147,55 @@ class MomentImages(NamedTuple):
     mean: Tensor  # expected colors over the background, (3, H, W)
     variance: Tensor  # of the colors, at least 0, (3, H, W)
     alpha_mean: Tensor  # expected accumulated alpha, (H, W)
+
+
+class Engine(Protocol):
+    """Turns Gaussians into pictures, and into the exact moments of pictures.
+
+    All tensors of a call share one dtype and one device, and have been checked (`reference_trainer.render.renderer`,
+    `reference_trainer.render.moments`); results are differentiable unless said otherwise. A new engine is to be added
+    to `reference_trainer.render.engine`.
+    """
+
+    name: str
+
+    def project(
+        self, inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
+    ) -> tuple[Projection, Tensor]:
+        """Project M of N Gaussians, those at ``indices`` (M,), and evaluate their colors, (M, 3).
+
+        The inputs, by name, are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh
+        (N, K, 3), used up to band ``degree``, or colors (N, 3), whose ``degree`` is None.
+        """
+
+    def bin(self, projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
+        """List the Gaussians of every tile, given their activated opacities (M,).
+
+        A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the rectangle spanned by the
+        tile's pixel centers. The test is exact: within a row of tiles, an ellipse covers an interval of columns.
+        """
+
+    def masked(self, splats: Splats, opacities: Tensor) -> Splats:
+        """Return the splats with other opacities (M,), nowhere higher; those below `MIN_ALPHA` cost nothing."""
+
+    def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Draw splats front to back over a background (3,): image (3, H, W), alpha (H, W), depth (H, W) if asked."""
+
+    def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw K pictures with opacities (K, M), as in `masked`: images (K, 3, H, W), alphas (K, H, W); no graph."""
+
+    def absolute_gradients(self, splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
+        """Sum the absolute values of each pixel's gradient of the projected centers (AbsGS), (M, 2), without a graph.
+
+        ``drawn`` (5, H, W) holds colors and depth over black and the accumulated alpha, and ``gradient`` that of a loss
+        with respect to it.
+        """
+
+    def moments(self, splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
+        """Return mean and variance of every pixel under random factors on the alphas of the full model.
+
+        ``multiplier`` (M, 2) holds mean and variance of every splat's factor, the background is (3, H, W).
+        """
+
+    def shares(self, splats: Splats, multiplier: Tensor, background: Tensor, weights: Tensor) -> Tensor:
+        """Return every splat's share of the variance, (M,), float64, for weights of the pixels (H, W)."""

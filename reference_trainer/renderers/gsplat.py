@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
@@ -25,11 +24,11 @@ __all__ = ["GsplatRenderer", "GsplatRendering", "GsplatSplats", "load_gsplat_ren
 
 
 class GsplatSplats(NamedTuple):
-    """What density control reads of `Splats`, under the same names."""
+    """What density control reads of a render, see `ViewSplats`."""
 
-    indices: Tensor  # which of the N Gaussians lie in view, (M,)
-    projection: SimpleNamespace  # has means, pixel coordinates, (M, 2), which keep their gradient
-    lists: SimpleNamespace  # has touched, whether a Gaussian was drawn, (M,) bool
+    indices: Tensor
+    means: Tensor
+    touched: Tensor
 
 
 class GsplatRendering(NamedTuple):
@@ -96,7 +95,7 @@ def render_by(
     """Render 3D Gaussians with ``gsplat.rasterization``, 1.5 or newer; differentiable in all but the background.
 
     Arguments and conventions are those of `render`; with ``absgrad`` the backward pass leaves absolute gradients (M, 2)
-    in ``projection.means.absgrad``.
+    in ``splats.means.absgrad``.
 
     Raises:
         TypeError: if the Gaussians are not float32, the only dtype that gsplat takes.
@@ -128,8 +127,6 @@ def render_by(
         info["means2d"].retain_grad()
     image = images[0].permute(2, 0, 1)
     splats = GsplatSplats(
-        indices=info["gaussian_ids"].long(),
-        projection=SimpleNamespace(means=info["means2d"]),
-        lists=SimpleNamespace(touched=info["tiles_per_gauss"] > 0),
+        indices=info["gaussian_ids"].long(), means=info["means2d"], touched=info["tiles_per_gauss"] > 0
     )
     return GsplatRendering(image[:3], alphas[0, ..., 0], image[3] if depth else None, splats)

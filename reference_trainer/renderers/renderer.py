@@ -17,7 +17,7 @@ class Renderer(abc.ABC):
         capabilities: besides image and alpha: ``"depth"``; ``"moments"`` if `reference_trainer.render.render_moments`
             draws the same picture, which analytic training and terms that render moments need; ``"absgrad"`` if it
             takes ``absgrad=True``, with which the backward pass leaves the sums of absolute gradients (M, 2) in
-            ``splats.projection.means.absgrad``.
+            ``splats.means.absgrad``.
     """
 
     capabilities: ClassVar[frozenset[str]] = frozenset()

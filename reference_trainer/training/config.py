@@ -6,15 +6,9 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from reference_trainer.json_files import settings_from
-
-if TYPE_CHECKING:
-    from ca_reg import Chain
-    from reference_trainer.density import DensityStrategy
-    from reference_trainer.losses import LossTerm
-    from reference_trainer.renderers import Renderer
 
 __all__ = ["TrainConfig", "saved_config"]
 
@@ -156,56 +150,6 @@ class TrainConfig:
     def sh_degree_at(self, number: int) -> int:
         """Highest band of spherical harmonics of the step with this number, the first being 1."""
         return min(self.sh_degree, number // self.sh_every) if self.sh_every else self.sh_degree
-
-    # The following methods import torch, which the command line defers until it has to.
-
-    def make_regularizer(self) -> Chain:
-        """Make the regularizers; empty if there are none."""
-        from ca_reg.regularizers import parse
-
-        return parse(self.regularizers)
-
-    def make_losses(self) -> list[LossTerm]:
-        """Make the terms of the loss."""
-        from reference_trainer.losses import LOSSES
-
-        return LOSSES.make(self.loss)
-
-    def make_density(self, index: int = 0) -> DensityStrategy:
-        """Make the density control of one of the models."""
-        from reference_trainer.density import DENSITY
-
-        density = DENSITY.make_one(self.density)
-        density.index = index
-        return density
-
-    def make_renderer(self) -> Renderer:
-        """Make the renderer."""
-        from reference_trainer.renderers import RENDERERS
-
-        return RENDERERS.make_one(self.renderer)
-
-    def check(self) -> None:
-        """Raise a ValueError unless all expressions are valid and what they name is compatible."""
-        self.make_regularizer()
-        density = self.make_density()
-        renderer, terms = self.make_renderer(), self.make_losses()
-        if not terms:
-            raise ValueError("loss needs at least one term, such as photometric.")
-        of_terms = frozenset[str]().union(*(term.needs for term in terms))
-        if self.models < 2 and "models" in density.needs | of_terms:
-            raise ValueError(f"{self.loss} with {self.density} compares models, of which there is one: set models=2.")
-        if self.analytic and "moments" not in renderer.capabilities:
-            raise ValueError("analytic training needs the moments of the builtin renderer: leave out renderer.")
-        if self.analytic and "absgrad" in density.needs:
-            raise ValueError(f"analytic training has no absolute gradients, which {self.density} needs: leave it out.")
-        for what, needs in ((self.density, density.needs), ("the loss", of_terms)):
-            if lacking := ", ".join(sorted(needs - renderer.capabilities - {"models"})):
-                raise ValueError(f"{what} needs {lacking}, which the renderer {self.renderer} lacks.")
-        if self.analytic and (drawn := [type(term).__name__ for term in terms if not term.analytic]):
-            raise ValueError(
-                f"analytic training has no draw, which {', '.join(drawn)} needs: leave out analytic, or the term."
-            )
 
 
 def saved_config(values: Any, where: str) -> TrainConfig:

@@ -65,5 +65,5 @@ def drawn_by_any(gaussians: Gaussians, views: tuple[View, ...]) -> Tensor:
     drawn = torch.zeros(len(gaussians), dtype=torch.bool)
     for view in views:
         splats = splat(**arguments(gaussians), camera=view.camera, sh_degree=0)
-        drawn[splats.indices[splats.lists.touched]] = True
+        drawn[splats.indices[splats.touched]] = True
     return drawn

@@ -8,10 +8,12 @@ from typing import Any
 
 import torch
 
+from ca_reg import Chain
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.density import DensityStrategy
 from reference_trainer.training.initial import initial_gaussians
 
 __all__ = ["ModelState"]
@@ -26,8 +28,10 @@ class ModelState:
     Args:
         scene: with the points to start from.
         config: all settings.
+        density: its density control; prepared here.
+        regularizer: its regularizers.
         device: where to train.
-        number: of the model; the first, 0, is the one that is measured and written.
+        index: which of the models it is; the first, 0, is the one that is measured and written.
 
     Attributes:
         label: prefix of the labels of the model's random streams.
@@ -37,15 +41,26 @@ class ModelState:
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
-        >>> state = ModelState(synthetic_scene(width=16, height=12, points=50), TrainConfig(), "cpu")
+        >>>         >>> scene, config = synthetic_scene(width=16, height=12, points=50), TrainConfig()
+        >>> state = ModelState(scene, config, make_density(config), make_regularizer(config))
         >>> len(state.gaussians)
         50
     """
 
-    def __init__(self, scene: Scene, config: TrainConfig, device: torch.device | str, number: int = 0) -> None:
-        self.label = f"field {number}/" if number else ""  # names random streams: another word would draw other numbers
-        self.regularizer = config.make_regularizer()
-        learns, start = self.regularizer.learns, initial_gaussians(scene, config)
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        density: DensityStrategy,
+        regularizer: Chain,
+        *,
+        device: torch.device | str = "cpu",
+        index: int = 0,
+    ) -> None:
+        # The label names random streams: with another word than "field", trainings would come out differently.
+        self.label = f"field {index}/" if index else ""
+        self.regularizer = regularizer
+        learns, start = regularizer.learns, initial_gaussians(scene, config)
         known = start.learned  # of a model with the same regularizers
         learned = {name: known.get(name, torch.full((len(start),), x.start)) for name, x in learns.items()}
         start = replace(start, learned=learned)
@@ -59,8 +74,8 @@ class ModelState:
             **{name: learned.rate for name, learned in learns.items()},
         }
         self.optimizer = GaussianOptimizer(start.to(device), rates)
-        self.density = config.make_density(number)
-        self.density.begin(config, scene, torch.device(device), len(start))
+        self.density = density
+        density.begin(config, scene, torch.device(device), len(start))
 
     @property
     def gaussians(self) -> Gaussians:

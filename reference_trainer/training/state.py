@@ -13,6 +13,7 @@ from torch import Tensor
 
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.assembly import make_density, make_regularizer
 from reference_trainer.training.config import TrainConfig, saved_config
 
 __all__ = ["TrainingState", "read_state"]
@@ -90,7 +91,7 @@ def _read_model(
     """Read the state of one of the models."""
     _refuse_other_entries(state, _OF_A_MODEL, where)
     tensors, moments = state["gaussians"], state["moments"]
-    parameters = [*PARAMETERS, *config.make_regularizer().learns]
+    parameters = [*PARAMETERS, *make_regularizer(config).learns]
     _refuse_other_entries(tensors, parameters, f"{where}, gaussians")
     _refuse_other_entries(moments, parameters, f"{where}, moments")
     try:
@@ -105,7 +106,7 @@ def _read_model(
         _check(x, tuple(x.shape), f"{where}, {name}")
         if moments[name] != {}:  # as before the first step
             _check_moments(moments[name], tuple(x.shape), step, f"{where}, moments of {name}")
-    counts = config.make_density(number)
+    counts = make_density(config, number)
     counts.begin(config, scene, gaussians.means.device, len(gaussians))
     expected = counts.state_dict()
     _refuse_other_entries(state["statistics"], expected, f"{where}, statistics")

@@ -15,8 +15,7 @@ from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
-from reference_trainer.render import MomentImages, Rendering, Splats
-from reference_trainer.renderers.gsplat import GsplatSplats
+from reference_trainer.render import MomentImages, Rendering, ViewSplats
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.randomness import stream
 
@@ -67,7 +66,7 @@ class Step:
     rendered: Params = field(init=False)
     variance: Tensor | None = field(default=None, init=False)
     rendering: Rendering | None = field(default=None, init=False)
-    observed: list[tuple[Splats | GsplatSplats, Camera]] = field(default_factory=list, init=False)
+    observed: list[tuple[ViewSplats, Camera]] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         self.params = self.gaussians.params(self.view.camera, step=self.number)

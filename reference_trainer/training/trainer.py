@@ -15,6 +15,7 @@ from ca_reg import Chain
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import NotFiniteError
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.assembly import check, make_density, make_losses, make_regularizer, make_renderer
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
@@ -60,22 +61,25 @@ class Trainer:
     """
 
     def __init__(self, scene: Scene, config: TrainConfig, device: torch.device | str = "cpu") -> None:
-        config.check()
+        check(config)
         if scene.start is not None:  # whose colors have all bands already
             config = dataclasses.replace(config, sh_every=0)
         self.scene = scene
         self.config = config
         self.device = torch.device(device)
-        self.renderer = config.make_renderer()
+        self.renderer = make_renderer(config)
         self.renderer.prepare(self.device)
         self.step = 0
         self.seconds = self.processor_seconds = 0.0
         self.views = [view.to(self.device) for view in scene.train]
         self.background = scene.background.to(self.device)
-        self.models = [ModelState(scene, config, self.device, number) for number in range(config.models)]
+        self.models = [
+            ModelState(scene, config, make_density(config, i), make_regularizer(config), device=self.device, index=i)
+            for i in range(config.models)
+        ]
         first = self.models[0]
         self.optimizer, self.density, self.regularizer = first.optimizer, first.density, first.regularizer
-        self.losses = config.make_losses()
+        self.losses = make_losses(config)
         for term in self.losses:
             term.begin(scene)
         if config.random_background and any(view.alpha is not None for view in scene.train):
@@ -166,7 +170,7 @@ class Trainer:
             loss.backward()  # type: ignore[no-untyped-call]
             for model, step in zip(self.models, steps, strict=True):
                 for splats, camera in step.observed if model.density.observes(self.step) else ():
-                    if splats.projection.means.grad is not None:  # none if nothing was drawn, or no term saw it
+                    if splats.means.grad is not None:  # none if nothing was drawn, or no term saw it
                         model.density.observe(splats, camera)
                 model.optimizer.set_means_rate(self.config.means_rate_at(self.step) * self.scene.extent)
                 model.optimizer.step()

@@ -10,13 +10,13 @@ import torch
 
 from benchmarks.workloads import Workload
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render.engine import using_engine
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.clocks import Clock, in_turns
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.losses.photometric import photometric_loss
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["MASKS", "PARTS", "analytic_step", "scores", "step_parts"]

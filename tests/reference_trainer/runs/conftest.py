@@ -5,13 +5,14 @@ import dataclasses
 import pytest
 import torch
 
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 
 
 @pytest.fixture
 def masked(options, monkeypatch) -> SceneOptions:
     """Options whose scene has masks: of every photograph the left half counts, and the right half is noise."""
-    scene, generator = options.load(), torch.Generator().manual_seed(0)
+    scene, generator = load_scene(options), torch.Generator().manual_seed(0)
 
     def half(view):
         mask = torch.zeros_like(view.image[0])

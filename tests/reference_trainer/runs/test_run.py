@@ -14,6 +14,7 @@ from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import run as run_module
 from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, CONFIG, PLAN, PLY, RESULTS, read_results
 from reference_trainer.runs.run import load_run, model_of, run_experiment
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
@@ -231,7 +232,7 @@ def test_an_interrupted_run_ends_like_an_uninterrupted_one(finished, interrupted
 
 def test_a_killed_run_continues_from_its_last_checkpoint(finished, options, short, tmp_path):
     """No farewell: the checkpoint of step 4, and a log that is already further, with half a line at its end."""
-    partial = Trainer(options.load(seed=0), short)
+    partial = Trainer(load_scene(options, seed=0), short)
     partial.train(until=4)
     partial.save(tmp_path / CHECKPOINT)
     shutil.copy(finished[0] / CONFIG, tmp_path)
@@ -293,7 +294,7 @@ def test_a_mistyped_scene_does_not_claim_the_folder(options, short, tmp_path):
 
 def broken_scene(options: SceneOptions, monkeypatch) -> None:
     """Give one training view a pixel that is not a number."""
-    scene = options.load()
+    scene = load_scene(options)
     image = scene.train[1].image.clone()
     image[0, 0, 0] = torch.nan
     bad = dataclasses.replace(scene.train[1], image=image)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from reference_trainer.runs.run import model_of
+from reference_trainer.training.assembly import check
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.step import Step
@@ -95,8 +96,8 @@ def test_a_damaged_second_field_is_refused(tiny_scene, tmp_path, change, said):
 @pytest.mark.parametrize("settings", [{"loss": "photometric + co_regularization"}, {"density": "co_pruning"}])
 def test_what_compares_fields_needs_two(settings):
     with pytest.raises(ValueError, match="compares models, of which there is one: set models=2"):
-        TrainConfig(**settings).check()
-    TrainConfig(**settings, models=2).check()
+        check(TrainConfig(**settings))
+    check(TrainConfig(**settings, models=2))
     with pytest.raises(ValueError, match="models must be at least 1, got 0"):
         TrainConfig(models=0)
 

@@ -19,15 +19,16 @@ from torch import Tensor
 
 from ca_reg import Chain, GaussianDropout, OpacityNoise
 from reference_trainer.camera import Camera
-from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
 from reference_trainer.render import render
 from reference_trainer.renderers import gsplat as kernels
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import PointCloud, Scene, View
+from reference_trainer.training.assembly import check
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.determinism import deterministic
+from reference_trainer.training.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.recipes import RECIPES
 from reference_trainer.training.trainer import Trainer
@@ -182,7 +183,7 @@ def gsplat(monkeypatch):
 def test_a_pair_is_what_its_options_say_or_refused(pair, gsplat):
     if pair in REFUSED:
         with pytest.raises(ValueError, match=REFUSED[pair]):
-            together(pair)[0].check()
+            check(together(pair)[0])
         return
     (config, draws, scaled), white = together(pair), "white" in pair
     world = scene(white)

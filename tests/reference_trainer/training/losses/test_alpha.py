@@ -1,0 +1,58 @@
+"""Alpha on the background against the source's rule, written out in numpy."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from reference_trainer.training.losses import LOSSES
+from reference_trainer.training.losses.alpha import Alpha, dark_background
+
+
+def literal_background(image, threshold):
+    """A pixel is background if it and the 49 above it, as far as there are any, are dark."""
+    dark = image.max(0) < threshold
+    rows, columns = dark.shape
+    return np.array([[dark[max(0, i - 49) : i + 1, j].all() for j in range(columns)] for i in range(rows)], float)
+
+
+def test_the_mean_of_alpha_where_the_photograph_has_none(take_step):
+    step = take_step()
+    expected = (step.rendering.alpha.numpy() * (1 - step.view.alpha.numpy())).mean()
+    assert Alpha(0.6)(step).item() == pytest.approx(0.6 * expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("rows", [3, 50, 120])
+def test_the_dark_background_is_the_rule_of_the_source(rows):
+    g = torch.Generator().manual_seed(rows)
+    image = torch.rand(3, rows, 40, generator=g) ** 0.05 * (torch.rand(3, rows, 40, generator=g) < 0.004)
+    expected = literal_background(image.numpy(), 0.5)
+    assert 0 < expected.mean() < 1
+    np.testing.assert_array_equal(dark_background(image, 0.5).numpy(), expected)
+
+
+def test_a_dark_background_counts_instead_of_alpha(take_step):
+    step = take_step()
+    image = step.view.image.clone()
+    image[:, 4:] *= (torch.arange(25) < 12).double()
+    step.view = dataclasses.replace(step.view, image=image, alpha=None)
+    image = image * (torch.arange(25) < 12).double()
+    step.view = dataclasses.replace(step.view, image=image)
+    expected = (step.rendering.alpha.numpy() * literal_background(image.numpy(), 0.1)).mean()
+    assert expected > 0
+    assert Alpha(1.0, dark=0.1)(step).item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_gradients(assert_gradients_of_differences):
+    assert_gradients_of_differences(Alpha(0.7), "means", "opacity_logits", "log_scales")
+
+
+def test_arguments_and_photographs(three_views, tiny_scene):
+    for text, message in (("alpha(-1.0)", "weight must"), ("alpha(dark=0.0)", r"dark must be in \(0, 1\]")):
+        with pytest.raises(ValueError, match=message):
+            LOSSES.make(text)
+    opaque = dataclasses.replace(three_views[1], alpha=None)
+    with pytest.raises(ValueError, match=r"\['b'\] have no alpha.*dark"):
+        Alpha().begin(dataclasses.replace(tiny_scene, train=(three_views[0], opaque)))
+    Alpha(dark=0.1).begin(dataclasses.replace(tiny_scene, train=(opaque,)))
