@@ -133,7 +133,7 @@ class Train:
     def __call__(self) -> None:
         from reference_trainer.evaluation.tables import summary
         from reference_trainer.runs.run import run_experiment
-        from reference_trainer.training.determinism import deterministic
+        from reference_trainer.training.randomness import deterministic
 
         if self.deterministic and self.config.renderer == "gsplat":
             raise ValueError(

@@ -6,8 +6,14 @@ import torch
 from torch import Tensor
 
 from reference_trainer.render.splats import Splats
-from reference_trainer.render.torch.formulas import blend_weights
-from reference_trainer.render.torch.walk import blocks, geometry_rows, pad_entries, pixel_offsets, tile
+from reference_trainer.render.torch.compositing import (
+    blend_weights,
+    blocks,
+    geometry_rows,
+    pad_entries,
+    pixel_offsets,
+    tile,
+)
 
 __all__ = ["contributions"]
 

@@ -14,9 +14,8 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.compat.antialiasing import filtered
 from reference_trainer.render import Splats, rasterize, splat
-from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradients
 from reference_trainer.render.constants import DILATION, MIN_ALPHA, NEAR_PLANE
-from reference_trainer.render.radii import longer_radii
+from reference_trainer.render.densification import absgrad_sink, longer_radii, with_absolute_gradients
 
 __all__ = ["make_rasterization"]
 

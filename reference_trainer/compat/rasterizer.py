@@ -16,11 +16,10 @@ from reference_trainer.compat.outputs import Picture, Unknown, kinds_of
 from reference_trainer.compat.settings import GaussianRasterizationSettings, camera_of, warn_of_ignored
 from reference_trainer.compat.surfels import surface_planes
 from reference_trainer.compat.unpacking import names_of_results
-from reference_trainer.model.relocation import compute_relocation
+from reference_trainer.model.gaussians import compute_relocation
 from reference_trainer.render import rasterize, splat
-from reference_trainer.render.absolute import splat_weights, with_absolute_gradients
 from reference_trainer.render.constants import DILATION
-from reference_trainer.render.radii import in_front, visible_radii
+from reference_trainer.render.densification import in_front, splat_weights, visible_radii, with_absolute_gradients
 
 __all__ = ["GaussianRasterizer", "rasterizer_module"]
 

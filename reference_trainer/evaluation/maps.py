@@ -8,8 +8,8 @@ from torch import Tensor
 from ca_reg.functional import Multiplier
 from reference_trainer.render.renderer import rasterize
 from reference_trainer.render.splats import Splats
-from reference_trainer.render.torch import formulas
-from reference_trainer.render.torch.walk import geometry_rows, walk
+from reference_trainer.render.torch import compositing
+from reference_trainer.render.torch.compositing import geometry_rows, walk
 
 __all__ = ["color_variance_map", "first_order_map"]
 
@@ -62,4 +62,4 @@ def first_order_map(splats: Splats, multiplier: Multiplier) -> Tensor:
         spread = spread[splats.indices].to(splats.colors)[:, None]
     rows = torch.cat([geometry_rows(splats), (spread * splats.colors.square()).T])
     behind = rows.new_zeros(3, splats.lists.height, splats.lists.width)
-    return walk(formulas.first_order, rows, behind, splats.lists, extra=0)
+    return walk(compositing.first_order, rows, behind, splats.lists, extra=0)

@@ -6,8 +6,7 @@ former is tested against the latter. `use_engine` chooses.
 
 from reference_trainer.render.checks import NotFiniteError
 from reference_trainer.render.engine import chosen_engine, describe_engine, use_engine
-from reference_trainer.render.moments import render_moments, variance_shares
-from reference_trainer.render.renderer import rasterize, render, render_masks, splat
+from reference_trainer.render.renderer import rasterize, render, render_masks, render_moments, splat, variance_shares
 from reference_trainer.render.splats import MomentImages, Rendering, Splats, ViewSplats
 
 __all__ = [

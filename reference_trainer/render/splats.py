@@ -153,7 +153,7 @@ class Engine(Protocol):
     """Turns Gaussians into pictures, and into the exact moments of pictures.
 
     All tensors of a call share one dtype and one device, and have been checked (`reference_trainer.render.renderer`,
-    `reference_trainer.render.moments`); results are differentiable unless said otherwise. A new engine is to be added
+    `reference_trainer.render.renderer`); results are differentiable unless said otherwise. A new engine is to be added
     to `reference_trainer.render.engine`.
     """
 

@@ -1,9 +1,8 @@
 """The renderers of the training views, one per file, and their registry: what ``--renderer`` knows by name."""
 
 from ca_reg.registry import Registry
-from reference_trainer.renderers.builtin import BuiltinRenderer
 from reference_trainer.renderers.gsplat import GsplatRenderer
-from reference_trainer.renderers.renderer import Renderer
+from reference_trainer.renderers.renderer import BuiltinRenderer, Renderer
 
 __all__ = ["RENDERERS", "BuiltinRenderer", "GsplatRenderer", "Renderer"]
 

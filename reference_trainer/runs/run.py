@@ -44,8 +44,7 @@ from reference_trainer.threads import threads_for
 from reference_trainer.training.assembly import check
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
-from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.interruption import TrainingInterrupted, TrainingStoppedError
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
 

@@ -12,8 +12,8 @@ import torch
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.assembly import make_density, make_losses, make_regularizer
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.initial import drawn_by_any, initial_gaussians
 from reference_trainer.training.losses import Photometric
+from reference_trainer.training.model_state import drawn_by_any, initial_gaussians
 
 __all__ = ["DROPOUT_GAINS", "FAR_APART_GAINS", "RULES", "PlanItem"]
 

@@ -16,13 +16,11 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import NotFiniteError
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.assembly import check, make_density, make_losses, make_regularizer, make_renderer
-from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
+from reference_trainer.training.checkpoint import load_checkpoint, read_state, save_checkpoint
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
-from reference_trainer.training.interruption import hold_interrupts
+from reference_trainer.training.interruption import TrainingStoppedError, hold_interrupts
 from reference_trainer.training.model_state import ModelState
 from reference_trainer.training.randomness import stream, view_order
-from reference_trainer.training.state import read_state
 from reference_trainer.training.step import Step
 
 __all__ = ["Trainer"]

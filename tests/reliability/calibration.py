@@ -19,7 +19,7 @@ from torch import Tensor
 from ca_reg import CAScore, MomentsFn, RenderFn
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.render import render_masks, splat
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render.renderer import render_moments
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer

@@ -20,7 +20,7 @@ from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.interruption import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["CASES", "Ending", "main", "push"]

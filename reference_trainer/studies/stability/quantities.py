@@ -12,7 +12,7 @@ from ca_reg import CAScore
 from ca_reg.functional import Multiplier, apply_dropout, apply_opacity_noise, draw_keep_mask, draw_opacity_noise
 from reference_trainer.camera import Camera
 from reference_trainer.render import Splats, rasterize, splat
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render.renderer import render_moments
 from reference_trainer.studies.stability.baseline import render_simply
 from reference_trainer.studies.stability.scenes import PARAMETERS, StressScene
 

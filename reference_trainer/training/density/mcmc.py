@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from ca_reg._check import check_finite
-from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.gaussians import Gaussians, compute_relocation
 from reference_trainer.model.optimizer import GaussianOptimizer
-from reference_trainer.model.relocation import compute_relocation
 from reference_trainer.rotations import rotation_matrices
 from reference_trainer.training.density.operations import refuse_not_finite
 from reference_trainer.training.density.strategy import DensityStrategy

@@ -2,21 +2,11 @@
 
 from ca_reg.registry import Registry
 from ca_reg.schedules import SCHEDULES
-from reference_trainer.training.losses.alpha import Alpha
-from reference_trainer.training.losses.co_adaptation import CoAdaptation
-from reference_trainer.training.losses.co_regularization import CoRegularization
-from reference_trainer.training.losses.consistency import Consistency
-from reference_trainer.training.losses.flat import Flat
-from reference_trainer.training.losses.opacity import Opacity
-from reference_trainer.training.losses.patch_depth import PatchDepth
-from reference_trainer.training.losses.pearson import Pearson
-from reference_trainer.training.losses.photometric import Photometric
-from reference_trainer.training.losses.scale import Scale
-from reference_trainer.training.losses.smooth_depth import SmoothDepth
-from reference_trainer.training.losses.straight_through import StraightThrough
+from reference_trainer.training.losses.comparisons import CoAdaptation, Consistency, CoRegularization, StraightThrough
+from reference_trainer.training.losses.depth import PatchDepth, Pearson, SmoothDepth, Warp
+from reference_trainer.training.losses.penalties import Alpha, Flat, Opacity, Scale
+from reference_trainer.training.losses.photometric import Photometric, Views
 from reference_trainer.training.losses.term import LossTerm
-from reference_trainer.training.losses.views import Views
-from reference_trainer.training.losses.warp import Warp
 
 __all__ = ["LOSSES", "CoAdaptation", "Consistency", "LossTerm", "Photometric"]
 

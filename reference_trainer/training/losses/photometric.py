@@ -1,4 +1,4 @@
-"""The photometric loss of 3D Gaussian Splatting, L1 + D-SSIM, optimized for being called at every step."""
+"""The photometric loss, L1 + D-SSIM, of one or several views; optimized for being called at every step."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ca_reg._check import check_count
 from ca_reg.functional import expected_absolute_error
 from ca_reg.schedules import Schedule
 from reference_trainer.render.engine import engine_for
 from reference_trainer.training.losses.term import WeightedTerm
 from reference_trainer.training.step import Step
 
-__all__ = ["Photometric", "check_lambda", "expected_photometric_loss", "photometric_loss", "ssim_map"]
+__all__ = ["Photometric", "Views", "check_lambda", "expected_photometric_loss", "photometric_loss", "ssim_map"]
 
 _RADIUS = 5
 _SIGMA = 1.5
@@ -199,7 +200,7 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
         blurred: x, y, x y and x^2 + y^2, shape (4, C, H, W).
     """
     if engine_for(blurred.device, blurred.dtype).name == "numba":
-        from reference_trainer.training.losses.ssim_loops import similarity
+        from reference_trainer.training.losses._ssim_numba import similarity
 
         return similarity(blurred, _C1, _C2)
     mean_x, mean_y, mean_xy, mean_squares = blurred
@@ -215,7 +216,7 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
 def _blur(maps: Tensor) -> Tensor:
     """Blur maps (..., H, W) with the zero-padded window."""
     if engine_for(maps.device, maps.dtype).name == "numba":
-        from reference_trainer.training.losses.ssim_loops import blur
+        from reference_trainer.training.losses._ssim_numba import blur
 
         return blur(maps, _WEIGHTS)
     # Sums of shifted slices: on a CPU faster than a depthwise convolution, whose speed depends on the memory layout.
@@ -229,3 +230,35 @@ def _blur(maps: Tensor) -> Tensor:
             blurred.narrow(axis, 0, length).add_(maps.narrow(axis, offset, length), alpha=weight)
         maps = blurred
     return maps
+
+
+class Views(WeightedTerm):
+    """``weight`` times the sum of the photometric losses of n - 1 further training views (MVGS, 2024).
+
+    Each is drawn like the view of the step, with its own draw of the regularizers, and counted by density control (the
+    source counts the last one alone). ``photometric + views(3)`` makes three views a step.
+
+    Args:
+        n: views in a step, including the step's own, at least 2; all, if there are fewer training views.
+        weight: at least 0, or a schedule.
+        lambda_dssim: of `photometric_loss`.
+
+    Raises:
+        TypeError: if ``n`` is no integer.
+        ValueError: if one is out of range.
+    """
+
+    analytic = True
+
+    def __init__(self, n: int = 3, weight: float | Schedule = 1.0, lambda_dssim: float = 0.2) -> None:
+        super().__init__(weight)
+        check_count(n, "n", minimum=2, hint=": one view is what photometric has")
+        self.n, self.photometric = n, Photometric(lambda_dssim)
+
+    def value(self, step: Step) -> Tensor:
+        """Draw the views and compare each with its photograph."""
+        others = [view for view in step.views if view.name != step.view.name]
+        generator = step.generator("views")
+        order = torch.randperm(len(others), generator=generator, device=generator.device)[: self.n - 1]
+        losses = [self.photometric(step.at(others[i])) for i in order.tolist()]
+        return sum(losses, start=step.image.new_zeros(()))

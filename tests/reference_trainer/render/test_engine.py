@@ -1,10 +1,13 @@
-"""Which engine draws."""
+"""Which engine renders, and the choice of the user afterwards."""
+
+import os
 
 import pytest
 import torch
 from oracles import random_scene
 
 from reference_trainer.render import describe_engine, render, use_engine
+from reference_trainer.render.engine import engines_on, using_engine
 
 pytest.importorskip("numba")
 
@@ -55,3 +58,33 @@ def test_the_old_name_of_an_engine_is_refused_with_the_new_one(monkeypatch):
     monkeypatch.setenv("CA_REG_ENGINE", "loops")
     with pytest.raises(ValueError, match="CA_REG_ENGINE names the engine 'loops'; it is called numba now"):
         describe_engine("cpu")
+
+
+@pytest.mark.parametrize("chosen", [None, "auto", "torch"])
+@pytest.mark.parametrize("drawing", ["numba", "torch"])
+def test_what_was_chosen_is_chosen_again(chosen, drawing, monkeypatch):
+    if chosen is None:
+        monkeypatch.delenv("CA_REG_ENGINE", raising=False)
+    else:
+        monkeypatch.setenv("CA_REG_ENGINE", chosen)
+
+    def interrupted():
+        with using_engine(drawing):
+            assert describe_engine("cpu").startswith(drawing)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert os.environ.get("CA_REG_ENGINE") == chosen
+
+
+def test_an_engine_that_is_not_there_changes_nothing(monkeypatch):
+    monkeypatch.setenv("CA_REG_ENGINE", "torch")
+    with pytest.raises(ValueError, match="no engine 'lasers'"), using_engine("lasers"):
+        pass
+    assert os.environ["CA_REG_ENGINE"] == "torch"
+
+
+def test_loops_draw_on_a_cpu_alone():
+    assert engines_on(torch.device("cpu")) == ("numba", "torch")
+    assert engines_on(torch.device("cuda")) == ("torch",)

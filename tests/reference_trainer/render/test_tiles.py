@@ -8,6 +8,7 @@ from oracles import random_scene
 
 from reference_trainer.render import splat
 from reference_trainer.render.constants import MIN_ALPHA, TILE
+from reference_trainer.render.torch import compositing
 
 ROUNDING = {torch.float64: 1e-9, torch.float32: 1e-3}  # of an alpha, relative
 
@@ -84,14 +85,13 @@ def test_equal_depths_keep_the_order_of_the_gaussians(case):
 
 @pytest.mark.parametrize("budget", [1, 4000, 1 << 30])
 def test_blocks_hold_every_list_once_whatever_their_size(budget, monkeypatch):
-    from reference_trainer.render.torch import walk
 
-    monkeypatch.setattr(walk, "BLOCK_PAIRS_CPU", budget)
+    monkeypatch.setattr(compositing, "BLOCK_PAIRS_CPU", budget)
     scene = random_scene(300, 70, 50, seed=1)
     lists = splat(*scene[:4], scene.camera, colors=scene.colors).lists
     starts, found = lists.starts.tolist(), {}
-    for block in walk.blocks(lists, torch.device("cpu")):
-        assert block.gaussians.numel() * walk.PIXELS <= budget or len(block.tiles) == 1
+    for block in compositing.blocks(lists, torch.device("cpu")):
+        assert block.gaussians.numel() * compositing.PIXELS <= budget or len(block.tiles) == 1
         for tile, row in zip(block.tiles.tolist(), block.gaussians.tolist(), strict=True):
             assert tile not in found
             length = starts[tile + 1] - starts[tile]

@@ -14,7 +14,7 @@ from stand_ins.gsplat import centered, rasterization
 from reference_trainer.render import render
 from reference_trainer.renderers import BuiltinRenderer
 from reference_trainer.renderers.gsplat import load_gsplat_render, render_by
-from reference_trainer.training.density.statistics import DensityStatistics
+from reference_trainer.training.density.operations import DensityStatistics
 
 N, WIDTH, HEIGHT = 80, 40, 24
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])

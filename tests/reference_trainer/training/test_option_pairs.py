@@ -27,9 +27,8 @@ from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.training.assembly import check
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.determinism import deterministic
 from reference_trainer.training.losses.photometric import expected_photometric_loss, photometric_loss
-from reference_trainer.training.randomness import stream
+from reference_trainer.training.randomness import deterministic, stream
 from reference_trainer.training.recipes import RECIPES
 from reference_trainer.training.trainer import Trainer
 

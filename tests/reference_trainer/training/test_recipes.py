@@ -14,7 +14,7 @@ import torch
 
 from ca_reg.schedules import as_schedule
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
+from reference_trainer.render.densification import SMALLEST_SPREAD, longer_radii
 from reference_trainer.scenes.depth import true_priors
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training import step as step_module

@@ -11,7 +11,7 @@ from ca_reg import functional as F
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import render
 from reference_trainer.render.engine import using_engine
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render.renderer import render_moments
 from reference_trainer.studies.stability.quantities import scene_quantities, splats_of
 from reference_trainer.studies.stability.scenes import PARAMETERS, base_scene
 

@@ -7,8 +7,14 @@ from strategies import begun
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.training.density.operations import clone, decay_opacity, prune, reset_opacity, split
-from reference_trainer.training.density.statistics import DensityStatistics
+from reference_trainer.training.density.operations import (
+    DensityStatistics,
+    clone,
+    decay_opacity,
+    prune,
+    reset_opacity,
+    split,
+)
 
 
 def some(n: int, seed: int = 0, **given: torch.Tensor) -> Gaussians:

@@ -12,7 +12,7 @@ from strategies import short
 from reference_trainer.training.assembly import check
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.density import DENSITY
-from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.interruption import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
 ALL = {

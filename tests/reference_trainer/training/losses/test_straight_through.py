@@ -6,8 +6,8 @@ import torch
 from ca_reg import Chain, GaussianDropout
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import LOSSES
+from reference_trainer.training.losses.comparisons import StraightThrough
 from reference_trainer.training.losses.photometric import Photometric, photometric_loss
-from reference_trainer.training.losses.straight_through import StraightThrough
 from reference_trainer.training.trainer import Trainer
 
 NAMES = "opacity_logits", "sh_dc", "means", "log_scales"

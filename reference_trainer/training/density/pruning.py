@@ -1,4 +1,4 @@
-"""SE-GS's density control: the second model is perturbed where the first one's pictures change over time."""
+"""Density control that prunes by more than opacity: co-adapting Gaussians, and those on which models disagree."""
 
 from __future__ import annotations
 
@@ -8,21 +8,124 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from ca_reg import attribute
 from ca_reg._check import check_count
 from ca_reg.neighbors import nearest_distance
 from ca_reg.regularizers.segs import SEGSNoise
+from reference_trainer.evaluation.shares import all_but_highest, blend_weights, share_per_weight
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.model.rendering import arguments, render_gaussians
 from reference_trainer.render import splat
-from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
+from reference_trainer.render.densification import SMALLEST_SPREAD, longer_radii
 from reference_trainer.scenes.pseudo import pseudo_cameras
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.density.co_pruning import CoPruning
+from reference_trainer.training.density.adaptive import AdaptiveDensity
+from reference_trainer.training.density.operations import refuse_not_finite
 from reference_trainer.training.density.strategy import ControlledModel
+from reference_trainer.training.interruption import TrainingStoppedError
 from reference_trainer.training.randomness import stream
 
-__all__ = ["SelfEnsembling"]
+__all__ = ["CoPruning", "SelfEnsembling", "SharePruning"]
+
+
+class SharePruning(AdaptiveDensity):
+    """`AdaptiveDensity` that also prunes by the share of the exact score per blend weight.
+
+    Every ``every`` steps between ``densify_from`` and ``densify_until`` this removes the ``fraction`` of the Gaussians
+    whose `ca_reg.attribute` shares, summed over the training views, are highest relative to their blend weights; those
+    without a share stay. Not a published method: in docs/studies.md, where finished models were pruned, this criterion
+    lowered the score most at equal count. Each time costs an exact score, its shares and a backward pass per training
+    view.
+
+    Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; shares and weights are those of the plain
+    opacities, without draws or test-time scaling.
+
+    Args:
+        every: positive number of steps.
+        fraction: of the Gaussians, in (0, 1).
+        drop_rate: of the score, in (0, 1).
+
+    Raises:
+        TypeError: if ``every`` is no integer.
+        ValueError: if one is out of range.
+    """
+
+    def __init__(self, every: int = 500, fraction: float = 0.02, drop_rate: float = 0.5) -> None:
+        check_count(every, "every", minimum=1, hint=": density control without it is 'adaptive'")
+        for name, value in (("fraction", fraction), ("drop_rate", drop_rate)):
+            if not 0 < value < 1:
+                raise ValueError(f"{name} must be in (0, 1), got {value}.")
+        self.every, self.fraction, self.drop_rate = every, fraction, drop_rate
+
+    def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
+        """Prune by share as well, after all else; the other Gaussians keep their statistics."""
+        super().before_step(optimizer, step)
+        if self.config.densify_from < step < self.config.densify_end and step % self.every == 0:
+            refuse_not_finite(optimizer, step)
+            self.select(optimizer, all_but_highest(self.shares_per_weight(optimizer, step), self.fraction))
+
+    def shares_per_weight(self, optimizer: GaussianOptimizer, step: int) -> Tensor:
+        """Return each current Gaussian's share per blend weight over the training views, shape (N,), float64."""
+        model = TrainedModel(
+            optimizer.gaussians.map(torch.Tensor.detach),
+            self.scene.background.to(self.device),
+            sh_degree=self.config.sh_degree_at(step),
+        )
+        views = [view.to(self.device) for view in self.scene.train]
+        score, opacities = model.exact_ca_score(drop_rate=self.drop_rate), model.gaussians.opacities
+        shares = torch.stack([attribute(score, model.shares, opacities, view).shares for view in views]).sum(0)
+        return share_per_weight(shares, blend_weights(model, views))
+
+
+class CoPruning(AdaptiveDensity):
+    """`AdaptiveDensity` that also prunes where the models disagree (CoR-GS, Zhang et al. 2024, Sec. 3.3).
+
+    Every ``every`` steps after ``densify_from``, to the end of the training, Gaussians that lack a neighbor nearer than
+    ``distance`` in any other model are pruned; all models are compared before any is pruned. It needs ``models=2``.
+    Defaults are the source's for LLFF (jiaw-z/CoR-GS 1db13a4, train.py, lines 284-301).
+
+    Dropped Gaussians: not counted in the gradients, as in `AdaptiveDensity`; neighbors are sought among all.
+
+    Args:
+        distance: world units, positive: 5 in the worlds of LLFF, 10 in those of DTU.
+        every: positive number of steps.
+
+    Raises:
+        TypeError: if ``every`` is no integer.
+        ValueError: if one is out of range.
+    """
+
+    needs = frozenset({"models"})
+
+    def __init__(self, distance: float = 5.0, every: int = 500) -> None:
+        if not distance > 0:
+            raise ValueError(f"distance must be positive, got {distance}.")
+        check_count(every, "every", minimum=1, hint=": density control without it is 'adaptive'")
+        self.distance, self.every = distance, every
+
+    def together(self, models: Sequence[ControlledModel], step: int) -> None:
+        """Prune all models."""
+        if not (step > self.config.densify_from and step % self.every == 0):
+            return
+        for model in models:
+            refuse_not_finite(model.optimizer, step)
+        means = [model.gaussians.means.detach() for model in models]
+        keeps = [
+            torch.stack([nearest_distance(own, other) < self.distance for other in means if other is not own]).all(0)
+            for own in means
+        ]
+        for model, keep in zip(models, keeps, strict=True):
+            if not bool(keep.any()):
+                raise TrainingStoppedError(
+                    f"no Gaussian has one of another model within {self.distance:g} after step {step}: raise distance, "
+                    "which is in world units."
+                )
+            assert isinstance(model.density, AdaptiveDensity)
+            model.density.select(model.optimizer, keep)
+
 
 _BOX = 5  # pixels, over which deviations are averaged
 
