@@ -141,6 +141,7 @@ class Gaussians:
     @classmethod
     def from_named(cls, tensors: Mapping[str, Tensor]) -> Gaussians:
         """Make Gaussians of named parameters, as `named` yields them."""
+        # Whatever is not a parameter of every Gaussian was learned by a regularizer.
         own = {name: tensors[name] for name in PARAMETERS}
         return cls(**own, learned={name: x for name, x in tensors.items() if name not in PARAMETERS})
 

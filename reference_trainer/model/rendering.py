@@ -41,6 +41,7 @@ def render_gaussians(
         >>> render_gaussians(gaussians, camera, torch.zeros(3)).image.shape
         torch.Size([3, 16, 16])
     """
+    # Renderers that know no absolute gradients do not have the argument.
     given = arguments(model, opacities) | ({"absgrad": True} if absgrad else {})
     out: Rendering = renderer(**given, camera=camera, sh_degree=sh_degree, background=background, depth=depth)
     return out

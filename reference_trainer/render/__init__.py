@@ -1,7 +1,7 @@
 """The renderer: tensors and a camera in, a picture out. It knows neither scenes nor the model.
 
-Two engines render: loops compiled by numba for float32 on a CPU, and PyTorch operations for everything else. The
-former is tested against the latter. `use_engine` chooses.
+Two engines render: loops compiled by numba for float32 on a CPU, and PyTorch operations for
+everything else. The former is tested against the latter. `use_engine` chooses.
 """
 
 from reference_trainer.render.checks import NotFiniteError

@@ -25,20 +25,22 @@ __all__ = [
 ]
 
 SMALLEST_SPREAD = 0.1**0.5  # px^2, of the INRIA code
-CUDA_TILE = 16  # pixels; a Gaussian is visible to the INRIA code if the square around it meets a tile of the picture
+# Pixels; a Gaussian is visible to the INRIA code if the square around it meets a tile of the image.
+CUDA_TILE = 16
 
 
 def in_front(means: Tensor, camera: Camera) -> Tensor:
-    """Say which Gaussians, at world coordinates (N, 3), lie beyond the near plane; shape (N,) bool."""
+    """Return which Gaussians, means (N, 3), lie beyond the near plane, shape (N,) bool."""
     pose = camera.world_to_camera.to(means)
     return means.detach() @ pose[2, :3] + pose[2, 3] > NEAR_PLANE
 
 
 @torch.no_grad()
 def longer_radii(covariances: Tensor, smallest: float) -> Tensor:
-    """Return three standard deviations of the longer axis of 2D covariances (M, 3), rounded up, pixels, shape (M,).
+    """Return three standard deviations of the longer axis of 2D covariances (M, 3), rounded up.
 
-    More for round splats: half the difference of the axes' variances counts as at least ``smallest``.
+    More for round splats: half the difference of the axes' variances counts as at least
+    ``smallest``.
 
     Example:
         >>> longer_radii(torch.tensor([[1.0, 0.0, 1.0], [9.0, 0.0, 1.0]]), SMALLEST_SPREAD).tolist()  # 3 sqrt(1.32), 9
@@ -53,10 +55,10 @@ def longer_radii(covariances: Tensor, smallest: float) -> Tensor:
 def visible_radii(
     means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera, *, blur: float = DILATION
 ) -> Tensor:
-    """Measure the radii of the splats that meet the picture: pixels, (N,) int32, 0 before the near plane or off it.
+    """Return the radii of splats on the screen, pixels, (N,) int32; 0 for those off the image.
 
-    As in the originals the opacity does not matter: a Gaussian of opacity 0 has a radius, though it is not drawn.
-    Quaternions are wxyz, scales standard deviations, ``blur`` is in square pixels.
+    As in the originals the opacity does not matter: a Gaussian of opacity 0 has a radius, though it
+    is not drawn. Quaternions are wxyz, scales standard deviations, ``blur`` is in square pixels.
 
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
@@ -78,7 +80,8 @@ def visible_radii(
 
 
 def splat_weights(splats: Splats) -> Tensor:
-    """Sum every splat's blend weight, alpha times transmittance, over the pixels of the picture; shape (M,)."""
+    """Sum every splat's alpha times transmittance over the pixels of the image, shape (M,)."""
+    # The image is linear in the colors: the gradient of the sum of red is the sum of the weights.
     colors = torch.zeros_like(splats.colors).requires_grad_()
     with torch.enable_grad():
         red = rasterize(splats._replace(colors=colors)).image[0].sum()
@@ -86,7 +89,7 @@ def splat_weights(splats: Splats) -> Tensor:
 
 
 class _AbsoluteGradients(torch.autograd.Function):
-    """The identity, whose backward pass also hands the sums of absolute gradients to a separate input."""
+    """The identity; backward also hands the sums of absolute gradients to another input."""
 
     @staticmethod
     def forward(ctx: Any, drawn: Tensor, sink: Tensor, splats: Splats, background: Tensor) -> Tensor:
@@ -97,7 +100,8 @@ class _AbsoluteGradients(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        # The remaining light, 1 - alpha, shows the background; once that is taken out, its gradient is part of alpha's.
+        # image = black + (1 - alpha) background, where black is the image over a black background.
+        # Engines take the gradients of black and alpha; alpha's is less by gradient . background.
         (drawn,), (gradient,) = ctx.saved_tensors, gradients
         black = torch.cat([drawn[:4] - (1 - drawn[4]) * ctx.background, drawn[4:]])
         of_alpha = gradient[4:] - (gradient[:4] * ctx.background).sum(0, keepdim=True)
@@ -106,7 +110,7 @@ class _AbsoluteGradients(torch.autograd.Function):
 
 
 def absgrad_sink(means: Tensor) -> Tensor:
-    """Return zeros shaped like ``means`` whose gradient becomes ``means.absgrad``, gsplat's name for it."""
+    """Return zeros like ``means`` whose gradient becomes ``means.absgrad`` (gsplat's name)."""
     sink = torch.zeros_like(means).requires_grad_()
     sink.register_hook(lambda gradient: setattr(means, "absgrad", gradient))  # type: ignore[no-untyped-call]
     return sink
@@ -115,8 +119,8 @@ def absgrad_sink(means: Tensor) -> Tensor:
 def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tensor | None = None) -> Rendering:
     """Return the rendering with a backward pass that also computes `Engine.absolute_gradients`.
 
-    They become the gradient of ``sink`` (M, 2), whose values do not matter. The image's background (3,) is black by
-    default.
+    They become the gradient of ``sink`` (M, 2), whose values do not matter. The image's background
+    (3,) is black by default.
     """
     depth = torch.zeros_like(rendering.alpha) if rendering.depth is None else rendering.depth
     background = rendering.image.new_zeros(3) if background is None else background.detach().to(rendering.image)

@@ -34,10 +34,11 @@ _TORCH = TorchEngine()
 
 
 def use_engine(name: str) -> None:
-    """Choose the engine of this process and of those that it starts (through the environment, ``CA_REG_ENGINE``).
+    """Choose the engine of this process and, by ``CA_REG_ENGINE``, of those that it starts.
 
     Args:
-        name: ``torch``, ``numba``, or ``auto``, the default: numba for float32 on a CPU where it is installed.
+        name: ``torch``, ``numba``, or ``auto``, the default: numba for float32 on a CPU where it is
+            installed.
 
     Raises:
         ValueError: if there is no such engine.
@@ -56,7 +57,7 @@ def use_engine(name: str) -> None:
 
 
 def chosen_engine() -> str:
-    """Return the engine that `use_engine` or the environment has chosen, to tell workers on other machines.
+    """Return the name that was chosen, to tell workers on other machines.
 
     Raises:
         ValueError: if the environment names an engine that does not exist.
@@ -74,14 +75,16 @@ def _check_name(name: str, complaint: str) -> None:
 
 
 def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engine:
-    """Return numba for float32 on a CPU, if chosen and available, else torch; errors are `chosen_engine`'s."""
+    """Return the engine for a device and dtype; errors are those of `chosen_engine`."""
+    # Loops are compiled for float32 on a CPU; whoever asks for anything else gets it, by the other
+    # engine.
     if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
         return _TORCH
     return _numba_engine() or _TORCH
 
 
 def engines_on(device: torch.device) -> tuple[str, ...]:
-    """Return the engines that draw float32 on a device: "numba" only on a CPU, and where numba works."""
+    """Return the engines that render float32 on a device; "numba" only on a CPU."""
     return ("numba", "torch") if device.type == "cpu" and _numba_engine() is not None else ("torch",)
 
 
@@ -94,13 +97,14 @@ def using_engine(engine: str) -> Iterator[None]:
         ...     describe_engine("cpu")
         'torch'
     """
+    # The choice lives in the environment, so that processes started within the block make it too.
     with patch.dict(os.environ):
         use_engine(engine)
         yield
 
 
 def describe_engine(device: torch.device | str) -> str:
-    """Describe for people which engine draws a model (float32) on a device, which need not be present."""
+    """Describe for people which engine renders on a device, which need not be present."""
     if engine_for(torch.device(device)).name == "torch":
         return "torch"
     count = torch.get_num_threads()

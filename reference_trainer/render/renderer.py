@@ -28,23 +28,25 @@ def splat(
 ) -> Splats:
     """Project Gaussians, evaluate their colors and list them per tile.
 
-    Gaussians that cannot be seen (behind the near plane, or with an opacity below `MIN_ALPHA`, such as dropped ones)
-    are left out before the projection and cost nothing. The arguments are those of `render`.
+    Gaussians that cannot be seen (behind the near plane, or with an opacity below `MIN_ALPHA`, such
+    as dropped ones) are left out before the projection and cost nothing. The arguments are those of
+    `render`.
 
     Raises:
         TypeError: if a tensor is not floating point.
-        ValueError: if not exactly one of ``sh`` and ``colors`` is given, a tensor has the wrong shape, or the world
-            coordinates are too large for their precision, see `MAX_ROUNDING`.
-        NotFiniteError: if an input that affects the view is nan or infinite. Of Gaussians behind the camera, or
-            dropped, only position and opacity must be finite.
+        ValueError: if not exactly one of ``sh`` and ``colors`` is given, a tensor has the wrong
+            shape, or the world coordinates are too large for their precision, see `MAX_ROUNDING`.
+        NotFiniteError: if an input that affects the view is nan or infinite. Of Gaussians behind
+            the camera, or dropped, only position and opacity must be finite.
     """
     values, degree = checked_colors(sh, sh_degree, colors)
     n = means.shape[0]
     if opacities.shape not in ((n,), (n, 1)):
         raise ValueError(f"opacities must have shape ({n},) or ({n}, 1), got {tuple(opacities.shape)}.")
+    # Shapes are checked here, once for all engines: compiled loops would read beyond the ends.
     named = {"means": means, "quaternions": quaternions, "scales": scales, "colors" if degree is None else "sh": values}
     for (name, x), shape in zip(named.items(), ((n, 3), (n, 4), (n, 3), (n, *values.shape[1:])), strict=True):
-        if x.shape != shape:  # the loops would read beyond the ends
+        if x.shape != shape:
             raise ValueError(f"{name} must have shape {shape}, got {tuple(x.shape)}.")
     named["opacities"] = opacities.reshape(n)
     inputs = {name: _working(name, x, means.dtype) for name, x in named.items()}
@@ -59,6 +61,7 @@ def splat(
         check_projection(depths.sum() + opacities.detach().sum(), projection, shown, inputs, camera)
         if indices.shape[0] < n:
             opacities = opacities.index_select(0, indices)
+        # Which tile a splat touches is a decision, not a quantity: nothing flows through the lists.
         with torch.no_grad():
             lists = engine.bin(projection, opacities, camera.width, camera.height)
         return Splats(indices, projection, opacities, shown, lists, engine)
@@ -86,8 +89,9 @@ def render(
 ) -> Rendering:
     """Render 3D Gaussians; differentiable in every tensor.
 
-    Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA rasterizer. The work is
-    done in float64 if the means are, else in float32: also for float16 and bfloat16 inputs, and inside torch.autocast.
+    Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA
+    rasterizer. The work is done in float64 if the means are, else in float32: also for float16 and
+    bfloat16 inputs, and inside torch.autocast.
 
     Args:
         means: world coordinates, shape (N, 3).
@@ -120,6 +124,7 @@ def render(
 
 def rasterize(splats: Splats, *, background: Tensor | None = None, depth: bool = False) -> Rendering:
     """Composite the splats of `splat`; other arguments and errors are those of `render`."""
+    # Projected centers are no leaves; density control reads their gradient all the same.
     if splats.projection.means.requires_grad:
         splats.projection.means.retain_grad()
     with torch.autocast(splats.opacities.device.type, enabled=False):
@@ -131,12 +136,12 @@ def rasterize(splats: Splats, *, background: Tensor | None = None, depth: bool =
 
 @torch.no_grad()
 def render_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Render the same Gaussians K times with lower opacities, without projecting and sorting them again.
+    """Render the same Gaussians K times with lower opacities, projecting and sorting once.
 
     Args:
         splats: of a view.
-        opacities: activated, of all N Gaussians, (K, N), nowhere higher than those of the splats; 0 leaves a Gaussian
-            out, at no cost.
+        opacities: activated, of all N Gaussians, (K, N), nowhere higher than those of the splats; 0
+            leaves a Gaussian out, at no cost.
         background: as for `render`.
 
     Returns:
@@ -148,15 +153,17 @@ def render_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None
 
 
 def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor | None = None) -> MomentImages:
-    """Render the exact mean and variance of a view under random factors on the alphas; differentiable.
+    """Render exact mean and variance of a view under random factors on the alphas.
 
-    The factors are independent per splat. There is no early stop: splats behind an opaque surface shine through its
-    dropped ones.
+    Differentiable. The factors are independent per splat. There is no early stop: splats behind an
+    opaque surface shine through its dropped ones.
 
     Args:
         splats: of the full model, with its plain opacities.
-        multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,), one value each.
-        background: fixed color behind everything, shape (3,), or one for each pixel, (3, H, W); black by default.
+        multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,), one
+            value each.
+        background: fixed color behind everything, shape (3,), or one for each pixel, (3, H, W);
+            black by default.
 
     Raises:
         ValueError: if the background has another shape, or is not finite.
@@ -179,12 +186,14 @@ def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor
 def variance_shares(
     splats: Splats, multiplier: Multiplier, weights: Tensor, *, background: Tensor | None = None
 ) -> Tensor:
-    """Attribute a weighted sum of the variance over the pixels to the Gaussians; the shares add up to it.
+    """Attribute a weighted sum of the variance over the pixels to the Gaussians.
 
-    A Gaussian's share at a pixel is its summand of the variance, `ca_reg.functional.contributions`, mean over RGB.
+    The shares add up to it. A Gaussian's share at a pixel is its summand of the variance,
+    `ca_reg.functional.contributions`, mean over RGB.
 
-    The weights have shape (H, W); 1 / count in the region of a score gives shares of that score. Other arguments are
-    those of `render_moments`. Returns one share for every projected Gaussian (``splats.indices``), (M,), float64.
+    The weights have shape (H, W); 1 / count in the region of a score gives shares of that score.
+    Other arguments are those of `render_moments`. Returns one share for every projected Gaussian
+    (``splats.indices``), (M,), float64.
 
     Raises:
         ValueError: if the weights or the background have another shape.

@@ -101,6 +101,7 @@ def render_by(
         TypeError: if the Gaussians are not float32, the only dtype that gsplat takes.
         ValueError: if not exactly one of ``sh`` and ``colors`` is given.
     """
+    # gsplat tells colors from coefficients by their shape and the degree alone.
     values, degree = checked_colors(sh, sh_degree, colors)
     if means.dtype != torch.float32:
         raise TypeError(f"the gsplat renderer knows float32 only, got {means.dtype}: use the builtin one.")
@@ -123,6 +124,7 @@ def render_by(
         render_mode="RGB+D" if depth else "RGB",
         absgrad=absgrad,
     )
+    # As in `rasterize`: projected centers are no leaves, and density control reads their gradient.
     if info["means2d"].requires_grad:
         info["means2d"].retain_grad()
     image = images[0].permute(2, 0, 1)

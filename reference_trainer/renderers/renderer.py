@@ -46,6 +46,7 @@ class BuiltinRenderer(Renderer):
     def __call__(self, *, absgrad: bool = False, **arguments: Any) -> Any:
         """Draw."""
         out = render(**arguments)
+        # Without gradients there is nothing to take absolute values of.
         if absgrad and out.splats.projection.means.requires_grad:
             sink = absgrad_sink(out.splats.projection.means)
             return with_absolute_gradients(out, sink, arguments.get("background"))

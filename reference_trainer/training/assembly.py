@@ -36,6 +36,7 @@ def make_renderer(config: TrainConfig) -> Renderer:
 
 def check(config: TrainConfig) -> None:
     """Raise a ValueError unless all expressions are valid and what they name goes together."""
+    # Making them is the check of the expressions; each error names what is known instead.
     make_regularizer(config)
     density, renderer, terms = make_density(config), make_renderer(config), make_losses(config)
     if not terms:

@@ -144,6 +144,7 @@ class TrainConfig:
             >>> round(TrainConfig().means_rate_at(1500), 7)  # half way
             1.6e-05
         """
+        # Linear in the logarithm.
         along = step / self.iterations
         return math.exp((1 - along) * math.log(self.means_rate) + along * math.log(self.means_rate_final))
 

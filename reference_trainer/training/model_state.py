@@ -119,6 +119,7 @@ class ModelState:
         known = start.learned  # of a model with the same regularizers
         learned = {name: known.get(name, torch.full((len(start),), x.start)) for name, x in learns.items()}
         start = replace(start, learned=learned)
+        # The means move in the world's units, everything else in units of its own.
         rates = {
             "means": config.means_rate_at(0) * scene.extent,
             "log_scales": config.scales_rate,
@@ -149,6 +150,7 @@ class ModelState:
             ValueError: if the regularizers refuse their part.
         """
         self.optimizer.load_state_dict(dict(state))
+        # For the size of the loaded model; its counts follow.
         self.density.reset(len(self.gaussians))
         self.density.load_state_dict(state["statistics"])
         try:

@@ -26,6 +26,7 @@ def stream(seed: int, step: int, purpose: str, device: torch.device | str = "cpu
         >>> torch.equal(a, b)
         True
     """
+    # Hashed, so that streams of neighboring seeds and steps have nothing in common.
     words = np.random.SeedSequence([seed, step, *purpose.encode()]).generate_state(2, np.uint32)
     return torch.Generator(device=device).manual_seed(int(words[0]) << 32 | int(words[1]))
 
@@ -37,6 +38,7 @@ def view_order(seed: int, step: int, count: int) -> int:
         >>> sorted(view_order(0, step, 3) for step in range(3))
         [0, 1, 2]
     """
+    # Drawn anew from the epoch alone: a resumed run needs no state to continue in the middle of one.
     epoch, position = divmod(step, count)
     order = torch.randperm(count, generator=stream(seed, epoch, "views"))
     return int(order[position])

@@ -169,6 +169,7 @@ def with_recipe(name: str, **changes: object) -> TrainConfig:
     if name not in RECIPES:
         raise ValueError(f"there is no recipe {name!r}; choose one of {', '.join(RECIPES)}.")
     config = RECIPES[name].config
+    # Through TrainConfig, which refuses a number of iterations that is none.
     times = TrainConfig(iterations=changes.get("iterations", config.iterations)).iterations / config.iterations  # type: ignore[arg-type]
     scaled: dict[str, object] = {
         mark: max(int(mark == "sh_every"), round(times * at))

@@ -1,4 +1,4 @@
-"""One training step in progress: what a loss term may read and render."""
+"""One training step: its view, its render, and the means for loss terms to render more."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ __all__ = ["Step"]
 
 @dataclass(eq=False, repr=False)
 class Step:
-    """A view, what was drawn of it, and the means to draw more.
+    """One training step: its view, its render, and the means for loss terms to render more.
+
+    The trainer calls `sample` or `expect`, which set ``image``; then every term of the loss reads from
+    the step, and renders with `render` and `moments` whatever else it compares.
 
     Args:
         number: of the step, the first being 0.
@@ -69,6 +72,7 @@ class Step:
     observed: list[tuple[ViewSplats, Camera]] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
+        # Activated once for all terms: they share its graph.
         self.params = self.gaussians.params(self.view.camera, step=self.number)
 
     @property
@@ -97,6 +101,7 @@ class Step:
 
         Density control counts it as it counts the view of the step.
         """
+        # A shallow copy: `observed` is one list, so density control sees the renders of both.
         other = copy(self)
         other.view, other.params = view, self.gaussians.params(view.camera, step=self.number)
         other.label += f"{view.name}/"
@@ -126,6 +131,7 @@ class Step:
             absgrad=observed and self.absgrad,
             renderer=self.renderer,
         )
+        # The projected centers have no gradient yet: the trainer hands them on after the backward pass.
         if observed:
             self.observed.append((out.splats, camera))
         return out

@@ -1,7 +1,7 @@
 """Which Gaussian touches which tile, by counting instead of sorting.
 
-A radix sort orders the Gaussians by depth. Each in turn is then appended to the lists of its tiles, which are thereby
-in order of depth as well.
+A radix sort orders the Gaussians by depth. Each in turn is then appended to the lists of its tiles,
+which are thereby in order of depth as well.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array = Any
 f4 = np.float32
 _ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
 _TILE = f4(TILE)
-_PARTS = 8  # of the depth order; each counts its own entries per tile, so that all can be filled in parallel
+_PARTS = 8  # of the depth order; each fills places of its own in a tile's list, so all run in parallel
 _BITS = 12  # of a digit of the radix sort
 
 
@@ -50,12 +50,15 @@ def _squared_radius(opacity: Any) -> Any:
 @kernel
 def _nearest_first(depths: Array) -> Any:
     """Return the stable order of positive depths, nearest first."""
+    # Digits of 12 bits, the last first; every round is stable, so earlier rounds stay sorted within
+    # it.
     keys, mask, shift = depths.view(np.uint32).copy(), (1 << _BITS) - 1, 0
     order = np.arange(len(keys)).astype(np.int32)
     if len(keys):
         keys -= keys.min()  # the bits of positive floats are in the order of the floats
     other_keys, other_order = np.empty_like(keys), np.empty_like(order)
     while len(keys) and keys.max() >> shift > 0:
+        # places[d] becomes the number of keys with a smaller digit: where digit d begins.
         places = np.zeros(mask + 2, np.int64)
         for key in keys:
             places[((key >> shift) & mask) + 1] += 1
@@ -76,13 +79,15 @@ def _measure(
     first: int, last: int, centers: Array, factors: Array, covariances: Array, opacities: Array, height: int,
     ellipses: Array, strips: Array,
 ) -> None:  # fmt: skip
-    """Collect what `_find_spans` needs of every ellipse, its first row of tiles last, and count its rows of tiles.
+    """Collect what `_find_spans` needs of every ellipse, and count its rows of tiles.
 
-    An ellipse's values are adjacent: taken nearest first, ellipses are scattered over memory; cache misses dominate.
+    An ellipse's values are adjacent: taken nearest first, ellipses are scattered over memory; cache
+    misses dominate.
     """
     size = f4(height)
     for i in range(first, last):
         x, y, limit = centers[i, 0], centers[i, 1], _squared_radius(opacities[i])
+        # The ellipse x' inverse(covariance) x = limit spans sqrt(limit yy) in y.
         reach = math.sqrt(limit * covariances[i, 2])
         top, bottom = _first_pixel(y - reach, size), _last_pixel(y + reach, size)
         row = np.int32(top) // TILE
@@ -90,7 +95,8 @@ def _measure(
         ellipse = ellipses[i]
         ellipse[0], ellipse[1], ellipse[5], ellipse[7] = x, y, limit, f4(row)
         ellipse[2], ellipse[3], ellipse[4] = factors[i, 0], factors[i, 1], factors[i, 2]
-        ellipse[6] = covariances[i, 1] * math.sqrt(limit / covariances[i, 0])  # dy where it is furthest right
+        # dy where it is furthest right
+        ellipse[6] = covariances[i, 1] * math.sqrt(limit / covariances[i, 0])
 
 
 @kernel
@@ -98,7 +104,7 @@ def _find_spans(
     first: int, last: int, order: Array, ellipses: Array, width: int, height: int, strips: Array, spans: Array,
     entries: Array,
 ) -> None:  # fmt: skip
-    """Find the interval of tiles that an ellipse covers in each of its rows of tiles (a strip), nearest first."""
+    """Find the interval of tiles that an ellipse covers in each of its rows of tiles."""
     columns = (width + TILE - 1) // TILE
     for place in range(first, last):
         prefetch(ellipses[order[min(place + 8, len(order) - 1)]])
@@ -106,6 +112,9 @@ def _find_spans(
         x, y, a, b, c, limit, tip, top = ellipses[i]
         row, total = np.int32(top), 0
         for strip in range(strips[place], strips[place + 1]):
+            # The strip holds the pixel centers from upper to lower, relative to the mean. Its
+            # leftmost and rightmost points of the ellipse are at the tips, if these are inside,
+            # else at the nearer border: there x solves (a dx + b dy)^2 + (c dy)^2 = limit.
             upper = f4(row * TILE) + _HALF - y
             lower = min(f4(row * TILE) + (_TILE - _HALF), f4(height) - _HALF) - y
             to_left, to_right = min(max(-tip, upper), lower), min(max(tip, upper), lower)
@@ -125,7 +134,7 @@ def _walk(
     first: int, last: int, order: Array, strips: Array, spans: Array, offsets: Array, places: Array, gaussians: Array,
     slots: Array,
 ) -> None:  # fmt: skip
-    """Append the Gaussians to the lists of their tiles; only count them if there are no lists yet."""
+    """Append Gaussians to the lists of their tiles; without lists, only count them."""
     fill = gaussians.shape[0] > 0
     for part in range(first, last):
         at = places[part]
@@ -159,6 +168,9 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
     strips = _ends(of_rows[order])
     spans = np.empty((strips[-1], 2), np.int32)
     in_threads(_find_spans, count, order, ellipses, width, height, strips, spans, entries, least=4096)
+    # Twice over the same lists: once to count the entries of every tile, once to fill them in. The
+    # parts of the depth order have places of their own within a tile, so they may be filled in
+    # parallel.
     offsets, of_parts, nothing = _ends(entries), np.zeros((_PARTS, tiles), np.int64), np.empty(0, np.int32)
     least = -(-_PARTS * 4096 // max(1, count))  # parts that are worth a thread
     in_threads(_walk, _PARTS, order, strips, spans, offsets, of_parts, nothing, nothing, least=least)

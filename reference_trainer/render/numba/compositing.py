@@ -1,7 +1,13 @@
 """The loop over a tile: front-to-back compositing of its list, and its gradient.
 
-A pixel's transmittance is negative from the splat on that terminates it (`MIN_TRANSMITTANCE`). The backward pass goes
-front to back as well: what lies behind a splat is the picture less what has been passed, so alphas are evaluated once.
+A pixel sees ``C = sum_i T_i a_i c_i + T_end b``: colors c, alphas a, background b, and
+transmittances ``T_i = prod_{j<i} (1 - a_j)``. Its transmittance is kept as a negative number from
+the splat on that terminates it (`MIN_TRANSMITTANCE`).
+
+The backward pass needs, for every splat, ``dC / da_i = T_i c_i - B_i / (1 - a_i)``, where B_i is
+the light from behind it, background included, which the splat dims by 1 - a_i. It goes front to
+back as well: B_i is the image less the light of all splats that have been passed, so nothing is
+stored per splat, and every alpha is evaluated once.
 """
 
 from __future__ import annotations
@@ -25,14 +31,16 @@ Array = Any
 f4 = np.float32
 _ZERO, _ONE, _MIN_TRANSMITTANCE = f4(0), f4(1), f4(MIN_TRANSMITTANCE)
 
-# Offsets into a tile's state. All values of the pixels share one array, so that the compiler sees that nothing
-# overlaps; with an array for each it would not vectorize: four times slower.
+# Offsets into a tile's state. All values of the pixels share one array, so that the compiler sees
+# that nothing overlaps; with an array for each it would not vectorize: four times slower.
 _TRANSMITTANCE, _RED, _GREEN, _BLUE, _DEPTH, _BEHIND, _SLOPE = (i * PIXELS for i in range(7))
 
 
 @inlined
 def _pass(alpha: Any, transmittance: Any) -> Any:
     """Return the weight of a splat, and the transmittance behind it."""
+    # Without a branch, so that eight pixels or more are one instruction. A terminated pixel, whose
+    # transmittance is negative, has a negative rest: it stays terminated and takes no more weight.
     rest = transmittance * (_ONE - alpha)
     goes_on = rest >= _MIN_TRANSMITTANCE
     return alpha * transmittance if goes_on else _ZERO, rest if goes_on else -abs(transmittance)
@@ -70,6 +78,7 @@ def _forward(
         s[_TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
         for begin in range(starts[tile], starts[tile + 1], CHUNK):
             end = min(begin + CHUNK, starts[tile + 1])
+            # Two splats at a time: the sums of a pixel are then loaded and stored half as often.
             for k in range(0, tiles.read_entries(gaussians, begin, end, 1, table, tile, columns, entries), 2):
                 a, b = entries[k], entries[k + 1]
                 shape_a, shape_b = tiles.footprint_of(a), tiles.footprint_of(b)
@@ -98,7 +107,7 @@ def _masked(
     first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array,
     transmittances: Array, images: Array,
 ) -> None:  # fmt: skip
-    """Draw K pictures of the same lists; the last K columns of the table are factors on the alphas in each."""
+    """Composite K images of the same lists; table columns from 9 on are factors on alphas."""
     count = images.shape[0]
     states, ended, kept = np.empty((count, 4 * PIXELS), f4), np.empty(count, np.bool_), np.empty(CHUNK + 1, np.int64)
     entries, alphas = np.empty((CHUNK + 1, table.shape[1]), f4), np.empty((CHUNK + 1, PIXELS), f4)
@@ -111,6 +120,7 @@ def _masked(
                 break
             end = min(begin + CHUNK, starts[tile + 1])
             last_entry = tiles.read_entries(gaussians, begin, end, 1, table, tile, columns, entries)
+            # The alphas of the full model are shared by all images; a mask only multiplies them.
             for k in range(last_entry + 1):
                 shape, of_entry = tiles.footprint_of(entries[k]), alphas[k]
                 for p in range(PIXELS):
@@ -141,7 +151,7 @@ def _masked(
 
 
 def _make_backward(absolute: bool) -> Any:
-    """Return the kernel of the gradients, or of the sums of absolute gradients of the centers, depth included."""
+    """Return the kernel of the gradients, or that of absolute gradients of the centers."""
 
     @kernel
     def _backward(
@@ -154,6 +164,9 @@ def _make_backward(absolute: bool) -> Any:
             tiles.load(to_image, tile, columns, s, _RED)
             tiles.load(transmittance, tile, columns, d, _TRANSMITTANCE)
             tiles.load(image, tile, columns, d, _RED)
+            # Only what the loss sees of the light matters: B_i enters as the number g . B_i, with g
+            # the gradient of the pixel. In front of everything it is g . C + (dL / dT_end) T_end,
+            # as T_end too shrinks by 1 - a_i.
             for p in range(PIXELS):
                 of_colors = s[_RED + p] * d[_RED + p] + s[_GREEN + p] * d[_GREEN + p] + s[_BLUE + p] * d[_BLUE + p]
                 s[_BEHIND + p] = of_colors + s[_TRANSMITTANCE + p] * d[_TRANSMITTANCE + p]
@@ -182,8 +195,11 @@ def _make_backward(absolute: bool) -> Any:
                         along += s[_DEPTH + p] * table[i, 9]
                     beyond = s[_BEHIND + p] - weight * along
                     s[_BEHIND + p], s[_TRANSMITTANCE + p] = beyond, rest
-                    # A splat adds T c alpha, and scales all light from behind by 1 - alpha; gradients pass the clamp.
+                    # raw (T c - B / (1 - alpha)) is the gradient of ln alpha, from which
+                    # `footprint_gradient` goes on. alpha is raw but for the clamp, which lets
+                    # gradients pass, and at most 0.99, so that the division is safe.
                     s[_SLOPE + p] = raw * (now * along - beyond / (_ONE - alpha)) if rest > _ZERO else _ZERO
+                    # dC / dc_i = T_i a_i
                     to_r += weight * s[_RED + p]
                     to_g += weight * s[_GREEN + p]
                     to_b += weight * s[_BLUE + p]
@@ -192,6 +208,7 @@ def _make_backward(absolute: bool) -> Any:
                 else:
                     tiles.footprint_gradient(table, i, tile, columns, s[_SLOPE:], row)
                     row[6], row[7], row[8] = to_r, to_g, to_b
+                # Asking all pixels is not free, hence not after each splat.
                 if e % CHUNK == 0:
                     ended = _have_ended(s)
 
@@ -202,7 +219,8 @@ _backward, _absolute = _make_backward(False), _make_backward(True)
 
 
 def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Draw all in one pass, see `Engine.composite_masks`: what does not depend on the opacity is evaluated once."""
+    """Composite all masks in one pass, see `Engine.composite_masks`."""
+    # What no mask shows has opacity 0 and is skipped as faint; its factors, 0 / 0, are not read.
     highest = opacities.amax(0)
     table = tiles.make_table(splats._replace(opacities=highest), (opacities / highest).T)
     transmittances, images = (tiles.whole_tiles(splats.lists, len(opacities), channels) for channels in (1, 3))
@@ -211,7 +229,7 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
 
 
 class _Composite(torch.autograd.Function):
-    """The transmittance of all splats, (1, H, W), and their image over the background, (3, H, W)."""
+    """Transmittance of all splats (1, H, W), and image over the background (3, H, W)."""
 
     @staticmethod
     def forward(ctx: Any, splats: Splats, background: Tensor, *_differentiable: Tensor) -> tuple[Tensor, Tensor]:
@@ -233,7 +251,7 @@ class _Composite(torch.autograd.Function):
 
 
 def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Draw splats front to back, see `Engine.composite`; depth is the red channel of a second picture."""
+    """Composite front to back, see `Engine.composite`; depth is the red of a second image."""
     p = splats.projection
     transmittance, image = _Composite.apply(  # type: ignore[no-untyped-call]
         splats, background, p.means, p.factors, splats.opacities, splats.colors
@@ -247,6 +265,7 @@ def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tenso
 
 def absolute_gradients(splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
     """Sum the absolute gradients of the centers, see `Engine.absolute_gradients`."""
+    # The kernel works with transmittance, 1 - alpha, whose gradient has the other sign.
     lists, table = splats.lists, tiles.make_table(splats, splats.projection.depths[:, None])
     rows = table.new_empty(lists.gaussians.shape[0], 2)
     assert lists.slots is not None

@@ -1,4 +1,4 @@
-"""The engine of compiled loops: float32 on a CPU, with hand-derived gradients, the same for any number of threads."""
+"""The engine of compiled loops: float32 on a CPU, the same bits for any number of threads."""
 
 from __future__ import annotations
 

@@ -1,11 +1,23 @@
-"""The recursion of the exact moments (`ca_reg.functional.pixel_moments`), tile by tile, its gradient, and the shares.
+"""The recursion of the exact moments, tile by tile, its gradient, and the shares.
 
-Back to front, with ``d_i = c_i - mu_{i+1}`` the contrast of a splat with the mean of what is behind it:
+The recursion is that of `ca_reg.functional.pixel_moments`.
 
-    mu_i = mu_{i+1} + m alpha_i d_i        V = sum_i spread_i S_i d_i^2        S_i = prod_{j<i} shrink_j
+Every alpha is multiplied by an independent random factor of mean m and variance v. With X the color
+of what is behind a splat, of mean mu and variance V, the splat makes of it
 
-where ``spread = v alpha^2`` and ``shrink = (1 - m alpha)^2 + spread``. Every term of V is a square times a non-negative
-weight: nothing cancels. The expected transmittance is 1 minus the expected accumulated alpha.
+    f alpha c + (1 - f alpha) X.
+
+Mean and variance of that, by the law of total variance, with the contrast ``d = c - mu``:
+
+    mu -> mu + m alpha d
+    V  -> ((1 - m alpha)^2 + v alpha^2) V + v alpha^2 d^2  =  shrink V + spread d^2
+
+Applied back to front to all splats, nearest first i = 0, 1, ..., this is
+
+    mu_i = mu_{i+1} + m alpha_i d_i     V = sum_i spread_i S_i d_i^2     S_i = prod_{j<i} shrink_j
+
+Every term of V is a square times a non-negative weight: nothing cancels. The terms are the shares
+of the splats. The expected transmittance is 1 minus the expected accumulated alpha.
 """
 
 from __future__ import annotations
@@ -49,6 +61,7 @@ def _random(alpha: Any, factor: Any, varies: Any) -> Any:
 @inlined
 def _over(alpha: Any, entry: Any, means: Any, variances: Any, transmittance: Any) -> Any:
     """Return means, variances and transmittance with one more splat in front."""
+    # Means before variances, whose terms take the contrast with the mean *behind* the splat.
     r, g, b, factor, varies = entry
     (m0, m1, m2), (v0, v1, v2) = means, variances
     expected, spread, passed, shrink = _random(tiles.clamped(alpha), factor, varies)
@@ -68,6 +81,7 @@ def _forward(
         s[_TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
         s[_VARIANCE:] = _ZERO
         tiles.load(background, tile, columns, s, _MEAN)
+        # Back to front, and to the end of the list: no early stop, see `render_moments`.
         for begin in range(starts[tile + 1] - 1, starts[tile] - 1, -CHUNK):
             end = max(begin - CHUNK, starts[tile] - 1)
             for k in range(0, tiles.read_entries(gaussians, begin, end, -1, table, tile, columns, entries), 2):
@@ -92,8 +106,8 @@ def _make_backward(complete: bool) -> Any:
     """Return the kernel of the gradients.
 
     Args:
-        complete: whether to add those of the accumulated alpha and of the factors' moments, and the shares; a quarter
-            slower.
+        complete: whether to add those of the accumulated alpha and of the factors' moments, and the
+            shares; a quarter slower.
     """
     size = 6 if complete else 5
 
@@ -102,10 +116,20 @@ def _make_backward(complete: bool) -> Any:
         first: int, last: int, columns: int, starts: Array, gaussians: Array, slots: Array, table: Array,
         background: Array, to_mean: Array, to_variance: Array, to_alpha: Array, rows: Array, to_background: Array,
     ) -> None:  # fmt: skip
-        """Sum up, back to front, what is behind every splat; then carry gradients to the splats, front to back.
+        """Sum up what is behind every splat, back to front; then carry gradients front to back.
 
-        With Q_i the gradient of the weight S_i spread_i of splat i, what is behind it sums up to
-        hidden_i = sum_{j > i} Q_j spread_j S_j / S_{i + 1}, by recursion: a division would fail at 0.
+        Let G be the gradient of V, Q_i = G . d_i^2 that of the weight S_i spread_i, and u_i that of
+        mu_i, the mean of what splat i and all behind it show. Then, with S_i the product of all
+        shrinks in front of i ("front"):
+
+            dL / dspread_i = S_i Q_i + dL / dshrink_i          as shrink contains spread
+            dL / dshrink_i = S_i hidden_i,   hidden_i = sum_{j>i} Q_j spread_j S_j / S_{i+1}
+            dL / d(m alpha)_i = u_i . d_i - 2 (1 - m alpha_i) dL / dshrink_i
+            dL / dd_i = m alpha_i u_i + 2 S_i spread_i G d_i   =: t_i
+            dL / dc_i = t_i,     u_{i+1} = u_i - t_i           as d_i = c_i - mu_{i+1}
+
+        hidden_i comes from the recursion hidden_{i-1} = shrink_i hidden_i + Q_i spread_i, back to
+        front, since a division by S would fail at 0; u_i and S_i come front to back.
         """
         kept = np.empty(np.diff(starts[first : last + 1]).max() * size * PIXELS, f4)
         s = np.empty(_SIZE, f4)  # _VARIANCE holds the gradient of the variance
@@ -118,6 +142,8 @@ def _make_backward(complete: bool) -> Any:
             tiles.load(to_variance, tile, columns, s, _VARIANCE)
             tiles.load(to_alpha[:1], tile, columns, s, _TO_TRANSMITTANCE)
             begin = starts[tile]
+            # First pass, back to front: alpha, contrasts and hidden of every entry, kept for the
+            # second.
             for k in range(starts[tile + 1] - begin - 1, -1, -1):
                 i = gaussians[begin + k]
                 if tiles.is_faint(table, i):
@@ -141,6 +167,7 @@ def _make_backward(complete: bool) -> Any:
                     s[_MEAN + p] += expected * d0
                     s[_MEAN_1 + p] += expected * d1
                     s[_MEAN_2 + p] += expected * d2
+            # Second pass, front to back: the formulas above, summed over the pixels of the tile.
             for k in range(starts[tile + 1] - begin):
                 i = gaussians[begin + k]
                 row = rows[slots[begin + k]]
@@ -167,17 +194,22 @@ def _make_backward(complete: bool) -> Any:
                     to_r += t0
                     to_g += t1
                     to_b += t2
+                    # The alpha of the whole list, 1 - prod (1 - m alpha_i): its derivative by m
+                    # alpha_i is the product over the others, of which d3 holds those behind.
                     if complete:
                         to_expected += s[_TO_TRANSMITTANCE + p] * of_entry[_D3 + p]
                         s[_TO_TRANSMITTANCE + p] *= passed
                         to_factor += to_expected * alpha
                         to_varies += to_spread * alpha * alpha
                         share += of_spread * spread
+                    # d(m alpha) = m dalpha,   dspread = 2 v alpha dalpha,
+                    # dalpha = alpha dln(alpha).
                     s[_SLOPE + p] = raw * (_TWO * varies * to_spread * alpha + to_expected * factor)
                 tiles.footprint_gradient(table, i, tile, columns, s[_SLOPE:], row)
                 row[6], row[7], row[8] = to_r, to_g, to_b
                 if complete:
                     row[9], row[10], row[11] = to_factor, to_varies, share
+            # What is left of u behind the last splat is the gradient of the background.
             tiles.store(s, _TO_MEAN, to_background, tile, columns)
 
     return _backward
@@ -189,7 +221,10 @@ _backward, _complete_backward = _make_backward(False), _make_backward(True)
 def _gradients(
     lists: TileLists, table: Tensor, background: Tensor, upstream: Sequence[Tensor], complete: bool
 ) -> list[Tensor]:
-    """Return the gradients of the splats; of their multipliers, and the shares, (M, 3) or (M, 0); of the background."""
+    """Return the gradients of splats, (multipliers, shares) and background.
+
+    The second has shape (M, 3) if ``complete``, else (M, 0).
+    """
     rows = table.new_empty(lists.gaussians.shape[0], 12 if complete else 9)
     to_background = torch.empty_like(background)
     assert lists.slots is not None
@@ -199,10 +234,11 @@ def _gradients(
 
 
 class _Moments(torch.autograd.Function):
-    """Mean and variance of the colors, and the expected accumulated alpha: 3, 3 and 1 channels, whole tiles."""
+    """Mean and variance of the colors, and expected alpha: 3, 3 and 1 channels, whole tiles."""
 
     @staticmethod
     def forward(ctx: Any, splats: Splats, multiplier: Tensor, background: Tensor, *_differentiable: Tensor) -> Any:
+        # Without a gradient of the alphas, the faster kernel is enough: None must not become zeros.
         ctx.set_materialize_grads(False)
         table, ctx.lists = tiles.make_table(splats, multiplier), splats.lists
         images = tuple(tiles.whole_tiles(ctx.lists, channels) for channels in (3, 3, 1))
@@ -234,6 +270,8 @@ def shares(splats: Splats, multiplier: Tensor, background: Tensor, weights: Tens
     """Return every splat's share of the weighted variance of the pixels, see `Engine.shares`."""
     lists, table = splats.lists, tiles.make_table(splats, multiplier)
     upstream = lists.padded((weights / 3).expand(3, -1, -1))
+    # A share is a summand of V times its gradient, here the weight of the pixel: the backward pass
+    # of a loss that is the weighted variance, of which only the shares are read.
     nothing = torch.zeros_like(upstream)
     *_, more, _ = _gradients(lists, table, lists.padded(background), (nothing, upstream, nothing), complete=True)
     return more[:, 2].double()

@@ -1,10 +1,10 @@
-"""The walk over the tile lists, and what is evaluated on the way: the image, its exact moments, and their first order.
+"""The walk over the tile lists: the image, its exact moments, and their first order.
 
-Tiles with lists of similar length are padded to a block and handed to a formula. Nothing of the size of the
-pixel-Gaussian pairs outlives its block: the backward pass evaluates the formula again.
+Tiles with lists of similar length are padded to a block and handed to a formula. Nothing of the
+size of the pixel-Gaussian pairs outlives its block: the backward pass evaluates the formula again.
 
-A formula takes a `Block`, the rows of its entries and the background of its tiles, and is differentiable. A block has T
-tiles of 64 pixels, with L entries each, nearest first.
+A formula takes a `Block`, the rows of its entries and the background of its tiles, and is
+differentiable. A block has T tiles of 64 pixels, with L entries each, nearest first.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ class Block(NamedTuple):
     Args:
         tiles: tile indices, row by row over the image, shape (T,).
         centers: of the tiles, pixels, shape (2, T, 1).
-        gaussians: the Gaussian of every entry, nearest first, shape (T, L); M, the number of Gaussians, marks padding.
+        gaussians: the Gaussian of every entry, nearest first, shape (T, L); M, the number of
+            Gaussians, marks padding.
     """
 
     tiles: Tensor
@@ -65,40 +66,44 @@ class Block(NamedTuple):
     gaussians: Tensor
 
     def alphas(self, geometry: Tensor) -> Tensor:
-        """Evaluate the alphas at every pixel, (T, 64, L), before the clamp at `MAX_ALPHA`; 0 below `MIN_ALPHA`.
+        """Evaluate the alphas at every pixel, (T, 64, L), not clamped; 0 below `MIN_ALPHA`.
 
         The geometry is `geometry_rows` of the entries, (6, T, L); differentiable in it.
         """
         x, y, l11, l21, l22, log_opacity = geometry.unbind(0)
         dx, dy = x - self.centers[0], y - self.centers[1]
-        # log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2, expanded around the tile's center. Squaring w1 and w2,
-        # which are small wherever alpha is not, avoids the cancellation of a dx^2 + 2 b dx dy + c dy^2.
+        # log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2, expanded around the tile's center.
+        # Squaring w1 and w2, which are small wherever alpha is not, avoids the cancellation of
+        # a dx^2 + 2 b dx dy + c dy^2.
         w1, w2 = l11 * dx + l21 * dy, l22 * dy
         polynomial = [
             log_opacity - _HALF * (w1 * w1 + w2 * w2), 2 * _HALF * (l11 * w1), 2 * _HALF * (l21 * w1 + l22 * w2),
             -_HALF * (l11 * l11), -2 * _HALF * (l11 * l21), -_HALF * (l21 * l21 + l22 * l22),
         ]  # fmt: skip
+        # The monomials at 64 pixels times the coefficients of L entries: one matrix product per
+        # block.
         x, y = pixel_offsets(geometry)
         exponents = torch.cat([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1) @ torch.stack(polynomial, dim=1)
         return torch.nn.functional.threshold(exponents, math.log2(MIN_ALPHA), -math.inf).exp2()
 
 
 def pixel_offsets(like: Tensor) -> Tensor:
-    """Return x and y of a tile's pixels relative to its center, with the dtype and device of a tensor, (2, 64, 1)."""
+    """Return x and y of a tile's pixels relative to its center, typed as a tensor, (2, 64, 1)."""
     axis = torch.arange(TILE, dtype=like.dtype, device=like.device) - (TILE - 1) / 2
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     return torch.stack([x, y]).view(2, PIXELS, 1)
 
 
 def geometry_rows(splats: Splats) -> Tensor:
-    """Return x, y, l11, l21, l22 and the binary logarithm of the opacity of M splats, shape (6, M)."""
+    """Return x, y, l11, l21, l22 and log2 of the opacity of M splats, shape (6, M)."""
     means, factors = splats.projection.means, splats.projection.factors
-    opacities = splats.opacities.clamp_min(MIN_ALPHA)  # masked-out splats are in no list: their gradient is 0
+    # Splats that a mask drops are in no list: their gradient is 0.
+    opacities = splats.opacities.clamp_min(MIN_ALPHA)
     return torch.cat([means.T, factors.T, torch.log2(opacities)[None]])
 
 
 def blocks(lists: TileLists, device: torch.device) -> Iterator[Block]:
-    """Iterate over blocks of all tiles with a non-empty list; a list that is too long gets a block of its own."""
+    """Yield blocks of all tiles with a list; one that is too long gets a block of its own."""
     pairs = BLOCK_PAIRS_CPU if device.type == "cpu" else BLOCK_PAIRS_CUDA
     lengths, tiles = torch.sort(lists.lengths, descending=True, stable=True)
     sizes = lengths.cpu().tolist()
@@ -120,8 +125,9 @@ def walk(formula: Formula, rows: Tensor, background: Tensor, lists: TileLists, *
     """Evaluate a formula on every tile's list over a background; differentiable in both.
 
     Args:
-        formula: takes a block, the rows of its entries (R, T, L) and the background of its tiles (T, C, 64); returns
-            (T, C + extra, 64), which without any splats is the background, followed by zeros.
+        formula: takes a block, the rows of its entries (R, T, L) and the background of its tiles
+            (T, C, 64); returns (T, C + extra, 64), which without any splats is the background,
+            followed by zeros.
         rows: values of every splat, the first six those of `geometry_rows`, shape (R, M).
         background: images, shape (C, H, W).
         lists: the splats of every tile.
@@ -158,6 +164,8 @@ class _Walk(torch.autograd.Function):
             with torch.enable_grad(), torch.autocast(rows.device.type, enabled=False):
                 result = ctx.formula(block, *inputs)
                 of_block, of_tiles = torch.autograd.grad(result, inputs, upstream[block.tiles], materialize_grads=True)
+            # A Gaussian is in the lists of many tiles; padding goes to the row that is cut off
+            # below.
             to_entries.index_add_(1, block.gaussians.flatten(), of_block.flatten(1))
             to_tiles[block.tiles] = of_tiles
         return None, to_entries[:, :-1], untile(to_tiles, lists), None, None
@@ -177,7 +185,7 @@ def untile(tiles: Tensor, lists: TileLists) -> Tensor:
 
 
 def tile(image: Tensor, lists: TileLists) -> Tensor:
-    """Reorder an image of shape (C, H, W) into per-tile pixels of shape (tiles, C, 64), zero outside the image."""
+    """Reorder an image (C, H, W) into pixels of tiles (tiles, C, 64), zero outside the image."""
     grid = lists.padded(image).view(-1, lists.rows, TILE, lists.columns, TILE)
     return grid.permute(1, 3, 0, 2, 4).reshape(lists.rows * lists.columns, -1, PIXELS)
 
@@ -190,8 +198,8 @@ def _clamped(raw: Tensor) -> Tensor:
 def _running(x: Tensor, *, product: bool) -> Tensor:
     """Return running products or sums along the last dimension.
 
-    On CUDA `torch.cumsum` has no deterministic algorithm, and raises where one is required. Only there are shifted
-    copies combined, log2 L times.
+    On CUDA `torch.cumsum` has no deterministic algorithm, and raises where one is required. Only
+    there are shifted copies combined, log2 L times.
     """
     if x.device.type == "cpu" or not torch.are_deterministic_algorithms_enabled():
         return x.cumprod(-1) if product else x.cumsum(-1)
@@ -204,10 +212,11 @@ def _running(x: Tensor, *, product: bool) -> Tensor:
 
 
 class _BlendWeights(torch.autograd.Function):
-    """Alpha times transmittance; the hand-derived gradient is twice as fast as that of `torch.cumprod`."""
+    """Alpha times transmittance; its gradient is twice as fast as that of `torch.cumprod`."""
 
     @staticmethod
     def forward(ctx: Any, raw: Tensor) -> Tensor:
+        # w_i = alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j).
         alpha = raw.clamp(max=MAX_ALPHA)
         passed = 1 - alpha
         behind = _running(passed, product=True)
@@ -221,14 +230,17 @@ class _BlendWeights(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         passed, transmittance, weights = ctx.saved_tensors
-        # A splat adds its own light, and scales all light from behind by 1 - alpha; gradients pass the clamp.
+        # dw_i / dalpha_i = T_i, and for j > i  dw_j / dalpha_i = -w_j / (1 - alpha_i): a splat adds
+        # its own light, and scales all light from behind by 1 - alpha. With gradients g_j of the
+        # weights, sum_{j>i} w_j g_j is the total less what has been passed. Gradients pass the
+        # clamp.
         along = _running(weights * gradients[0], product=False)
         result: Tensor = transmittance * gradients[0] - (along[..., -1:] - along) / passed
         return result
 
 
 def blend_weights(raw: Tensor) -> Tensor:
-    """Return alpha times the transmittance in front of every splat, given alphas before the clamp, (T, 64, L).
+    """Return alpha times the transmittance in front of every splat, (T, 64, L), unclamped alphas given.
 
     The weights are 0 from the splat on that terminates its pixel.
     """
@@ -237,7 +249,7 @@ def blend_weights(raw: Tensor) -> Tensor:
 
 
 def composite(block: Block, rows: Tensor, background: Tensor) -> Tensor:
-    """Composite C values front to back over a background (T, C, 64); append the accumulated alpha, (T, C + 1, 64).
+    """Composite C values over a background (T, C, 64), and the alpha, (T, C + 1, 64).
 
     The rows are geometry and values of the entries, (6 + C, T, L).
     """
@@ -255,14 +267,15 @@ def over(weights: Tensor, values: Tensor, background: Tensor) -> Tensor:
 
 
 def moments(block: Block, rows: Tensor, background: Tensor) -> Tensor:
-    """Return mean and variance of C values under random factors, and the expected alpha, (T, 2 C + 1, 64).
+    """Return mean and variance of C values, and the expected alpha, (T, 2 C + 1, 64).
 
-    The recursion of `ca_reg.functional.pixel_moments`, back to front: with d the contrast of a splat with the mean of
-    what is behind it, the mean grows by m alpha d, and the variance V becomes ((1 - m alpha)^2 + v alpha^2) V
-    + v alpha^2 d^2. Every term is a square times a non-negative weight: nothing cancels.
+    The recursion of `ca_reg.functional.pixel_moments`, back to front: with d the contrast of a
+    splat with the mean of what is behind it, the mean grows by m alpha d, and the variance V
+    becomes ((1 - m alpha)^2 + v alpha^2) V + v alpha^2 d^2. Every term is a square times a
+    non-negative weight: nothing cancels.
 
-    The rows (9 + C, T, L) are the entries' geometry, mean m and variance v of the random factor, a factor on the
-    summand v alpha^2 d^2, whose gradient is the summand's share, and values.
+    The rows (9 + C, T, L) are the entries' geometry, mean m and variance v of the random factor, a
+    factor on the summand v alpha^2 d^2, whose gradient is the summand's share, and values.
     """
     alpha = _clamped(block.alphas(rows[:6])).permute(2, 0, 1)[:, :, None]
     m, v, factor = rows[6:9].transpose(1, 2)[..., None, None]
@@ -270,7 +283,8 @@ def moments(block: Block, rows: Tensor, background: Tensor) -> Tensor:
     values = rows[9:].permute(2, 1, 0)[..., None]
     terms = expected, factor * spread, (1 - expected).square() + spread, values
     mean, variance = background, torch.zeros_like(background)
-    entries = zip(*(reversed(x.unbind(0)) for x in terms), strict=True)  # indexing would copy all in the backward pass
+    # unbind, because indexing would copy everything in the backward pass.
+    entries = zip(*(reversed(x.unbind(0)) for x in terms), strict=True)
     for e, s, kept, value in entries:
         contrast = value - mean
         variance = kept * variance + s * contrast.square()

@@ -24,6 +24,7 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
     xx, xy, yy = projection.covariances[order].unbind(-1)
     squared_radius = 2.0 * torch.log(opacities[order] / MIN_ALPHA).clamp_(min=0.0)
 
+    # The rows of tiles that an ellipse meets: it spans sqrt(squared_radius yy) in y.
     reach = torch.sqrt(squared_radius * yy)
     top = torch.ceil(mean_y - reach - 0.5).clamp_(0, height)
     bottom = torch.floor(mean_y + reach - 0.5).clamp_(-1, height - 1)
@@ -31,13 +32,17 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
     rows = torch.where(bottom >= top, (bottom / TILE).floor().long() - first_row + 1, 0)
     entry, row = _expand(first_row, rows)
 
+    # Then, within each row of tiles, the columns: from where the ellipse is furthest left to
+    # furthest right, at its tips if these are in the row, else at the row's nearer border.
     y = mean_y[entry]
     upper = row * TILE + 0.5 - y
     lower = torch.clamp(row * TILE + (TILE - 0.5), max=height - 0.5) - y
-    tip = (xy * torch.sqrt(squared_radius / xx))[entry]  # the dy at which the ellipse reaches furthest right
+    # The dy at which the ellipse reaches furthest right.
+    tip = (xy * torch.sqrt(squared_radius / xx))[entry]
     limit, a, b, c, x = squared_radius[entry], l11[entry], l21[entry], l22[entry], mean_x[entry]
 
     def boundary(dy: Tensor, side: float) -> Tensor:
+        # x at dy on the ellipse (a dx + b dy)^2 + (c dy)^2 = limit.
         half = torch.sqrt((limit - (c * dy) ** 2).clamp_(min=0.0))
         return x + (side * half - b * dy) / a
 
@@ -49,6 +54,7 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
     columns = torch.where(right >= left, (right / TILE).floor().long() - first_column + 1, 0)
     strip, column = _expand(first_column, columns)
 
+    # Entries are in order of depth; a stable sort by tile keeps that order within every tile.
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     tile = row[strip] * tiles_x + column
     gaussians = order[entry[strip]]
@@ -65,7 +71,7 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
 
 
 def _expand(first: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """List the integers first[i] .. first[i] + counts[i] - 1 for every i; return the i and the integer of each."""
+    """List the integers first[i] .. first[i] + counts[i] - 1; return the i and integer of each."""
     source = torch.repeat_interleave(counts)
     offset = first - (counts.cumsum(0) - counts)
     return source, offset[source] + torch.arange(source.shape[0], device=first.device)
@@ -121,7 +127,10 @@ class TorchEngine:
             with torch.enable_grad():
                 image = compositing.over(compositing.blend_weights(raw), entries[6:], rows.new_zeros(()))
             (to_raw,) = torch.autograd.grad(image, raw, upstream[block.tiles])
-            # ln alpha = ln o - |(l11 dx + l21 dy, l22 dy)|^2 / 2, and the gradient of alpha is alpha times that of it.
+            # ln alpha = ln o - |(l11 dx + l21 dy, l22 dy)|^2 / 2 with (dx, dy) from the mean to the
+            # pixel: d ln alpha / dx_mean = l11 w1 and d ln alpha / dy_mean = l21 w1 + l22 w2. The
+            # gradient of alpha is alpha times that of its logarithm. Absolute values before the sum
+            # over pixels.
             x, y, l11, l21, l22 = entries[:5, :, None]
             dx, dy = pixels[0] + block.centers[0][..., None] - x, pixels[1] + block.centers[1][..., None] - y
             w1, w2 = l11 * dx + l21 * dy, l22 * dy

@@ -47,6 +47,7 @@ class AdaptiveDensity(DensityStrategy):
     def before_step(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Densify, prune, reset and decay as scheduled after ``step`` steps."""
         config = self.config
+        # Before pruning, so that what has decayed below its threshold goes at once.
         if config.opacity_decay < 1 and step > config.densify_from:
             decay_opacity(optimizer, config.opacity_decay)
         if self.is_due(step):
@@ -56,6 +57,7 @@ class AdaptiveDensity(DensityStrategy):
                 raise TrainingStoppedError(
                     f"all Gaussians were pruned after step {step}: lower prune_opacity or noise, raise opacity_reset."
                 )
+            # Sums over the old set mean nothing for the new one.
             self.reset(len(optimizer.gaussians))
         if config.opacity_reset_every and step < self.config.densify_end:
             since = step - config.opacity_reset_from
@@ -73,6 +75,7 @@ class AdaptiveDensity(DensityStrategy):
 
     def grow(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Clone and split once."""
+        # Both decided before either acts: a clone must not be split in the same step.
         selected, large = self.selected(optimizer), is_large(optimizer, self.large)
         clone(optimizer, selected & ~large)
         split(optimizer, selected & large, generator=self.split_generator(step))
@@ -166,5 +169,6 @@ class AbsGradDensity(AdaptiveDensity):
         """Select large Gaussians by their absolute gradients."""
         seen = self.statistics
         assert seen.absolute_sum is not None
+        # A mean over the steps that drew it, like the signed gradient that decides about clones.
         torn = seen.absolute_sum / seen.steps.clamp(min=1) >= self.split_gradient
         return torch.where(is_large(optimizer, self.large), torn, super().selected(optimizer))

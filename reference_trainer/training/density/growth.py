@@ -57,6 +57,7 @@ class ProximityDensity(AdaptiveDensity):
 
     def grow(self, optimizer: GaussianOptimizer, step: int) -> None:
         """Clone, split and unpool, in this order: each sees what the previous ones have added."""
+        # Clones are appended: the first len(steep) Gaussians are still those that were judged.
         steep, large = self.selected(optimizer), is_large(optimizer, self.large)
         clone(optimizer, steep & ~large)
         sparse = self._sparse(optimizer, self.split_distance)[0]
@@ -72,6 +73,7 @@ class ProximityDensity(AdaptiveDensity):
         if len(means) <= _NEIGHBORS:
             nobody = torch.zeros(len(means), dtype=torch.bool, device=means.device)
             return nobody, nobody.long()[:, None].expand(-1, _NEIGHBORS)
+        # Squared distances against a length, as in the source: see the class.
         squares, neighbors = nearest_neighbors(means, _NEIGHBORS)
         return (squares.mean(1) > distance * self.extent) & is_large(optimizer, self.extent), neighbors
 
@@ -92,6 +94,7 @@ def between(gaussians: Gaussians, selected: Tensor, neighbors: Tensor) -> Gaussi
         >>> new.means.tolist(), new.scales[0, 0].item()
         ([[1.0, 0.0, 0.0]], 3.0)
     """
+    # Copies of the neighbors, of which position, orientation and color are replaced.
     sources = gaussians.means[selected].repeat_interleave(neighbors.shape[1], 0)
     new = gaussians[neighbors[selected].flatten()]
     return replace(
@@ -135,6 +138,7 @@ class RayBoxDensity(AdaptiveDensity):
         """Clone and split once."""
         order = torch.randperm(len(self.scene.train), generator=stream(self.config.seed, step, "ray_boxes"))
         views = [self.scene.train[i].to(self.device) for i in order[: self.views].tolist()]
+        # Cameras more than 1 apart on the unit sphere around the world's origin count as far apart.
         places = normalize(torch.stack([view.camera.position for view in views]), dim=1)
         threshold = self.config.densify_gradient * (0.5 if bool((pdist(places) > 1).any()) else 1.0)
         steep = self.statistics.mean_gradient >= threshold
@@ -209,6 +213,8 @@ def ray_box(one: Camera, corners: Tensor, other: Camera, others: Tensor) -> tupl
     first, second = one.position, other.position
     along = normalize(one.lift(corners, torch.ones_like(corners[:, 0])) - first, dim=1)
     across = normalize(other.lift(others, torch.ones_like(others[:, 0])) - second, dim=1)
+    # The shortest segment between two lines is along their common normal. With n = along x across,
+    # the parameters of its ends are ((q - p) x across) . n / n^2 and ((q - p) x along) . n / n^2.
     normal = torch.linalg.cross(along, across)
     squared = normal.square().sum(1)
     if bool((squared < 1e-12).any()):

@@ -69,6 +69,8 @@ class MCMCDensity(DensityStrategy):
             gaussians = optimizer.gaussians
             axes = rotation_matrices(gaussians.quaternions) * gaussians.scales[:, None]
             generator = stream(self.config.seed, step, "exploration", self.device)
+            # Sigma xi = R S S' R' xi: noise in the shape of the Gaussian, so that flat ones stay in
+            # their surface. The factor of the opacity leaves opaque ones where they are.
             xi = torch.empty_like(gaussians.means).normal_(generator=generator)
             xi *= torch.sigmoid(100 * (0.005 - gaussians.opacities))[:, None]
             xi *= self.noise * self.config.means_rate_at(step - 1) * self.extent

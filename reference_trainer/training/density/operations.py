@@ -68,6 +68,8 @@ class DensityStatistics:
         """
         for total, x in ((self.gradient_sum, gradient), (self.absolute_sum, absolute)):
             if total is not None and x is not None:
+                # From pixels to normalized device coordinates, in which thresholds do not depend on
+                # the size of the image.
                 norms = torch.hypot(0.5 * width * x[:, 0], 0.5 * height * x[:, 1])
                 total.index_add_(0, indices, norms.to(total))
         self.steps.index_add_(0, indices, drawn.to(self.steps))
@@ -92,6 +94,7 @@ _SPLIT_SHRINK = 0.8 * _SPLIT_INTO  # children of a split are smaller by this fac
 
 def clone(optimizer: GaussianOptimizer, selected: Tensor) -> None:
     """Add exact copies of the selected Gaussians, (N,) bool, at the end."""
+    # A clone's optimizer state starts at 0 and the original's does not: this moves the two apart.
     optimizer.append(optimizer.gaussians[selected].map(torch.Tensor.detach))
 
 
@@ -107,6 +110,7 @@ def split(optimizer: GaussianOptimizer, selected: Tensor, *, generator: torch.Ge
     selected = torch.nn.functional.pad(selected, (0, len(gaussians) - len(selected)))
     parents = gaussians[selected].map(lambda x: x.repeat(_SPLIT_INTO, *[1] * (x.ndim - 1)))
     noise = torch.randn(len(parents), 3, generator=generator, dtype=parents.means.dtype, device=parents.means.device)
+    # Drawn from the parent itself: standard normal, scaled along its axes, turned into the world.
     offsets = (rotation_matrices(parents.quaternions) @ (noise * parents.scales)[:, :, None]).squeeze(-1)
     smaller = parents.log_scales - math.log(_SPLIT_SHRINK)
     optimizer.select(~selected)
@@ -138,12 +142,14 @@ def prune(optimizer: GaussianOptimizer, *, min_opacity: float, max_scale: float 
     keep = optimizer.gaussians.opacities.detach() >= min_opacity
     if max_scale is not None:
         keep &= ~is_large(optimizer, max_scale)
+    # Selecting copies all tensors, for nothing if all stay.
     if not bool(keep.all()):
         optimizer.select(keep)
 
 
 def reset_opacity(optimizer: GaussianOptimizer, ceiling: float) -> None:
     """Lower every opacity to at most ``ceiling`` and forget its optimizer state (Kerbl et al. 2023, Sec. 5.2)."""
+    # In logits, so that opacities below the ceiling stay bit for bit.
     logits = optimizer.gaussians.opacity_logits.detach().clamp(max=math.log(ceiling / (1 - ceiling)))
     optimizer.set_opacity_logits(logits)
     optimizer.forget(slice(None), "opacity_logits")

@@ -113,6 +113,7 @@ class CoPruning(AdaptiveDensity):
         for model in models:
             refuse_not_finite(model.optimizer, step)
         means = [model.gaussians.means.detach() for model in models]
+        # All are compared before any is pruned: the order of the models must not matter.
         keeps = [
             torch.stack([nearest_distance(own, other) < self.distance for other in means if other is not own]).all(0)
             for own in means
@@ -211,6 +212,7 @@ class SelfEnsembling(CoPruning):
         """Return where images (T, V, 3, H, W) of V views at T times differ, shape (V, H, W), bool."""
         deviation = avg_pool2d(images.std(0).mean(1), _BOX, stride=1, padding=_BOX // 2)
         pixels = deviation[0].numel()
+        # Above the limit lie a `share` of the pixels, or fewer where deviations are below `least`.
         limit = deviation.flatten(1).kthvalue(pixels - int(self.share * pixels), dim=1).values
         return deviation > limit.clamp(min=self.least)[:, None, None]
 
@@ -240,6 +242,7 @@ class SelfEnsembling(CoPruning):
             "quaternions": noisy.quaternions,
             "opacity_logits": noisy.opacities.logit(eps=1e-6),
         }
+        # Overwritten in place: the optimizer keeps its Gaussians, but forgets where they were heading.
         every = dict(model.gaussians.named())
         model.optimizer.relocate(chosen.nonzero()[:, 0], Gaussians.from_named(every | geometry)[chosen])
         model.optimizer.forget(slice(None), *geometry)

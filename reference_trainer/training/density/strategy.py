@@ -67,7 +67,8 @@ class DensityStrategy(abc.ABC):
             device: of the Gaussians.
             count: their number.
         """
-        self.config = replace(config, seed=config.seed + (self.index << 32))  # every model has its own random splits
+        # Every model has its own random splits: those of seeds below 2^32 never meet.
+        self.config = replace(config, seed=config.seed + (self.index << 32))
         self.scene, self.extent, self.device = scene, scene.extent, device
         self.large = config.dense_fraction * self.extent  # what is larger is split, what is smaller cloned
         self.reset(count)
@@ -91,8 +92,12 @@ class DensityStrategy(abc.ABC):
             TrainingStoppedError: if the Gaussians are not finite, or none is left.
         """
 
-    def together(self, models: Sequence[ControlledModel], step: int) -> None:  # noqa: B027 (most look at one model alone)
-        """Change what depends on several models, after `before_step` of each; called on the first model's strategy."""
+    def together(self, models: Sequence[ControlledModel], step: int) -> None:  # noqa: B027
+        """Change models by comparing them with each other: pruning what another one lacks, for example.
+
+        Called once a step, of the first model's strategy, after `before_step` of every model's. Most
+        strategies look at one model alone and do nothing here.
+        """
 
     def observes(self, step: int) -> bool:
         """Whether `observe` is to be called at a step, with what the strategy needs of the renderer."""

@@ -71,6 +71,7 @@ class CoAdaptation(WeightedTerm):
         camera, variance = step.view.camera, step.variance
         if self.where != "training":
             camera, variance = self.draw(step.generator("co_adaptation")), None
+        # An analytic step has rendered the variance of its own draws; other cameras need a render.
         if variance is None:
             variance = step.moments(camera, self.multiplier).variance
         return self.every * variance.mean()
@@ -124,6 +125,7 @@ class Consistency(WeightedTerm):
         """Compare the two renders."""
         camera = step.view.camera
         untouched = step.rendering is not None and step.rendered is step.params
+        # Without a regularizer the step has rendered the plain model already.
         full = step.image if untouched else step.render(camera).image
         if self.exact:
             moments = step.moments(camera, Multiplier.dropout(self.p))
@@ -169,6 +171,7 @@ class CoRegularization(WeightedTerm):
         zero = step.image.new_zeros(())
         if step is not step.siblings[0]:
             return zero
+        # One camera for all models, drawn from the first one's stream.
         camera = self.draw(step.generator("co_regularization"))
         images = [each.render(camera).image for each in step.siblings]
         losses = [photometric_loss(own, other.detach(), self.lambda_dssim) for own, other in permutations(images, 2)]
@@ -220,4 +223,5 @@ class StraightThrough(WeightedTerm):
         """Compare one render of the step's view with its photograph, and send the gradients through the other."""
         full = step.render(step.view.camera, observed=self.error == "dropped").image
         seen, through = (full, step.image) if self.error == "full" else (step.image, full)
+        # The value is that of `seen`, the derivative that of `through`: the difference is a constant.
         return photometric_loss(through + (seen - through).detach(), step.view.image, self.lambda_dssim)

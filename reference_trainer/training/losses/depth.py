@@ -58,8 +58,10 @@ class Pearson(PriorTerm):
         assert prior is not None
         known = prior.isfinite()
         prior, depth = prior[known], step.depth[known]
+        # A prior may be a depth or an inverse depth up to scale: the reading that fits better counts.
         readings = [prior] if self.offset is None else [prior, 1 / (self.offset - prior)]
         centered = [each - each.mean() for each in (depth, *readings)]
+        # Pearson's correlation is the cosine of the centered vectors; 0 where one has no contrast.
         correlations = [torch.cosine_similarity(centered[0], reading, dim=0) for reading in centered[1:]]
         return 1 - torch.stack(correlations).amax()
 
@@ -126,6 +128,7 @@ class PatchDepth(PriorTerm):
         if self.which == "plain":
             return step.depth
         names, x = ("opacities", "means", "scales", "quaternions", "sh"), step.params
+        # All parameters are constants but those that this pass is to move.
         fixed = x._replace(**{name: getattr(x, name).detach() for name in names})
         if self.which == "hard":
             fixed = fixed._replace(means=x.means, opacities=torch.full_like(x.opacities, _HARD_OPACITY))
@@ -157,6 +160,7 @@ def patch_error(depth: Tensor, prior: Tensor, side: int, tolerance: float, *, ov
         >>> round(patch_error(depth, 3 * depth + 1, 4, 1e-6).item(), 12)
         0.0
     """
+    # A patch with an unknown pixel has no mean to compare: only whole ones count.
     side = min(side, *depth.shape)
     known, flat = prior.isfinite(), []
     whole = unfold(known[None, None].to(depth), side, stride=side)[0].amin(0) > 0
@@ -226,6 +230,7 @@ class Warp(WeightedTerm):
         camera, photograph, generator = step.view.camera, step.view.image, step.generator("warp")
         shift = self.shift * (2 * torch.rand((), generator=generator, device=generator.device) - 1).item()
         pose = camera.world_to_camera.clone()
+        # x_camera = R x + t: moving the camera by +shift along its own x axis lowers t_x.
         pose[0, 3] -= shift
         shifted = step.render(replace(camera, world_to_camera=pose)).image
         disparity = -camera.fx * shift / (step.depth + 1e-5)
@@ -255,6 +260,7 @@ def warp_horizontally(image: Tensor, disparity: Tensor) -> tuple[Tensor, Tensor]
         0
     ].unbind(-1)
     x = x + disparity
+    # Bilinear interpolation needs a pixel to the right.
     inside = (x >= 0) & (x < width - 1)
     return remap(image[None], x[None], y[None], align_corners=True)[0], inside.to(image.dtype)
 

@@ -46,6 +46,7 @@ class Alpha(WeightedTerm):
     def value(self, step: Step) -> Tensor:
         """Return the mean over all pixels."""
         assert step.rendering is not None
+        # Computed once per photograph: it does not change, and pooling 49 rows is not free.
         name = step.view.name
         if name not in self._backgrounds:
             self._backgrounds[name] = self._background(step.view)
@@ -152,6 +153,7 @@ class Opacity(WeightedTerm):
         opacities = step.params.opacities
         if self.split is None:
             return opacities.mean()
+        # Sums over masks instead of indexing, whose shapes would depend on the values: no wait on a GPU.
         above, below = opacities > self.split, opacities < self.split
         reward = (opacities.square() * above).sum() / above.sum().clamp_min(1)
         return 1 - reward + ((1 - opacities).square() * below).sum() / below.sum().clamp_min(1)

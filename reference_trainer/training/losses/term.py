@@ -75,6 +75,7 @@ class WeightedTerm(LossTerm):
 
     def __call__(self, step: Step) -> Tensor:
         """Return the weighted value."""
+        # The schedule is asked again at every step: it is a function of the step, and of nothing else.
         return self._weight(step.number) * self.value(step)
 
     @abc.abstractmethod
