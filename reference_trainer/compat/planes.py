@@ -6,12 +6,20 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render import Rendering, draw
+from reference_trainer.render import Rendering, rasterize
 from reference_trainer.render.constants import DILATION
-from reference_trainer.render.eager.formulas import blend_weights
-from reference_trainer.render.eager.projection import project
-from reference_trainer.render.eager.walk import PIXELS, blocks, geometry_rows, pad_entries, pixel_offsets, tile, untile
 from reference_trainer.render.splats import Splats
+from reference_trainer.render.torch.compositing import (
+    PIXELS,
+    blend_weights,
+    blocks,
+    geometry_rows,
+    pad_entries,
+    pixel_offsets,
+    tile,
+    untile,
+)
+from reference_trainer.render.torch.projection import project
 from reference_trainer.rotations import rotation_matrices
 
 __all__ = ["FAR", "NEAR", "contributions", "filtered", "heaviest", "surface_planes"]
@@ -124,14 +132,14 @@ def surface_planes(
     away = (normals * (seen @ pose[:3, :3].T + pose[:3, 3])).sum(1, keepdim=True) > 0
     mapped = FAR / (FAR - NEAR) * (1 - NEAR / splats.projection.depths)
     mapped = mapped - mapped.detach().mean()  # differences count: near 1, the distortion of a thin wall would cancel
-    first = draw(
+    first = rasterize(
         splats._replace(
             colors=torch.where(away, -normals, normals).to(splats.colors),
             projection=splats.projection._replace(depths=mapped),
         ),
         depth=True,
     )
-    second = draw(splats._replace(colors=mapped[:, None].square().expand(-1, 3).contiguous()))
+    second = rasterize(splats._replace(colors=mapped[:, None].square().expand(-1, 3).contiguous()))
     assert first.depth is not None
     distortion = alpha * second.image[0] - first.depth.square()
     mean = depth / torch.where(alpha > 0, alpha, 1.0)

@@ -37,14 +37,14 @@ from reference_trainer.runs.folder import (
     run_settings,
 )  # fmt: skip
 from reference_trainer.runs.lock import run_lock
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.threads import threads_for
+from reference_trainer.training.assembly import check
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
-from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.interruption import TrainingInterrupted, TrainingStoppedError
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
 
@@ -143,7 +143,7 @@ def run_experiment(
             SIGTERM a checkpoint is saved as well, and the signal is raised again, which ends the process.
         OSError: if a file cannot be written, such as on a full disk; its previous content is kept.
     """
-    config.check()
+    check(config)
     check_intervals(monitor_every, checkpoint_every)
     perceptual = load_lpips(lpips, device=device)
     begun_with(out, options, config, auto=auto, given=given)

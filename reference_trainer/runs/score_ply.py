@@ -21,7 +21,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.frame_check import check_frame
 from reference_trainer.runs.measure import measure
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import BACKGROUNDS, OrbitOptions, SceneOptions
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import bounding_sphere, orbit_views

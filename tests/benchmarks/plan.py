@@ -21,7 +21,7 @@ from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.run import model_of
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.study import Study, run_study
 from reference_trainer.training.config import TrainConfig

@@ -26,11 +26,11 @@ import tyro
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import format_mean_std, markdown_table, mean_std
 from reference_trainer.runs.run import model_of
-from reference_trainer.scenes import synthetic_scene
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene, synthetic_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.study import Record, Records, Study, run_study
+from reference_trainer.training.assembly import check
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
@@ -137,7 +137,7 @@ def remedy_study(
     if unknown := set(scenes) - set(SCENES if views == "final" else CHOOSING):
         raise ValueError(f"{views} knows the scenes {', '.join(SCENES if views == 'final' else CHOOSING)}: {unknown}.")
     for text in arms:
-        TrainConfig(**COMMON | arm(text)).check()
+        check(TrainConfig(**COMMON | arm(text)))
     found = {
         name: options if options.path == "synthetic" else replace(options, path=f"{data}/{options.path}")
         for name, options in SCENES.items()

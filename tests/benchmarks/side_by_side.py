@@ -21,7 +21,7 @@ from pathlib import Path
 from benchmarks.fork_scene import write_scene
 from benchmarks.trainers import EVALUATE, EXPORT, OPTIONS, TRAINERS, named, settings, steps
 from reference_trainer.evaluation.results import machine
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.paper.rows import Row, Rows
 

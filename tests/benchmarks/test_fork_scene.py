@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from benchmarks.fork_scene import write_scene
-from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes import load_scene, synthetic_scene
 from reference_trainer.scenes.depth import point_prior
-from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
 
 

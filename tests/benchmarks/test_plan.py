@@ -14,7 +14,7 @@ from benchmarks.plan_parts import parts_of_a_step
 from reference_trainer.runs.engines.engine import Task
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig

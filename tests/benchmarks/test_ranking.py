@@ -17,7 +17,7 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import run_experiment
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from benchmarks import remedy
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.studies.study import run_study

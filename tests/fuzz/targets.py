@@ -24,7 +24,7 @@ from reference_trainer.scenes.numpy_formats import read_arrays, read_idr, read_l
 from reference_trainer.scenes.points import ply_points
 from reference_trainer.scenes.transforms import read_transforms
 from reference_trainer.training.checkpoint import load_checkpoint
-from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.interruption import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["TARGETS"]

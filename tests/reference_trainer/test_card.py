@@ -9,7 +9,7 @@ from reference_trainer.cli import main
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import RESULTS
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.trainer import Trainer
 
@@ -32,7 +32,7 @@ def test_commands(card, tmp_path, options):
 
 def test_the_deterministic_switch_reaches_the_device(card, tmp_path, monkeypatch, capsys):
     """With sums as CUDA refuses them there, training is refused: the test above would not have seen them."""
-    monkeypatch.setattr("reference_trainer.render.eager.formulas._running", lambda x, product: x.cumsum(-1))
+    monkeypatch.setattr("reference_trainer.render.torch.compositing._running", lambda x, product: x.cumsum(-1))
     with pytest.raises(SystemExit):
         main([*TRAIN.split(), "--deterministic", "--monitor-every", "0", "--out", str(tmp_path)])
     assert "cumsum does not have a deterministic implementation" in capsys.readouterr().err

@@ -17,12 +17,12 @@ from torch import Tensor
 
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import markdown_table
-from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.losses.photometric import photometric_loss
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["gradient_differences", "gradients", "main", "trained"]

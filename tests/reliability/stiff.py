@@ -21,7 +21,7 @@ from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.interruption import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["CASES", "Ending", "main", "push"]

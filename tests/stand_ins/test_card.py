@@ -5,7 +5,7 @@ import torch
 from stand_ins.card import counted_synchronizations, pretended_card
 
 from ca_reg import GaussianDropout, OpacityNoise
-from reference_trainer.training.determinism import deterministic
+from reference_trainer.training.randomness import deterministic
 
 
 def on(device, *shape):

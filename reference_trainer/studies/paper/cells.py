@@ -22,7 +22,7 @@ from reference_trainer.runs.engines.engine import Failure, Task, attempt
 from reference_trainer.runs.folder import folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.runs.measure import of_run
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.paper.claims import Claim, Setting

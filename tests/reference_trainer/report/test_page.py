@@ -22,7 +22,7 @@ from reference_trainer.report.findings import find
 from reference_trainer.report.page import write_report
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG, run_settings
 from reference_trainer.runs.measure import of_run
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.config import TrainConfig

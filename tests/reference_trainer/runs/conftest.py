@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 
 

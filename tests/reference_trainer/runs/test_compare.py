@@ -134,7 +134,7 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("changes", "lacking"),
-    [({"loss": "pearson"}, "--depth"), ({"fields": 2, "loss": "co_regularization"}, "no initial point")],
+    [({"loss": "pearson"}, "--depth"), ({"models": 2, "loss": "co_regularization"}, "no initial point")],
 )
 def test_what_a_scene_lacks_is_said_once_before_any_run(changes, lacking, tmp_path, monkeypatch):
     nothing = PointCloud(torch.empty(0, 3), torch.empty(0, 3), "nowhere")
@@ -320,7 +320,7 @@ def test_a_worker_draws_with_the_engine_of_the_sweep(chosen, tmp_path, options, 
     train = grid.train_run
 
     def elsewhere(*arguments):
-        monkeypatch.setenv("CA_REG_ENGINE", "loops")
+        monkeypatch.setenv("CA_REG_ENGINE", "numba")
         return train(*arguments)
 
     monkeypatch.setattr(grid, "train_run", elsewhere)

@@ -10,7 +10,7 @@ from ca_reg.regularizers import REGULARIZERS
 from reference_trainer.runs.folder import PLY
 from reference_trainer.runs.run import load_run, model_of, run_experiment
 from reference_trainer.runs.score_ply import of_ply
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 

@@ -19,7 +19,7 @@ from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.runs.lock import LOCK, FolderInUseError, run_lock
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import run_experiment
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.training.trainer import Trainer
 
 HOLD = """

@@ -14,11 +14,10 @@ from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import run as run_module
 from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, CONFIG, PLAN, PLY, RESULTS, read_results
 from reference_trainer.runs.run import load_run, model_of, run_experiment
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
-from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.interruption import TrainingInterrupted, TrainingStoppedError
 from reference_trainer.training.plan import Plan
 from reference_trainer.training.trainer import Trainer
 

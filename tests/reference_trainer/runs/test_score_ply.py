@@ -15,7 +15,7 @@ from reference_trainer.runs.folder import BAKED_PLY, PLY
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.runs.score_ply import of_ply, score_ply
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import OrbitOptions
 
 FEW = OrbitOptions(cameras=2, size=40)

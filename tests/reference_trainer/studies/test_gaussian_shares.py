@@ -17,7 +17,7 @@ from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.measure import of_run
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies import gaussian_shares as shares_module
 from reference_trainer.studies.gaussian_shares import study_attribution

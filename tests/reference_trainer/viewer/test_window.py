@@ -11,7 +11,7 @@ from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import run_experiment
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.scenes.virtual_cameras import orbit_views
 from reference_trainer.viewer import window
