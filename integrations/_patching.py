@@ -223,7 +223,8 @@ class PatchedClasses:
         def make(update: Callable[..., Any]) -> Callable[..., Any]:
             @functools.wraps(update)
             def update_learning_rate(model: Any, iteration: int, *args: Any, **kwargs: Any) -> Any:
-                if self._updated is model:  # called by an override in a subclass
+                # Called by an override in a subclass, or not for Gaussians, as that of a network that deforms them.
+                if self._updated is model or not _has_opacities(model):
                     return update(model, iteration, *args, **kwargs)
                 self._update(model, int(iteration))
                 self._updated = model
@@ -241,6 +242,11 @@ class PatchedClasses:
 def _takes_a_step(method: Callable[..., Any] | None) -> bool:
     """Whether a method takes an argument besides ``self``: without one it cannot tell the iteration."""
     return method is not None and len(inspect.signature(method).parameters) > 1
+
+
+def _has_opacities(model: Any) -> bool:
+    """Whether a model is one of Gaussians, which have opacities by some name."""
+    return any("opacit" in name for name in dir(model))
 
 
 class _Override(NamedTuple):

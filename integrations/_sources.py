@@ -129,7 +129,8 @@ def _is_own(folder: Path, module: str) -> bool:
     place = folder.joinpath(package, *inner)
     files = [file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()]
     # The Python half of an extension imports its compiled half, which was built if this file can be imported.
-    compiled = re.compile(rf"^\s*from\s+(\.|{re.escape(module)})\s+import\s.*\b_C\b|^\s*from\s+\._C\s", re.MULTILINE)
+    names = rf"(\.+\w*|{re.escape(module)})"
+    compiled = re.compile(rf"^\s*from\s+{names}(\s+import\s.*\b_C\b|\._C\s)", re.MULTILINE)
     if any(compiled.search(file.read_text("utf-8", "replace")) for file in files):
         return False
     return bool(files) or place.is_dir()

@@ -2,6 +2,7 @@
 
 import gc
 import re
+import sys
 import weakref
 
 import pytest
@@ -323,3 +324,21 @@ def test_a_warm_step_does_not_wait_for_the_device(rasterizer):
             assert waits[0] > 0
             assert not any(waits[16:31])
             assert "dropped twice" in hook.problem()
+
+
+def test_the_steps_of_a_network_beside_the_gaussians_are_not_theirs(rasterizer, model_class, monkeypatch):
+    """As that of Deformable-3D-Gaussians, which has a method of the same name and renders nothing."""
+
+    class Network:
+        def update_learning_rate(self, iteration):
+            return iteration
+
+    monkeypatch.setattr(sys.modules["scene.gaussian_model"], "Network", Network, raising=False)
+    models = ["scene.gaussian_model:GaussianModel", "scene.gaussian_model:Network"]
+    model, network, render = model_class(), Network(), make_render(rasterizer)
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, models=models) as hook:
+        for step in range(1, 5):
+            model.update_learning_rate(step)
+            render(model.camera, model, PIPE, BLACK)
+            assert network.update_learning_rate(step) == step
+    assert (hook.tally.regularized, hook.tally.lost) == (4, 0)

@@ -114,3 +114,25 @@ def test_the_sources_of_extensions_and_hidden_folders_are_not_read(repository):
     (repository / "diff_local" / "setup.py").touch()  # an extension that is installed from there
     assert set(read_folder(repository).rasterizers) == {"diff_tools", "diff_local"}
     assert read_folder(repository).models == ["scene.gaussian_model:GaussianModel"]
+
+
+def test_rasterizers_within_packages_are_extensions_if_they_are_compiled(repository):
+    """Under a dotted name, with their Python half in the repository (RAIN-GS) or built into its package."""
+    halves = {"from ..setup import _C": "a", "from . import _C": "b", "import torch": "own"}
+    for half, name in halves.items():
+        folder = repository / "packages" / name / "raster"
+        folder.mkdir(parents=True)
+        (folder / "__init__.py").write_text(f"{half}\nclass GaussianRasterizer: ...\n")
+    (repository / "scene" / "late.py").write_text("from .built.raster import GaussianRasterizer\n")
+    lines = [f"from packages.{name}.raster import GaussianRasterizer\n" for name in halves.values()]
+    (repository / "tools.py").write_text("".join(lines))
+    found = read_folder(repository).rasterizers
+    assert set(found) == {"packages.a.raster", "packages.b.raster", "scene.built.raster"}
+
+
+def test_a_method_without_an_argument_does_not_tell_the_steps(repository):
+    (repository / "trainer.py").write_text(
+        "class Trainer:\n    def update_learning_rate(self):\n        pass\n"
+        "class Model:\n    def update_learning_rate(self, iteration):\n        pass\n"
+    )
+    assert read_folder(repository).models == ["scene.gaussian_model:GaussianModel", "trainer:Model"]
