@@ -29,7 +29,7 @@ def check_projection(
 ) -> None:
     """Raise unless all numbers are finite and the world's coordinates not too large.
 
-    ``total`` sums what decides which Gaussians are drawn: all depths and opacities. Only if it and
+    ``total`` sums what decides which Gaussians are rendered: all depths and opacities. Only if it and
     the projected values add up to nan or infinity are the inputs (of all Gaussians, by name)
     examined one by one.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 NEAR_PLANE: Final = 0.2
-"""Gaussians whose center is nearer along the camera's z axis are not drawn: their linearized
+"""Gaussians whose center is nearer along the camera's z axis are not rendered: their linearized
 projection explodes."""
 
 DILATION: Final = 0.3
@@ -32,7 +32,7 @@ ellipse."""
 
 MIN_TRANSMITTANCE: Final = 1e-4
 """A splat that would leave less transmittance than this terminates its pixel and is itself not
-drawn."""
+rendered."""
 
 TILE: Final = 8
 """Side of a tile in pixels. Own choice: at the INRIA value of 16, about 1.6 times as many pairs are

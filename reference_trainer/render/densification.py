@@ -58,7 +58,7 @@ def visible_radii(
     """Return the radii of splats on the screen, pixels, (N,) int32; 0 for those off the image.
 
     As in the originals the opacity does not matter: a Gaussian of opacity 0 has a radius, though it
-    is not drawn. Quaternions are wxyz, scales standard deviations, ``blur`` is in square pixels.
+    is not rendered. Quaternions are wxyz, scales standard deviations, ``blur`` is in square pixels.
 
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
@@ -92,18 +92,18 @@ class _AbsoluteGradients(torch.autograd.Function):
     """The identity; backward also hands the sums of absolute gradients to another input."""
 
     @staticmethod
-    def forward(ctx: Any, drawn: Tensor, sink: Tensor, splats: Splats, background: Tensor) -> Tensor:
+    def forward(ctx: Any, rendered: Tensor, sink: Tensor, splats: Splats, background: Tensor) -> Tensor:
         ctx.splats, ctx.background = splats, torch.nn.functional.pad(background, (0, 1))[:, None, None]
-        ctx.save_for_backward(drawn)
-        return drawn.view_as(drawn)
+        ctx.save_for_backward(rendered)
+        return rendered.view_as(rendered)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         # image = black + (1 - alpha) background, where black is the image over a black background.
         # Engines take the gradients of black and alpha; alpha's is less by gradient . background.
-        (drawn,), (gradient,) = ctx.saved_tensors, gradients
-        black = torch.cat([drawn[:4] - (1 - drawn[4]) * ctx.background, drawn[4:]])
+        (rendered,), (gradient,) = ctx.saved_tensors, gradients
+        black = torch.cat([rendered[:4] - (1 - rendered[4]) * ctx.background, rendered[4:]])
         of_alpha = gradient[4:] - (gradient[:4] * ctx.background).sum(0, keepdim=True)
         sums = ctx.splats.engine.absolute_gradients(ctx.splats, black, torch.cat([gradient[:4], of_alpha]))
         return gradient, sums, None, None
@@ -124,6 +124,8 @@ def with_absolute_gradients(rendering: Rendering, sink: Tensor, background: Tens
     """
     depth = torch.zeros_like(rendering.alpha) if rendering.depth is None else rendering.depth
     background = rendering.image.new_zeros(3) if background is None else background.detach().to(rendering.image)
-    drawn = torch.cat([rendering.image, depth[None], rendering.alpha[None]])
-    drawn = _AbsoluteGradients.apply(drawn, sink, rendering.splats, background)  # type: ignore[no-untyped-call]
-    return rendering._replace(image=drawn[:3], alpha=drawn[4], depth=None if rendering.depth is None else drawn[3])
+    rendered = torch.cat([rendering.image, depth[None], rendering.alpha[None]])
+    rendered = _AbsoluteGradients.apply(rendered, sink, rendering.splats, background)  # type: ignore[no-untyped-call]
+    return rendering._replace(
+        image=rendered[:3], alpha=rendered[4], depth=None if rendering.depth is None else rendered[3]
+    )

@@ -119,6 +119,6 @@ def _numba_engine() -> Engine | None:
     try:
         from reference_trainer.render.numba.engine import NumbaEngine
     except ImportError as error:  # such as a NumPy that is too new for it
-        warnings.warn(f"numba is installed but cannot be imported ({error}): the engine torch draws.", stacklevel=2)
+        warnings.warn(f"numba is installed but cannot be imported ({error}): the engine torch renders.", stacklevel=2)
         return None
     return NumbaEngine()

@@ -82,11 +82,11 @@ class TileLists:
         """Return the part (..., H, W) of an image of whole tiles."""
         return image[..., : self.height, : self.width]
 
-    def only(self, kept: Tensor) -> TileLists:
-        """Return the lists of the Gaussians that are kept, (M,) bool; slots and offsets are lost."""
-        stays = kept[self.gaussians]
+    def only(self, keep: Tensor) -> TileLists:
+        """Return the lists of some Gaussians, ``keep`` (M,) bool; slots and offsets are lost."""
+        stays = keep[self.gaussians]
         starts = torch.nn.functional.pad(stays.cumsum(0), (1, 0))[self.starts]
-        gaussians, touched = self.gaussians[stays], self.touched & kept
+        gaussians, touched = self.gaussians[stays], self.touched & keep
         return replace(self, starts=starts, gaussians=gaussians, touched=touched, slots=None, offsets=None)
 
 
@@ -98,7 +98,7 @@ class Splats(NamedTuple):
     opacities: Tensor  # activated, (M,)
     colors: Tensor  # towards this camera, (M, 3)
     lists: TileLists
-    engine: Engine  # what made them, and draws them
+    engine: Engine  # what made them, and renders them
 
     @property
     def means(self) -> Tensor:
@@ -124,7 +124,7 @@ class ViewSplats(Protocol):
 
     @property
     def touched(self) -> Tensor:
-        """Which of them were drawn, shape (M,) bool."""
+        """Which of them were rendered, shape (M,) bool."""
 
 
 class Rendering(NamedTuple):
@@ -135,7 +135,7 @@ class Rendering(NamedTuple):
         alpha: accumulated alpha, shape (H, W).
         depth: sum of weight times camera depth, not divided by alpha, shape (H, W); None unless
             asked for.
-        splats: what was drawn. ``splats.projection.means`` keeps its gradient (pixels) for
+        splats: what was rendered. ``splats.projection.means`` keeps its gradient (pixels) for
             densification.
     """
 
@@ -200,10 +200,10 @@ class Engine(Protocol):
         The opacities (K, M) are as in `masked`. Returns images (K, 3, H, W) and alphas (K, H, W).
         """
 
-    def absolute_gradients(self, splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
+    def absolute_gradients(self, splats: Splats, rendered: Tensor, gradient: Tensor) -> Tensor:
         """Sum the absolute values of each pixel's gradient of the centers (AbsGS), (M, 2).
 
-        Without a graph. ``drawn`` (5, H, W) holds colors and depth over black and the accumulated
+        Without a graph. ``rendered`` (5, H, W) holds colors and depth over black and the accumulated
         alpha, and ``gradient`` that of a loss with respect to it.
         """
 

@@ -1,4 +1,4 @@
-"""The renderers of the training views, one per file, and their registry: what ``--renderer`` knows by name."""
+"""The renderers of the training views, and their registry: what ``--renderer`` knows by name."""
 
 from ca_reg.registry import Registry
 from reference_trainer.renderers.gsplat import GsplatRenderer

@@ -55,7 +55,7 @@ class GsplatRenderer(Renderer):
 
 
 def load_gsplat_render(device: torch.device | str) -> Callable[..., GsplatRendering]:
-    """Return a function with the arguments of `render` that draws with gsplat, for Gaussians on a device.
+    """Return a function with the arguments of `render` that renders with gsplat, for Gaussians on a device.
 
     Raises:
         RuntimeError: if the device is not a CUDA device, or there is none.
@@ -63,7 +63,7 @@ def load_gsplat_render(device: torch.device | str) -> Callable[..., GsplatRender
     """
     if torch.device(device).type != "cuda":
         raise RuntimeError(
-            f"the gsplat renderer draws on CUDA devices only, and the device is {str(device)!r}: train with --device "
+            f"the gsplat renderer renders on CUDA devices only, and the device is {str(device)!r}: train with --device "
             "cuda, or with --renderer builtin, which runs anywhere."
         )
     if not torch.cuda.is_available():

@@ -18,7 +18,7 @@ class Renderer(abc.ABC):
 
     Attributes:
         capabilities: besides image and alpha: ``"depth"``; ``"moments"`` if `reference_trainer.render.render_moments`
-            draws the same picture, which analytic training and terms that render moments need; ``"absgrad"`` if it
+            renders the same picture, which analytic training and terms that render moments need; ``"absgrad"`` if it
             takes ``absgrad=True``, with which the backward pass leaves the sums of absolute gradients (M, 2) in
             ``splats.means.absgrad``.
     """
@@ -26,11 +26,11 @@ class Renderer(abc.ABC):
     capabilities: ClassVar[frozenset[str]] = frozenset()
 
     def prepare(self, device: torch.device) -> None:  # noqa: B027
-        """Load what is needed to draw on a device.
+        """Load what is needed to render on a device.
 
         Raises:
             ImportError: if something is missing.
-            RuntimeError: if it cannot draw there.
+            RuntimeError: if it cannot render there.
         """
 
     @abc.abstractmethod

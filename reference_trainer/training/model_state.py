@@ -20,7 +20,7 @@ from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.density import DensityStrategy
 
-__all__ = ["ModelState", "drawn_by_any", "initial_gaussians"]
+__all__ = ["ModelState", "initial_gaussians", "seen_by_any"]
 
 
 def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
@@ -56,7 +56,7 @@ def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
         )
     if config.initial_points == "all":
         return start
-    seen = drawn_by_any(start, scene.train)
+    seen = seen_by_any(start, scene.train)
     if not bool(seen.any()):
         raise ValueError(
             f"no initial Gaussian of scene {scene.name!r} has a pixel in a training view: give other points."
@@ -65,13 +65,13 @@ def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
 
 
 @torch.no_grad()
-def drawn_by_any(gaussians: Gaussians, views: tuple[View, ...]) -> Tensor:
+def seen_by_any(gaussians: Gaussians, views: tuple[View, ...]) -> Tensor:
     """Return which Gaussians have a pixel in some view, shape (N,), bool. The others never receive a gradient."""
-    drawn = torch.zeros(len(gaussians), dtype=torch.bool)
+    seen = torch.zeros(len(gaussians), dtype=torch.bool)
     for view in views:
         splats = splat(**arguments(gaussians), camera=view.camera, sh_degree=0)
-        drawn[splats.indices[splats.touched]] = True
-    return drawn
+        seen[splats.indices[splats.touched]] = True
+    return seen
 
 
 class ModelState:

@@ -13,7 +13,7 @@ from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.assembly import make_density, make_losses, make_regularizer
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import Photometric
-from reference_trainer.training.model_state import drawn_by_any, initial_gaussians
+from reference_trainer.training.model_state import initial_gaussians, seen_by_any
 
 __all__ = ["DROPOUT_GAINS", "FAR_APART_GAINS", "RULES", "PlanItem"]
 
@@ -153,7 +153,7 @@ def unseen(scene: Scene, config: TrainConfig) -> PlanItem:
     """Initial Gaussians that have no pixel in a training view: they would stay as they are and fog the test views."""
     name = "Gaussians outside every view"
     start = initial_gaussians(scene, replace(config, initial_points="all"))
-    outside = len(start) - int(drawn_by_any(start, scene.train).sum())
+    outside = len(start) - int(seen_by_any(start, scene.train).sum())
     counts = f"{outside} of {len(start)} initial Gaussians have no pixel in a training view"
     if outside == 0:
         return PlanItem(name, "left out", f"by construction: {counts}")

@@ -109,7 +109,7 @@ def _masked(
 ) -> None:  # fmt: skip
     """Composite K images of the same lists; table columns from 9 on are factors on alphas."""
     count = images.shape[0]
-    states, ended, kept = np.empty((count, 4 * PIXELS), f4), np.empty(count, np.bool_), np.empty(CHUNK + 1, np.int64)
+    states, ended, visible = np.empty((count, 4 * PIXELS), f4), np.empty(count, np.bool_), np.empty(CHUNK + 1, np.int64)
     entries, alphas = np.empty((CHUNK + 1, table.shape[1]), f4), np.empty((CHUNK + 1, PIXELS), f4)
     for tile in range(first, last):
         states[:] = _ZERO
@@ -130,12 +130,12 @@ def _masked(
                     continue
                 s, shown = states[mask], 0
                 for k in range(last_entry):
-                    kept[shown] = k
+                    visible[shown] = k
                     shown += entries[k, 9 + mask] > _ZERO
-                kept[shown] = last_entry  # an invisible one
+                visible[shown] = last_entry  # an invisible one
                 for k in range(0, shown, 2):
-                    a, b = entries[kept[k]], entries[kept[k + 1]]
-                    alpha_a, alpha_b = alphas[kept[k]], alphas[kept[k + 1]]
+                    a, b = entries[visible[k]], entries[visible[k + 1]]
+                    alpha_a, alpha_b = alphas[visible[k]], alphas[visible[k + 1]]
                     red_a, green_a, blue_a, red_b, green_b, blue_b = a[6], a[7], a[8], b[6], b[7], b[8]
                     factor_a, factor_b = a[9 + mask], b[9 + mask]
                     for p in range(PIXELS):
@@ -263,12 +263,12 @@ def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tenso
     return image, 1 - transmittance[0], depths[0]
 
 
-def absolute_gradients(splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
+def absolute_gradients(splats: Splats, rendered: Tensor, gradient: Tensor) -> Tensor:
     """Sum the absolute gradients of the centers, see `Engine.absolute_gradients`."""
     # The kernel works with transmittance, 1 - alpha, whose gradient has the other sign.
     lists, table = splats.lists, tiles.make_table(splats, splats.projection.depths[:, None])
     rows = table.new_empty(lists.gaussians.shape[0], 2)
     assert lists.slots is not None
-    images = (lists.padded(x) for x in (1 - drawn[4:], drawn[:4], -gradient[4:], gradient[:4]))
+    images = (lists.padded(x) for x in (1 - rendered[4:], rendered[:4], -gradient[4:], gradient[:4]))
     tiles.over_tiles(_absolute, lists, lists.slots, table, *images, rows)
     return torch.segment_reduce(rows, "sum", offsets=lists.offsets)

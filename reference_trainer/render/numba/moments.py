@@ -41,7 +41,7 @@ Array = Any
 f4 = np.float32
 _ZERO, _ONE, _TWO = f4(0), f4(1), f4(2)
 
-# Offsets into a tile's state, see drawing.py.
+# Offsets into a tile's state, see compositing.py.
 _MEAN, _MEAN_1, _MEAN_2, _TRANSMITTANCE = (i * PIXELS for i in range(4))
 _VARIANCE, _VARIANCE_1, _VARIANCE_2 = (i * PIXELS for i in range(4, 7))
 _TO_MEAN, _TO_MEAN_1, _TO_MEAN_2, _TO_TRANSMITTANCE = (i * PIXELS for i in range(7, 11))
@@ -131,7 +131,7 @@ def _make_backward(complete: bool) -> Any:
         hidden_i comes from the recursion hidden_{i-1} = shrink_i hidden_i + Q_i spread_i, back to
         front, since a division by S would fail at 0; u_i and S_i come front to back.
         """
-        kept = np.empty(np.diff(starts[first : last + 1]).max() * size * PIXELS, f4)
+        memory = np.empty(np.diff(starts[first : last + 1]).max() * size * PIXELS, f4)
         s = np.empty(_SIZE, f4)  # _VARIANCE holds the gradient of the variance
         for tile in range(first, last):
             s[_TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
@@ -150,7 +150,7 @@ def _make_backward(complete: bool) -> Any:
                     continue
                 polynomial = tiles.footprint(table, i, tile, columns)
                 r, g, b, factor, varies = table[i, 6], table[i, 7], table[i, 8], table[i, 9], table[i, 10]
-                of_entry = kept[k * size * PIXELS : (k + 1) * size * PIXELS]
+                of_entry = memory[k * size * PIXELS : (k + 1) * size * PIXELS]
                 for p in range(PIXELS):
                     raw = tiles.alpha_at(polynomial, p)
                     expected, spread, passed, shrink = _random(tiles.clamped(raw), factor, varies)
@@ -176,7 +176,7 @@ def _make_backward(complete: bool) -> Any:
                     continue
                 factor, varies = table[i, 9], table[i, 10]
                 to_r, to_g, to_b, to_factor, to_varies, share = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
-                of_entry = kept[k * size * PIXELS : (k + 1) * size * PIXELS]
+                of_entry = memory[k * size * PIXELS : (k + 1) * size * PIXELS]
                 for p in range(PIXELS):
                     raw, d0, d1, d2 = of_entry[_RAW + p], of_entry[_D0 + p], of_entry[_D1 + p], of_entry[_D2 + p]
                     u0, u1, u2 = s[_TO_MEAN + p], s[_TO_MEAN_1 + p], s[_TO_MEAN_2 + p]

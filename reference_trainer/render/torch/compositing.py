@@ -285,9 +285,9 @@ def moments(block: Block, rows: Tensor, background: Tensor) -> Tensor:
     mean, variance = background, torch.zeros_like(background)
     # unbind, because indexing would copy everything in the backward pass.
     entries = zip(*(reversed(x.unbind(0)) for x in terms), strict=True)
-    for e, s, kept, value in entries:
+    for e, s, shrink, value in entries:
         contrast = value - mean
-        variance = kept * variance + s * contrast.square()
+        variance = shrink * variance + s * contrast.square()
         mean = mean + e * contrast
     return torch.cat([mean, variance, 1 - (1 - expected).prod(0)], dim=1)
 

@@ -113,11 +113,11 @@ class TorchEngine:
 
     def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
         """Draw one picture after the other."""
-        drawn = (self.composite(self.masked(splats, row), background, depth=False) for row in opacities)
-        images, alphas, _ = zip(*drawn, strict=True)
+        rendered = (self.composite(self.masked(splats, row), background, depth=False) for row in opacities)
+        images, alphas, _ = zip(*rendered, strict=True)
         return torch.stack(images), torch.stack(alphas)
 
-    def absolute_gradients(self, splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
+    def absolute_gradients(self, splats: Splats, rendered: Tensor, gradient: Tensor) -> Tensor:
         """Differentiate block after block."""
         rows = pad_entries(torch.cat([geometry_rows(splats), splats.colors.T, splats.projection.depths[None]]))
         upstream, total, pixels = tile(gradient, splats.lists), rows.new_zeros(2, rows.shape[1]), pixel_offsets(rows)

@@ -1,4 +1,4 @@
-"""Density control: the strategies, one per file, and their registry: what ``--density`` knows by name."""
+"""Density control: the strategies and their registry: what ``--density`` knows by name."""
 
 from ca_reg.registry import Registry
 from reference_trainer.training.density.adaptive import AbsGradDensity, AdaptiveDensity

@@ -50,7 +50,7 @@ class DensityStatistics:
     def update(
         self,
         indices: Tensor,
-        drawn: Tensor,
+        rendered: Tensor,
         gradient: Tensor,
         width: int,
         height: int,
@@ -59,9 +59,9 @@ class DensityStatistics:
         """Count one step.
 
         Args:
-            indices: the Gaussians that may have been drawn, each once, shape (M,).
-            drawn: which of them were, shape (M,) bool.
-            gradient: of the loss with respect to their projected centers, per pixel; 0 if not drawn, shape (M, 2).
+            indices: the Gaussians that may have been rendered, each once, shape (M,).
+            rendered: which of them were, shape (M,) bool.
+            gradient: of the loss with respect to their projected centers, per pixel; 0 if not rendered, shape (M, 2).
             width: image width, pixels.
             height: image height, pixels.
             absolute: the sums over the pixels of the absolute gradients, shape (M, 2).
@@ -72,7 +72,7 @@ class DensityStatistics:
                 # the size of the image.
                 norms = torch.hypot(0.5 * width * x[:, 0], 0.5 * height * x[:, 1])
                 total.index_add_(0, indices, norms.to(total))
-        self.steps.index_add_(0, indices, drawn.to(self.steps))
+        self.steps.index_add_(0, indices, rendered.to(self.steps))
 
     def named(self) -> dict[str, Tensor]:
         """Return the statistics that are kept, by name."""

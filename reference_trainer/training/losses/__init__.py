@@ -1,4 +1,4 @@
-"""The terms of the training loss, one per file, and their registry: what ``--loss`` knows by name."""
+"""The terms of the training loss, and their registry: what ``--loss`` knows by name."""
 
 from ca_reg.registry import Registry
 from ca_reg.schedules import SCHEDULES

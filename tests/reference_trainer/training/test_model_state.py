@@ -13,7 +13,7 @@ from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.training.assembly import check
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.model_state import drawn_by_any, initial_gaussians
+from reference_trainer.training.model_state import initial_gaussians, seen_by_any
 from reference_trainer.training.step import Step
 from reference_trainer.training.trainer import Trainer
 
@@ -44,13 +44,13 @@ def test_a_gaussian_is_drawn_where_its_footprint_reaches_the_picture():
     means = torch.tensor([[0.0, 0.0, 10.0], [9.0, 0.0, 10.0], [40.0, 0.0, 10.0], [0.0, 0.0, -10.0]])
     gaussians = Gaussians.from_points(means, torch.rand(4, 3), torch.ones(4), sh_degree=0)
     view = View("a", camera(), torch.zeros(3, 24, 32))
-    assert drawn_by_any(gaussians, (view,)).tolist() == [True, True, False, False]
+    assert seen_by_any(gaussians, (view,)).tolist() == [True, True, False, False]
 
 
 def test_unseen_points_change_nothing_at_the_training_views(tiny_scene):
     """Without draws, which depend on the number of Gaussians, training is the same but for rounding."""
     scene = with_points(tiny_scene, BEHIND.repeat(3, 1) + torch.arange(3.0)[:, None])
-    drawn = drawn_by_any(initial_gaussians(scene, TrainConfig()), scene.train)
+    drawn = seen_by_any(initial_gaussians(scene, TrainConfig()), scene.train)
     assert torch.nonzero(~drawn).flatten().tolist() == [150, 151, 152]
     config = TrainConfig(iterations=6, sh_every=2, densify_every=0, opacity_reset_from=3)
     everything, seen = (Trainer(scene, dataclasses.replace(config, initial_points=which)) for which in ("all", "seen"))

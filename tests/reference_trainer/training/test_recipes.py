@@ -20,7 +20,7 @@ from reference_trainer.scenes.scene import Scene
 from reference_trainer.training import step as step_module
 from reference_trainer.training.assembly import check, make_density, make_losses
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.density import absgrad, adaptive
+from reference_trainer.training.density import adaptive
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.recipes import RECIPES, with_recipe
 from reference_trainer.training.trainer import Trainer
@@ -116,7 +116,6 @@ def control(monkeypatch: pytest.MonkeyPatch, scene: Scene, config: TrainConfig) 
     note("prune", lambda *a, max_scale, **k: None if max_scale is None else pytest.approx(max_scale / scene.extent))
     note("reset_opacity", lambda optimizer, ceiling: ceiling)
     note("decay_opacity", lambda optimizer, factor: factor)
-    monkeypatch.setattr(absgrad, "reset_opacity", adaptive.reset_opacity)
     for trainer.step in range(config.iterations):
         trainer.density.before_step(trainer.optimizer, trainer.step)
     return events
