@@ -1,8 +1,10 @@
-"""What is timed."""
+"""What is timed, and by which clock."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
+from time import process_time
 
 import torch
 from torch import Tensor
@@ -12,9 +14,10 @@ from reference_trainer.camera import Camera
 from reference_trainer.render import render
 from reference_trainer.render.engine import drawn_by, engines_on
 from reference_trainer.renderers.gsplat import load_gsplat_render
-from reference_trainer.studies.stability.baseline import render_simply
+from reference_trainer.studies.stability.quantities import render_simply
+from reference_trainer.studies.study import Clock, now
 
-__all__ = ["BASELINE", "PASSES", "Draw", "draw_of", "gradients", "image", "others_on"]
+__all__ = ["BASELINE", "PASSES", "Draw", "draw_of", "gradients", "image", "others_on", "processor_clock"]
 
 PASSES = ("forward", "forward+backward")
 
@@ -72,3 +75,8 @@ def gradients(draw: Draw, workload: Workload) -> dict[str, Tensor]:
     leaves = {name: x.detach().requires_grad_() for name, x in workload.parameters.items()}
     loss = (draw(leaves, workload.camera) - workload.target).square().mean()
     return dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
+
+
+def processor_clock(device: torch.device) -> Clock:
+    """Return a clock less disturbed by other programs: CPU time of this process; on a GPU, `now`."""
+    return process_time if device.type == "cpu" else partial(now, device)

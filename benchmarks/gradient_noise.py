@@ -31,8 +31,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
 from reference_trainer.runs.run import load_run
 from reference_trainer.scenes.scene import View
-from reference_trainer.studies.clocks import now
-from reference_trainer.studies.study import Record, Records, Study, checkpoints, run_study
+from reference_trainer.studies.study import Record, Records, Study, checkpoints, now, run_study
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.randomness import stream
 

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import torch
 import tyro
 
-from benchmarks.calls import PASSES, draw_of, gradients, image
+from benchmarks.calls import PASSES, draw_of, gradients, image, processor_clock
 from benchmarks.growth_axes import Axis, gaussians_per_pixel, growth_axes
 from benchmarks.growth_report import fits, growth_figure, growth_tables
 from benchmarks.memory import peak_memory
@@ -26,7 +26,7 @@ from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.render.engine import engines_on
-from reference_trainer.studies.clocks import in_turns, processor_clock
+from reference_trainer.studies.study import in_turns
 
 __all__ = ["extrapolated", "growth", "measure_growth"]
 

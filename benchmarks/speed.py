@@ -17,7 +17,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from benchmarks.calls import BASELINE, PASSES, Draw, draw_of, gradients, image, others_on
+from benchmarks.calls import BASELINE, PASSES, Draw, draw_of, gradients, image, others_on, processor_clock
 from benchmarks.memory import peak_memory
 from benchmarks.speed_report import regressions, speed_tables
 from benchmarks.stages import STAGES, Staged, staged
@@ -29,7 +29,7 @@ from reference_trainer.json_files import read_json
 from reference_trainer.render.engine import engines_on
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.studies.clocks import in_turns, now, processor_clock
+from reference_trainer.studies.study import in_turns, now
 
 __all__ = ["measure_speed", "speed"]
 

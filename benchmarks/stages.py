@@ -12,7 +12,7 @@ from torch import Tensor
 from benchmarks.workloads import Workload
 from reference_trainer.render import splat
 from reference_trainer.render.engine import drawn_by, engine_for
-from reference_trainer.studies.clocks import Clock
+from reference_trainer.studies.study import Clock
 
 __all__ = ["STAGES", "Staged", "staged"]
 

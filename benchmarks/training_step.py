@@ -15,7 +15,7 @@ from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render.engine import drawn_by
 from reference_trainer.scenes.scene import Scene, View
-from reference_trainer.studies.clocks import Clock, in_turns
+from reference_trainer.studies.study import Clock, in_turns
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
