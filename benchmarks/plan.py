@@ -8,26 +8,75 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 import tyro
+from torch import Tensor
 
+from benchmarks.calls import processor_clock
 from benchmarks.memory import PROCESS, process_status
-from benchmarks.plan_parts import parts_of_a_step
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
+from reference_trainer.losses.photometric import photometric_loss
+from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.render import render
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.studies.study import Study, run_study
+from reference_trainer.studies.study import Study, in_turns, run_study
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import Plan, make_plan
+from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["ALTERNATIVES", "plan", "plan_study", "plan_table", "shortened", "variants"]
+__all__ = ["ALTERNATIVES", "parts_of_a_step", "plan", "plan_study", "plan_table", "shortened", "variants"]
+
+_DROP_RATE = 0.2
+
+
+def parts_of_a_step(trainer: Trainer, *, repeats: int = 7) -> dict[str, float]:
+    """Time render, loss and gradients at the first training view, and how much more or less certain changes take.
+
+    Args:
+        trainer: with the model to measure; it does not change.
+        repeats: rounds, in turns, of which the fastest counts.
+
+    Returns:
+        Seconds, of processors on a CPU: of the "step" (render, loss, gradients), and by how much each change differs.
+    """
+    gaussians, view, background = trainer.gaussians, trainer.views[0], trainer.background
+    leaves = [x for _, x in gaussians.named() if x.numel()]
+    generator = stream(trainer.config.seed, 0, "dropout", trainer.device)
+    kept = torch.rand(len(gaussians), generator=generator, device=trainer.device) >= _DROP_RATE
+    score, model = model_of(trainer).exact_ca_score(), model_of(trainer)
+
+    def step(*, degree: int | None = None, depth: bool = False, opacities: Tensor | None = None) -> None:
+        out = render_gaussians(gaussians, view.camera, background, opacities=opacities, sh_degree=degree, depth=depth)
+        loss = photometric_loss(out.image, view.image)
+        torch.autograd.grad(loss if out.depth is None else loss + 0 * out.depth.mean(), leaves, allow_unused=True)
+
+    def without_background() -> None:
+        g = gaussians
+        out = render(g.means, g.quaternions, g.scales, g.opacities, view.camera, sh=g.sh)
+        loss = photometric_loss(out.image, view.image)
+        torch.autograd.grad(loss, leaves, allow_unused=True)
+
+    calls: dict[str, Callable[[], object]] = {
+        "step": step,
+        "all bands left out": lambda: step(degree=0),
+        "background left out": without_background,
+        "depth added": lambda: step(depth=True),
+        f"{_DROP_RATE:.0%} of the Gaussians dropped": lambda: step(opacities=gaussians.opacities * kept),
+    }
+    calls["exact moments added"] = lambda: score(model.gaussians.opacities, view)
+    seconds = in_turns(calls, repeats, processor_clock(trainer.device))
+    fastest = {name: min(times) for name, times in seconds.items()}
+    fastest["exact moments added"] += fastest["step"]
+    return {name: seconds - fastest["step"] * (name != "step") for name, seconds in fastest.items()}
+
 
 AS_ASKED = "as asked"
 WHOLE_PLAN = "the whole plan"

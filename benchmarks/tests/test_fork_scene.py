@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.fork_scene import write_scene
+from benchmarks.side_by_side import write_scene
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.depth import point_prior
 from reference_trainer.scenes.options import SceneOptions

@@ -5,8 +5,7 @@ import json
 import pytest
 
 from benchmarks import growth as module
-from benchmarks.growth import extrapolated, measure_growth
-from benchmarks.growth_axes import Axis
+from benchmarks.growth import Axis, extrapolated, measure_growth
 from benchmarks.workloads import WorkloadSpec
 
 MIB = 1 << 20

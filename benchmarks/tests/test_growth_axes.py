@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.growth_axes import calibrated, gaussians_per_pixel, growth_axes
+from benchmarks.growth import calibrated, gaussians_per_pixel, growth_axes
 from benchmarks.workloads import WORKLOADS, WorkloadSpec, covered_pairs
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.growth_report import fit_exponent, fits
+from benchmarks.growth import fit_exponent, fits
 
 
 def test_a_power_law_is_recovered_exactly():

@@ -9,8 +9,7 @@ from subprocesses import subprocess_environment
 from waiting import PATIENCE, until
 
 from benchmarks import plan as plan_module
-from benchmarks.plan import ALTERNATIVES, plan_study, plan_table, shortened, variants
-from benchmarks.plan_parts import parts_of_a_step
+from benchmarks.plan import ALTERNATIVES, parts_of_a_step, plan_study, plan_table, shortened, variants
 from reference_trainer.runs.engines.engine import Task
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all

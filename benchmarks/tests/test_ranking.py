@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from benchmarks import ranking as ranking_module
-from benchmarks.ranking import correlations, disagreements, group_labels, mean_of, ranking_study
-from benchmarks.score_variants import VARIANTS, score_view
+from benchmarks.ranking import VARIANTS, correlations, disagreements, group_labels, mean_of, ranking_study, score_view
 from reference_trainer.camera import Camera
 from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.trained_model import TrainedModel

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks import side_by_side, trainers
+from benchmarks import side_by_side
 from benchmarks.timed import main
 
 
@@ -46,7 +46,7 @@ def test_what_is_kept_is_not_measured_again(tmp_path, monkeypatch):
 
     def train(trainer, setting, seed, out, args):
         asked.append((trainer, setting, seed))
-        return {"setting": trainers.named(trainer, setting), "seed": seed, "gaussians": 9}
+        return {"setting": side_by_side.named(trainer, setting), "seed": seed, "gaussians": 9}
 
     monkeypatch.setattr(side_by_side, "train", train)
     (tmp_path / "llff").mkdir()
@@ -64,13 +64,13 @@ def test_what_is_kept_is_not_measured_again(tmp_path, monkeypatch):
 
 def test_every_command_line_is_complete():
     names = {"scene": "s", "images": "i", "out": "o", "forks": "f", "both": "b", "fork_scene": "l", "seed": 7}
-    for trainer, command in trainers.TRAINERS.items():
-        told = command.format(**names, **trainers.steps(300), option="--dropout 0.2").split()
+    for trainer, command in side_by_side.TRAINERS.items():
+        told = command.format(**names, **side_by_side.steps(300), option="--dropout 0.2").split()
         own = trainer in ("splatfacto-ca", "Co-Adaptation-of-3DGS --dropout_factor 0.2")
         assert (told.count("--dropout"), told.count("--seed"), told[told.index("--seed") + 1]) == (1 - own, 1, "7")
         assert "300" in told
-        assert own == (trainers.named(trainer, "dropout") == {"recipe": trainer})
-    assert len({trainers.TRAINERS[name] for name in trainers.TRAINERS}) == len(trainers.TRAINERS)
+        assert own == (side_by_side.named(trainer, "dropout") == {"recipe": trainer})
+    assert len({side_by_side.TRAINERS[name] for name in side_by_side.TRAINERS}) == len(side_by_side.TRAINERS)
 
 
 def test_depth_of_a_network_that_is_downloaded_is_that_of_files(tmp_path, monkeypatch):
