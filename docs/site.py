@@ -34,12 +34,20 @@ def _link(obj: griffe.Object, short: str, name: str) -> str:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
-    """Give the start page the README up to its mark, with the links, which lie in this folder."""
-    if page.file.src_uri != "index.md":
-        return markdown
-    shown, rest = Path("README.md").read_text("utf-8").split("<!-- the site ends here -->")
-    links = "\n".join(re.findall(r"^\[.*", rest, re.MULTILINE))
-    return markdown + shown + links.replace(": docs/", ": ").replace(": CHANGELOG", ": changelog")
+    """Give the start page the README up to its mark; name the pages of benchmarks, which are no part of the site."""
+    if page.file.src_uri == "index.md":
+        shown, rest = Path("README.md").read_text("utf-8").split("<!-- the site ends here -->")
+        for name, target in re.findall(r"^\[([\w-]+)\]: (.*)", rest, re.MULTILINE):
+            target = target.removeprefix("docs/").replace("CHANGELOG", "changelog")
+            shown = shown.replace(f"][{name}]", f"]({target})")
+        markdown += shown.replace("](benchmarks/", "](../benchmarks/")
+    return re.sub(r"\[([^\]]+)\]\(\.\./(benchmarks/[^)\s#]*)[^)\s]*\)", _named, markdown)
+
+
+def _named(link: re.Match[str]) -> str:
+    """Return the words of a link and the file that it leads to in a checkout."""
+    text, file = link.groups()
+    return f"`{file}`" if file in text else f"{text} (`{file}`)"
 
 
 def on_page_content(content: str, **_: object) -> str:

@@ -5,8 +5,7 @@ from decimal import Decimal, localcontext
 import numpy as np
 import torch
 
-from reference_trainer.studies.stability.quantities import loss_weights
-from reference_trainer.studies.stability.scenes import PARAMETERS
+from reference_trainer.studies.stability.quantities import PARAMETERS, loss_weights
 
 __all__ = ["exact_images"]
 

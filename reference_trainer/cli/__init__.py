@@ -22,7 +22,7 @@ from reference_trainer.cli.ply import Bake, Clean
 from reference_trainer.cli.poses import Poses
 from reference_trainer.cli.report import Report, View
 from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
-from reference_trainer.cli.studies import Study
+from reference_trainer.cli.studies import MOVED, Study
 from reference_trainer.devices import check_device
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
@@ -53,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _parse(arguments: Sequence[str]) -> Any:
     """Return the command with its options; exits if they cannot be parsed."""
+    if arguments[:1] == ["study"] and (moved := MOVED.get("".join(arguments[1:2]))):
+        raise ValueError(f"study {arguments[1]} is now {moved}, called from a checkout of the repository.")
     peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
     peek.add_argument("--recipe", choices=list(RECIPES))
     peek.add_argument("--iterations", type=int, default=argparse.SUPPRESS)

@@ -25,8 +25,7 @@ from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.score_ply import of_plain_ply
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.scenes.virtual_cameras import orbit_views
-from reference_trainer.studies.clocks import in_turns, now
-from reference_trainer.studies.study import Record, Records, Study, checkpoints
+from reference_trainer.studies.study import Record, Records, Study, checkpoints, in_turns, now
 
 __all__ = ["entries_of", "error_runtime", "error_runtime_study", "rms", "samples_to_match", "single", "slope"]
 

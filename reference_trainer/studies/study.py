@@ -7,7 +7,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
+
+import torch
 
 from reference_trainer.evaluation.kept import KeptRecords, fingerprint
 from reference_trainer.evaluation.results import machine, write_json
@@ -21,9 +24,11 @@ from reference_trainer.runs.lock import run_lock
 if TYPE_CHECKING:  # an extra
     from matplotlib.figure import Figure
 
-__all__ = ["Record", "Records", "Study", "checkpoints", "run_study"]
+__all__ = ["Clock", "Record", "Records", "Study", "checkpoints", "in_turns", "now", "run_study"]
 
 Say = Callable[[str], None]
+Clock = Callable[[], float]
+"""Returns seconds."""
 Record = dict[str, Any]
 """The measurement of one case: strings, numbers including nan and infinity, None, lists and dictionaries."""
 Records = Mapping[str, Record]
@@ -148,3 +153,36 @@ def _decisive(settings: Any) -> Any:
     if isinstance(settings, dict):
         return {name: _decisive(value) for name, value in settings.items()}
     return [_decisive(value) for value in settings] if isinstance(settings, list | tuple) else settings
+
+
+def in_turns(calls: Mapping[str, Callable[[], object]], repeats: int, clock: Clock) -> dict[str, list[float]]:
+    """Time several calls in turns, so that a change in the machine's load affects all of them alike.
+
+    Args:
+        calls: by name.
+        repeats: number of timed rounds, after one untimed round.
+        clock: such as `now` of a device, or `time.process_time`.
+
+    Returns:
+        Seconds of every round, by name.
+
+    Example:
+        >>> len(in_turns({"nothing": lambda: None}, 3, perf_counter)["nothing"])
+        3
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for call in calls.values():
+        call()
+    for _ in range(repeats):
+        for name, call in calls.items():
+            start = clock()
+            call()
+            seconds[name].append(clock() - start)
+    return seconds
+
+
+def now(device: torch.device) -> float:
+    """Wait until all work queued on a device is done; return the wall-clock time in seconds."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return perf_counter()

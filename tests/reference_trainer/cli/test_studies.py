@@ -3,31 +3,16 @@
 from pathlib import Path
 
 import pytest
+from commands import refused
 
 from reference_trainer.cli import main
 from reference_trainer.studies import error_runtime as error_runtime_module
-from reference_trainer.studies import gaussian_shares as shares_module
 from reference_trainer.studies import study as study_module
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["attribution", "r"], ("r", None, {"split": "test", "drop_rate": 0.5})),
-        (["attribution", "r", "--out", "o", "--split", "train", "--drop-rate", "0.3"],
-         ("r", "o", {"split": "train", "drop_rate": 0.3})),
-    ],
-)  # fmt: skip
-def test_attribution(arguments, expected, monkeypatch):
-    asked = []
-
-    def fake(run, out, **keywords):
-        asked.append((str(run), out and str(out), keywords))
-
-    monkeypatch.setattr(shares_module, "study_attribution", fake)
-    main(["study", *arguments])
-    source, out, keywords = expected
-    assert asked == [(source, out, {**keywords, "device": "cpu"})]
+@pytest.mark.parametrize("name", ["paper", "attribution"])
+def test_a_study_that_moved_is_refused_with_its_new_name(name, capsys):
+    assert f"python -m benchmarks.{name}" in refused(["study", name, "--list"], capsys)
 
 
 def test_error_runtime(monkeypatch):

@@ -1,5 +1,6 @@
 """What runs every study: records on the disk, what of them is used again, and what is written of all."""
 
+import itertools
 import json
 import math
 import os
@@ -12,7 +13,7 @@ from stand_ins.engine import Here
 from reference_trainer.runs.folder import CHECKPOINT
 from reference_trainer.runs.lock import FolderInUseError, run_lock
 from reference_trainer.studies import study as study_module
-from reference_trainer.studies.study import Study, checkpoints, run_study
+from reference_trainer.studies.study import Study, checkpoints, in_turns, run_study
 
 measured: list[str] = []
 
@@ -150,3 +151,10 @@ def test_a_folder_where_another_study_is_at_work_is_left_alone(tmp_path):
         assert (measured, sorted(tmp_path.iterdir())) == ([], before)
     run_study(study(a={"text": "x"}), tmp_path, say=quiet)
     assert measured == ["x"]
+
+
+def test_calls_are_made_in_turns_and_the_first_round_is_not_timed():
+    made = []
+    calls = {name: lambda name=name: made.append(name) for name in "ab"}
+    assert in_turns(calls, 3, itertools.count().__next__) == {"a": [1] * 3, "b": [1] * 3}
+    assert made == ["a", "b"] * 4

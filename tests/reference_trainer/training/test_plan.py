@@ -7,10 +7,10 @@ import pytest
 import torch
 from pages import ROOT
 
+from benchmarks.paper.claims import Check
+from benchmarks.paper.comparison import Kept, differences
 from reference_trainer.scenes.scene import PointCloud, Scene
 from reference_trainer.scenes.virtual_cameras import look_at
-from reference_trainer.studies.paper.claims import Check
-from reference_trainer.studies.paper.comparison import Kept, differences
 from reference_trainer.training import step as step_module
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import Plan, PlanItem, make_plan

@@ -12,8 +12,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import render
 from reference_trainer.render.engine import using_engine
 from reference_trainer.render.renderer import render_moments
-from reference_trainer.studies.stability.quantities import scene_quantities, splats_of
-from reference_trainer.studies.stability.scenes import PARAMETERS, base_scene
+from reference_trainer.studies.stability.quantities import PARAMETERS, base_scene, scene_quantities, splats_of
 
 AT = 4  # the number of the element that is bad
 HALF = F.Multiplier.dropout(0.5)

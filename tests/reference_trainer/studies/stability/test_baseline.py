@@ -6,7 +6,7 @@ import pytest
 import torch
 from oracles import brute_force, random_scene
 
-from reference_trainer.studies.stability.baseline import render_simply
+from reference_trainer.studies.stability.quantities import render_simply
 
 
 @pytest.mark.parametrize("size", [0.03, 0.4])  # the larger ones are opaque: the early stop and the clamp matter

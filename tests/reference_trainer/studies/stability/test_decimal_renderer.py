@@ -8,14 +8,16 @@ from decimal_renderer import exact_images
 from oracles import brute_force
 
 from reference_trainer.render.engine import engines_on, using_engine
-from reference_trainer.studies.stability.judge import GRADIENT_TOLERANCE, VALUE_TOLERANCE, relative_error
 from reference_trainer.studies.stability.quantities import (
     IMAGES,
+    PARAMETERS,
+    base_scene,
+    camera_of,
     independent_images,
     loss_weights,
     scene_quantities,
 )
-from reference_trainer.studies.stability.scenes import PARAMETERS, base_scene, camera_of
+from reference_trainer.studies.stability.stability_study import GRADIENT_TOLERANCE, VALUE_TOLERANCE, relative_error
 
 
 def test_image_and_gradients_equal_brute_force():

@@ -5,8 +5,13 @@ import math
 import pytest
 import torch
 
-from reference_trainer.studies.stability.case import Case, Probe, decades, single
-from reference_trainer.studies.stability.judge import GRADIENT_TOLERANCE, VALUE_TOLERANCE, judge, relative_error
+from reference_trainer.studies.stability.cases import Case, Probe, decades, single
+from reference_trainer.studies.stability.stability_study import (
+    GRADIENT_TOLERANCE,
+    VALUE_TOLERANCE,
+    judge,
+    relative_error,
+)
 
 
 def growing(x, *, name="image", rate=1e-6):

@@ -7,16 +7,19 @@ import pytest
 import torch
 from oracles import brute_force
 
-from reference_trainer.studies.stability.judge import relative_error
 from reference_trainer.studies.stability.quantities import (
     IMAGES,
+    PARAMETERS,
     SCENE_QUANTITIES,
+    base_scene,
+    camera_of,
     independent_images,
     loss_weights,
     reference_quantities,
     scene_quantities,
+    stack,
 )
-from reference_trainer.studies.stability.scenes import PARAMETERS, base_scene, camera_of, stack
+from reference_trainer.studies.stability.stability_study import relative_error
 
 
 def over_background(scene, **changes):

@@ -8,11 +8,9 @@ from PIL import Image
 
 from reference_trainer.render import renderer
 from reference_trainer.studies.stability import stability_study as module
-from reference_trainer.studies.stability.case import Case, Probe, decades, single
-from reference_trainer.studies.stability.judge import judge
-from reference_trainer.studies.stability.quantities import splats_of
-from reference_trainer.studies.stability.scenes import base_scene
-from reference_trainer.studies.stability.stability_study import all_cases, judge_with, stability_study, study_stability
+from reference_trainer.studies.stability.cases import Case, Probe, all_cases, decades, single
+from reference_trainer.studies.stability.quantities import base_scene, splats_of
+from reference_trainer.studies.stability.stability_study import judge, judge_with, stability_study, study_stability
 
 SLOW = {"Gaussians on one pixel", "renders K", "4096", "beyond any scene", "HDR"}
 

@@ -1,0 +1,118 @@
+"""Figures of the claims: gains against strength and number of views, and settings ranked by their gain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.paper.claims import GAINS, Check
+from benchmarks.paper.comparison import Kept, differences, interval, ranked
+from reference_trainer.runs.figures import new_figure
+
+__all__ = ["gains_figure", "ranking_figure"]
+
+_FIGURES = ("test psnr", "PSNR, dB more than without", 1.0), ("test ca_exact_half", "exact CA at 1/2, % more", 0.01)
+_DASHES = ".-", ".--"
+
+
+def gains_figure(kept: Kept, path: Path) -> None:
+    """Draw what is kept of `GAINS`: differences in PSNR and in the exact score, with two standard errors, by scene.
+
+    A scene has one color; lines of one scene differ by their dashes. A line needs at least three points, a column of
+    panels at least one line. A single seed has no error bar.
+
+    Args:
+        kept: the rows.
+        path: the PNG or SVG to write.
+
+    Raises:
+        ValueError: if there is no line to draw.
+        ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
+    """
+    panels = {axis: [_lines(axis, of, unit, kept) for of, _, unit in _FIGURES] for axis in GAINS}
+    panels = {axis: of for axis, of in panels.items() if any(of)}
+    if not panels:
+        raise ValueError(
+            f"{kept.folder} has no setting at three strengths or numbers of views: there is no line to draw."
+        )
+    colors = _colors(kept)
+    with new_figure(path) as figure:
+        figure.set_size_inches(1.5 + 4.5 * len(panels), 7)
+        grid = figure.subplots(len(_FIGURES), len(panels), sharex="col", sharey="row", squeeze=False)
+        for row, (_, title, _) in zip(grid, _FIGURES, strict=True):
+            row[0].set_ylabel(title)
+        for column, (axis, of) in zip(grid.T, panels.items(), strict=True):
+            for ax, lines in zip(column, of, strict=True):
+                ax.axhline(0, color="0.6", linewidth=0.8)
+                for (scene, name), places in lines.items():
+                    means, errors = zip(*places.values(), strict=True)
+                    style = _DASHES[[*GAINS[axis]].index(name)]
+                    label = f"{scene} {name}".strip()
+                    ax.errorbar([*places], means, errors, fmt=style, color=colors[scene], label=label, capsize=2)
+            ticks = sorted({x for lines in of for places in lines.values() for x in places})
+            if ticks[0] > 0:  # numbers of views
+                ax.set_xscale("log")
+                ax.set_xticks(ticks, labels=[f"{x:g}" for x in ticks])
+                ax.minorticks_off()
+            ax.set_xlabel(axis)
+            column[0].legend(fontsize="small")
+
+
+def ranking_figure(kept: Kept, names: Sequence[str], path: Path) -> None:
+    """Draw the settings of claims, the best first: difference in PSNR with two standard errors, and in the exact score.
+
+    Args:
+        kept: the rows.
+        names: of the claims, each with a row of two panels.
+        path: the PNG or SVG to write.
+
+    Raises:
+        ValueError: if nothing is known of a claim.
+        ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
+    """
+    ranks = {name: ranked(name, kept) for name in names}
+    if unknown := [name for name, rank in ranks.items() if not rank]:
+        raise ValueError(f"{kept.folder} has no two seeds of the settings of claim {unknown[0]}: nothing to rank.")
+    colors, sizes = _colors(kept), [len(rank) for rank in ranks.values()]
+    with new_figure(path) as figure:
+        figure.set_size_inches(13, 1.2 * len(sizes) + 0.3 * sum(sizes))
+        grid = figure.subplots(len(sizes), 2, sharex="col", sharey="row", squeeze=False, height_ratios=sizes)
+        for row, rank in zip(grid, ranks.values(), strict=True):
+            scenes = sorted({scene for _, _, gains in rank for scene in gains})
+            for number, scene in enumerate(scenes):
+                known = [(place, gains[scene]) for place, (_, _, gains) in enumerate(rank) if scene in gains]
+                # The scenes of a setting stand below each other, so that their bars do not cover each other.
+                heights = [place + 0.5 * (number / max(1, len(scenes) - 1) - 0.5) for place, _ in known]
+                style = {"fmt": ".", "color": colors[scene], "label": scene, "capsize": 2}
+                row[0].errorbar([x.psnr for _, x in known], heights, xerr=[x.error for _, x in known], **style)
+                row[1].plot([100 * x.score for _, x in known], heights, ".", color=colors[scene])
+            for panel in row:
+                panel.axvline(0, color="0.6", linewidth=0.8)
+                panel.grid(axis="y", color="0.9")
+                panel.set_axisbelow(True)
+            row[0].set_yticks(range(len(rank)), labels=[named for named, _, _ in rank], family="monospace")
+            row[0].set_ylim(len(rank) - 0.5, -0.5)
+            row[0].legend(fontsize="small")
+        for panel, (_, title, _) in zip(grid[-1], _FIGURES, strict=True):
+            panel.set_xlabel(title)
+
+
+def _colors(kept: Kept) -> dict[str, str]:
+    """Return the color of every scene, the same in all figures."""
+    return {scene: f"C{number}" for number, scene in enumerate(kept.scenes)}
+
+
+def _lines(axis: str, of: str, unit: float, kept: Kept) -> dict[tuple[str, str], dict[float, tuple[float, float]]]:
+    """Return the lines of a panel by scene and name: mean and two standard errors in ``unit``, by position."""
+    lines = {}
+    for name, pairs in GAINS[axis].items():
+        for scene in kept.scenes:
+            found = {x: differences(Check(of, *pair, relative=unit != 1), scene, kept) for x, pair in pairs.items()}
+            ends = {x: interval(seeds) for x, seeds in found.items() if seeds}
+            places = {
+                x: (mean / unit, error / unit if math.isfinite(error) else 0.0) for x, (mean, error) in ends.items()
+            }
+            if len(places) > 2:
+                lines[scene, name] = places
+    return lines
