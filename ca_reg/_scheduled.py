@@ -64,8 +64,8 @@ class Scheduled(nn.Module):
         self._check_rate(rate, f"{self.rate_name or 'the rate'} at step {step}")
         return rate
 
-    def rate_at(self, step: int) -> Rate:
-        """Return the rate at a step, for a draw ``x.step``; a number, after a check of its range.
+    def rate_at(self, step: int | None) -> Rate:
+        """Return the rate at a step, for a draw ``x.step``, None for the current one; a number, after a range check.
 
         Inside ``torch.compile`` it is that of the last :meth:`set_step`, a scalar tensor, so that one graph serves all.
         """

@@ -20,9 +20,11 @@ __all__ = ["Chain", "Foreign"]
 class Chain(Regularizer):
     """Regularizers applied one after the other; trainers and hooks wrap whatever they are given in a chain.
 
-    A Gaussian is dropped if any member drops it. Members in ``eval()`` apply their test-time value even in training. At
-    test time the members whose test-time value is a mean contribute their joint mean, in whatever order they are given;
-    ``nn.Sequential`` would evaluate the mean of the second at the mean of the first.
+    Use it in place of ``nn.Sequential``, which has no :attr:`keep`, :meth:`mask_radii` and :meth:`set_step`, and which
+    evaluates the mean of the second member at the mean of the first: in a chain the members whose test-time value is a
+    mean contribute their joint mean, in whatever order they are given. A Gaussian is dropped if any member drops it, so
+    :attr:`keep` is the product of their masks; a module that stands in a chain twice draws twice, and its own ``keep``
+    is only the last mask. Members in ``eval()`` apply their test-time value even in training.
 
     Args:
         members: regularizers; an ``nn.Sequential`` or another chain is flattened, and any other module is taken for a
@@ -86,7 +88,7 @@ class Chain(Regularizer):
         for member in self:
             if member.training:
                 x = member.regularize(x, generator)
-                draws.append(member.last)
+                draws.append(member.last)  # this thread's
             else:
                 member.check_needs(x)
                 x = member.expected(x)

@@ -6,9 +6,11 @@ import json
 import logging
 import math
 import os
+import weakref
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,6 +53,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         views: non-empty groups of views by name, usually ``{"train": [...], "test": [...]}``; a group is any iterable.
             The views are passed on to the callables as they are.
         every: number of steps between measurements, at least 1.
+        last_step: the last step of the training, measured whether or not it is a multiple of ``every``.
         psnr: ``psnr(opacity, view)`` returns the PSNR in dB of the view rendered with these opacities, already scaled
             by ``1 - p`` for test time. Called without gradients. None leaves PSNR out.
         details: ``details(opacity, view)`` returns, by name, what TensorBoard shows of the first view of each group
@@ -66,7 +69,8 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         TypeError: if ``views`` is not a mapping or an argument is of the wrong type.
         ValueError: if there are no views, a group is empty, ``every`` or ``resume_step`` is out of range, or a line of
             the log to resume is damaged.
-        OSError: if the log cannot be written, such as on a full disk; its earlier lines stay intact.
+        OSError: if the log cannot be written, such as on a full disk; its earlier lines stay intact. A BlockingIOError
+            if another monitor, in this process or another, has the directory open: each would lose lines of the other.
 
     Example:
         >>> import tempfile
@@ -86,13 +90,15 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         *,
         views: Mapping[str, Iterable[Any]],
         every: int = 500,
+        last_step: int | None = None,
         psnr: Callable[[Tensor, Any], float] | None = None,
         details: Callable[[Tensor, Any], Mapping[str, Tensor]] | None = None,
         resume_step: int | None = None,
     ) -> None:
         check_count(every, "every", minimum=1)
-        if resume_step is not None:
-            check_count(resume_step, "resume_step", minimum=0)
+        for name, step in (("last_step", last_step), ("resume_step", resume_step)):
+            if step is not None:
+                check_count(step, name, minimum=0)
         for name, fn in (("psnr", psnr), ("details", details)):
             if fn is not None:
                 check_callable(fn, name)
@@ -106,21 +112,27 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
             )
         self.score = score
         self.every = every
+        self.last_step = last_step
         self.psnr = psnr
         self.details = details
 
         folder = Path(log_dir)
         folder.mkdir(parents=True, exist_ok=True)
         self.path = folder / LOG_NAME
-        self._last_step = _keep_lines(self.path, resume_step)
-        self._file = self.path.open("ab", buffering=0)
-        self._writer = _summary_writer(folder, resume_step)
+        self._unlock = weakref.finalize(self, _lock(folder))
+        try:
+            self._logged = _keep_lines(self.path, resume_step)
+            self._file = self.path.open("ab", buffering=0)
+            self._writer = _summary_writer(folder, resume_step)
+        except BaseException:
+            self._unlock()
+            raise
         self.backends: tuple[str, ...] = ("jsonl",) if self._writer is None else ("jsonl", "tensorboard")
         hint = "" if self._writer else "; for TensorBoard: pip install 'ca_reg[tensorboard]'"
         _log.info("co-adaptation is logged to %s (%s)%s", self.path, ", ".join(self.backends), hint)
 
     def __call__(self, step: int, opacity: Tensor | Params) -> dict[str, float | int | str | None] | None:
-        """Measure and log if the step is due: a multiple of ``every``, later than the last step in the log.
+        """Measure and log if the step is due: a multiple of ``every`` or the last, and later than those in the log.
 
         Args:
             step: the training step.
@@ -136,7 +148,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         """
         check_count(step, "step", minimum=0)
         step = int(step)
-        if step % self.every or step <= self._last_step:
+        if (step % self.every and step != self.last_step) or step <= self._logged:
             return None
         if self._file.closed:
             raise ValueError("the monitor is closed; make a new one with resume_step to add to its log.")
@@ -159,7 +171,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
                 record[f"psnr/{name}"] = self._mean_psnr(self.psnr, opacity, group)
         record.update(asdict(self.score.settings))
         self._write(record)
-        self._last_step = step
+        self._logged = step
         if self.details is not None and self._writer is not None:
             self._show(self._writer, self.details, opacity, step)
         return record
@@ -167,6 +179,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
     def close(self) -> None:
         """Close the files. A second call does nothing."""
         self._file.close()
+        self._unlock()
         if self._writer is not None:
             self._writer.close()
 
@@ -217,6 +230,33 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
             self._file.truncate(end)
             reason = f"{error.strerror} (the last measurement is not logged)"
             raise OSError(error.errno, reason, str(self.path)) from error
+
+
+def _lock(folder: Path) -> Callable[[], Any]:
+    """Lock a directory for one monitor and return what unlocks it; the system unlocks it when the process ends."""
+    try:
+        import fcntl
+
+        handle = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):  # Windows has no such locks
+        return lambda: None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        reason = "another CAMonitor logs to this directory; close it, or give each its own log_dir"
+        raise BlockingIOError(error.errno, reason, str(folder)) from error
+    except OSError:  # such as a network file system without locks
+        os.close(handle)
+        return lambda: None
+    return partial(_unlock, handle)
+
+
+def _unlock(handle: int) -> None:
+    import fcntl
+
+    fcntl.flock(handle, fcntl.LOCK_UN)  # also for forked processes that hold the same handle
+    os.close(handle)
 
 
 def _keep_lines(path: Path, resume_step: int | None) -> int:

@@ -27,7 +27,7 @@ class Params(NamedTuple):
         sh: spherical-harmonic coefficients, constant band first, shape (N, K, 3).
         view_matrix: of the rendered camera, the first if there are several, shape (4, 4).
         learned: per-Gaussian values that regularizers learn, by name, each (N,).
-        step: the training step, which schedules follow; 0 for that of the module or score that is called.
+        step: the training step, from 0 on, which schedules follow; None for that of the module or score that is called.
 
     Example:
         >>> import torch
@@ -43,7 +43,7 @@ class Params(NamedTuple):
     sh: Tensor | None = None
     view_matrix: Tensor | None = None
     learned: Mapping[str, Tensor] | None = None
-    step: int = 0
+    step: int | None = None
 
 
 class Draw(NamedTuple):

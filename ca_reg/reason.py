@@ -8,7 +8,11 @@ __all__ = ["Reason"]
 
 
 class Reason(Enum):
-    """The outcome of a measurement. Every member but ``OK`` comes with the value nan, a message and a remedy.
+    """The outcome of a measurement: why a score has the value it has, as a message and a remedy.
+
+    Every member but ``OK`` and ``NO_EFFECT``, whose value is 0, comes with the value nan.
+
+    Convention: files store ``reason.name``, such as ``"EMPTY"``; people read ``str(reason)``.
 
     Example:
         >>> Reason.OK.message
@@ -26,6 +30,14 @@ class Reason(Enum):
     NOT_FINITE = (
         "NaN or infinity in an alpha, or in a color where the alpha is not 0",
         "look at the colors and opacities of the model: the training has diverged or the renderer is at fault",
+    )
+    OUT_OF_RANGE = (
+        "the variance is above that of any colors in [0, 1]",
+        "return images in [0, 1], not in 0..255; if they are, the colors of the model have diverged",
+    )
+    NO_EFFECT = (
+        "no pixel changed in any render, although Gaussians were left out",
+        "check that render_fn renders with the opacities that it is given, in place of the model's own",
     )
     NO_VIEWS = ("no view was measured", "call update(opacity, view) before compute()")
 

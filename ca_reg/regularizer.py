@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import weakref
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -15,6 +17,8 @@ from ca_reg.params import Draw, Params
 __all__ = ["Learned", "Regularizer"]
 
 Given = TypeVar("Given", Tensor, Params)
+
+_LOCK = threading.Lock()
 
 
 class Learned(NamedTuple):
@@ -40,7 +44,7 @@ class Regularizer(Scheduled):
     a draw; with a schedule ``state_dict`` saves the step.
 
     Called as a module it takes activated opacities, (N,) or (N, 1), or :class:`~ca_reg.Params`, and returns the same
-    type: under a new draw in ``train()``, the test-time value in ``eval()``.
+    type: under a new draw in ``train()``, the test-time value in ``eval()``. A ``generator=`` goes to the call.
 
     Attributes:
         needs: fields of :class:`~ca_reg.Params` besides the opacities that it reads or changes.
@@ -48,7 +52,8 @@ class Regularizer(Scheduled):
         drops: whether it may set opacities to 0.
         renders_mean: whether its test-time value is the mean of its draws.
         rate_name: name of the argument that may follow a schedule, for errors and ``print``.
-        last: the last draw; None if there was none, in evaluation, and in a copy.
+        last: the last draw; None if there was none, in evaluation, and in a copy. Each thread that calls the module has
+            its own, except inside ``torch.compile``.
         step: the training step, set with :meth:`set_step`.
 
     Example:
@@ -74,11 +79,29 @@ class Regularizer(Scheduled):
     learns: ClassVar[Mapping[str, Learned]] = {}
     drops: ClassVar[bool] = True
     renders_mean: bool = False
-    last: Draw | None = None
+    _latest: Draw | None = None
+    _by_thread: weakref.WeakKeyDictionary[threading.Thread, Draw | None] | None = None
+
+    @property
+    def last(self) -> Draw | None:
+        """The last draw of the calling thread; that of any thread if this one has not called the module."""
+        by_thread = self._by_thread
+        return self._latest if by_thread is None else by_thread.get(threading.current_thread(), self._latest)
+
+    @last.setter
+    def last(self, draw: Draw | None) -> None:
+        self._latest = draw
+        if torch.compiler.is_compiling():
+            self._by_thread = None  # a graph knows no threads
+        else:
+            with _LOCK:
+                if self._by_thread is None:
+                    self._by_thread = weakref.WeakKeyDictionary()
+                self._by_thread[threading.current_thread()] = draw
 
     def __getstate__(self) -> dict[str, Any]:
-        # Without the draw, which may be part of the graph of a step and then cannot be copied.
-        return {name: x for name, x in vars(self).items() if name != "last"}
+        # Without the draws, which may be part of the graph of a step and then cannot be copied.
+        return {name: x for name, x in vars(self).items() if name not in ("_latest", "_by_thread")}
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw for one training step, for which ``x`` is what the rasterizer would receive without a regularizer.
@@ -115,17 +138,18 @@ class Regularizer(Scheduled):
             ValueError: if ``x`` lacks a field that the regularizer needs.
         """
         self.check_needs(x)
-        self.last = self.draw(x, generator)
-        return self.replay(x, self.last)
+        self.last = draw = self.draw(x, generator)
+        return self.replay(x, draw)
 
     def forward(self, x: Given, *, drawn: Draw | None = None, generator: torch.Generator | None = None) -> Given:
         """Return what to render.
 
         Args:
-            x: activated opacities in [0, 1], shape (N,) or (N, 1), or all parameters with such opacities. If these have
-                no step, i.e. 0, that of :meth:`set_step` counts; inside ``torch.compile`` only for :meth:`rate_at`.
+            x: activated opacities in [0, 1], shape (N,) or (N, 1), or all parameters with such opacities. Without a
+                step in these, that of :meth:`set_step` counts; inside ``torch.compile`` only for :meth:`rate_at`.
             drawn: an earlier draw to replay instead of a new one; in training only.
-            generator: source of the draw; the global random state is then untouched.
+            generator: source of this draw; the global random state is then untouched. It belongs to the call and not to
+                the constructor, so that the random numbers of a step can depend on the step alone.
 
         Returns:
             The same type as ``x``; the very same object if nothing changes.
@@ -138,7 +162,7 @@ class Regularizer(Scheduled):
         given = x if isinstance(x, Params) else Params(x)
         self._check(given.opacities)
         # Reading the step would recompile the graph at every step; the graph reads the rate from a tensor.
-        step = given.step or (0 if torch.compiler.is_compiling() else self.step)
+        step = self.step if given.step is None and not torch.compiler.is_compiling() else given.step
         flat = given.opacities.reshape(-1) if given.opacities.ndim > 1 else given.opacities
         params = given._replace(opacities=flat, step=step)
         if not self.training:
@@ -169,7 +193,8 @@ class Regularizer(Scheduled):
     @property
     def keep(self) -> Tensor | None:
         """Which Gaussians the last draw kept, shape (N,) bool; None if it dropped none."""
-        return None if self.last is None else self.last.keep
+        last = self.last
+        return None if last is None else last.keep
 
     def mask_radii(self, radii: Tensor) -> Tensor:
         """Zero the radii of the Gaussians that the last call dropped, so that density control does not count them.

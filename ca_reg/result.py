@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["CAResult", "CASettings", "CASummary", "LimitEstimate", "Method", "summarize"]
 
+_COUNTED = (Reason.EMPTY, Reason.NOT_FINITE, Reason.OUT_OF_RANGE, Reason.NO_EFFECT)
+COLUMNS = 3 + len(_COUNTED)
+
 Method = Literal["sampling", "adaptive", "exact", "exact_neutral"]
 """How a score was computed: see :class:`CASettings`."""
 
@@ -124,8 +127,8 @@ class CAResult(_Score):
     """The co-adaptation score of one view.
 
     Args:
-        value: the score: variance of the renders, mean over RGB and over the visible pixels; nan unless ``reason`` is
-            ``Reason.OK``.
+        value: the score: variance of the renders, mean over RGB and over the visible pixels; nan where ``reason`` says
+            that there is none.
         std_error: standard error of ``value`` over the choice of masks; 0 for an exact score; nan below three samples,
             without a value, and if no render of an adaptive score differed although some Gaussians were dropped.
         variance: variance of every pixel, mean over RGB, shape (H, W), float64, visible or not.
@@ -165,9 +168,10 @@ class CASummary(_Score):
     """The mean co-adaptation score of several views.
 
     Args:
-        value: mean over the views that have a value; nan unless ``reason`` is ``Reason.OK``.
+        value: mean over the views that have a value; else nan, see ``reason``.
         std_error: standard error of ``value`` over the choice of masks, the views held fixed.
-        reason: ``NOT_FINITE`` if it holds for any view, ``EMPTY`` if for all, ``NO_VIEWS`` without views, else ``OK``.
+        reason: ``NOT_FINITE`` or ``OUT_OF_RANGE`` if it holds for any view, ``EMPTY`` or ``NO_EFFECT`` if for all,
+            ``NO_VIEWS`` without views, else ``OK``.
         views: number of views that were measured.
         empty_views: number of views without a visible pixel, which ``value`` leaves out.
     """
@@ -191,7 +195,7 @@ def summarize(results: Iterable[CAResult]) -> CASummary:
         >>> summarize(score(torch.ones(10), view=None, index=i) for i in range(2)).views
         2
     """
-    sums, settings = torch.zeros(5, dtype=torch.float64, device="cpu"), set()
+    sums, settings = torch.zeros(COLUMNS, dtype=torch.float64, device="cpu"), set()
     for result in results:
         sums += row_of(result)
         settings.add(result.settings)
@@ -201,24 +205,31 @@ def summarize(results: Iterable[CAResult]) -> CASummary:
 
 
 def row_of(result: CAResult) -> Tensor:
-    """Return value, squared standard error, 1, whether empty, whether not finite, (5,) float64, to be summed."""
+    """Encode a result as float64 numbers, (COLUMNS,), so that the results of views and ranks can be added.
+
+    They are its value, its squared standard error, 1, and for each reason of `_COUNTED` whether it is that.
+    """
     ok = result.reason is Reason.OK
-    row = [result.value, result.std_error**2] if ok else [0.0, 0.0]
-    row += [1.0, float(result.reason is Reason.EMPTY), float(result.reason is Reason.NOT_FINITE)]
+    row = [result.value, result.std_error**2, 1.0] if ok else [0.0, 0.0, 1.0]
+    row += [float(result.reason is reason) for reason in _COUNTED]
     return torch.tensor(row, dtype=torch.float64, device="cpu")
 
 
 def summary_of(sums: Tensor, settings: CASettings) -> CASummary:
-    """Return the mean over views, given the sum of their rows, (5,)."""
-    total, squared_error, views, empty, not_finite = sums.tolist()
+    """Return the mean over views, given the sum of their rows, (COLUMNS,)."""
+    total, squared_error, views, empty, not_finite, out_of_range, no_effect = sums.tolist()
     counted = views - empty
     if views == 0:
         reason = Reason.NO_VIEWS
     elif not_finite > 0:
         reason = Reason.NOT_FINITE
+    elif out_of_range > 0:
+        reason = Reason.OUT_OF_RANGE
+    elif counted == 0:
+        reason = Reason.EMPTY
     else:
-        reason = Reason.OK if counted > 0 else Reason.EMPTY
-    ok = reason is Reason.OK
+        reason = Reason.NO_EFFECT if no_effect == counted else Reason.OK
+    ok = reason in (Reason.OK, Reason.NO_EFFECT)
     return CASummary(
         value=total / counted if ok else math.nan,
         std_error=math.sqrt(squared_error) / counted if ok else math.nan,

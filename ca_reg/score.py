@@ -21,7 +21,7 @@ from ca_reg.params import Params
 from ca_reg.reason import Reason
 from ca_reg.regularizer import Regularizer
 from ca_reg.regularizers import GaussianDropout
-from ca_reg.result import CAResult, CASummary, row_of, summary_of
+from ca_reg.result import COLUMNS, CAResult, CASummary, row_of, summary_of
 from ca_reg.types import (
     ExactMoments,
     Layout,
@@ -34,6 +34,8 @@ from ca_reg.types import (
 )
 
 __all__ = ["CAScore", "view_position"]
+
+MAX_ALPHA = 1.01  # above what rounding to 16 bits makes of an alpha of 1
 
 
 class ExactView(NamedTuple):
@@ -217,7 +219,7 @@ class CAScore:
         check_opacity(x.opacities)
         check_opacity_range(x.opacities)
         self.regularizer.check_needs(x)
-        return x._replace(opacities=x.opacities.detach(), step=x.step or self.regularizer.step)
+        return x._replace(opacities=x.opacities.detach(), step=self.regularizer.step if x.step is None else x.step)
 
     def update(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> CAResult:
         """Measure one view and count it in the mean that :meth:`compute` returns.
@@ -253,7 +255,7 @@ class CAScore:
 
     def reset(self) -> None:
         """Forget all views."""
-        self._sums = torch.zeros(5, dtype=torch.float64, device="cpu")
+        self._sums = torch.zeros(COLUMNS, dtype=torch.float64, device="cpu")
         self._updates = 0
 
     def _exact(self, moments_fn: MomentsFn, x: Params, view: Any) -> ExactView:
@@ -283,7 +285,7 @@ class CAScore:
             colors, odd = _finite(colors, alpha, alpha, settings.threshold)
             broken |= odd
         variance = colors.mean(0).to(torch.float64)
-        value, reason = _mean(variance, visible, broken)
+        value, reason = _mean(variance, visible, broken, 1.0)
         std_error = 0.0 if reason is Reason.OK else math.nan
         result = self._result(value, std_error, variance, visible, reason, None)
         return ExactView(result, opacity, multiplier, background)
@@ -294,18 +296,20 @@ class CAScore:
         assert settings.samples is not None
         assert settings.ddof is not None
         moments, lowest, broken = RenderMoments(min(settings.samples, GROUPS)), torch.tensor(math.inf), False
-        for image, alpha in self._renders(render_fn, self._drawn(x, index, settings.samples), view):
+        differ: list[Tensor] = []
+        for image, alpha in self._renders(render_fn, self._drawn(x, index, settings.samples, differ), view):
             lowest = torch.minimum(lowest.to(alpha), alpha)
             image, odd = _finite(image, alpha, lowest, settings.threshold)
             broken |= odd
             moments.add(image)
         visible = lowest > settings.threshold
         variance = moments.variance(settings.ddof)
-        value, reason = _mean(variance, visible, broken)
+        value, reason = _mean(variance, visible, broken, moments.count / (moments.count - settings.ddof))
         std_error = math.nan
         if reason is Reason.OK:
             # For a given visible region this factor relates the unbiased variance to this one, and so their errors.
             std_error = moments.jackknife_error(visible) * (moments.count - 1) / (moments.count - settings.ddof)
+            reason = _effect(value, differ)
         return self._result(value, std_error, variance, visible, reason, moments.count)
 
     def _adapt(self, render_fn: RenderFn, x: Params, view: Any, index: int) -> CAResult:
@@ -322,8 +326,8 @@ class CAScore:
         expected, broken = _finite(expected, alpha, visible, 0)
         moments, deviations = RenderMoments(), Deviations(expected, visible)
         del expected, alpha  # may be buffers of the renderer, which the next render overwrites
-        result = None
-        renders = self._renders(render_fn, self._drawn(x, index, settings.max_samples), view)
+        result, differ = None, list[Tensor]()
+        renders = self._renders(render_fn, self._drawn(x, index, settings.max_samples, differ), view)
         for k, (image, alpha) in enumerate(renders, start=1):
             image, odd = _finite(image, alpha, visible, 0)
             broken |= odd
@@ -331,7 +335,9 @@ class CAScore:
             deviations.add(image)
             if k == settings.max_samples or (k >= LEAST and k % ROUND == 0):
                 variance = moments.variance(ddof=1)
-                value, reason = _mean(variance, visible, broken)
+                value, reason = _mean(variance, visible, broken, k / (k - 1))
+                if reason is Reason.OK and k == settings.max_samples:
+                    reason = _effect(value, differ)
                 result = self._result(value, self._error(value, deviations), variance, visible, reason, k)
                 if self._is_settled(result):
                     break
@@ -359,9 +365,12 @@ class CAScore:
             )
         return multiplied
 
-    def _drawn(self, x: Params, index: int, count: int) -> Iterator[Tensor]:
-        """Yield the opacities of one view under ``count`` random draws, each a new tensor."""
-        generator, flat = seeded(self.seed, index), _flat(x)
+    def _drawn(self, x: Params, index: int, count: int, differ: list[Tensor]) -> Iterator[Tensor]:
+        """Yield the opacities of one view under ``count`` random draws, each a new tensor.
+
+        ``differ`` takes, for every draw but the first, whether it differs from that, as a tensor that is not yet read.
+        """
+        generator, flat, first = seeded(self.seed, index), _flat(x), None
         for _ in range(count):
             drawn, *others = self.regularizer.replay(flat, self.regularizer.draw(flat, generator))
             if any(a is not b for a, b in zip(others, flat[1:], strict=True)):
@@ -369,6 +378,10 @@ class CAScore:
                     f"{type(self.regularizer).__name__} changes more than opacities, which is all that render_fn is "
                     "given: leave out of the score what does."
                 )
+            if first is None:
+                first = drawn.clone()  # the callable may edit its opacities
+            else:
+                differ.append((drawn != first).any())
             yield (drawn.clone() if drawn is flat.opacities else drawn).view_as(x.opacities)
 
     def _renders(self, render_fn: RenderFn, drawn: Iterator[Tensor], view: Any) -> Iterator[tuple[Tensor, Tensor]]:
@@ -424,21 +437,40 @@ def _finite(colors: Tensor, alpha: Tensor, cover: Tensor, threshold: float) -> t
     """Return colors (3, H, W) with pixels that are not finite set to 0, and whether a non-finite value matters.
 
     In alpha (H, W) any does. In the colors it does unless alpha is 0 there and ``cover`` (H, W) at most the threshold,
-    because some renderers divide 0 by 0 where nothing covers a pixel; it always does if no pixel is finite.
+    because some renderers divide 0 by 0 where nothing covers a pixel; it always does if no pixel is finite. Raises a
+    ValueError for an alpha above 1.
     """
-    if bool((colors.sum() + alpha.sum()).isfinite()):
+    # One transfer for both numbers: each would make the host wait for a GPU.
+    total, highest = torch.stack((colors.sum() + alpha.sum(), alpha.amax() if alpha.numel() else alpha.sum())).tolist()
+    if MAX_ALPHA < highest < math.inf:
+        raise ValueError(
+            f"an alpha must be in [0, 1], got values up to {highest:g}: is it a depth map, or does it count to 255? "
+            "Return the accumulated alpha of every pixel, the sum of its blend weights."
+        )
+    if math.isfinite(total):
         return colors, False
     odd = ~colors.isfinite().all(0)
     broken = (~alpha.isfinite() | (odd & ((alpha != 0) | (cover > threshold)))).any() | odd.all()
     return colors.masked_fill(odd, 0.0), bool(broken)
 
 
-def _mean(variance: Tensor, visible: Tensor, broken: bool) -> tuple[float, Reason]:
-    """Average over the visible pixels, or say why not; ``broken`` is what `_finite` found."""
+def _effect(value: float, differ: list[Tensor]) -> Reason:
+    """Return NO_EFFECT if the score is exactly 0 although the draws differed: the renderer may have ignored them."""
+    return Reason.NO_EFFECT if value == 0 and bool(torch.stack(differ).any()) else Reason.OK
+
+
+def _mean(variance: Tensor, visible: Tensor, broken: bool, excess: float) -> tuple[float, Reason]:
+    """Average over the visible pixels, or say why not; ``broken`` is what `_finite` found.
+
+    ``excess`` is the divisor of a population variance over that of this one.
+    """
     pixels = int(visible.count_nonzero())
     if broken:
         return math.nan, Reason.NOT_FINITE
     if pixels == 0:
         return math.nan, Reason.EMPTY
     mean = float((variance * visible).sum()) / pixels
-    return (mean, Reason.OK) if math.isfinite(mean) else (math.nan, Reason.NOT_FINITE)
+    if not math.isfinite(mean):
+        return math.nan, Reason.NOT_FINITE
+    # Colors in [0, 1] vary by at most 1/4 (Popoviciu's inequality), which is reached if they are 0 or 1 half the time.
+    return (mean, Reason.OK) if mean <= 0.25 * excess * (1.0 + 1e-6) else (math.nan, Reason.OUT_OF_RANGE)

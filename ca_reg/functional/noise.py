@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ca_reg._check import Rate, check_count, check_finite, check_opacity, check_per_gaussian, is_zero
+from ca_reg._check import Rate, check_count, check_opacity, check_per_gaussian, check_sigma, is_zero
 from ca_reg._random import draw_numbers
 
 __all__ = ["apply_opacity_noise", "draw_opacity_noise", "opacity_noise"]
@@ -23,7 +23,7 @@ def draw_opacity_noise(
 
     Args:
         n: number of Gaussians.
-        sigma: standard deviation, at least 0.
+        sigma: standard deviation, from 0 to 1e30.
         clip: clip the draw to [-sigma, sigma], as the authors' released code does but the paper does not mention. The
             variance is then 0.516 sigma^2.
         generator: source of the draw, with the limits of :func:`~ca_reg.functional.draw_keep_mask`.
@@ -34,7 +34,7 @@ def draw_opacity_noise(
 
     Raises:
         TypeError: if ``n`` is not an integer or ``sigma`` not a number.
-        ValueError: if ``n`` or ``sigma`` is negative, or ``sigma`` not finite.
+        ValueError: if ``n`` or ``sigma`` is negative, or ``sigma`` above 1e30.
         RuntimeError: if the draw with a generator is repeated during ``backward()``.
 
     Example:
@@ -43,7 +43,7 @@ def draw_opacity_noise(
         (torch.Size([1000]), tensor(True))
     """
     check_count(n, "n", minimum=0)
-    check_finite(sigma, "sigma", minimum=0.0)
+    check_sigma(sigma)
     noise = draw_numbers(torch.randn, n, generator, device)
     return (noise.clamp(-1.0, 1.0) if clip else noise) * sigma
 
@@ -88,7 +88,7 @@ def opacity_noise(
         True
     """
     check_opacity(opacity)
-    check_finite(sigma, "sigma", minimum=0.0)
+    check_sigma(sigma)
     if is_zero(sigma):
         return opacity, None
     noise = draw_opacity_noise(opacity.shape[0], sigma, clip=clip, generator=generator, device=opacity.device)

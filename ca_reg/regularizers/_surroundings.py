@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ca_reg._check import Rate, check_count, check_rate
-from ca_reg._precision import at_least_single
+from ca_reg._precision import at_least_single, without_autocast
 from ca_reg.neighbors import nearest_neighbors
 from ca_reg.params import Params
 from ca_reg.regularizers.independent import IndependentDropout
@@ -45,8 +45,9 @@ class Refreshed(nn.Module):
         assert x.means is not None
         means = x.means.detach()
         if self.value is None or not self.holds(x):
-            with torch.inference_mode(False):  # a value computed at test time may be used in training
-                self.value, self.since = compute(means), x.step
+            # A value computed at test time may be used in training; autocast would find neighbors in 16 bits.
+            with torch.inference_mode(False), without_autocast(means.device):
+                self.value, self.since = compute(means), x.step or 0
             self._seen = weakref.ref(x.means), _version(x.means)
         self.value = self.value.to(means.device)
         return self.value
@@ -58,7 +59,7 @@ class Refreshed(nn.Module):
         if len(self.value) != len(x.means):
             return False
         same = self._seen is not None and self._seen[0]() is x.means and self._seen[1] == _version(x.means)
-        return same or 0 < x.step - self.since < self.every
+        return same or 0 < (x.step or 0) - self.since < self.every
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_seen"}
@@ -174,4 +175,5 @@ def camera_depths(x: Params) -> Tensor:
     assert x.view_matrix is not None
     means = at_least_single(x.means.detach())
     row = x.view_matrix.detach()[2].to(means)
-    return means @ row[:3] + row[3]
+    with without_autocast(means.device):  # which would round the product to 16 bits
+        return means @ row[:3] + row[3]

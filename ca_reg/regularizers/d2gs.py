@@ -115,7 +115,7 @@ class _ByStepsAlone(Refreshed):
     """Recomputed at step 1 and at multiples of ``every`` only, even if the number of Gaussians changes in between."""
 
     def holds(self, x: Params) -> bool:
-        return x.step != 1 and x.step % self.every != 0
+        return x.step != 1 and (x.step or 0) % self.every != 0
 
 
 def _min_max(values: Tensor) -> Tensor:

@@ -55,7 +55,7 @@ class SHDropout(Regularizer):
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw which Gaussians keep all degrees, (N,) bool, and note how many coefficients the others keep."""
         assert x.sh is not None
-        step = x.step or self.step  # in a compiled graph the former is 0
+        step = self.step if x.step is None else x.step
         degree = sum(step >= start for start in self.until)
         rate = self.rate_at(x.step)
         count = (degree + 1) ** 2

@@ -26,6 +26,10 @@ class GaussianDropout(IndependentDropout):
     Dropped Gaussians must leave no trace in density control: pass the radii through
     :meth:`~ca_reg.Regularizer.mask_radii`.
 
+    A draw comes from the global random state, or from a generator given to the call: ``dropout(opacity,
+    generator=generator)``. Under ``torch.vmap`` draw the masks outside, and map
+    :func:`~ca_reg.functional.apply_dropout` over them.
+
     Inside ``torch.compile`` one graph serves all steps, even with ``fullgraph=True``, and the next all numbers of
     Gaussians: the values of the opacities are then not checked, and a schedule draws even where its rate is 0. Inside
     ``torch.utils.checkpoint`` draw without ``generator``, or draw outside and pass ``keep``. The same holds for

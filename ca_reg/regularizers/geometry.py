@@ -5,10 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ca_reg._precision import at_least_single
+from ca_reg._precision import at_least_single, without_autocast
 from ca_reg.regularizers._surroundings import RankedDropout, neighbors_of, relative_ranks
 
 __all__ = ["GeometryDropout", "surface_variation"]
+
+EIGEN_CHUNK = 16_384  # matrices; cuSOLVER's batches end at 32k
 
 
 class GeometryDropout(RankedDropout):
@@ -73,5 +75,7 @@ def surface_variation(means: Tensor, k: int) -> Tensor:
     offsets = offsets - offsets.mean(1, keepdim=True)
     # Relative to the largest offset, so that squares neither vanish nor overflow.
     offsets = offsets / offsets.abs().amax((1, 2), keepdim=True).clamp_min(torch.finfo(means.dtype).tiny)
-    variances: Tensor = torch.linalg.eigvalsh(offsets.mT @ offsets)
+    with without_autocast(means.device):
+        # In chunks, because cuSOLVER refuses larger batches; each matrix is solved by itself, whatever the chunk.
+        variances = torch.cat([torch.linalg.eigvalsh(x.mT @ x) for x in offsets.split(EIGEN_CHUNK)])
     return variances[:, 0].clamp_min(0) / variances.sum(1).clamp_min(torch.finfo(means.dtype).eps)

@@ -26,9 +26,10 @@ class OpacityNoise(ParameterNoise):
     :func:`~ca_reg.functional.expected_opacity` at the current ``sigma``; training is the same. The clamp makes that
     mean differ from the opacity (0.72 for an opacity of 1 at ``sigma = 0.8``), so without ``scale`` the model is
     evaluated at opacities other than those it was fitted with: ``scale`` raises the test PSNR by 0.3 to 0.7 dB on four
-    scenes at ``sigma = 0.8``, see docs/results.md. The noise comes before dropout,
-    ``nn.Sequential(OpacityNoise(0.8, scale=True), GaussianDropout(0.2))``: in training the order of the two does not
-    matter, because a factor of 0 or 1 commutes with the clamp; in evaluation the noise must see the plain opacities.
+    scenes at ``sigma = 0.8``, see docs/results.md. To combine it with dropout use
+    ``Chain(OpacityNoise(0.8, scale=True), GaussianDropout(0.2))``, whose order does not matter: in training a factor of
+    0 or 1 commutes with the clamp, and in evaluation :class:`~ca_reg.Chain` takes the joint mean. An ``nn.Sequential``
+    with dropout first would hand opacities to the noise that are scaled already.
 
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call rejects negative ones as logits.
 
@@ -44,7 +45,7 @@ class OpacityNoise(ParameterNoise):
 
     Raises:
         TypeError: if ``sigma`` is neither a number nor callable.
-        ValueError: if a constant ``sigma`` is negative or not finite; a schedule is checked at each use.
+        ValueError: if a constant ``sigma`` is negative or above 1e30; a schedule is checked at each use.
 
     Example:
         >>> noise = OpacityNoise(sigma=0.8)

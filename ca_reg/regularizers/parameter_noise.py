@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ca_reg import functional
-from ca_reg._check import is_zero
+from ca_reg._check import check_sigma, is_zero
 from ca_reg.params import Draw, Params
 from ca_reg.regularizer import Regularizer
 from ca_reg.schedules import Schedule
@@ -32,7 +32,7 @@ class ParameterNoise(Regularizer):
 
     Raises:
         TypeError: if ``sigma`` is neither a number nor callable.
-        ValueError: if a constant ``sigma`` is negative or not finite; a schedule is checked at each use.
+        ValueError: if a constant ``sigma`` is negative or above 1e30; a schedule is checked at each use.
 
     Example:
         >>> class PositionShake(ParameterNoise):
@@ -52,6 +52,9 @@ class ParameterNoise(Regularizer):
         super().__init__(sigma)
         self.clip = clip
 
+    def _check_rate(self, rate: float, name: str) -> None:
+        check_sigma(rate, name)
+
     @property
     def sigma(self) -> float:
         """The standard deviation at the current step."""
@@ -60,7 +63,8 @@ class ParameterNoise(Regularizer):
     @property
     def noise(self) -> Tensor | None:
         """The last draw, float32, the shape of the parameter; None if there was none."""
-        return None if self.last is None else self.last.value
+        last = self.last
+        return None if last is None else last.value
 
     def perturb(self, values: Tensor, noise: Tensor) -> Tensor:
         """Return the parameter with the noise, in its own dtype."""

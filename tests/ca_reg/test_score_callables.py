@@ -263,3 +263,63 @@ def test_numbers_of_numpy_are_kept(arguments, kind):
         assert (data["drop_rate"], data["threshold"]) == (0.25, 0.5)
     from_p = CAScore(render, p=kind(0.5), **arguments)
     assert json.loads(json.dumps(from_p(OPACITY, None).as_dict()))["drop_rate"] == 0.75
+
+
+# --- callables that return something else ---
+
+
+@pytest.mark.parametrize("depth", [5.0, 255.0])
+@pytest.mark.parametrize("arguments", METHODS.values(), ids=METHODS)
+def test_a_depth_map_in_the_place_of_the_alpha_is_refused(depth, arguments):
+    def with_depth(opacity, view):
+        image, alpha = render(opacity, view)
+        return image, depth * alpha / alpha.amax()
+
+    with pytest.raises(ValueError, match=f"alpha must be in .0, 1., got values up to {depth:g}"):
+        CAScore(with_depth, **SETTINGS, **arguments)(OPACITY, None)
+
+
+def test_an_expected_alpha_above_1_is_refused():
+    def with_depth(*arguments):
+        return {**moments(*arguments), "alpha_mean": torch.full((HEIGHT, WIDTH), 5.0)}
+
+    with pytest.raises(ValueError, match="alpha must be in"):
+        CAScore(exact=with_depth)(OPACITY, None)
+
+
+@pytest.mark.parametrize("arguments", METHODS.values(), ids=METHODS)
+def test_images_up_to_255_have_no_score_but_a_reason(arguments):
+    def bright(opacity, view):
+        image, alpha = render(opacity, view)
+        return 255 * image, alpha
+
+    score = CAScore(bright, **SETTINGS, **arguments)
+    result = score.update(OPACITY, None)
+    assert math.isnan(result.value)
+    assert result.reason is score.compute().reason is Reason.OUT_OF_RANGE
+    assert "0..255" in str(result.reason)
+
+
+def test_the_largest_variance_of_colors_in_0_to_1_is_a_score():
+    """One Gaussian, kept or not: 0 or 1. The population variance over two renders is 0 or 1/4, the unbiased one 1/2."""
+    flip = torch.ones(1)
+    for ddof in (0, 1):
+        score = CAScore(
+            lambda o, _: (o.reshape(1, 1, 1).expand(3, 2, 2), torch.ones(2, 2)), samples=2, ddof=ddof, threshold=0.0
+        )
+        results = [score(flip, None, index=i) for i in range(20)]
+        assert max(result.value for result in results) == pytest.approx(0.25 * (1 + ddof))
+        assert all(result.reason is Reason.OK or result.value == 0 for result in results)
+
+
+@pytest.mark.parametrize("arguments", METHODS.values(), ids=METHODS)
+def test_a_renderer_that_ignores_the_opacities_is_noticed(arguments):
+    score = CAScore(lambda opacity, view: render(OPACITY, view), **SETTINGS, **arguments)
+    result = score.update(OPACITY, None)
+    assert result.value == 0
+    assert result.reason is score.compute().reason is Reason.NO_EFFECT
+    assert "opacities" in str(result.reason)
+
+
+def test_a_score_of_0_without_dropout_is_one():
+    assert CAScore(render, **SETTINGS, drop_rate=0.0)(OPACITY, None).reason is Reason.OK
