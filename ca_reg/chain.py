@@ -11,10 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from ca_reg.functional import Multiplier
-from ca_reg.params import Draw, Params
-from ca_reg.regularizer import Learned, Regularizer
+from ca_reg.regularizer import Draw, Learned, Params, Regularizer
 
-__all__ = ["Chain", "Foreign"]
+__all__ = ["Chain", "WrappedModule"]
 
 
 class Chain(Regularizer):
@@ -28,7 +27,7 @@ class Chain(Regularizer):
 
     Args:
         members: regularizers; an ``nn.Sequential`` or another chain is flattened, and any other module is taken for a
-            function of the opacities alone, see :class:`Foreign`.
+            function of the opacities alone, see :class:`WrappedModule`.
 
     Raises:
         TypeError: if a member is not a module.
@@ -93,7 +92,7 @@ class Chain(Regularizer):
                 member.check_needs(x)
                 x = member.expected(x)
                 draws.append(None)
-        self.last = _together(draws)
+        self.last = _combine_draws(draws)
         return x
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
@@ -102,7 +101,7 @@ class Chain(Regularizer):
         for member in self:
             draws.append(member.draw(x, generator))
             x = member.replay(x, draws[-1])
-        return _together(draws)
+        return _combine_draws(draws)
 
     def replay(self, x: Params, draw: Draw) -> Params:
         """Apply the members' draws, and the test-time values of those that were in ``eval()``."""
@@ -115,7 +114,7 @@ class Chain(Regularizer):
         means = [member for member in self if member.renders_mean]
         for member in means:
             member.check_needs(x)
-        if len(means) > 1 and (both := _multiplied(means, x, test=True)) is not None:
+        if len(means) > 1 and (both := _alpha_factor(means, x, test=True)) is not None:
             x = both[0]._replace(opacities=(both[0].opacities * both[1].mean).to(x.opacities.dtype))
         else:
             for member in means:
@@ -125,12 +124,12 @@ class Chain(Regularizer):
                 x = member.expected(x)
         return x
 
-    def multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
+    def alpha_factor(self, x: Params) -> tuple[Params, Multiplier] | None:
         """Return the product of the multipliers; None if a member has none."""
-        return _multiplied(list(self), x)
+        return _alpha_factor(list(self), x)
 
 
-class Foreign(Regularizer):
+class WrappedModule(Regularizer):
     """A module that knows nothing of this package, called in its own mode to map activated opacities (N,) to others.
 
     It drops the Gaussians where its attribute ``keep``, (N,) bool, is False, or, without that attribute, those whose
@@ -144,7 +143,7 @@ class Foreign(Regularizer):
         TypeError: if it is not a module; in a draw with a generator, if its ``forward`` takes none.
 
     Example:
-        >>> Foreign(nn.Dropout(0.5)).eval()(torch.full((3,), 0.5))
+        >>> WrappedModule(nn.Dropout(0.5)).eval()(torch.full((3,), 0.5))
         tensor([0.5000, 0.5000, 0.5000])
     """
 
@@ -166,7 +165,7 @@ class Foreign(Regularizer):
     def set_step(self, step: int) -> None:
         """Pass the step to the `set_step` of the module and its submodules, where they have one."""
         super().set_step(step)
-        _tell(self.module, step)
+        _set_step(self.module, step)
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Call the module."""
@@ -188,7 +187,7 @@ class Foreign(Regularizer):
     def expected(self, x: Params) -> Params:
         """Call a copy of the module in ``eval()``."""
         twin = _evaluating(self.module)
-        _tell(twin, x.step)
+        _set_step(twin, x.step)
         opacities: Tensor = twin(x.opacities)
         return x if opacities is x.opacities else x._replace(opacities=opacities)
 
@@ -199,27 +198,27 @@ def _flatten(module: nn.Module) -> list[Regularizer]:
         return list(module)
     if isinstance(module, nn.Sequential) and type(module).forward is nn.Sequential.forward:
         return [member for child in module for member in _flatten(child)]
-    return [module if isinstance(module, Regularizer) else Foreign(module)]
+    return [module if isinstance(module, Regularizer) else WrappedModule(module)]
 
 
-def _together(draws: Sequence[Draw | None]) -> Draw:
+def _combine_draws(draws: Sequence[Draw | None]) -> Draw:
     """Combine the draws of all members: a Gaussian is kept if no member drops it."""
     kept = [draw.keep for draw in draws if draw is not None and draw.keep is not None]
     return Draw(tuple(draws), functools.reduce(torch.logical_and, kept) if kept else None)
 
 
-def _multiplied(members: list[Regularizer], x: Params, *, test: bool = False) -> tuple[Params, Multiplier] | None:
+def _alpha_factor(members: list[Regularizer], x: Params, *, test: bool = False) -> tuple[Params, Multiplier] | None:
     """Compose the members' multipliers; None if one has none."""
     total = Multiplier(1.0, 0.0)
     for member in members:
-        one = member.test_multiplied(x) if test else member.multiplied(x)
+        one = member.test_alpha_factor(x) if test else member.alpha_factor(x)
         if one is None:
             return None
         x, total = one[0], total * one[1]
     return x, total
 
 
-def _tell(module: nn.Module, step: int) -> None:
+def _set_step(module: nn.Module, step: int) -> None:
     """Pass the step to the `set_step` of a module and its submodules, where they have one."""
     for part in module.modules():
         if callable(set_step := getattr(part, "set_step", None)):

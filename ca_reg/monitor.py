@@ -1,4 +1,4 @@
-"""Log co-adaptation scores during training."""
+"""Log co-adaptation during training, read the log back, and plot the training dynamics."""
 
 from __future__ import annotations
 
@@ -7,27 +7,30 @@ import logging
 import math
 import os
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from functools import partial
+from itertools import cycle, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ca_reg._check import check_callable, check_count, check_opacity
-from ca_reg._log import read_log
 from ca_reg.functional import scale_opacity
-from ca_reg.params import Params
-from ca_reg.result import summarize
+from ca_reg.regularizer import Params
+from ca_reg.result import new_axes, summarize
 from ca_reg.score import CAScore
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from torch.utils.tensorboard import SummaryWriter
 
-__all__ = ["LOG_NAME", "CAMonitor"]
+__all__ = ["LOG_NAME", "CAMonitor", "plot_dynamics", "read_dynamics", "read_log"]
 
 LOG_NAME = "ca.jsonl"
 """Name of the log inside the log directory."""
@@ -42,7 +45,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
     each group of views ``ca/<group>``, ``ca_std_error/<group>``, ``ca_reason/<group>``, ``ca_empty_views/<group>`` and
     ``psnr/<group>``, then the settings of the score. A missing value is null. If tensorboard is installed,
     ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` are written as scalars as well. ``backends`` and a message of the
-    logger ``ca_reg.monitor`` (level INFO) tell what is in use. :func:`ca_reg.dynamics.plot_dynamics` plots the file.
+    logger ``ca_reg.monitor`` (level INFO) tell what is in use. :func:`ca_reg.monitor.plot_dynamics` plots the file.
 
     As long as the number of Gaussians stays the same, every measurement of a view uses the same masks, which removes
     sampling noise from the comparison of steps.
@@ -283,3 +286,111 @@ def _summary_writer(folder: Path, resume_step: int | None) -> SummaryWriter | No
         return None
     # Hides what the earlier run wrote beyond the checkpoint; for a new run, all of it.
     return SummaryWriter(str(folder), purge_step=0 if resume_step is None else resume_step + 1)
+
+
+def read_log(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Iterate over the measurements of a log, each with its raw line.
+
+    An unterminated last line is skipped if it does not parse: a running or killed process has not finished it.
+
+    Raises:
+        ValueError: if another line is not a measurement; the message names file and line.
+    """
+    *whole, rest = path.read_bytes().split(b"\n")
+    for number, line in enumerate(whole, start=1):
+        try:
+            yield line.decode(), _measurement(line)
+        except ValueError as error:
+            raise ValueError(
+                f"{path}, line {number}, is no measurement of a CAMonitor: {error}; remove that line to go on."
+            ) from error
+    try:
+        record = _measurement(rest)
+    except ValueError:
+        return
+    yield rest.decode(), record
+
+
+def _measurement(line: bytes) -> dict[str, Any]:
+    """Parse a line: numbers, strings or null by name, including an integer ``step``."""
+    try:
+        record = json.loads(line.decode())
+    except RecursionError as error:
+        raise ValueError(str(error)) from error
+    if not isinstance(record, dict) or not isinstance(record.get("step"), int):
+        raise ValueError("expected an object with a whole number 'step'")
+    for name, x in record.items():
+        if not isinstance(x, int | float | str | None) or (isinstance(x, int) and x.bit_length() > 64):
+            raise ValueError(f"{name!r} must be a number, text or null")
+    return record
+
+
+def read_dynamics(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[np.float64]]:
+    """Read the log of a :class:`ca_reg.CAMonitor`.
+
+    Args:
+        path: the log, or the directory that holds it.
+
+    Returns:
+        Every numeric column by name (``step``, ``gaussians``, ``ca/test``, ``psnr/test``, ...), shape (lines,) each,
+        sorted by step; nan where a line has no value. Text columns are left out.
+
+    Raises:
+        FileNotFoundError: if there is no log.
+        ValueError: if it holds no complete line, or a damaged one.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     lines = '{"step": 500, "ca/test": 0.01}', '{"step": 1000, "ca/test": null}'
+        ...     _ = Path(folder, "ca.jsonl").write_text(chr(10).join(lines))
+        ...     columns = read_dynamics(folder)
+        >>> columns["step"], columns["ca/test"]
+        (array([ 500., 1000.]), array([0.01,  nan]))
+    """
+    file = Path(path)
+    file = file / LOG_NAME if file.is_dir() else file
+    if not file.exists():
+        raise FileNotFoundError(f"there is no log of a CAMonitor at {file}; give the file or the log_dir it was given.")
+    records = [record for _, record in read_log(file)]
+    if not records:
+        raise ValueError(f"{file} holds no measurement yet; a CAMonitor writes the first at a multiple of `every`.")
+    records.sort(key=lambda record: record["step"])
+    texts = {key for record in records for key, x in record.items() if isinstance(x, str)}
+    keys = dict.fromkeys(key for record in records for key in record if key not in texts)
+    return {key: np.array([record.get(key) for record in records], dtype=np.float64) for key in keys}
+
+
+def plot_dynamics(
+    runs: str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]], *, axes: Sequence[Axes] | None = None
+) -> tuple[Axes, Axes]:
+    """Plot co-adaptation and PSNR against the step, each on its own axes.
+
+    ``runs`` is one log or log directory, or several by label. Each run has one color; its last group of views (test) is
+    solid, the others are dotted or dashed; nan leaves a gap. Draws on two ``axes``, by default side by side in a new
+    figure, and returns them: co-adaptation, PSNR.
+
+    Raises:
+        ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
+        FileNotFoundError: if a log is missing.
+        ValueError: if there is no run, or a log is empty.
+    """
+    labelled = runs if isinstance(runs, Mapping) else {"": runs}
+    if not labelled:
+        raise ValueError("runs must hold at least one log, got an empty mapping.")
+    columns = {label: read_dynamics(path) for label, path in labelled.items()}
+    ca_axes, psnr_axes = new_axes(2) if axes is None else axes
+    for number, (label, column) in enumerate(columns.items()):
+        groups = [key.removeprefix("ca/") for key in column if key.startswith("ca/")]
+        lines = [*islice(cycle(("-", ":", "--", "-.")), len(groups))][::-1]
+        for group, line in zip(groups, lines, strict=True):
+            style: dict[str, Any] = {"color": f"C{number}", "linestyle": line, "marker": ".", "markersize": 4}
+            ca_axes.plot(column["step"], column[f"ca/{group}"], label=f"{label} {group}".strip(), **style)
+            if f"psnr/{group}" in column:
+                psnr_axes.plot(column["step"], column[f"psnr/{group}"], **style)
+    for drawn, quantity in ((ca_axes, "co-adaptation score CA"), (psnr_axes, "PSNR in dB")):
+        drawn.set_xlabel("iteration")
+        drawn.set_ylabel(quantity)
+    ca_axes.set_ylim(bottom=0.0)
+    psnr_axes.legend(handles=[*ca_axes.lines], loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    return ca_axes, psnr_axes

@@ -1,4 +1,4 @@
-"""The base class of all regularizers: what to draw, how to apply it, what to render at test time."""
+"""What a rasterizer receives, and the base class of the regularizers that change it: draw, apply, test time."""
 
 from __future__ import annotations
 
@@ -10,15 +10,81 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from ca_reg._scheduled import Scheduled
+from ca_reg._precision import at_least_single, without_autocast
 from ca_reg.functional import Multiplier
-from ca_reg.params import Draw, Params
+from ca_reg.schedules import Scheduled
 
-__all__ = ["Learned", "Regularizer"]
-
-Given = TypeVar("Given", Tensor, Params)
+__all__ = ["Draw", "Learned", "Params", "Regularizer"]
 
 _LOCK = threading.Lock()
+
+
+class Params(NamedTuple):
+    """The activated parameters of N Gaussians as a rasterizer receives them; a regularizer returns a modified copy.
+
+    Only the opacities are required. A regularizer lists the other fields that it reads or changes in
+    :attr:`Regularizer.needs <ca_reg.Regularizer.needs>`; callers that cannot supply one raise an error naming it.
+
+    Convention: world coordinates; quaternions wxyz, not necessarily normalized; the view matrix is world to camera,
+    OpenCV axes (x right, y down, z forward), applied from the left to column vectors.
+
+    Attributes:
+        opacities: in [0, 1], shape (N,).
+        means: centers, world units, shape (N, 3).
+        scales: standard deviations along the axes, world units, shape (N, 3).
+        quaternions: orientations, shape (N, 4).
+        sh: spherical-harmonic coefficients, constant band first, shape (N, K, 3).
+        view_matrix: of the rendered camera, the first if there are several, shape (4, 4).
+        learned: per-Gaussian values that regularizers learn, by name, each (N,).
+        step: the training step, from 0 on, which schedules follow; None for that of the module or score that is called.
+
+    Example:
+        >>> import torch
+        >>> x = Params(torch.full((4,), 0.5), means=torch.zeros(4, 3))
+        >>> x._replace(opacities=x.opacities * 0.8).opacities
+        tensor([0.4000, 0.4000, 0.4000, 0.4000])
+    """
+
+    opacities: Tensor
+    means: Tensor | None = None
+    scales: Tensor | None = None
+    quaternions: Tensor | None = None
+    sh: Tensor | None = None
+    view_matrix: Tensor | None = None
+    learned: Mapping[str, Tensor] | None = None
+    step: int | None = None
+
+    @property
+    def depths(self) -> Tensor:
+        """Depths of the centers along the camera's z axis, (N,), at least float32, negative behind the camera.
+
+        A regularizer that reads them lists ``means`` and ``view_matrix`` in its ``needs``. Without gradients.
+
+        Raises:
+            ValueError: if there are no means or no view matrix.
+        """
+        if self.means is None or self.view_matrix is None:
+            raise ValueError("depths need means and view_matrix; list both in the needs of the regularizer.")
+        means = at_least_single(self.means.detach())
+        row = self.view_matrix.detach()[2].to(means)  # for column vectors, the third row is the viewing direction
+        with without_autocast(means.device):  # which would round the product to 16 bits
+            return means @ row[:3] + row[3]
+
+
+class Draw(NamedTuple):
+    """One draw of a regularizer, with all it takes to replay it.
+
+    Attributes:
+        value: whatever the regularizer's ``replay`` reads, such as a mask or noise; None for nothing.
+        keep: True where a Gaussian was kept, shape (N,) bool; None if none was dropped. Density control must not count
+            dropped Gaussians as seen.
+    """
+
+    value: Any = None
+    keep: Tensor | None = None
+
+
+Given = TypeVar("Given", Tensor, Params)
 
 
 class Learned(NamedTuple):
@@ -35,7 +101,7 @@ class Regularizer(Scheduled):
     """Perturbs what a rasterizer receives in training, and defines what is rendered at test time.
 
     A custom regularizer is a subclass with ``draw`` and ``replay``; it also overrides ``expected`` if it does not
-    render the plain model at test time, and ``multiplied`` if its draws are independent factors of the opacities. It
+    render the plain model at test time, and ``alpha_factor`` if its draws are independent factors of the opacities. It
     then works wherever the package's own do: in the bundled trainer, the INRIA hook and its launcher, gsplat,
     splatfacto-ca, a :class:`~ca_reg.Chain`, and as the masks of a :class:`~ca_reg.CAScore`. To drop Gaussians
     independently of each other, subclass :class:`~ca_reg.IndependentDropout` and define the rates only.
@@ -119,7 +185,7 @@ class Regularizer(Scheduled):
         """Return what is rendered at test time: ``x`` itself unless overridden."""
         return x
 
-    def multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
+    def alpha_factor(self, x: Params) -> tuple[Params, Multiplier] | None:
         """Return parameters, and the independent random factor on their alphas, that together reproduce the draws.
 
         Exact scores and penalties take this :class:`~ca_reg.functional.Multiplier`. None, the default, means that the
@@ -127,9 +193,9 @@ class Regularizer(Scheduled):
         """
         return None
 
-    def test_multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
-        """Return :meth:`multiplied` for test time; it differs only if training uses measurements of an earlier step."""
-        return self.multiplied(x)
+    def test_alpha_factor(self, x: Params) -> tuple[Params, Multiplier] | None:
+        """Return :meth:`alpha_factor` for a finished model; override it only if training caches measurements."""
+        return self.alpha_factor(x)
 
     def regularize(self, x: Params, generator: torch.Generator | None = None) -> Params:
         """Draw, store the draw in :attr:`last`, and apply it; trainers and hooks call this.

@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ca_reg import CAScore, CASummary, Params, RenderFn
-from ca_reg.result import COLUMNS, row_of, summary_of
+from ca_reg import CAScore, Params
+from ca_reg.result import COLUMNS, CASummary, row_of, summary_of
 from ca_reg.score import view_position
+from ca_reg.types import RenderFn
 
 __all__ = ["CAScoreMetric"]
 

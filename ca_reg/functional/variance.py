@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ca_reg._check import check_tensor
-from ca_reg.reason import Reason
+from ca_reg.result import Reason
 
 __all__ = ["ColorVariance", "color_variance"]
 

@@ -83,7 +83,7 @@ def test_the_version_is_that_of_the_project_file():
 
 def test_importing_loads_no_optional_or_heavy_package():
     code = (
-        "import sys, torch; before = set(sys.modules); import ca_reg, ca_reg.dynamics; "
+        "import sys, torch; before = set(sys.modules); import ca_reg, ca_reg.monitor; "
         "new = {name.split('.')[0] for name in set(sys.modules) - before}; "
         "print(*sorted(new & {'kornia', 'matplotlib', 'tensorboard', 'PIL', 'reference_trainer', 'tyro', 'tqdm'}))"
     )

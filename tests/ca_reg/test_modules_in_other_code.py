@@ -9,8 +9,9 @@ import torch
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from ca_reg import CAPenalty, Chain, GaussianDropout, LinearRamp, OpacityNoise
+from ca_reg import CAPenalty, Chain, GaussianDropout, OpacityNoise
 from ca_reg.functional import Multiplier
+from ca_reg.schedules import LinearRamp
 
 OPACITY = torch.linspace(0.05, 0.95, 40)
 RAMP = LinearRamp(0.0, 0.5, 0, 100)

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from ca_reg import CAMonitor, CAScore
-from ca_reg.dynamics import plot_dynamics, read_dynamics
+from ca_reg.monitor import plot_dynamics, read_dynamics
 
 OPACITY = torch.linspace(0.1, 0.9, 30)
 COLORS = torch.rand(3, 30, generator=torch.Generator().manual_seed(0)) / 50  # in [0, 1] in all views

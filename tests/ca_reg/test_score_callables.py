@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from ca_reg import CAMonitor, CAScore, Reason, attribute, total_effects
+from ca_reg import CAMonitor, CAScore, Reason, attribute
+from ca_reg.attribution import total_effects
 from ca_reg.functional import Multiplier, alpha_moments, contributions, pixel_moments
 
 N, HEIGHT, WIDTH = 7, 3, 4
@@ -100,8 +101,8 @@ def test_moments_may_fill_the_same_buffers(neutral):
     def reusing(*arguments):
         return dict(zip(("mean", "variance", "alpha_mean"), write(*moments(*arguments).values()), strict=True))
 
-    expected = CAScore(exact=moments, neutral=neutral, **SETTINGS)(OPACITY, None)
-    same(CAScore(exact=reusing, neutral=neutral, **SETTINGS)(OPACITY, None), expected)
+    expected = CAScore.exact(moments, neutral=neutral, **SETTINGS)(OPACITY, None)
+    same(CAScore.exact(reusing, neutral=neutral, **SETTINGS)(OPACITY, None), expected)
 
 
 # --- callables that edit their opacities in place ---
@@ -126,10 +127,10 @@ def white(opacity, view):
     [
         lambda f, **a: CAScore(f(render), **a),
         lambda f, **a: CAScore(f(render), alpha_fn=f(white), **a),
-        lambda f, **a: CAScore(f(render), relative_error=0.2, **a),
-        lambda f, **a: CAScore(f(render), alpha_fn=f(white), relative_error=0.2, **a),
-        lambda f, **a: CAScore(exact=f(moments), **a),
-        lambda f, **a: CAScore(exact=f(moments), neutral=True, **a),
+        lambda f, **a: CAScore.adaptive(f(render), relative_error=0.2, **a),
+        lambda f, **a: CAScore.adaptive(f(render), alpha_fn=f(white), relative_error=0.2, **a),
+        lambda f, **a: CAScore.exact(f(moments), **a),
+        lambda f, **a: CAScore.exact(f(moments), neutral=True, **a),
     ],
     ids=["sampling", "sampling, alpha_fn", "adaptive", "adaptive, alpha_fn", "exact", "neutral"],
 )
@@ -142,9 +143,9 @@ def test_a_callable_that_edits_its_opacities_reaches_nobody_else_s(make, drop_ra
 
 def test_attribution_and_monitor_keep_the_opacities_too(tmp_path):
     opacity = OPACITY.clone()
-    score = CAScore(exact=moments, **SETTINGS)
+    score = CAScore.exact(moments, **SETTINGS)
     assert torch.equal(attribute(score, spoiling(shares), opacity, None)[0], attribute(score, shares, OPACITY, None)[0])
-    score = CAScore(exact=spoiling(moments), **SETTINGS)
+    score = CAScore.exact(spoiling(moments), **SETTINGS)
     total_effects(score, opacity, None)
     with CAMonitor(
         score, tmp_path, views={"all": [0, 1]}, every=1, psnr=spoiling(lambda o, v: o.sum().item())
@@ -215,7 +216,7 @@ def test_nan_in_exact_moments_is_not_finite(name, where, neutral):
         found[name][..., where] = math.nan
         return found
 
-    result = CAScore(exact=fn, neutral=neutral, threshold=0.0)(OPACITY, None)
+    result = CAScore.exact(fn, neutral=neutral, threshold=0.0)(OPACITY, None)
     assert (result.reason, math.isnan(result.value)) == (Reason.NOT_FINITE, True)
 
 
@@ -232,9 +233,9 @@ def test_an_empty_region_is_empty_whatever_the_masks():
 
     opacity = torch.full((8,), 2 * (1 - 0.28 ** (1 / 8)))
     for seed in range(10):
-        result = CAScore(fn, relative_error=0.1, threshold=0.8, seed=seed)(opacity, None)
+        result = CAScore.adaptive(fn, relative_error=0.1, threshold=0.8, seed=seed)(opacity, None)
         assert (result.reason, result.visible.any().item()) == (Reason.EMPTY, False)
-    assert CAScore(fn, relative_error=0.1, threshold=0.7)(opacity, None).reason is Reason.OK
+    assert CAScore.adaptive(fn, relative_error=0.1, threshold=0.7)(opacity, None).reason is Reason.OK
 
 
 def test_renders_that_do_not_differ_are_not_taken_for_certainty():
@@ -243,11 +244,13 @@ def test_renders_that_do_not_differ_are_not_taken_for_certainty():
     def fn(opacity, view):
         return (opacity * torch.linspace(0, 1, 20)).mean().expand(3, 2, 2), torch.ones(2, 2)
 
-    results = [CAScore(fn, drop_rate=0.002, relative_error=0.9, seed=seed)(torch.ones(20), None) for seed in range(6)]
+    results = [
+        CAScore.adaptive(fn, drop_rate=0.002, relative_error=0.9, seed=seed)(torch.ones(20), None) for seed in range(6)
+    ]
     # P(16 renders without a drop) = 0.998^320 = 0.53 for each seed: in 6 seeds there is one but for a chance of 1 %.
     assert max(result.samples for result in results) > 16
     assert all(result.value > 0 and result.std_error > 0 for result in results)
-    never = CAScore(fn, drop_rate=1e-9, relative_error=0.5)(torch.ones(20), None)
+    never = CAScore.adaptive(fn, drop_rate=1e-9, relative_error=0.5)(torch.ones(20), None)
     assert (never.value, never.samples, never.as_dict()["std_error"]) == (0.0, 256, None)
 
 
@@ -284,7 +287,7 @@ def test_an_expected_alpha_above_1_is_refused():
         return {**moments(*arguments), "alpha_mean": torch.full((HEIGHT, WIDTH), 5.0)}
 
     with pytest.raises(ValueError, match="alpha must be in"):
-        CAScore(exact=with_depth)(OPACITY, None)
+        CAScore.exact(with_depth)(OPACITY, None)
 
 
 @pytest.mark.parametrize("arguments", METHODS.values(), ids=METHODS)

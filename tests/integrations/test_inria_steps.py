@@ -7,8 +7,9 @@ import torch
 from stand_ins.inria import PIPE, Model, make_rasterizer, make_render, rasterize
 from torch import nn
 
-from ca_reg import GaussianDropout, LinearRamp, OpacityNoise, StartStop
+from ca_reg import GaussianDropout, OpacityNoise
 from ca_reg.integrations.inria import RasterizerHook
+from ca_reg.schedules import LinearRamp, StartStop
 
 BLACK = torch.zeros(3)
 

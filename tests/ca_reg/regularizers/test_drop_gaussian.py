@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ca_reg.regularizers import parse
-from ca_reg.regularizers.drop_gaussian import DropGaussian
+from ca_reg.regularizers.dropout import DropGaussian
 
 
 @pytest.mark.parametrize("step", [1, 2_500, 10_000])

@@ -10,8 +10,7 @@ from clouds import KINDS, cloud, params, rank
 
 from ca_reg import Chain
 from ca_reg.regularizers import REGULARIZERS, _surroundings, parse
-from ca_reg.regularizers._surroundings import Refreshed, relative_ranks
-from ca_reg.regularizers.geometry import surface_variation
+from ca_reg.regularizers.surroundings import Refreshed, relative_ranks, surface_variation
 
 LOOKING = ("clustered(0.3)", "d2gs", "density", "drop_anchors", "geometry", "position_noise(0.3)")
 ALL = (*LOOKING, "d2gs(literal=True)", "depth", "drop_sh(until=[9_000])")
@@ -185,5 +184,5 @@ def test_autocast_costs_no_precision(text):
 def test_planes_are_told_from_volumes_in_chunks(monkeypatch):
     points = cloud("spread", 300)
     whole = surface_variation(points, 10)
-    monkeypatch.setattr("ca_reg.regularizers.geometry.EIGEN_CHUNK", 7)
+    monkeypatch.setattr("ca_reg.regularizers.surroundings.EIGEN_CHUNK", 7)
     assert torch.equal(surface_variation(points, 10), whole)

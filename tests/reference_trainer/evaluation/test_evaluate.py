@@ -148,7 +148,9 @@ def test_the_exact_score_is_the_limit_of_many_samples(tiny_scene, gaussians):
     result = score(gaussians.opacities, scene.train[0])
     assert view.ca_exact == result.value
     assert (result.drop_rate, result.threshold) == (pytest.approx(0.6), 0.8)
-    adaptive = CAScore(model.render, p=0.2, relative_error=0.03, max_samples=160)(gaussians.opacities, scene.train[0])
+    adaptive = CAScore.adaptive(model.render, p=0.2, relative_error=0.03, max_samples=160)(
+        gaussians.opacities, scene.train[0]
+    )
     # 5 standard errors, themselves known to 27 %: false alarm below 1e-3, and the seed is fixed.
     assert abs(adaptive.value - result.value) < 5 * adaptive.std_error < 0.5 * result.value
 
