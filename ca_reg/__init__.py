@@ -29,21 +29,9 @@ from ca_reg.score import CAScore
 
 __version__ = "0.2.0"
 
-__all__ = [  # in the order in which one meets them, which help() and the API page follow
-    "CAMonitor",
-    "CAPenalty",
-    "CAResult",
-    "CAScore",
-    "Chain",
-    "Draw",
-    "GaussianDropout",
-    "IndependentDropout",
-    "OpacityNoise",
-    "Params",
-    "Reason",
-    "Regularizer",
+__all__ = [  # noqa: RUF022  # in the order in which one meets them, which the API page follows
+    "GaussianDropout", "OpacityNoise", "Chain", "CAScore",
+    "CAResult", "Reason", "CAMonitor", "CAPenalty", "attribute",
+    "IndependentDropout", "Regularizer", "Params", "Draw", "scale_opacity", "expected_opacity",
     "__version__",
-    "attribute",
-    "expected_opacity",
-    "scale_opacity",
 ]  # fmt: skip

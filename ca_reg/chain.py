@@ -187,7 +187,8 @@ class WrappedModule(Regularizer):
     def expected(self, x: Params) -> Params:
         """Call a copy of the module in ``eval()``."""
         twin = _evaluating(self.module)
-        _set_step(twin, x.step)
+        if x.step is not None:
+            _set_step(twin, x.step)
         opacities: Tensor = twin(x.opacities)
         return x if opacities is x.opacities else x._replace(opacities=opacities)
 

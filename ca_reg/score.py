@@ -68,8 +68,8 @@ class CAScore:
     Read a sampled score with its error. At 5 samples the variance of a single pixel is known to about 70 %. The mean
     over an image is known better: ``std_error`` estimates its error by a delete-a-group jackknife over the renders,
     with the visible region held fixed. With few samples it is too large (by some 15 % at 5, 50 % at 3); it needs at
-    least three. The memory does not grow with ``samples``: renders are pooled in at most 8 groups of one image and one map
-    each, in the precision of the renders, at least float32.
+    least three. The memory does not grow with ``samples``: renders are pooled in at most 8 groups of one image and one
+    map each, in the precision of the renders, at least float32.
 
     The region of the protocol, the pixels that all renders cover, has no limit, because it shrinks with every render.
     The two other methods take the pixels whose *expected* alpha exceeds the threshold, whatever is drawn.

@@ -265,5 +265,5 @@ def surface_variation(means: Tensor, k: int) -> Tensor:
     offsets = offsets / offsets.abs().amax((1, 2), keepdim=True).clamp_min(torch.finfo(means.dtype).tiny)
     with without_autocast(means.device):
         # In chunks, because cuSOLVER refuses larger batches; each matrix is solved by itself, whatever the chunk.
-        variances = torch.cat([torch.linalg.eigvalsh(x.mT @ x) for x in offsets.split(EIGEN_CHUNK)])
+        variances = torch.cat([torch.linalg.eigvalsh(x.mT @ x) for x in torch.split(offsets, EIGEN_CHUNK)])
     return variances[:, 0].clamp_min(0) / variances.sum(1).clamp_min(torch.finfo(means.dtype).eps)

@@ -2,12 +2,13 @@
 
 import itertools
 import math
+from functools import partial
 
 import pytest
 import torch
 from oracles import random_scene
 
-from ca_reg import CAScore, OpacityNoise, Params, Reason, attribute
+from ca_reg import CAScore, OpacityNoise, Reason, attribute
 from ca_reg.attribution import total_effects
 from ca_reg.lists import ListMoments, PixelLists
 from ca_reg.types import ExactMoments
@@ -193,7 +194,7 @@ def test_total_effects_come_through_the_reference_renderer():
 
     score = CAScore.exact(moments_fn, neutral=True, threshold=0.3)
     effects, result = total_effects(score, gaussians.opacities, None)
-    _, _, multiplier, background = score._exact(moments_fn, Params(gaussians.opacities), None)
+    _, _, multiplier, background = score.measure(gaussians.opacities, None)
 
     def value(variances):
         variance = moments_fn(gaussians.opacities, None, type(multiplier)(0.5, variances), background).variance
@@ -224,10 +225,10 @@ def test_without_a_value_all_are_zero_and_the_reason_says_why(reason):
     assert shares.tolist() == effects.tolist() == [0.0] * 4
 
 
-@pytest.mark.parametrize("settings", [{}, {"relative_error": 0.1}])
-def test_a_sampled_score_cannot_be_attributed(settings):
+@pytest.mark.parametrize("make", [CAScore, partial(CAScore.adaptive, relative_error=0.1)])
+def test_a_sampled_score_cannot_be_attributed(make):
     scene = Scene(3)
-    score = CAScore(lambda opacity, view: None, **settings)
+    score = make(lambda opacity, view: None)
     for name, call in (
         ("attribute", lambda: attribute(score, scene.moments.shares, scene.opacity, None)),
         ("total_effects", lambda: total_effects(score, scene.opacity, None)),

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise, Params, functional
+from ca_reg import CAScore, Chain, Draw, GaussianDropout, OpacityNoise, Params, functional
 from ca_reg.schedules import Constant, LinearRamp, StartStop
 
 OPACITY = torch.linspace(0.05, 0.95, 40)
@@ -49,8 +49,8 @@ def test_draws_are_replayed_bit_for_bit_without_drawing():
     keep, eps = dropout.keep, noise.noise
     dropout(OPACITY), noise(OPACITY)
     before = torch.get_rng_state()
-    assert torch.equal(dropout(OPACITY, keep=keep), first[0])
-    assert torch.equal(noise(OPACITY, noise=eps), first[1])
+    assert torch.equal(dropout(OPACITY, drawn=Draw(keep=keep)), first[0])
+    assert torch.equal(noise(OPACITY, drawn=Draw(eps)), first[1])
     assert dropout.keep is keep
     assert noise.noise is eps
     assert torch.equal(torch.get_rng_state(), before)
@@ -103,13 +103,13 @@ def test_a_draw_cannot_be_replayed_in_eval_nor_on_another_number_of_gaussians():
     dropout(OPACITY), noise(OPACITY)
     keep, eps = dropout.keep, noise.noise
     with pytest.raises(ValueError, match="draw again"):
-        dropout(OPACITY[:-1], keep=keep)
+        dropout(OPACITY[:-1], drawn=Draw(keep=keep))
     with pytest.raises(ValueError, match="draw again"):
-        noise(OPACITY[:-1], noise=eps)
+        noise(OPACITY[:-1], drawn=Draw(eps))
     with pytest.raises(ValueError, match="eval"):
-        dropout.eval()(OPACITY, keep=keep)
+        dropout.eval()(OPACITY, drawn=Draw(keep=keep))
     with pytest.raises(ValueError, match="eval"):
-        noise.eval()(OPACITY, noise=eps)
+        noise.eval()(OPACITY, drawn=Draw(eps))
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_mask_radii_zeroes_the_dropped_and_nothing_else(shape: tuple[int, ...], 
     dropout = GaussianDropout(p=0.5)
     radii = torch.arange(1, 1 + torch.Size(shape).numel()).reshape(shape).to(dtype)
     keep = torch.tensor([True, False, True, True, False, False])
-    dropout(torch.full((6,), 0.5), keep=keep)
+    dropout(torch.full((6,), 0.5), drawn=Draw(keep=keep))
     masked = dropout.mask_radii(radii)
     assert masked.dtype == dtype
     assert torch.equal(masked[keep], radii[keep])

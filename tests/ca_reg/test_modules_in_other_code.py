@@ -214,8 +214,8 @@ def test_recomputation_repeats_the_draw_or_refuses(module, reentrant):
     x = OPACITY.clone().requires_grad_()
     torch.manual_seed(3)
     module(x).square().sum().backward()
-    draw = {"keep": module.keep} if isinstance(module, GaussianDropout) else {"noise": module.noise}
+    draw = {"drawn": module.last}
     assert torch.equal(gradient(), x.grad)
     assert torch.equal(gradient(**draw), x.grad)
-    with pytest.raises(RuntimeError, match=r"generator=.*torch\.utils\.checkpoint.*keep="):
+    with pytest.raises(RuntimeError, match=r"generator=.*torch\.utils\.checkpoint.*drawn="):
         gradient(generator=torch.Generator().manual_seed(3))

@@ -351,7 +351,7 @@ def test_modules_replay_and_do_nothing_in_evaluation(opacity, p, sigma, seed):
 @given(st.floats(0, 0.9), st.integers(2, 20), st.integers(0, 1), st.floats(0.1, 1.0), SEEDS, st.floats(-2, 2))
 def test_a_score_is_a_variance(drop_rate, samples, ddof, gain, seed, offset):
     generator = seeded(seed)
-    colors = torch.rand(3, 20, generator=generator, dtype=torch.float64)
+    colors = torch.rand(3, 20, generator=generator, dtype=torch.float64) / 20
     opacity = torch.rand(20, generator=generator, dtype=torch.float64)
 
     renders = []

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from ca_reg import GaussianDropout, OpacityNoise
+from ca_reg import Draw, GaussianDropout, OpacityNoise
 from ca_reg.functional import expected_opacity, opacity_noise, scale_opacity
 from ca_reg.schedules import LinearRamp
 
@@ -83,7 +83,7 @@ def test_the_module_scales_at_the_present_sigma_and_only_in_evaluation():
     assert torch.equal(drawn, plain)
     assert "scale=True" in repr(noise)
     with pytest.raises(ValueError, match="eval"):
-        noise.eval()(OPACITY, noise=torch.zeros(6))
+        noise.eval()(OPACITY, drawn=Draw(torch.zeros(6)))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])

@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,8 +18,8 @@ FOOTPRINT = torch.rand(HEIGHT * WIDTH, N, generator=G, dtype=torch.float64)
 COLORS = torch.rand(N, 3, generator=G, dtype=torch.float64)
 OPACITY = 0.2 + 0.7 * torch.rand(N, generator=G, dtype=torch.float64)
 SETTINGS = {"threshold": 0.3}
-METHODS = {"sampling": {}, "adaptive": {"relative_error": 0.2}}
-each_method = pytest.mark.parametrize("arguments", METHODS.values(), ids=METHODS)
+METHODS = {"sampling": CAScore, "adaptive": partial(CAScore.adaptive, relative_error=0.2)}
+each_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 
 
 def images(x):
@@ -72,26 +73,26 @@ def into(*buffers):
 
 @each_method
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_reused_output_buffer_changes_nothing(arguments, dtype):
+def test_a_reused_output_buffer_changes_nothing(method, dtype):
     write = into(torch.empty(3, HEIGHT, WIDTH, dtype=dtype), torch.empty(HEIGHT, WIDTH, dtype=dtype))
 
     def fresh(opacity, view):
         return tuple(x.to(dtype) for x in render(opacity, view))
 
-    expected = CAScore(fresh, **SETTINGS, **arguments)(OPACITY, None)
-    same(CAScore(lambda o, v: write(*render(o, v)), **SETTINGS, **arguments)(OPACITY, None), expected)
+    expected = method(fresh, **SETTINGS)(OPACITY, None)
+    same(method(lambda o, v: write(*render(o, v)), **SETTINGS)(OPACITY, None), expected)
 
 
 @each_method
 @pytest.mark.parametrize("numpy", [False, True])
-def test_an_alpha_pass_may_fill_the_buffer_of_the_image(arguments, numpy):
+def test_an_alpha_pass_may_fill_the_buffer_of_the_image(method, numpy):
     write = into(torch.empty(3, HEIGHT, WIDTH, dtype=torch.float64))
 
     def drawn(values):
         return lambda opacity, view: (lambda x: x.numpy() if numpy else x)(write(blend(opacity, values)))
 
-    score = CAScore(drawn(COLORS), alpha_fn=drawn(torch.ones_like(COLORS)), **SETTINGS, **arguments)
-    same(score(OPACITY, None), CAScore(render, **SETTINGS, **arguments)(OPACITY, None))
+    score = method(drawn(COLORS), alpha_fn=drawn(torch.ones_like(COLORS)), **SETTINGS)
+    same(score(OPACITY, None), method(render, **SETTINGS)(OPACITY, None))
 
 
 @pytest.mark.parametrize("neutral", [False, True])
@@ -175,26 +176,26 @@ ALL, HALF, ONE = torch.ones(3, 4, dtype=torch.bool), torch.arange(12).view(3, 4)
 @each_method
 @pytest.mark.parametrize("where", [ALL, HALF, ONE], ids=["all", "half", "one pixel"])
 @pytest.mark.parametrize(("colors", "alpha"), [(True, True), (True, False), (False, True)])
-def test_nan_in_a_render_is_not_finite(arguments, where, colors, alpha):
-    result = CAScore(with_nan(where, colors, alpha), threshold=0.0, **arguments)(OPACITY, None)
+def test_nan_in_a_render_is_not_finite(method, where, colors, alpha):
+    result = method(with_nan(where, colors, alpha), threshold=0.0)(OPACITY, None)
     assert result.reason is Reason.NOT_FINITE
     assert math.isnan(result.value)
     assert math.isnan(result.std_error)
 
 
 @each_method
-def test_nan_in_a_single_render_is_not_finite(arguments):
+def test_nan_in_a_single_render_is_not_finite(method):
     calls = []
 
     def fn(opacity, view):
         calls.append(None)
         return with_nan(ONE, False, len(calls) == 3)(opacity, view)
 
-    assert CAScore(fn, **SETTINGS, **arguments)(OPACITY, None).reason is Reason.NOT_FINITE
+    assert method(fn, **SETTINGS)(OPACITY, None).reason is Reason.NOT_FINITE
 
 
 @each_method
-def test_nan_where_nothing_is_covered_does_not_count(arguments):
+def test_nan_where_nothing_is_covered_does_not_count(method):
     """Renderers that divide colors by alpha return 0 / 0 there."""
 
     def fn(opacity, view):
@@ -202,8 +203,8 @@ def test_nan_where_nothing_is_covered_does_not_count(arguments):
         image[:, ONE], alpha[ONE] = math.nan, 0.0
         return image, alpha
 
-    assert CAScore(fn, threshold=0.2, **arguments)(OPACITY, None).reason is Reason.OK
-    nothing = CAScore(lambda o, v: (torch.full((3, 4, 4), math.nan), torch.zeros(4, 4)), **arguments)
+    assert method(fn, threshold=0.2)(OPACITY, None).reason is Reason.OK
+    nothing = method(lambda o, v: (torch.full((3, 4, 4), math.nan), torch.zeros(4, 4)))
     assert nothing(OPACITY, None).reason is Reason.NOT_FINITE  # not one color is finite
 
 
@@ -259,12 +260,12 @@ def test_renders_that_do_not_differ_are_not_taken_for_certainty():
 
 @pytest.mark.parametrize("kind", [np.float32, np.float16, np.float64])
 @each_method
-def test_numbers_of_numpy_are_kept(arguments, kind):
-    score = CAScore(render, drop_rate=kind(0.25), threshold=kind(0.5), **arguments)
+def test_numbers_of_numpy_are_kept(method, kind):
+    score = method(render, drop_rate=kind(0.25), threshold=kind(0.5))
     for found in (score.update(OPACITY, None), score.compute()):
         data = json.loads(json.dumps(found.as_dict()))
         assert (data["drop_rate"], data["threshold"]) == (0.25, 0.5)
-    from_p = CAScore(render, p=kind(0.5), **arguments)
+    from_p = method(render, p=kind(0.5))
     assert json.loads(json.dumps(from_p(OPACITY, None).as_dict()))["drop_rate"] == 0.75
 
 
@@ -272,14 +273,14 @@ def test_numbers_of_numpy_are_kept(arguments, kind):
 
 
 @pytest.mark.parametrize("depth", [5.0, 255.0])
-@pytest.mark.parametrize("arguments", METHODS.values(), ids=METHODS)
-def test_a_depth_map_in_the_place_of_the_alpha_is_refused(depth, arguments):
+@each_method
+def test_a_depth_map_in_the_place_of_the_alpha_is_refused(depth, method):
     def with_depth(opacity, view):
         image, alpha = render(opacity, view)
         return image, depth * alpha / alpha.amax()
 
     with pytest.raises(ValueError, match=f"alpha must be in .0, 1., got values up to {depth:g}"):
-        CAScore(with_depth, **SETTINGS, **arguments)(OPACITY, None)
+        method(with_depth, **SETTINGS)(OPACITY, None)
 
 
 def test_an_expected_alpha_above_1_is_refused():
@@ -290,13 +291,13 @@ def test_an_expected_alpha_above_1_is_refused():
         CAScore.exact(with_depth)(OPACITY, None)
 
 
-@pytest.mark.parametrize("arguments", METHODS.values(), ids=METHODS)
-def test_images_up_to_255_have_no_score_but_a_reason(arguments):
+@each_method
+def test_images_up_to_255_have_no_score_but_a_reason(method):
     def bright(opacity, view):
         image, alpha = render(opacity, view)
         return 255 * image, alpha
 
-    score = CAScore(bright, **SETTINGS, **arguments)
+    score = method(bright, **SETTINGS)
     result = score.update(OPACITY, None)
     assert math.isnan(result.value)
     assert result.reason is score.compute().reason is Reason.OUT_OF_RANGE
@@ -315,9 +316,9 @@ def test_the_largest_variance_of_colors_in_0_to_1_is_a_score():
         assert all(result.reason is Reason.OK or result.value == 0 for result in results)
 
 
-@pytest.mark.parametrize("arguments", METHODS.values(), ids=METHODS)
-def test_a_renderer_that_ignores_the_opacities_is_noticed(arguments):
-    score = CAScore(lambda opacity, view: render(OPACITY, view), **SETTINGS, **arguments)
+@each_method
+def test_a_renderer_that_ignores_the_opacities_is_noticed(method):
+    score = method(lambda opacity, view: render(OPACITY, view), **SETTINGS)
     result = score.update(OPACITY, None)
     assert result.value == 0
     assert result.reason is score.compute().reason is Reason.NO_EFFECT

@@ -372,22 +372,22 @@ def test_the_paper_s_protocol_finds_four_fifths():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "message"),
+    ("make", "arguments", "error", "message"),
     [
-        ({}, ValueError, "render_fn, or exact"),
-        ({"exact": True}, TypeError, "exact must be callable"),
-        ({"render_fn": MANY.render, "neutral": True}, ValueError, "neutral needs exact"),
-        ({"exact": MANY.moments, "samples": 5}, ValueError, "samples does not apply to the method 'exact'"),
-        ({"exact": MANY.moments, "ddof": 1}, ValueError, "ddof does not apply"),
-        ({"exact": MANY.moments, "alpha_fn": MANY.render}, ValueError, "alpha_fn does not apply"),
-        ({"exact": MANY.moments, "relative_error": 0.1}, ValueError, "relative_error does not apply"),
-        ({"render_fn": MANY.render, "relative_error": 0.1, "samples": 9}, ValueError, "samples does not apply"),
-        ({"render_fn": MANY.render, "relative_error": 0.1, "ddof": 0}, ValueError, "ddof does not apply.* ddof is 1"),
-        ({"render_fn": MANY.render, "relative_error": 0.0}, ValueError, "relative_error must be above 0"),
-        ({"render_fn": MANY.render, "relative_error": 0.1, "max_samples": 15}, ValueError, "must be at least 16"),
-        ({"render_fn": MANY.render, "max_samples": 70}, ValueError, "give relative_error as well"),
+        (CAScore, {"render_fn": None}, TypeError, "render_fn must be callable"),
+        (CAScore, {"render_fn": MANY.render, "neutral": True}, TypeError, "neutral"),
+        (CAScore, {"render_fn": MANY.render, "max_samples": 70}, TypeError, "max_samples"),
+        (CAScore, {"render_fn": MANY.render, "samples": 3, "ddof": 3}, ValueError, "ddof must be below samples"),
+        (CAScore, {"render_fn": MANY.render, "samples": 1}, ValueError, "samples must be at least 2"),
+        (CAScore.exact, {"moments_fn": True}, TypeError, "moments_fn must be callable"),
+        (CAScore.exact, {"moments_fn": MANY.moments, "samples": 5}, TypeError, "samples"),
+        (CAScore.exact, {"moments_fn": MANY.moments, "drop_rate": 1.0}, ValueError, "drop_rate"),
+        (CAScore.adaptive, {"render_fn": MANY.render}, TypeError, "relative_error"),
+        (CAScore.adaptive, {"render_fn": MANY.render, "relative_error": 0.1, "ddof": 0}, TypeError, "ddof"),
+        (CAScore.adaptive, {"render_fn": MANY.render, "relative_error": 0.0}, ValueError, "relative_error must be abo"),
+        (CAScore.adaptive, {"render_fn": MANY.render, "relative_error": 0.1, "max_samples": 15}, ValueError, "16"),
     ],
 )  # fmt: skip
-def test_arguments_that_do_not_apply_are_refused(arguments, error, message):
+def test_arguments_that_do_not_apply_are_refused(make, arguments, error, message):
     with pytest.raises(error, match=message):
-        CAScore(**arguments)
+        make(**arguments)

@@ -9,7 +9,7 @@ import torch
 from clouds import KINDS, cloud, params, rank
 
 from ca_reg import Chain
-from ca_reg.regularizers import REGULARIZERS, _surroundings, parse
+from ca_reg.regularizers import REGULARIZERS, parse, surroundings
 from ca_reg.regularizers.surroundings import Refreshed, relative_ranks, surface_variation
 
 LOOKING = ("clustered(0.3)", "d2gs", "density", "drop_anchors", "geometry", "position_noise(0.3)")
@@ -24,9 +24,9 @@ def _rule(text):
 @pytest.fixture
 def looks(monkeypatch):
     """The numbers of points of all searches for neighbors."""
-    found, search = [], _surroundings.nearest_neighbors
+    found, search = [], surroundings.nearest_neighbors
     monkeypatch.setattr(
-        _surroundings, "nearest_neighbors", lambda means, count: (found.append(len(means)), search(means, count))[1]
+        surroundings, "nearest_neighbors", lambda means, count: (found.append(len(means)), search(means, count))[1]
     )
     return found
 
@@ -179,6 +179,13 @@ def test_autocast_costs_no_precision(text):
         found = cast(x, generator=torch.Generator().manual_seed(0))
     assert torch.equal(found.opacities, expected.opacities)
     assert torch.equal(found.means, expected.means)
+
+
+def test_the_surroundings_are_measured_in_full_precision():
+    points = cloud("spread", 300).float()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = surface_variation(points, 10)
+    assert torch.equal(found, surface_variation(points, 10))
 
 
 def test_planes_are_told_from_volumes_in_chunks(monkeypatch):
