@@ -12,7 +12,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from ca_reg._accumulate import Deviations, RenderMoments
+from ca_reg._accumulate import Deviations, RenderMoments, effect_of, finite_colors, visible_mean
 from ca_reg._check import (
     check_callable,
     check_count,
@@ -39,7 +39,6 @@ from ca_reg.types import (
 
 __all__ = ["CAScore", "ExactScore", "view_position"]
 
-MAX_ALPHA = 1.01  # above what rounding to 16 bits makes of an alpha of 1
 
 GROUPS = 8
 """Renders are pooled in at most this many groups, which bounds the memory; fewer groups would make the standard error
@@ -57,7 +56,7 @@ class CAScore:
     """Measure co-adaptation with any renderer (paper, "Quantifying Co-Adaptation").
 
     One view is rendered several times, each time without a random subset of the Gaussians. The score is the variance of
-    these renders, per pixel and channel, averaged over RGB and over the visible pixels. There are three ways to it:
+    these renders, per pixel and channel, averaged over RGB and over the visible pixels:
 
     - ``CAScore(render_fn)`` is the protocol of the authors' released code: 5 renders, drop rate ``1 - (1 - p)/2``, over
       the pixels with an alpha above 0.8 in every render, population variance, opacities not scaled and without noise,
@@ -68,8 +67,7 @@ class CAScore:
     Read a sampled score with its error. At 5 samples the variance of a single pixel is known to about 70 %. The mean
     over an image is known better: ``std_error`` estimates its error by a delete-a-group jackknife over the renders,
     with the visible region held fixed. With few samples it is too large (by some 15 % at 5, 50 % at 3); it needs at
-    least three. The memory does not grow with ``samples``: renders are pooled in at most 8 groups of one image and one
-    map each, in the precision of the renders, at least float32.
+    least three. The memory does not grow with ``samples``.
 
     The region of the protocol, the pixels that all renders cover, has no limit, because it shrinks with every render.
     The two other methods take the pixels whose *expected* alpha exceeds the threshold, whatever is drawn.
@@ -153,18 +151,12 @@ class CAScore:
         Nothing is sampled, the error is 0, and neither a seed nor the index of the view matters. A pixel is visible
         where its expected alpha exceeds ``threshold``.
 
-        Args:
-            moments_fn: moments of the model's renderer, ``moments_fn(opacity, view, multiplier, background)``; see
-                :class:`ca_reg.types.MomentsFn`. :class:`ca_reg.lists.ListMoments` makes one from the lists of the
-                Gaussians at each pixel.
-            neutral: composite each pixel over its own expected color (:func:`ca_reg.functional.neutral_background`), so
-                that holes do not show the background, and only disagreement between the colors of the Gaussians counts;
-                takes two calls of ``moments_fn``.
-            p: as for a sampled score, like the arguments that follow.
-            drop_rate: 1/2 compares models whatever they were trained with.
-            regularizer: it needs an ``alpha_factor``.
-            threshold: of the expected alpha.
-            layout: of the images.
+        ``moments_fn(opacity, view, multiplier, background)`` are the moments of the model's renderer, see
+        :class:`ca_reg.types.MomentsFn`; :class:`ca_reg.lists.ListMoments` makes them from lists of the Gaussians at
+        each pixel. With ``neutral`` each pixel is composited over its own expected color
+        (:func:`ca_reg.functional.neutral_background`), so that holes do not show the background, and only disagreement
+        between the colors of the Gaussians counts; this takes two calls. The other arguments are those of
+        :class:`CAScore`; a ``regularizer`` needs an ``alpha_factor``.
 
         Example:
             >>> from ca_reg.functional import alpha_moments
@@ -174,10 +166,8 @@ class CAScore:
             >>> round(CAScore.exact(moments_fn, threshold=0.3)(torch.tensor([0.8]), view=None).value, 6)  # 0 or 0.8
             0.16
         """
-        return ExactScore(
-            moments_fn, neutral=neutral, p=p, drop_rate=drop_rate, regularizer=regularizer, threshold=threshold,
-            layout=layout,
-        )  # fmt: skip
+        draws = {"p": p, "drop_rate": drop_rate, "regularizer": regularizer, "layout": layout}
+        return ExactScore(moments_fn, neutral, threshold, **draws)
 
     @classmethod
     def adaptive(
@@ -203,18 +193,9 @@ class CAScore:
         The standard error is itself an estimate, good to 18 % or better. In images of a dozen Gaussians, stopping where
         it looks small biases scores downward by up to 0.6 standard errors; docs/studies.md has the calibration.
 
-        Args:
-            render_fn: as for a sampled score, like the arguments that are not named here.
-            relative_error: target standard error as a fraction of the score, above 0.
-            max_samples: number of renders at which sampling stops in any case, at least 16. The standard error of the
-                result may then exceed the target.
-            p: as above.
-            drop_rate: as above.
-            regularizer: as above; it needs an ``alpha_factor``.
-            threshold: of the alpha of that one render.
-            layout: as above.
-            alpha_fn: as above.
-            seed: as above.
+        ``relative_error`` is the target of the standard error as a fraction of the score, above 0. Sampling stops at
+        ``max_samples`` renders, at least 16, in any case; the error may then exceed the target. The other arguments are
+        those of :class:`CAScore`; a ``regularizer`` needs an ``alpha_factor``.
 
         Example:
             >>> score = CAScore.adaptive(
@@ -224,10 +205,8 @@ class CAScore:
             >>> result.std_error / result.value <= 0.2, result.samples in range(16, 257, 8)
             (True, True)
         """
-        return _AdaptiveScore(
-            render_fn, relative_error=relative_error, max_samples=max_samples, p=p, drop_rate=drop_rate,
-            regularizer=regularizer, threshold=threshold, layout=layout, alpha_fn=alpha_fn, seed=seed,
-        )  # fmt: skip
+        draws = {"p": p, "drop_rate": drop_rate, "regularizer": regularizer, "layout": layout}
+        return _AdaptiveScore(render_fn, relative_error, max_samples, threshold, alpha_fn, seed, **draws)
 
     def _begin(self, p: float, drop_rate: float | None, regularizer: Regularizer | None, layout: Layout) -> None:
         """Check and store what all methods have in common."""
@@ -263,16 +242,13 @@ class CAScore:
         return CASettings(method=method, threshold=float(threshold), **self._draws, **others)
 
     def __call__(self, opacity: Tensor | Params, view: Any, *, index: int = 0) -> CAResult:
-        """Measure one view without counting it in :meth:`compute`.
+        """Measure one view without counting it in :meth:`compute`; return the score with its maps and its reason.
 
         Args:
             opacity: activated opacities in [0, 1], shape (N,) or (N, 1); or :class:`~ca_reg.Params` with all that the
                 regularizer needs.
             view: passed on to the callables as it is.
             index: position of the view among all views, at least 0; determines the masks together with the seed.
-
-        Returns:
-            The score with its maps. Without visible pixels the value is nan and ``reason`` says so.
 
         Raises:
             TypeError: if ``opacity`` or a render is not of the right type.
@@ -292,18 +268,11 @@ class CAScore:
         return x._replace(opacities=x.opacities.detach(), step=self.regularizer.step if x.step is None else x.step)
 
     def update(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> CAResult:
-        """Measure one view and count it in the mean that :meth:`compute` returns.
+        """Measure one view and count it in the mean that :meth:`compute` returns; arguments and errors are a call's.
 
-        Args:
-            opacity: as for a call of the score.
-            view: as for a call of the score.
-            index: position of the view among all views, which gives every view its own masks. By default views are
-                counted from the last reset, and over ranks as if dealt out in turn, as
-                :class:`torch.utils.data.DistributedSampler` does without shuffling: the result then is that of a single
-                process. Give the position in the whole set if the views are split in another way.
-
-        Raises:
-            TypeError, ValueError: as for a call of the score.
+        By default, views are counted from the last reset, and over ranks as if dealt out in turn, as
+        :class:`torch.utils.data.DistributedSampler` does without shuffling: the result then is that of a single
+        process. If they are split in another way, ``index`` is the position in the whole set.
         """
         result = self(opacity, view, index=view_position(self._updates) if index is None else index)
         self._sums += row_of(result)
@@ -337,17 +306,17 @@ class CAScore:
         differ: list[Tensor] = []
         for image, alpha in self._renders(self._drawn(x, index, settings.samples, differ), view):
             lowest = torch.minimum(lowest.to(alpha), alpha)
-            image, odd = _finite(image, alpha, lowest, settings.threshold)
+            image, odd = finite_colors(image, alpha, lowest, settings.threshold)
             broken |= odd
             moments.add(image)
         visible = lowest > settings.threshold
         variance = moments.variance(settings.ddof)
-        value, reason = _mean(variance, visible, broken, moments.count / (moments.count - settings.ddof))
+        value, reason = visible_mean(variance, visible, broken, moments.count / (moments.count - settings.ddof))
         std_error = math.nan
         if reason is Reason.OK:
             # For a given visible region this factor relates the unbiased variance to this one, and so their errors.
             std_error = moments.jackknife_error(visible) * (moments.count - 1) / (moments.count - settings.ddof)
-            reason = _effect(value, differ)
+            reason = effect_of(value, differ)
         return self._result(value, std_error, variance, visible, reason, moments.count)
 
     def _alpha_factor(self, x: Params) -> tuple[Params, Multiplier]:
@@ -420,27 +389,16 @@ class _AdaptiveScore(CAScore):
     """See :meth:`CAScore.adaptive`."""
 
     def __init__(
-        self,
-        render_fn: RenderFn,
-        *,
-        relative_error: float,
-        max_samples: int,
-        p: float,
-        drop_rate: float | None,
-        regularizer: Regularizer | None,
-        threshold: float,
-        layout: Layout,
-        alpha_fn: RenderFn | None,
-        seed: int,
+        self, render_fn: RenderFn, target: float, most: int, threshold: float, alpha_fn: Any, seed: int, **draws: Any
     ) -> None:
-        check_finite(relative_error, "relative_error")
-        if relative_error <= 0:
-            raise ValueError(f"relative_error must be above 0, got {relative_error}; use CAScore.exact without error.")
-        check_count(max_samples, "max_samples", minimum=MIN_RENDERS)
-        self._begin(p, drop_rate, regularizer, layout)
+        check_finite(target, "relative_error")
+        if target <= 0:
+            raise ValueError(f"relative_error must be above 0, got {target}; CAScore.exact has no error.")
+        check_count(most, "max_samples", minimum=MIN_RENDERS)
+        self._begin(**draws)
         self._begin_sampling(render_fn, alpha_fn, seed)
-        target = {"relative_error": float(relative_error), "max_samples": int(max_samples)}
-        self.settings = self._settings("adaptive", threshold, ddof=1, seed=self.seed, **target)
+        limits = {"relative_error": float(target), "max_samples": int(most)}
+        self.settings = self._settings("adaptive", threshold, ddof=1, seed=self.seed, **limits)
 
     def _measure(self, x: Params, view: Any, index: int) -> CAResult:
         """Render until the error is small enough, over the pixels that the expected image covers.
@@ -453,21 +411,21 @@ class _AdaptiveScore(CAScore):
         mean, multiplier = self._alpha_factor(x)
         expected, alpha = self._render((mean.opacities * multiplier.mean).view_as(x.opacities), view)
         visible = alpha > settings.threshold
-        expected, broken = _finite(expected, alpha, visible, 0)
+        expected, broken = finite_colors(expected, alpha, visible, 0)
         moments, deviations = RenderMoments(), Deviations(expected, visible)
         del expected, alpha  # may be buffers of the renderer, which the next render overwrites
         result, differ = None, list[Tensor]()
         renders = self._renders(self._drawn(x, index, settings.max_samples, differ), view)
         for k, (image, alpha) in enumerate(renders, start=1):
-            image, odd = _finite(image, alpha, visible, 0)
+            image, odd = finite_colors(image, alpha, visible, 0)
             broken |= odd
             moments.add(image)
             deviations.add(image)
             if k == settings.max_samples or (k >= MIN_RENDERS and k % BATCH == 0):
                 variance = moments.variance(ddof=1)
-                value, reason = _mean(variance, visible, broken, k / (k - 1))
+                value, reason = visible_mean(variance, visible, broken, k / (k - 1))
                 if reason is Reason.OK and k == settings.max_samples:
-                    reason = _effect(value, differ)
+                    reason = effect_of(value, differ)
                 result = self._result(value, self._error(value, deviations), variance, visible, reason, k)
                 if self._is_settled(result):
                     break
@@ -501,19 +459,9 @@ class ExactView(NamedTuple):
 class ExactScore(CAScore):
     """See :meth:`CAScore.exact`."""
 
-    def __init__(
-        self,
-        moments_fn: MomentsFn,
-        *,
-        neutral: bool,
-        p: float,
-        drop_rate: float | None,
-        regularizer: Regularizer | None,
-        threshold: float,
-        layout: Layout,
-    ) -> None:
+    def __init__(self, moments_fn: MomentsFn, neutral: bool, threshold: float, **draws: Any) -> None:
         check_callable(moments_fn, "moments_fn", "opacity, view, multiplier, background")
-        self._begin(p, drop_rate, regularizer, layout)
+        self._begin(**draws)
         self.moments_fn = moments_fn
         self.settings = self._settings("exact_neutral" if neutral else "exact", threshold)
 
@@ -539,17 +487,17 @@ class ExactScore(CAScore):
         if settings.method == "exact_neutral":
             # Over black the mean is sum w c and the expected alpha sum w: their ratio is the neutral background.
             over_black, total = moments(opacity.new_zeros(3))
-            black, broken = _finite(over_black.mean, total, total, 0)
+            black, broken = finite_colors(over_black.mean, total, total, 0)
             neutral = (black / torch.where(total > 0, total, 1.0)).nan_to_num(0.0, 0.0, 0.0)
             background = neutral if self.layout == "CHW" else neutral.permute(1, 2, 0)
         image, alpha = moments(background)
         alpha = alpha.to(image.variance.device)
         visible = alpha > settings.threshold
         for colors in image[:2]:
-            colors, odd = _finite(colors, alpha, alpha, settings.threshold)
+            colors, odd = finite_colors(colors, alpha, alpha, settings.threshold)
             broken |= odd
         variance = colors.mean(0).to(torch.float64)
-        value, reason = _mean(variance, visible, broken, 1.0)
+        value, reason = visible_mean(variance, visible, broken, 1.0)
         std_error = 0.0 if reason is Reason.OK else math.nan
         result = self._result(value, std_error, variance, visible, reason, None)
         return ExactView(result, opacity, multiplier, background)
@@ -565,46 +513,3 @@ def view_position(count: int, group: dist.ProcessGroup | None = None) -> int:
     if not (dist.is_available() and dist.is_initialized()):
         return count
     return dist.get_rank(group) + dist.get_world_size(group) * count
-
-
-def _finite(colors: Tensor, alpha: Tensor, cover: Tensor, threshold: float) -> tuple[Tensor, bool]:
-    """Return colors (3, H, W) with pixels that are not finite set to 0, and whether a non-finite value matters.
-
-    In alpha (H, W) any does. In the colors it does unless alpha is 0 there and ``cover`` (H, W) at most the threshold,
-    because some renderers divide 0 by 0 where nothing covers a pixel; it always does if no pixel is finite. Raises a
-    ValueError for an alpha above 1.
-    """
-    # One transfer for both numbers: each would make the host wait for a GPU.
-    total, highest = torch.stack((colors.sum() + alpha.sum(), alpha.amax() if alpha.numel() else alpha.sum())).tolist()
-    if MAX_ALPHA < highest < math.inf:
-        raise ValueError(
-            f"an alpha must be in [0, 1], got values up to {highest:g}: is it a depth map, or does it count to 255? "
-            "Return the accumulated alpha of every pixel, the sum of its blend weights."
-        )
-    if math.isfinite(total):
-        return colors, False
-    odd = ~colors.isfinite().all(0)
-    broken = (~alpha.isfinite() | (odd & ((alpha != 0) | (cover > threshold)))).any() | odd.all()
-    return colors.masked_fill(odd, 0.0), bool(broken)
-
-
-def _effect(value: float, differ: list[Tensor]) -> Reason:
-    """Return NO_EFFECT if the score is exactly 0 although the draws differed: the renderer may have ignored them."""
-    return Reason.NO_EFFECT if value == 0 and bool(torch.stack(differ).any()) else Reason.OK
-
-
-def _mean(variance: Tensor, visible: Tensor, broken: bool, excess: float) -> tuple[float, Reason]:
-    """Average over the visible pixels, or say why not; ``broken`` is what `_finite` found.
-
-    ``excess`` is the divisor of a population variance over that of this one.
-    """
-    pixels = int(visible.count_nonzero())
-    if broken:
-        return math.nan, Reason.NOT_FINITE
-    if pixels == 0:
-        return math.nan, Reason.EMPTY
-    mean = float((variance * visible).sum()) / pixels
-    if not math.isfinite(mean):
-        return math.nan, Reason.NOT_FINITE
-    # Colors in [0, 1] vary by at most 1/4 (Popoviciu's inequality), which is reached if they are 0 or 1 half the time.
-    return (mean, Reason.OK) if mean <= 0.25 * excess * (1.0 + 1e-6) else (math.nan, Reason.OUT_OF_RANGE)
