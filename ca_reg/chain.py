@@ -111,6 +111,8 @@ class Chain(Regularizer):
 
     def expected(self, x: Params) -> Params:
         """Return the test-time value of all members."""
+        # The mean of a product is not the product of the means where the factor of one depends on the opacity that
+        # another has changed, as that of clamped noise does; the moments of the composed factor account for that.
         means = [member for member in self if member.renders_mean]
         for member in means:
             member.check_needs(x)
@@ -130,7 +132,7 @@ class Chain(Regularizer):
 
 
 class WrappedModule(Regularizer):
-    """A module that knows nothing of this package, called in its own mode to map activated opacities (N,) to others.
+    """Adapter that lets any module on activated opacities (N,) act as a regularizer, called in its own mode.
 
     It drops the Gaussians where its attribute ``keep``, (N,) bool, is False, or, without that attribute, those whose
     opacity it sets to 0. The step is passed to its ``set_step`` and to those of its submodules. Test-time values come
@@ -171,10 +173,11 @@ class WrappedModule(Regularizer):
         """Call the module."""
         before = x.opacities
         if generator is not None:
-            self.check_generator()
+            self.check_generator()  # before the call, which would end in a TypeError that names no remedy
         after: Tensor = self.module(before) if generator is None else self.module(before, generator=generator)
         if after is before:
             return Draw(after)
+        # Its own mask first: where opacities were 0 before, the result does not tell what was dropped.
         if hasattr(self.module, "keep"):
             keep: Any = self.module.keep
             return Draw(after, None if keep is None else keep.reshape(-1))
@@ -229,7 +232,7 @@ def _set_step(module: nn.Module, step: int) -> None:
 def _evaluating(module: nn.Module) -> nn.Module:
     """Return a copy in ``eval()`` that shares all tensors with the module."""
     module = getattr(module, "_orig_mod", module)  # a compiled module calls the original, in its mode
-    twin = object.__new__(type(module))
+    twin = object.__new__(type(module))  # not deepcopy: the twin must see the parameters as they are
     vars(twin).update(vars(module))
     parts = {name: None if part is None else _evaluating(part) for name, part in module._modules.items()}
     vars(twin).update(training=False, _modules=parts)

@@ -183,6 +183,7 @@ def _blocks(lists: PixelLists, multiplier: Multiplier, background: Tensor | None
     n, size = lists.colors.shape[0], lists.height * lists.width
     pixels = lists.pixels.long()
     order = pixels.argsort(stable=True)
+    # Entry P, one behind the last, is the padding: Gaussian n, of alpha 0.
     gaussians = torch.nn.functional.pad(lists.gaussians.long()[order], (0, 1), value=n)
     alphas = torch.nn.functional.pad(lists.alphas[order], (0, 1))
     values = torch.cat([lists.colors, torch.ones_like(lists.colors[:, :1])], dim=1)
@@ -230,7 +231,7 @@ def _background_of(lists: PixelLists, background: Tensor | None) -> Tensor:
 
 
 def _per_gaussian(moment: float | Tensor, name: str, lists: PixelLists) -> float | Tensor:
-    """Return a moment of the multiplier as a number, or per Gaussian plus an entry for the padding, (N + 1,)."""
+    """Return a moment of the multiplier as it is if a number, else one value per Gaussian and one for the padding."""
     if not isinstance(moment, Tensor):
         return moment
     n = lists.colors.shape[0]

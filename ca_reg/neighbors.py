@@ -70,7 +70,11 @@ def _on_cpu(points: Tensor) -> Any:
 
 
 def _along_an_axis(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Sort the points along one axis: only those in a strip can be nearer than the neighbors already found."""
+    """Find exact neighbors by a sweep along the longest axis.
+
+    In the order along that axis, a chunk's neighbors among those nearby bound how far away the true ones can be; only
+    points in the strip of that width are then compared.
+    """
     n = points.shape[0]
     axis = int((points.amax(0) - points.amin(0)).argmax())
     order = points[:, axis].argsort()

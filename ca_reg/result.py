@@ -9,6 +9,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
+import torch.distributed as dist
 from torch import Tensor
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ class _Score(CASettings):
         """The choices behind the score, which are the same for every view of one :class:`~ca_reg.CAScore`."""
         values = {field.name: getattr(self, field.name) for field in fields(CASettings)}
         if self.method == "adaptive":
-            values["samples"] = None
+            values["samples"] = None  # found anew for each view, so no choice
         return CASettings(**values)
 
     @property
@@ -194,6 +195,7 @@ class CAResult(_Score):
             ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
         """
         ax = new_axes() if ax is None else ax
+        # The root, because a few pixels hold most of the variance.
         heat = self.variance.sqrt().masked_fill(~self.visible, math.nan).cpu().numpy()
         ax.set_facecolor("0.6")
         picture = ax.imshow(heat, cmap="inferno", vmin=0.0)
@@ -263,7 +265,7 @@ def summary_of(sums: Tensor, settings: CASettings) -> CASummary:
     counted = views - empty
     if views == 0:
         reason = Reason.NO_VIEWS
-    elif not_finite > 0:
+    elif not_finite > 0:  # one broken view is a fault of the model or the renderer, an empty one is not
         reason = Reason.NOT_FINITE
     elif out_of_range > 0:
         reason = Reason.OUT_OF_RANGE
@@ -280,6 +282,13 @@ def summary_of(sums: Tensor, settings: CASettings) -> CASummary:
         empty_views=int(empty),
         **asdict(settings),
     )
+
+
+def view_position(count: int, group: dist.ProcessGroup | None = None) -> int:
+    """Return the position, among the views of all ranks, of the view that follows ``count`` others on this rank."""
+    if not (dist.is_available() and dist.is_initialized()):
+        return count
+    return dist.get_rank(group) + dist.get_world_size(group) * count
 
 
 def new_axes(count: int = 1) -> Any:

@@ -25,7 +25,7 @@ from ca_reg._random import seeded
 from ca_reg.functional import Multiplier
 from ca_reg.regularizer import Params, Regularizer
 from ca_reg.regularizers import GaussianDropout
-from ca_reg.result import COLUMNS, CAResult, CASettings, CASummary, Method, Reason, row_of, summary_of
+from ca_reg.result import COLUMNS, CAResult, CASettings, CASummary, Method, Reason, row_of, summary_of, view_position
 from ca_reg.types import (
     ExactMoments,
     Layout,
@@ -282,8 +282,7 @@ class CAScore:
     def compute(self) -> CASummary:
         """Return the mean over the views counted so far, on all ranks if torch.distributed is initialized.
 
-        Views without visible pixels are left out of the mean; ``empty_views`` counts them. The standard error is over
-        the choice of masks, with the views held fixed. On several ranks every rank must call this.
+        Views without visible pixels are left out. On several ranks every rank must call this.
         """
         sums = self._sums.clone()
         if dist.is_available() and dist.is_initialized():
@@ -321,7 +320,7 @@ class CAScore:
 
     def _alpha_factor(self, x: Params) -> tuple[Params, Multiplier]:
         """Return the regularizer's ``alpha_factor``, or raise if it has none."""
-        factor = self.regularizer.alpha_factor(_flat(x))
+        factor = self.regularizer.alpha_factor(x._replace(opacities=x.opacities.reshape(-1)))
         if factor is None:
             raise ValueError(
                 f"the draws of {type(self.regularizer).__name__} are no independent factors of the opacities, which an "
@@ -334,7 +333,8 @@ class CAScore:
 
         ``differ`` takes, for every draw but the first, whether it differs from that, as a tensor that is not yet read.
         """
-        generator, flat, first = seeded(self.seed, index), _flat(x), None
+        # One generator per view: more renders extend the sequence, other views do not shift it.
+        generator, flat, first = seeded(self.seed, index), x._replace(opacities=x.opacities.reshape(-1)), None
         for _ in range(count):
             drawn, *others = self.regularizer.replay(flat, self.regularizer.draw(flat, generator))
             if any(a is not b for a, b in zip(others, flat[1:], strict=True)):
@@ -401,7 +401,7 @@ class _AdaptiveScore(CAScore):
         self.settings = self._settings("adaptive", threshold, ddof=1, seed=self.seed, **limits)
 
     def _measure(self, x: Params, view: Any, index: int) -> CAResult:
-        """Render until the error is small enough, over the pixels that the expected image covers.
+        """Render until the error is small enough.
 
         The region must not come from the sampled renders: pixels that they all happen to cover happen to vary little,
         and the error would have to include the variation of the region.
@@ -445,10 +445,7 @@ class _AdaptiveScore(CAScore):
 
 
 class ExactView(NamedTuple):
-    """An exact score and the inputs with which its moments were rendered, so that they can be rendered again.
-
-    The background is in the callable's own layout.
-    """
+    """An exact score and the inputs of its moments, to render them again; the background in the callable's layout."""
 
     result: CAResult
     opacity: Tensor
@@ -501,15 +498,3 @@ class ExactScore(CAScore):
         std_error = 0.0 if reason is Reason.OK else math.nan
         result = self._result(value, std_error, variance, visible, reason, None)
         return ExactView(result, opacity, multiplier, background)
-
-
-def _flat(x: Params) -> Params:
-    """Return ``x`` with opacities of shape (N,)."""
-    return x._replace(opacities=x.opacities.reshape(-1))
-
-
-def view_position(count: int, group: dist.ProcessGroup | None = None) -> int:
-    """Return the position, among the views of all ranks, of the view that follows ``count`` others on this rank."""
-    if not (dist.is_available() and dist.is_initialized()):
-        return count
-    return dist.get_rank(group) + dist.get_world_size(group) * count

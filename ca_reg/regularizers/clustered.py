@@ -32,9 +32,6 @@ class ClusteredDropout(Regularizer):
         k: neighbors dropped with an anchor; all others if there are fewer.
         every: steps between neighbor searches.
 
-    Raises:
-        ValueError: if ``p`` is outside [0, 1), or ``k`` or ``every`` below 1.
-
     Example:
         Each pair is dropped together:
 
@@ -103,9 +100,6 @@ class AnchorDropout(ClusteredDropout):
         k: neighbors dropped with an anchor, as in the paper.
         every: steps between neighbor searches; the paper does not say.
 
-    Raises:
-        ValueError: if a constant rate is outside [0, 1), or ``k`` or ``every`` below 1.
-
     Example:
         >>> import torch
         >>> from ca_reg import Params
@@ -138,9 +132,6 @@ class SHDropout(Regularizer):
     Args:
         p: rate in [0, 1), or a schedule of it. 0.2 in the paper.
         until: the steps at which the degree rises. 2,000, 4,000 and 6,000 in the paper.
-
-    Raises:
-        ValueError: if ``p`` is outside [0, 1), or ``until`` is not sorted.
 
     Example:
         >>> x = Params(torch.ones(1000), sh=torch.ones(1000, 16, 3), step=2500)

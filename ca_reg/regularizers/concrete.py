@@ -32,9 +32,6 @@ class BinaryConcrete(Regularizer):
         temperature: above 0 and at most 1.
         floor: smallest factor, in [0, 0.5); the largest is ``1 - floor``.
 
-    Raises:
-        ValueError: if one is out of range.
-
     Example:
         >>> class DimFaint(BinaryConcrete):
         ...     def logits(self, x):
@@ -129,10 +126,6 @@ class ConcreteDropout(BinaryConcrete):
         rate: learning rate of the logits. The paper does not give it; the default is that of the opacity logits.
         temperature: 0.1 in the paper.
 
-    Raises:
-        TypeError: if ``rate`` is not a number.
-        ValueError: if an argument is out of range.
-
     Example:
         >>> import torch
         >>> dropout = ConcreteDropout(p=0.1)
@@ -179,9 +172,6 @@ class SoftDropout(BinaryConcrete):
         temperature: above 0 and at most 1; 0.1 in UGOD's code, 0.2 for its results on Mip-NeRF 360.
         floor: the smallest omega; the largest is ``1 - floor``. 0.2 in UGOD.
 
-    Raises:
-        ValueError: if an argument is out of range.
-
     Example:
         >>> import torch
         >>> soft, opacity = SoftDropout(), torch.full((5,), 0.5)
@@ -208,5 +198,6 @@ class SoftDropout(BinaryConcrete):
         if not self.by_size:
             return math.log(self.u / (1 - self.u))
         assert x.scales is not None, "checked by check_needs"
+        # The rank, not the size: one huge Gaussian would otherwise leave the rest without dropout.
         ranks = x.scales.detach().amax(1).argsort(stable=True).argsort()
         return (2 * self.u * (ranks + 0.5) / len(ranks)).to(x.opacities.dtype).logit()

@@ -48,9 +48,6 @@ class D2GSDropout(SurroundingsDropout):
         literal: do what the published code does.
         scale: scale the opacities in evaluation, which the source does not.
 
-    Raises:
-        ValueError: if a weight is negative, or ``k`` or ``every`` below 1.
-
     Example:
         >>> from ca_reg import Params
         >>> means = torch.tensor([[0.0, 0, 1], [0.0, 0, 2], [0.0, 0, 4]])
@@ -107,7 +104,7 @@ class D2GSDropout(SurroundingsDropout):
 
 
 class _ByStepsAlone(Refreshed):
-    """Recomputed at step 1 and at multiples of ``every`` only, even if the number of Gaussians changes in between."""
+    """Measures when the published code does: at step 1 and at multiples of ``every``, whatever was densified since."""
 
     def holds(self, x: Params) -> bool:
         return x.step != 1 and (x.step or 0) % self.every != 0
@@ -141,9 +138,6 @@ class DepthDropout(IndependentDropout):
         near: factor of the rate for the nearest Gaussian, at least 0.
         far: factor of the rate for the farthest, at least 0.
         scale: scale the opacities in evaluation.
-
-    Raises:
-        ValueError: if a factor is negative or not finite.
 
     Example:
         >>> import torch

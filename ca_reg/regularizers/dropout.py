@@ -61,6 +61,7 @@ class IndependentDropout(Regularizer):
         """Set the opacities of dropped Gaussians to 0; if asked to, compensate the others for the rates of ``x``."""
         if draw.keep is None:
             return x
+        # Only compensation needs the rates again; some are the ranks of a whole model.
         rates = self.rates(x) if self.compensate else 0.0
         opacities = functional.apply_dropout(x.opacities, draw.keep, p=rates, compensate=self.compensate)
         return x._replace(opacities=opacities)
@@ -82,6 +83,7 @@ class IndependentDropout(Regularizer):
 
     def _alpha_factor(self, x: Params, rates: Rate) -> tuple[Params, Multiplier]:
         if self.compensate:
+            # Survivors may exceed 1: the renderer's clamp must see them before the factor does.
             x = x._replace(opacities=x.opacities / (1.0 - rate_like(rates, x.opacities)))
         return x, Multiplier.dropout(rates)
 
@@ -96,7 +98,7 @@ class GaussianDropout(IndependentDropout):
     survivors are multiplied by ``1 / (1 - p)`` in training instead, and evaluation leaves the opacities as they are.
     The two schemes are not equivalent: compositing is not linear in the opacities, and rasterizers clamp the alpha of
     survivors, so that Gaussians of opacity above ``0.99 (1 - p)`` are more opaque in evaluation than in the mean over
-    all masks. The module has no parameters; put it between the activation of the opacities and the rasterizer.
+    all masks.
 
     Dropped Gaussians must leave no trace in density control: pass the radii through
     :meth:`~ca_reg.Regularizer.mask_radii`.
@@ -115,11 +117,6 @@ class GaussianDropout(IndependentDropout):
     Args:
         p: drop rate in [0, 1), or a schedule of it. The paper uses 0.2.
         compensate: scale the survivors in training rather than all opacities in evaluation.
-
-    Attributes:
-        keep: the last mask, True where the Gaussian was kept, (N,) bool; None if nothing was dropped.
-        p: the rate at the current step.
-        step: the training step, set with :meth:`set_step`; a module with a schedule saves it in ``state_dict``.
 
     Raises:
         TypeError: if ``p`` is neither a number nor callable.
@@ -163,10 +160,6 @@ class DropGaussian(GaussianDropout):
         p: rate at the end of the ramp, in [0, 1); 0.2 in the source.
         steps: length of the ramp, after which the rate is constant; the source trains for 10,000 steps. Shorter
             trainings should pass their own length: 3,000 steps of the default reach 0.06.
-
-    Raises:
-        TypeError: if ``p`` is not a number or ``steps`` not an integer.
-        ValueError: if ``p`` is outside [0, 1) or ``steps`` below 1.
 
     Example:
         >>> import torch

@@ -23,17 +23,15 @@ class ParameterNoise(Regularizer):
     ``eval()`` changes nothing. A subclass names the parameter, and may override :meth:`perturb`, which applies noise.
 
     Args:
-        sigma: standard deviation of the relative noise, at least 0, or a schedule of it.
+        sigma: standard deviation of the relative noise, from 0 to 1e30, or a schedule of it.
         clip: clip the noise to [-sigma, sigma], as the paper's released code does for the opacities.
 
     Attributes:
         field: the field of :class:`~ca_reg.Params` that is perturbed.
-        noise: the last draw, float32, the shape of the parameter; None if there was none.
-        sigma: the standard deviation at the current step.
 
     Raises:
         TypeError: if ``sigma`` is neither a number nor callable.
-        ValueError: if a constant ``sigma`` is negative or above 1e30; a schedule is checked at each use.
+        ValueError: if a constant ``sigma`` is out of range; a schedule is checked at each use.
 
     Example:
         >>> class PositionShake(ParameterNoise):
@@ -112,15 +110,6 @@ class OpacityNoise(ParameterNoise):
         clip: clip the noise to [-sigma, sigma], as the authors' released code does.
         scale: return the mean opacities in evaluation. This reads their values, which breaks a ``torch.compile`` graph.
 
-    Attributes:
-        noise: the last draw, (N,) float32; None if there was none.
-        sigma: the standard deviation at the current step.
-        step: the training step, set with :meth:`set_step`; a module with a schedule saves it in ``state_dict``.
-
-    Raises:
-        TypeError: if ``sigma`` is neither a number nor callable.
-        ValueError: if a constant ``sigma`` is negative or above 1e30; a schedule is checked at each use.
-
     Example:
         >>> noise = OpacityNoise(sigma=0.8)
         >>> opacity = torch.full((5, 1), 0.5)
@@ -176,9 +165,6 @@ class ScaleNoise(ParameterNoise):
             PSNR is best at 0.2, the default, co-adaptation lowest from 0.6 on.
         clip: clip the noise to [-sigma, sigma].
 
-    Raises:
-        TypeError, ValueError: as :class:`~ca_reg.OpacityNoise`.
-
     Example:
         >>> import torch
         >>> from ca_reg import Params
@@ -212,9 +198,6 @@ class SHNoise(ParameterNoise):
         sigma: standard deviation of the relative noise, at least 0, or a schedule of it. The paper tries 0.1, 0.3 and
             0.5: PSNR is best at 0.1, the default.
         clip: clip the noise to [-sigma, sigma].
-
-    Raises:
-        TypeError, ValueError: as :class:`~ca_reg.OpacityNoise`.
 
     Example:
         >>> import torch

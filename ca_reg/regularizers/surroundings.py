@@ -23,8 +23,9 @@ __all__ = [
 
 
 class Refreshed(nn.Module):
-    """A cached tensor, one row per Gaussian, recomputed every ``every`` steps and when the number of Gaussians changes.
+    """Keeps a measurement of the surroundings between steps, because a neighbor search takes longer than a step.
 
+    It is a tensor with one row per Gaussian, measured again every ``every`` steps and when their number changes.
     If the step has not advanced it is recomputed unless the very same means come again, unmodified: one object may
     score several models. ``state_dict`` holds the tensor and its step, so that a resumed run continues with them; a
     checkpoint without them starts afresh. Pruning as many Gaussians as are added goes unnoticed until the next refresh.
@@ -57,7 +58,7 @@ class Refreshed(nn.Module):
         assert x.means is not None
         assert self.value is not None
         if len(self.value) != len(x.means):
-            return False
+            return False  # densified or pruned: rows no longer belong to their Gaussians
         same = self._seen is not None and self._seen[0]() is x.means and self._seen[1] == _version(x.means)
         return same or 0 < (x.step or 0) - self.since < self.every
 
@@ -75,10 +76,11 @@ class Refreshed(nn.Module):
 
 
 class SurroundingsDropout(IndependentDropout):
-    """Drop independently, at rates that depend on each Gaussian's surroundings; a subclass measures them.
+    """Base class of dropouts whose rates follow from a measurement of the surroundings, such as the density.
 
-    In training the measurement is refreshed every ``every`` steps (:class:`Refreshed`), at test time it is that of the
-    rendered model. The other arguments are those of :class:`~ca_reg.IndependentDropout`.
+    A subclass says what to measure and how rates follow from it. In training the measurement is refreshed every
+    ``every`` steps (:class:`Refreshed`), at test time it is that of the rendered model. The other arguments are those
+    of :class:`~ca_reg.IndependentDropout`.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("means",)
@@ -161,6 +163,7 @@ def relative_ranks(values: Tensor) -> Tensor:
     """
     if len(values) < 2:
         return torch.full_like(values, 0.5)
+    # A group of equal values that ends at rank e and has c members shares the mean rank e - (c + 1) / 2, from 0.
     _, places, counts = values.unique(return_inverse=True, return_counts=True)  # type: ignore[no-untyped-call]
     ranks: Tensor = (2 * counts.cumsum(0) - counts - 1).to(values.dtype) / (2 * len(values) - 2)
     return ranks[places]
@@ -179,11 +182,8 @@ class DensityDropout(RankedDropout):
         high: rate of the densest, in [0, 1). The paper uses 0.5.
         k: number of neighbors; 3DGS initializes its scales from 3.
         every: steps between neighbor searches; by default 3DGS's densification interval.
-        compensate: scale the survivors in training rather than all opacities in evaluation.
-        scale: scale the opacities in evaluation, as the paper does.
-
-    Raises:
-        ValueError: if a rate is outside [0, 1), or ``k`` or ``every`` below 1.
+        compensate: as in :class:`~ca_reg.IndependentDropout`.
+        scale: likewise.
 
     Example:
         >>> import torch
@@ -217,11 +217,8 @@ class GeometryDropout(RankedDropout):
         high: rate where they vary most, in [0, 1).
         k: number of neighbors.
         every: steps between neighbor searches; by default 3DGS's densification interval.
-        compensate: scale the survivors in training rather than all opacities in evaluation.
-        scale: scale the opacities in evaluation, as the paper does.
-
-    Raises:
-        ValueError: if a rate is outside [0, 1), or ``k`` or ``every`` below 1.
+        compensate: as in :class:`~ca_reg.IndependentDropout`.
+        scale: likewise.
 
     Example:
         >>> from ca_reg import Params
