@@ -63,7 +63,7 @@ def score_view(model: TrainedModel, view: View, *, index: int) -> dict[str, floa
     opacities = model.gaussians.opacities
     moments = read_moments(model.moments(opacities, view, Multiplier.dropout(_HALF)), layout="CHW")
     assert moments.alpha_mean is not None
-    exact_half = CAScore(exact=lambda *_: moments, drop_rate=_HALF)(opacities, view)
+    exact_half = CAScore.exact(lambda *_: moments, drop_rate=_HALF)(opacities, view)
     half = model.ca_score(drop_rate=_HALF)(opacities, view, index=index)
     repeat = model.ca_score(drop_rate=_HALF, seed=1)(opacities, view, index=index)
     neutral = model.exact_ca_score(drop_rate=_HALF, neutral=True)(opacities, view)

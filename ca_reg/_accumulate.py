@@ -1,4 +1,4 @@
-"""Streaming moments of renders: the variance map and the sampling error of its mean."""
+"""From renders to a score: streaming moments, the sampling error, and the mean over the visible pixels."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import torch
 from torch import Tensor
 
 from ca_reg._precision import at_least_single
+from ca_reg.result import Reason
 
-__all__ = ["Deviations", "RenderMoments"]
+__all__ = ["Deviations", "RenderMoments", "effect_of", "finite_colors", "visible_mean"]
+
+MAX_ALPHA = 1.01  # above what rounding to 16 bits makes of an alpha of 1
 
 
 class RenderMoments:
@@ -123,3 +126,46 @@ def _add_squares(to: Tensor, image: Tensor, factor: float = 1.0) -> Tensor:
     for channel in image:
         to.addcmul_(channel, channel, value=factor)
     return to
+
+
+def finite_colors(colors: Tensor, alpha: Tensor, cover: Tensor, threshold: float) -> tuple[Tensor, bool]:
+    """Return colors (3, H, W) with pixels that are not finite set to 0, and whether a non-finite value matters.
+
+    In alpha (H, W) any does. In the colors it does unless alpha is 0 there and ``cover`` (H, W) at most the threshold,
+    because some renderers divide 0 by 0 where nothing covers a pixel; it always does if no pixel is finite. Raises a
+    ValueError for an alpha above 1.
+    """
+    # One transfer for both numbers: each would make the host wait for a GPU.
+    total, highest = torch.stack((colors.sum() + alpha.sum(), alpha.amax() if alpha.numel() else alpha.sum())).tolist()
+    if MAX_ALPHA < highest < math.inf:
+        raise ValueError(
+            f"an alpha must be in [0, 1], got values up to {highest:g}: is it a depth map, or does it count to 255? "
+            "Return the accumulated alpha of every pixel, the sum of its blend weights."
+        )
+    if math.isfinite(total):
+        return colors, False
+    odd = ~colors.isfinite().all(0)
+    broken = (~alpha.isfinite() | (odd & ((alpha != 0) | (cover > threshold)))).any() | odd.all()
+    return colors.masked_fill(odd, 0.0), bool(broken)
+
+
+def effect_of(value: float, differ: list[Tensor]) -> Reason:
+    """Return NO_EFFECT if the score is exactly 0 although the draws differed: the renderer may have ignored them."""
+    return Reason.NO_EFFECT if value == 0 and bool(torch.stack(differ).any()) else Reason.OK
+
+
+def visible_mean(variance: Tensor, visible: Tensor, broken: bool, excess: float) -> tuple[float, Reason]:
+    """Average over the visible pixels, or say why not; ``broken`` is what `finite_colors` found.
+
+    ``excess`` is the divisor of a population variance over that of this one.
+    """
+    pixels = int(visible.count_nonzero())
+    if broken:
+        return math.nan, Reason.NOT_FINITE
+    if pixels == 0:
+        return math.nan, Reason.EMPTY
+    mean = float((variance * visible).sum()) / pixels
+    if not math.isfinite(mean):
+        return math.nan, Reason.NOT_FINITE
+    # Colors in [0, 1] vary by at most 1/4 (Popoviciu's inequality), which is reached if they are 0 or 1 half the time.
+    return (mean, Reason.OK) if mean <= 0.25 * excess * (1.0 + 1e-6) else (math.nan, Reason.OUT_OF_RANGE)

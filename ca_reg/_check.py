@@ -1,8 +1,7 @@
-"""Argument checks shared by the package.
+"""Argument checks shared by the package: a TypeError for a wrong type, a ValueError for a wrong shape or value.
 
-Types and shapes go through kornia's checks, whose ``TypeCheckError`` is a :class:`TypeError` and whose ``ShapeError``
-is a :class:`ValueError`; bad values raise a plain :class:`ValueError`. kornia is imported at the first check, because
-it takes longer to load than the rest of the package.
+They are plain code, so that ``python -O``, which removes assertions, and ``KORNIA_CHECKS=0``, which turns kornia's
+checks off, leave every documented error in place.
 """
 
 from __future__ import annotations
@@ -16,22 +15,27 @@ from torch import Tensor
 
 __all__ = [
     "Rate", "check_callable", "check_count", "check_finite", "check_opacity", "check_opacity_range",
-    "check_per_gaussian", "check_rate", "check_rates", "is_zero", "rate_like",
+    "check_per_gaussian", "check_rate", "check_rates", "check_sigma", "check_tensor", "is_zero", "rate_like",
 ]  # fmt: skip
+
+MAX_SIGMA = 1e30
 
 Rate = float | Tensor
 """A number, or one per Gaussian, shape (N,); inside ``torch.compile`` also a scalar tensor, so that a changing rate
 does not trigger a recompilation."""
 
 
+def check_tensor(x: Any, name: str, remedy: str = "") -> None:
+    """Raise a TypeError unless ``x`` is a tensor; the ``remedy`` ends the message."""
+    if not isinstance(x, Tensor):
+        raise TypeError(f"{name} must be a torch tensor, got {type(x).__name__}{remedy and '; '}{remedy}.")
+
+
 def check_opacity(opacity: Any) -> None:
     """Raise unless ``opacity`` is a floating-point tensor of shape (N,) or (N, 1)."""
-    from kornia.core.check import KORNIA_CHECK_IS_TENSOR, KORNIA_CHECK_SHAPE
-
-    KORNIA_CHECK_IS_TENSOR(opacity, "opacity must be a torch tensor; convert it with torch.as_tensor.")
-    KORNIA_CHECK_SHAPE(
-        opacity, ["N", "1"] if opacity.ndim > 1 else ["N"], "opacity must have shape (N,) or (N, 1), one per Gaussian."
-    )
+    check_tensor(opacity, "opacity", "convert it with torch.as_tensor")
+    if opacity.ndim not in (1, 2) or opacity.shape[1:] not in ((), (1,)):
+        raise ValueError(f"opacity must have shape (N,) or (N, 1), one per Gaussian, got {tuple(opacity.shape)}.")
     if not opacity.is_floating_point():
         raise TypeError(f"opacity must be a floating-point tensor, got {opacity.dtype}; convert it with .float().")
 
@@ -52,9 +56,7 @@ def check_opacity_range(opacity: Tensor, upper: float = 1.0) -> None:
 
 def check_per_gaussian(x: Any, opacity: Tensor, name: str) -> None:
     """Raise unless ``x`` is a tensor of shape (N,) for the N opacities."""
-    from kornia.core.check import KORNIA_CHECK_IS_TENSOR
-
-    KORNIA_CHECK_IS_TENSOR(x, f"{name} must be a torch tensor, as the draw function returned it.")
+    check_tensor(x, name, "give it as the draw function returned it")
     if x.shape != opacity.shape[:1]:
         raise ValueError(
             f"{name} must have shape ({opacity.shape[0]},), one value per opacity, got {tuple(x.shape)}; "
@@ -78,6 +80,14 @@ def check_rates(p: Any) -> None:
             f"p must be a number in [0, 1) or a floating-point tensor (N,) of such, got a {p.dtype} tensor of shape "
             f"{tuple(p.shape)}" + (f" from {p.min():g} to {p.max():g}." if p.numel() else ".")
         )
+
+
+def check_sigma(sigma: Any, name: str = "sigma") -> None:
+    """Raise unless ``sigma`` is a real number in [0, 1e30]."""
+    check_finite(sigma, name, minimum=0.0)
+    # The draws are float32: a larger product would be infinite, and nan times an opacity of 0.
+    if not _is_in_a_graph(sigma) and sigma > MAX_SIGMA:
+        raise ValueError(f"{name} must be at most {MAX_SIGMA:g}, got {sigma}; the paper uses 0.8.")
 
 
 def check_finite(x: Any, name: str, *, minimum: float = -math.inf, hint: str = "") -> None:

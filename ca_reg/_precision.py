@@ -5,9 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["at_least_single"]
+__all__ = ["at_least_single", "without_autocast"]
 
 
 def at_least_single(x: Tensor, *, copy: bool = False) -> Tensor:
     """Return a tensor in float32, or in its own dtype if that is wider."""
     return x.to(torch.promote_types(x.dtype, torch.float32), copy=copy)
+
+
+def without_autocast(device: torch.device) -> torch.autocast:
+    """Return a context in which torch.autocast does not reduce the precision of matrix products."""
+    return torch.autocast(device.type, enabled=False)

@@ -36,7 +36,7 @@ def draw_numbers(
         raise RuntimeError(
             "a draw with generator= was repeated during backward(): torch.utils.checkpoint restores the global random "
             "state and no other, so the gradient would be that of another draw. Draw outside the checkpointed function "
-            "and give it keep= or noise=, or leave out generator."
+            "and give it drawn=, or leave out generator."
         )
     if generator is None:  # and unnamed: a compiled graph could not draw for a number of Gaussians that changes
         return sample(n, dtype=torch.float32, device=device)

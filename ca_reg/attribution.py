@@ -21,10 +21,9 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
-from ca_reg.params import Params
-from ca_reg.reason import Reason
-from ca_reg.result import CAResult
-from ca_reg.score import CAScore, ExactView
+from ca_reg.regularizer import Params
+from ca_reg.result import CAResult, Reason
+from ca_reg.score import CAScore, ExactScore, ExactView
 from ca_reg.types import read_moments
 
 __all__ = ["CAAttribution", "CATotalEffects", "SharesFn", "attribute", "total_effects"]
@@ -35,7 +34,8 @@ class SharesFn(Protocol):
 
     It takes the arguments of :class:`~ca_reg.types.MomentsFn` and weights of the pixels, (H, W) in float64. It returns
     a tensor of shape (N,): for every Gaussian its :func:`~ca_reg.functional.contributions`, averaged over RGB and
-    summed over the pixels with these weights, 0 if the view does not see it. :meth:`ca_reg.ListMoments.shares` is one.
+    summed over the pixels with these weights, 0 if the view does not see it, as
+    :meth:`ca_reg.lists.ListMoments.shares` does.
 
     Example:
         >>> from ca_reg.functional import contributions
@@ -89,17 +89,17 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
     Example:
         A red Gaussian in front of a blue one, over black:
 
-        >>> from ca_reg import ListMoments, PixelLists
+        >>> from ca_reg.lists import ListMoments, PixelLists
         >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
         ...     both = torch.tensor([0, 1])
         ...     return PixelLists(both, torch.zeros(2, dtype=torch.int64), opacity, torch.eye(3)[[0, 2]], 1, 1)
         >>> moments = ListMoments(lists_fn)
-        >>> score = CAScore(exact=moments, threshold=0.5)
+        >>> score = CAScore.exact(moments, threshold=0.5)
         >>> shares, result = attribute(score, moments.shares, torch.tensor([0.5, 0.8]), None)
         >>> shares, round(result.value, 6)
         (tensor([0.0242, 0.0333], dtype=torch.float64), 0.0575)
     """
-    result, opacity, multiplier, background = _measure(score, opacity, view, "attribute")
+    _, (result, opacity, multiplier, background) = _measure(score, opacity, view, "attribute")
     if result.reason is not Reason.OK:
         return CAAttribution(opacity.new_zeros(len(opacity), dtype=torch.float64), result)
     weights = result.visible.to(torch.float64) / result.visible.sum()
@@ -129,22 +129,21 @@ def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATota
     Example:
         The scene of :func:`attribute`; the interaction now counts for the Gaussian in front as well.
 
-        >>> from ca_reg import ListMoments, PixelLists
+        >>> from ca_reg.lists import ListMoments, PixelLists
         >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
         ...     both = torch.tensor([0, 1])
         ...     return PixelLists(both, torch.zeros(2, dtype=torch.int64), opacity, torch.eye(3)[[0, 2]], 1, 1)
-        >>> total_effects(CAScore(exact=ListMoments(lists_fn), threshold=0.5), torch.tensor([0.5, 0.8]), None).effects
+        >>> total_effects(CAScore.exact(ListMoments(lists_fn), threshold=0.5), torch.tensor([0.5, 0.8]), None).effects
         tensor([0.0275, 0.0333], dtype=torch.float64)
     """
-    result, opacity, multiplier, background = _measure(score, opacity, view, "total_effects")
+    exact, (result, opacity, multiplier, background) = _measure(score, opacity, view, "total_effects")
     if result.reason is not Reason.OK:
         return CATotalEffects(opacity.new_zeros(len(opacity), dtype=torch.float64), result)
-    assert score.exact is not None
     opacity = opacity.clone()
     spread = (multiplier.variance * opacity.new_ones(opacity.shape[:1])).requires_grad_()
     gradient = None
     with torch.enable_grad():
-        answer = score.exact(opacity, view, Multiplier(multiplier.mean, spread), background)
+        answer = exact.moments_fn(opacity, view, Multiplier(multiplier.mean, spread), background)
         variance = read_moments(answer, layout=score.layout).variance
         if variance.requires_grad:
             value = variance.mean(0)[result.visible.to(variance.device)].mean()
@@ -158,14 +157,12 @@ def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATota
     return CATotalEffects((gradient * spread.detach()).to(torch.float64), result)
 
 
-def _measure(score: CAScore, opacity: Tensor | Params, view: Any, name: str) -> ExactView:
-    """Call an exact score, and return it with the multiplier and the background of its moments call."""
-    if score.exact is None:
+def _measure(score: CAScore, opacity: Tensor | Params, view: Any, name: str) -> tuple[ExactScore, ExactView]:
+    """Measure with an exact score, and return it with the inputs of its moments; raise if it is not exact."""
+    if not isinstance(score, ExactScore):
         raise ValueError(
             f"{name} needs an exact score, got the method {score.settings.method!r}; make it with "
-            "CAScore(exact=moments_fn). A renderer without moments that can list the Gaussians of its pixels has them "
-            "by ca_reg.ListMoments."
+            "CAScore.exact(moments_fn). A renderer without moments that can list the Gaussians of its pixels has them "
+            "by ca_reg.lists.ListMoments."
         )
-    x = score._params(opacity)
-    with torch.no_grad():
-        return score._exact(score.exact, x, view)
+    return score, score.measure(opacity, view)

@@ -11,22 +11,23 @@ import torch
 from torch import Tensor, nn
 
 from ca_reg.functional import Multiplier
-from ca_reg.params import Draw, Params
-from ca_reg.regularizer import Learned, Regularizer
+from ca_reg.regularizer import Draw, Learned, Params, Regularizer
 
-__all__ = ["Chain", "Foreign"]
+__all__ = ["Chain", "WrappedModule"]
 
 
 class Chain(Regularizer):
     """Regularizers applied one after the other; trainers and hooks wrap whatever they are given in a chain.
 
-    A Gaussian is dropped if any member drops it. Members in ``eval()`` apply their test-time value even in training. At
-    test time the members whose test-time value is a mean contribute their joint mean, in whatever order they are given;
-    ``nn.Sequential`` would evaluate the mean of the second at the mean of the first.
+    Use it in place of ``nn.Sequential``, which has no :attr:`keep`, :meth:`mask_radii` and :meth:`set_step`, and which
+    evaluates the mean of the second member at the mean of the first: in a chain the members whose test-time value is a
+    mean contribute their joint mean, in whatever order they are given. A Gaussian is dropped if any member drops it, so
+    :attr:`keep` is the product of their masks; a module that stands in a chain twice draws twice, and its own ``keep``
+    is only the last mask. Members in ``eval()`` apply their test-time value even in training.
 
     Args:
         members: regularizers; an ``nn.Sequential`` or another chain is flattened, and any other module is taken for a
-            function of the opacities alone, see :class:`Foreign`.
+            function of the opacities alone, see :class:`WrappedModule`.
 
     Raises:
         TypeError: if a member is not a module.
@@ -86,12 +87,12 @@ class Chain(Regularizer):
         for member in self:
             if member.training:
                 x = member.regularize(x, generator)
-                draws.append(member.last)
+                draws.append(member.last)  # this thread's
             else:
                 member.check_needs(x)
                 x = member.expected(x)
                 draws.append(None)
-        self.last = _together(draws)
+        self.last = _combine_draws(draws)
         return x
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
@@ -100,7 +101,7 @@ class Chain(Regularizer):
         for member in self:
             draws.append(member.draw(x, generator))
             x = member.replay(x, draws[-1])
-        return _together(draws)
+        return _combine_draws(draws)
 
     def replay(self, x: Params, draw: Draw) -> Params:
         """Apply the members' draws, and the test-time values of those that were in ``eval()``."""
@@ -110,10 +111,12 @@ class Chain(Regularizer):
 
     def expected(self, x: Params) -> Params:
         """Return the test-time value of all members."""
+        # The mean of a product is not the product of the means where the factor of one depends on the opacity that
+        # another has changed, as that of clamped noise does; the moments of the composed factor account for that.
         means = [member for member in self if member.renders_mean]
         for member in means:
             member.check_needs(x)
-        if len(means) > 1 and (both := _multiplied(means, x, test=True)) is not None:
+        if len(means) > 1 and (both := _alpha_factor(means, x, test=True)) is not None:
             x = both[0]._replace(opacities=(both[0].opacities * both[1].mean).to(x.opacities.dtype))
         else:
             for member in means:
@@ -123,13 +126,13 @@ class Chain(Regularizer):
                 x = member.expected(x)
         return x
 
-    def multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
+    def alpha_factor(self, x: Params) -> tuple[Params, Multiplier] | None:
         """Return the product of the multipliers; None if a member has none."""
-        return _multiplied(list(self), x)
+        return _alpha_factor(list(self), x)
 
 
-class Foreign(Regularizer):
-    """A module that knows nothing of this package, called in its own mode to map activated opacities (N,) to others.
+class WrappedModule(Regularizer):
+    """Adapter that lets any module on activated opacities (N,) act as a regularizer, called in its own mode.
 
     It drops the Gaussians where its attribute ``keep``, (N,) bool, is False, or, without that attribute, those whose
     opacity it sets to 0. The step is passed to its ``set_step`` and to those of its submodules. Test-time values come
@@ -142,7 +145,7 @@ class Foreign(Regularizer):
         TypeError: if it is not a module; in a draw with a generator, if its ``forward`` takes none.
 
     Example:
-        >>> Foreign(nn.Dropout(0.5)).eval()(torch.full((3,), 0.5))
+        >>> WrappedModule(nn.Dropout(0.5)).eval()(torch.full((3,), 0.5))
         tensor([0.5000, 0.5000, 0.5000])
     """
 
@@ -164,16 +167,17 @@ class Foreign(Regularizer):
     def set_step(self, step: int) -> None:
         """Pass the step to the `set_step` of the module and its submodules, where they have one."""
         super().set_step(step)
-        _tell(self.module, step)
+        _set_step(self.module, step)
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Call the module."""
         before = x.opacities
         if generator is not None:
-            self.check_generator()
+            self.check_generator()  # before the call, which would end in a TypeError that names no remedy
         after: Tensor = self.module(before) if generator is None else self.module(before, generator=generator)
         if after is before:
             return Draw(after)
+        # Its own mask first: where opacities were 0 before, the result does not tell what was dropped.
         if hasattr(self.module, "keep"):
             keep: Any = self.module.keep
             return Draw(after, None if keep is None else keep.reshape(-1))
@@ -186,7 +190,8 @@ class Foreign(Regularizer):
     def expected(self, x: Params) -> Params:
         """Call a copy of the module in ``eval()``."""
         twin = _evaluating(self.module)
-        _tell(twin, x.step)
+        if x.step is not None:
+            _set_step(twin, x.step)
         opacities: Tensor = twin(x.opacities)
         return x if opacities is x.opacities else x._replace(opacities=opacities)
 
@@ -197,27 +202,27 @@ def _flatten(module: nn.Module) -> list[Regularizer]:
         return list(module)
     if isinstance(module, nn.Sequential) and type(module).forward is nn.Sequential.forward:
         return [member for child in module for member in _flatten(child)]
-    return [module if isinstance(module, Regularizer) else Foreign(module)]
+    return [module if isinstance(module, Regularizer) else WrappedModule(module)]
 
 
-def _together(draws: Sequence[Draw | None]) -> Draw:
+def _combine_draws(draws: Sequence[Draw | None]) -> Draw:
     """Combine the draws of all members: a Gaussian is kept if no member drops it."""
     kept = [draw.keep for draw in draws if draw is not None and draw.keep is not None]
     return Draw(tuple(draws), functools.reduce(torch.logical_and, kept) if kept else None)
 
 
-def _multiplied(members: list[Regularizer], x: Params, *, test: bool = False) -> tuple[Params, Multiplier] | None:
+def _alpha_factor(members: list[Regularizer], x: Params, *, test: bool = False) -> tuple[Params, Multiplier] | None:
     """Compose the members' multipliers; None if one has none."""
     total = Multiplier(1.0, 0.0)
     for member in members:
-        one = member.test_multiplied(x) if test else member.multiplied(x)
+        one = member.test_alpha_factor(x) if test else member.alpha_factor(x)
         if one is None:
             return None
         x, total = one[0], total * one[1]
     return x, total
 
 
-def _tell(module: nn.Module, step: int) -> None:
+def _set_step(module: nn.Module, step: int) -> None:
     """Pass the step to the `set_step` of a module and its submodules, where they have one."""
     for part in module.modules():
         if callable(set_step := getattr(part, "set_step", None)):
@@ -227,7 +232,7 @@ def _tell(module: nn.Module, step: int) -> None:
 def _evaluating(module: nn.Module) -> nn.Module:
     """Return a copy in ``eval()`` that shares all tensors with the module."""
     module = getattr(module, "_orig_mod", module)  # a compiled module calls the original, in its mode
-    twin = object.__new__(type(module))
+    twin = object.__new__(type(module))  # not deepcopy: the twin must see the parameters as they are
     vars(twin).update(vars(module))
     parts = {name: None if part is None else _evaluating(part) for name, part in module._modules.items()}
     vars(twin).update(training=False, _modules=parts)

@@ -77,7 +77,7 @@ class ListMoments:
         ...     return PixelLists(gaussians, pixels, alphas, colors, height=1, width=2)
         >>> from ca_reg import CAScore, attribute
         >>> moments = ListMoments(lists_fn)
-        >>> score = CAScore(exact=moments, threshold=0.2)
+        >>> score = CAScore.exact(moments, threshold=0.2)
         >>> opacity = torch.full((2,), 0.8)
         >>> score(opacity, None).variance
         tensor([[0.1195, 0.0576]], dtype=torch.float64)
@@ -107,7 +107,7 @@ class ListMoments:
         lists = self._lists(opacity, view)
         pixels, means, variances = [], [], []
         for block in _blocks(lists, multiplier, background, self.elements):
-            mean, variance = pixel_moments(block.alphas, block.values, block.multiplier, background=block.behind)
+            mean, variance = pixel_moments(block.alphas, block.values, block.multiplier, background=block.background)
             pixels.append(block.pixels)
             means.append(mean)
             variances.append(variance)
@@ -141,7 +141,7 @@ class ListMoments:
         flat = weights.to(lists.alphas.device, torch.float64).flatten()
         out = flat.new_zeros(lists.colors.shape[0] + 1)  # the last one gathers the padding
         for block in _blocks(lists, multiplier, background, self.elements):
-            parts = contributions(block.alphas, block.values, block.multiplier, background=block.behind)
+            parts = contributions(block.alphas, block.values, block.multiplier, background=block.background)
             parts = parts[..., :3].mean(-1, dtype=torch.float64) * flat[block.pixels, None]
             out = out.index_add(0, block.gaussians.flatten(), parts.flatten())
         return out[:-1]
@@ -175,7 +175,7 @@ class _Block(NamedTuple):
     alphas: Tensor
     values: Tensor
     multiplier: Multiplier
-    behind: Tensor
+    background: Tensor
 
 
 def _blocks(lists: PixelLists, multiplier: Multiplier, background: Tensor | None, elements: int) -> Iterator[_Block]:
@@ -183,11 +183,12 @@ def _blocks(lists: PixelLists, multiplier: Multiplier, background: Tensor | None
     n, size = lists.colors.shape[0], lists.height * lists.width
     pixels = lists.pixels.long()
     order = pixels.argsort(stable=True)
+    # Entry P, one behind the last, is the padding: Gaussian n, of alpha 0.
     gaussians = torch.nn.functional.pad(lists.gaussians.long()[order], (0, 1), value=n)
     alphas = torch.nn.functional.pad(lists.alphas[order], (0, 1))
     values = torch.cat([lists.colors, torch.ones_like(lists.colors[:, :1])], dim=1)
     values = torch.nn.functional.pad(values, (0, 0, 0, 1))
-    behind = torch.nn.functional.pad(_behind(lists, background), (0, 1))
+    background = torch.nn.functional.pad(_background_of(lists, background), (0, 1))
     mean, variance = (_per_gaussian(getattr(multiplier, name), name, lists) for name in ("mean", "variance"))
 
     counts = pixels.bincount(minlength=size)
@@ -210,12 +211,12 @@ def _blocks(lists: PixelLists, multiplier: Multiplier, background: Tensor | None
             alphas=alphas.index_select(0, entry.flatten()).view(entry.shape),
             values=values.index_select(0, listed.flatten()).view(*entry.shape, 4),
             multiplier=Multiplier(_gather(mean, listed), _gather(variance, listed)),
-            behind=behind[which],
+            background=background[which],
         )
         start = stop
 
 
-def _behind(lists: PixelLists, background: Tensor | None) -> Tensor:
+def _background_of(lists: PixelLists, background: Tensor | None) -> Tensor:
     """Return the color behind every pixel, shape (H * W, 3)."""
     if background is None:
         background = lists.colors.new_zeros(3) if lists.background is None else lists.background
@@ -230,7 +231,7 @@ def _behind(lists: PixelLists, background: Tensor | None) -> Tensor:
 
 
 def _per_gaussian(moment: float | Tensor, name: str, lists: PixelLists) -> float | Tensor:
-    """Return a moment of the multiplier as a number, or per Gaussian plus an entry for the padding, (N + 1,)."""
+    """Return a moment of the multiplier as it is if a number, else one value per Gaussian and one for the padding."""
     if not isinstance(moment, Tensor):
         return moment
     n = lists.colors.shape[0]

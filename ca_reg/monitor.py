@@ -1,4 +1,4 @@
-"""Log co-adaptation scores during training."""
+"""Log co-adaptation during training, read the log back, and plot the training dynamics."""
 
 from __future__ import annotations
 
@@ -6,26 +6,31 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict
+from functools import partial
+from itertools import cycle, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ca_reg._check import check_callable, check_count, check_opacity
-from ca_reg._log import read_log
 from ca_reg.functional import scale_opacity
-from ca_reg.params import Params
-from ca_reg.result import summarize
+from ca_reg.regularizer import Params
+from ca_reg.result import new_axes, summarize
 from ca_reg.score import CAScore
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from torch.utils.tensorboard import SummaryWriter
 
-__all__ = ["LOG_NAME", "CAMonitor"]
+__all__ = ["LOG_NAME", "CAMonitor", "plot_dynamics", "read_dynamics", "read_log"]
 
 LOG_NAME = "ca.jsonl"
 """Name of the log inside the log directory."""
@@ -40,7 +45,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
     each group of views ``ca/<group>``, ``ca_std_error/<group>``, ``ca_reason/<group>``, ``ca_empty_views/<group>`` and
     ``psnr/<group>``, then the settings of the score. A missing value is null. If tensorboard is installed,
     ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` are written as scalars as well. ``backends`` and a message of the
-    logger ``ca_reg.monitor`` (level INFO) tell what is in use. :func:`ca_reg.dynamics.plot_dynamics` plots the file.
+    logger ``ca_reg.monitor`` (level INFO) tell what is in use. :func:`ca_reg.monitor.plot_dynamics` plots the file.
 
     As long as the number of Gaussians stays the same, every measurement of a view uses the same masks, which removes
     sampling noise from the comparison of steps.
@@ -51,6 +56,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         views: non-empty groups of views by name, usually ``{"train": [...], "test": [...]}``; a group is any iterable.
             The views are passed on to the callables as they are.
         every: number of steps between measurements, at least 1.
+        last_step: the last step of the training, measured whether or not it is a multiple of ``every``.
         psnr: ``psnr(opacity, view)`` returns the PSNR in dB of the view rendered with these opacities, already scaled
             by ``1 - p`` for test time. Called without gradients. None leaves PSNR out.
         details: ``details(opacity, view)`` returns, by name, what TensorBoard shows of the first view of each group
@@ -66,7 +72,8 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         TypeError: if ``views`` is not a mapping or an argument is of the wrong type.
         ValueError: if there are no views, a group is empty, ``every`` or ``resume_step`` is out of range, or a line of
             the log to resume is damaged.
-        OSError: if the log cannot be written, such as on a full disk; its earlier lines stay intact.
+        OSError: if the log cannot be written, such as on a full disk; its earlier lines stay intact. A BlockingIOError
+            if another monitor, in this process or another, has the directory open: each would lose lines of the other.
 
     Example:
         >>> import tempfile
@@ -86,13 +93,15 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         *,
         views: Mapping[str, Iterable[Any]],
         every: int = 500,
+        last_step: int | None = None,
         psnr: Callable[[Tensor, Any], float] | None = None,
         details: Callable[[Tensor, Any], Mapping[str, Tensor]] | None = None,
         resume_step: int | None = None,
     ) -> None:
         check_count(every, "every", minimum=1)
-        if resume_step is not None:
-            check_count(resume_step, "resume_step", minimum=0)
+        for name, step in (("last_step", last_step), ("resume_step", resume_step)):
+            if step is not None:
+                check_count(step, name, minimum=0)
         for name, fn in (("psnr", psnr), ("details", details)):
             if fn is not None:
                 check_callable(fn, name)
@@ -106,21 +115,27 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
             )
         self.score = score
         self.every = every
+        self.last_step = last_step
         self.psnr = psnr
         self.details = details
 
         folder = Path(log_dir)
         folder.mkdir(parents=True, exist_ok=True)
         self.path = folder / LOG_NAME
-        self._last_step = _keep_lines(self.path, resume_step)
-        self._file = self.path.open("ab", buffering=0)
-        self._writer = _summary_writer(folder, resume_step)
+        self._unlock = weakref.finalize(self, _lock(folder))
+        try:
+            self._logged = _keep_lines(self.path, resume_step)
+            self._file = self.path.open("ab", buffering=0)
+            self._writer = _summary_writer(folder, resume_step)
+        except BaseException:
+            self._unlock()
+            raise
         self.backends: tuple[str, ...] = ("jsonl",) if self._writer is None else ("jsonl", "tensorboard")
         hint = "" if self._writer else "; for TensorBoard: pip install 'ca_reg[tensorboard]'"
         _log.info("co-adaptation is logged to %s (%s)%s", self.path, ", ".join(self.backends), hint)
 
     def __call__(self, step: int, opacity: Tensor | Params) -> dict[str, float | int | str | None] | None:
-        """Measure and log if the step is due: a multiple of ``every``, later than the last step in the log.
+        """Measure and log if the step is due: a multiple of ``every`` or the last, and later than those in the log.
 
         Args:
             step: the training step.
@@ -136,7 +151,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         """
         check_count(step, "step", minimum=0)
         step = int(step)
-        if step % self.every or step <= self._last_step:
+        if (step % self.every and step != self.last_step) or step <= self._logged:
             return None
         if self._file.closed:
             raise ValueError("the monitor is closed; make a new one with resume_step to add to its log.")
@@ -159,7 +174,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
                 record[f"psnr/{name}"] = self._mean_psnr(self.psnr, opacity, group)
         record.update(asdict(self.score.settings))
         self._write(record)
-        self._last_step = step
+        self._logged = step
         if self.details is not None and self._writer is not None:
             self._show(self._writer, self.details, opacity, step)
         return record
@@ -167,6 +182,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
     def close(self) -> None:
         """Close the files. A second call does nothing."""
         self._file.close()
+        self._unlock()
         if self._writer is not None:
             self._writer.close()
 
@@ -219,6 +235,33 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
             raise OSError(error.errno, reason, str(self.path)) from error
 
 
+def _lock(folder: Path) -> Callable[[], Any]:
+    """Lock a directory for one monitor and return what unlocks it; the system unlocks it when the process ends."""
+    try:
+        import fcntl
+
+        handle = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):  # Windows has no such locks
+        return lambda: None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        reason = "another CAMonitor logs to this directory; close it, or give each its own log_dir"
+        raise BlockingIOError(error.errno, reason, str(folder)) from error
+    except OSError:  # such as a network file system without locks
+        os.close(handle)
+        return lambda: None
+    return partial(_unlock, handle)
+
+
+def _unlock(handle: int) -> None:
+    import fcntl
+
+    fcntl.flock(handle, fcntl.LOCK_UN)  # also for forked processes that hold the same handle
+    os.close(handle)
+
+
 def _keep_lines(path: Path, resume_step: int | None) -> int:
     """Drop the lines after ``resume_step``, all if it is None; return the last step that is kept, -1 if none is."""
     read = () if resume_step is None or not path.exists() else read_log(path)
@@ -243,3 +286,111 @@ def _summary_writer(folder: Path, resume_step: int | None) -> SummaryWriter | No
         return None
     # Hides what the earlier run wrote beyond the checkpoint; for a new run, all of it.
     return SummaryWriter(str(folder), purge_step=0 if resume_step is None else resume_step + 1)
+
+
+def read_log(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Iterate over the measurements of a log, each with its raw line.
+
+    An unterminated last line is skipped if it does not parse: a running or killed process has not finished it.
+
+    Raises:
+        ValueError: if another line is not a measurement; the message names file and line.
+    """
+    *whole, rest = path.read_bytes().split(b"\n")
+    for number, line in enumerate(whole, start=1):
+        try:
+            yield line.decode(), _measurement(line)
+        except ValueError as error:
+            raise ValueError(
+                f"{path}, line {number}, is no measurement of a CAMonitor: {error}; remove that line to go on."
+            ) from error
+    try:
+        record = _measurement(rest)
+    except ValueError:
+        return
+    yield rest.decode(), record
+
+
+def _measurement(line: bytes) -> dict[str, Any]:
+    """Parse a line: numbers, strings or null by name, including an integer ``step``."""
+    try:
+        record = json.loads(line.decode())
+    except RecursionError as error:
+        raise ValueError(str(error)) from error
+    if not isinstance(record, dict) or not isinstance(record.get("step"), int):
+        raise ValueError("expected an object with a whole number 'step'")
+    for name, x in record.items():
+        if not isinstance(x, int | float | str | None) or (isinstance(x, int) and x.bit_length() > 64):
+            raise ValueError(f"{name!r} must be a number, text or null")
+    return record
+
+
+def read_dynamics(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[np.float64]]:
+    """Read the log of a :class:`ca_reg.CAMonitor`.
+
+    Args:
+        path: the log, or the directory that holds it.
+
+    Returns:
+        Every numeric column by name (``step``, ``gaussians``, ``ca/test``, ``psnr/test``, ...), shape (lines,) each,
+        sorted by step; nan where a line has no value. Text columns are left out.
+
+    Raises:
+        FileNotFoundError: if there is no log.
+        ValueError: if it holds no complete line, or a damaged one.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     lines = '{"step": 500, "ca/test": 0.01}', '{"step": 1000, "ca/test": null}'
+        ...     _ = Path(folder, "ca.jsonl").write_text(chr(10).join(lines))
+        ...     columns = read_dynamics(folder)
+        >>> columns["step"], columns["ca/test"]
+        (array([ 500., 1000.]), array([0.01,  nan]))
+    """
+    file = Path(path)
+    file = file / LOG_NAME if file.is_dir() else file
+    if not file.exists():
+        raise FileNotFoundError(f"there is no log of a CAMonitor at {file}; give the file or the log_dir it was given.")
+    records = [record for _, record in read_log(file)]
+    if not records:
+        raise ValueError(f"{file} holds no measurement yet; a CAMonitor writes the first at a multiple of `every`.")
+    records.sort(key=lambda record: record["step"])
+    texts = {key for record in records for key, x in record.items() if isinstance(x, str)}
+    keys = dict.fromkeys(key for record in records for key in record if key not in texts)
+    return {key: np.array([record.get(key) for record in records], dtype=np.float64) for key in keys}
+
+
+def plot_dynamics(
+    runs: str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]], *, axes: Sequence[Axes] | None = None
+) -> tuple[Axes, Axes]:
+    """Plot co-adaptation and PSNR against the step, each on its own axes.
+
+    ``runs`` is one log or log directory, or several by label. Each run has one color; its last group of views (test) is
+    solid, the others are dotted or dashed; nan leaves a gap. Draws on two ``axes``, by default side by side in a new
+    figure, and returns them: co-adaptation, PSNR.
+
+    Raises:
+        ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
+        FileNotFoundError: if a log is missing.
+        ValueError: if there is no run, or a log is empty.
+    """
+    labelled = runs if isinstance(runs, Mapping) else {"": runs}
+    if not labelled:
+        raise ValueError("runs must hold at least one log, got an empty mapping.")
+    columns = {label: read_dynamics(path) for label, path in labelled.items()}
+    ca_axes, psnr_axes = new_axes(2) if axes is None else axes
+    for number, (label, column) in enumerate(columns.items()):
+        groups = [key.removeprefix("ca/") for key in column if key.startswith("ca/")]
+        lines = [*islice(cycle(("-", ":", "--", "-.")), len(groups))][::-1]
+        for group, line in zip(groups, lines, strict=True):
+            style: dict[str, Any] = {"color": f"C{number}", "linestyle": line, "marker": ".", "markersize": 4}
+            ca_axes.plot(column["step"], column[f"ca/{group}"], label=f"{label} {group}".strip(), **style)
+            if f"psnr/{group}" in column:
+                psnr_axes.plot(column["step"], column[f"psnr/{group}"], **style)
+    for drawn, quantity in ((ca_axes, "co-adaptation score CA"), (psnr_axes, "PSNR in dB")):
+        drawn.set_xlabel("iteration")
+        drawn.set_ylabel(quantity)
+    ca_axes.set_ylim(bottom=0.0)
+    psnr_axes.legend(handles=[*ca_axes.lines], loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    return ca_axes, psnr_axes

@@ -38,8 +38,8 @@ def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0]])
-        >>> squares, numbers = nearest_neighbors(points, 2)
-        >>> squares[0].tolist(), numbers[0].tolist()
+        >>> squares, indices = nearest_neighbors(points, 2)
+        >>> squares[0].tolist(), indices[0].tolist()
         ([1.0, 9.0], [1, 2])
     """
     n = points.shape[0]
@@ -57,8 +57,8 @@ def _by_tree(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     from scipy.spatial import cKDTree
 
     coordinates = _on_cpu(points)
-    distances, numbers = cKDTree(coordinates).query(coordinates, count + 1, workers=torch.get_num_threads())
-    found, places = torch.from_numpy(distances), torch.from_numpy(numbers)
+    distances, indices = cKDTree(coordinates).query(coordinates, count + 1, workers=torch.get_num_threads())
+    found, places = torch.from_numpy(distances), torch.from_numpy(indices)
     others = places != torch.arange(len(points), device=places.device)[:, None]
     others[others.all(1), -1] = False  # among more than `count` points at one place it may not have found itself
     shape = (len(points), count)
@@ -70,14 +70,18 @@ def _on_cpu(points: Tensor) -> Any:
 
 
 def _along_an_axis(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Sort the points along one axis: only those in a strip can be nearer than the neighbors already found."""
+    """Find exact neighbors by a sweep along the longest axis.
+
+    In the order along that axis, a chunk's neighbors among those nearby bound how far away the true ones can be; only
+    points in the strip of that width are then compared.
+    """
     n = points.shape[0]
     axis = int((points.amax(0) - points.amin(0)).argmax())
     order = points[:, axis].argsort()
     ordered = points[order]
     along = ordered[:, axis].contiguous()
     squares = points.new_empty(n, count)
-    numbers = torch.empty(n, count, dtype=torch.int64, device=points.device)
+    indices = torch.empty(n, count, dtype=torch.int64, device=points.device)
     rows = max(1, min(CHUNK_ROWS, CHUNK_ELEMENTS // n))
     for start in range(0, n, rows):
         stop = min(start + rows, n)
@@ -86,8 +90,8 @@ def _along_an_axis(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
         low = int(torch.searchsorted(along, along[start] - reach))
         high = int(torch.searchsorted(along, along[stop - 1] + reach, right=True))
         found, places = _search(ordered, start, stop, min(low, start), max(high, stop), count)
-        squares[order[start:stop]], numbers[order[start:stop]] = found, order[places]
-    return squares, numbers
+        squares[order[start:stop]], indices[order[start:stop]] = found, order[places]
+    return squares, indices
 
 
 def _search(ordered: Tensor, start: int, stop: int, low: int, high: int, count: int) -> tuple[Tensor, Tensor]:

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from ca_reg._check import check_callable
-from ca_reg._scheduled import Scheduled
 from ca_reg.functional import Multiplier
-from ca_reg.schedules import Schedule
+from ca_reg.schedules import Schedule, Scheduled
 from ca_reg.types import Layout, MomentsFn, check_layout, read_moments
 
 __all__ = ["CAPenalty", "PenalizedRender"]

@@ -125,7 +125,7 @@ class Registry(Generic[T]):
 
     def _make(self, node: ast.expr, text: str, imports: bool) -> T:
         """Make one object."""
-        call = node if isinstance(node, ast.Call) else ast.Call(node, [], [])
+        call = node if isinstance(node, ast.Call) else ast.Call(node, [], [])  # a bare name stands for a call
         if not re.fullmatch(r"[A-Za-z_][\w.:]*", name := _written(call.func, text)):
             raise ValueError(f"{_written(node, text)!r:.80} in {text!r:.200} is no {self.kind}; {self._form()}")
         name = name.replace(":", ".")

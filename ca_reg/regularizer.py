@@ -1,18 +1,88 @@
-"""The base class of all regularizers: what to draw, how to apply it, what to render at test time."""
+"""What a rasterizer receives, and the base class of the regularizers that change it: draw, apply, test time."""
 
 from __future__ import annotations
 
+import threading
+import weakref
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from ca_reg._scheduled import Scheduled
+from ca_reg._precision import at_least_single, without_autocast
 from ca_reg.functional import Multiplier
-from ca_reg.params import Draw, Params
+from ca_reg.schedules import Scheduled
 
-__all__ = ["Learned", "Regularizer"]
+__all__ = ["Draw", "Learned", "Params", "Regularizer"]
+
+_LOCK = threading.Lock()
+
+
+class Params(NamedTuple):
+    """The activated parameters of N Gaussians as a rasterizer receives them; a regularizer returns a modified copy.
+
+    Only the opacities are required. A regularizer lists the other fields that it reads or changes in
+    :attr:`Regularizer.needs <ca_reg.Regularizer.needs>`; callers that cannot supply one raise an error naming it.
+
+    Convention: world coordinates; quaternions wxyz, not necessarily normalized; the view matrix is world to camera,
+    OpenCV axes (x right, y down, z forward), applied from the left to column vectors.
+
+    Attributes:
+        opacities: in [0, 1], shape (N,).
+        means: centers, world units, shape (N, 3).
+        scales: standard deviations along the axes, world units, shape (N, 3).
+        quaternions: orientations, shape (N, 4).
+        sh: spherical-harmonic coefficients, constant band first, shape (N, K, 3).
+        view_matrix: of the rendered camera, the first if there are several, shape (4, 4).
+        learned: per-Gaussian values that regularizers learn, by name, each (N,).
+        step: the training step, from 0 on, which schedules follow; None for that of the module or score that is called.
+
+    Example:
+        >>> import torch
+        >>> x = Params(torch.full((4,), 0.5), means=torch.zeros(4, 3))
+        >>> x._replace(opacities=x.opacities * 0.8).opacities
+        tensor([0.4000, 0.4000, 0.4000, 0.4000])
+    """
+
+    opacities: Tensor
+    means: Tensor | None = None
+    scales: Tensor | None = None
+    quaternions: Tensor | None = None
+    sh: Tensor | None = None
+    view_matrix: Tensor | None = None
+    learned: Mapping[str, Tensor] | None = None
+    step: int | None = None
+
+    @property
+    def depths(self) -> Tensor:
+        """Depths of the centers along the camera's z axis, (N,), at least float32, negative behind the camera.
+
+        A regularizer that reads them lists ``means`` and ``view_matrix`` in its ``needs``. Without gradients.
+
+        Raises:
+            ValueError: if there are no means or no view matrix.
+        """
+        if self.means is None or self.view_matrix is None:
+            raise ValueError("depths need means and view_matrix; list both in the needs of the regularizer.")
+        means = at_least_single(self.means.detach())
+        row = self.view_matrix.detach()[2].to(means)  # for column vectors, the third row is the viewing direction
+        with without_autocast(means.device):  # which would round the product to 16 bits
+            return means @ row[:3] + row[3]
+
+
+class Draw(NamedTuple):
+    """One draw of a regularizer, with all it takes to replay it.
+
+    Attributes:
+        value: whatever the regularizer's ``replay`` reads, such as a mask or noise; None for nothing.
+        keep: True where a Gaussian was kept, shape (N,) bool; None if none was dropped. Density control must not count
+            dropped Gaussians as seen.
+    """
+
+    value: Any = None
+    keep: Tensor | None = None
+
 
 Given = TypeVar("Given", Tensor, Params)
 
@@ -31,7 +101,7 @@ class Regularizer(Scheduled):
     """Perturbs what a rasterizer receives in training, and defines what is rendered at test time.
 
     A custom regularizer is a subclass with ``draw`` and ``replay``; it also overrides ``expected`` if it does not
-    render the plain model at test time, and ``multiplied`` if its draws are independent factors of the opacities. It
+    render the plain model at test time, and ``alpha_factor`` if its draws are independent factors of the opacities. It
     then works wherever the package's own do: in the bundled trainer, the INRIA hook and its launcher, gsplat,
     splatfacto-ca, a :class:`~ca_reg.Chain`, and as the masks of a :class:`~ca_reg.CAScore`. To drop Gaussians
     independently of each other, subclass :class:`~ca_reg.IndependentDropout` and define the rates only.
@@ -40,7 +110,7 @@ class Regularizer(Scheduled):
     a draw; with a schedule ``state_dict`` saves the step.
 
     Called as a module it takes activated opacities, (N,) or (N, 1), or :class:`~ca_reg.Params`, and returns the same
-    type: under a new draw in ``train()``, the test-time value in ``eval()``.
+    type: under a new draw in ``train()``, the test-time value in ``eval()``. A ``generator=`` goes to the call.
 
     Attributes:
         needs: fields of :class:`~ca_reg.Params` besides the opacities that it reads or changes.
@@ -48,7 +118,8 @@ class Regularizer(Scheduled):
         drops: whether it may set opacities to 0.
         renders_mean: whether its test-time value is the mean of its draws.
         rate_name: name of the argument that may follow a schedule, for errors and ``print``.
-        last: the last draw; None if there was none, in evaluation, and in a copy.
+        last: the last draw; None if there was none, in evaluation, and in a copy. Each thread that calls the module has
+            its own, except inside ``torch.compile``.
         step: the training step, set with :meth:`set_step`.
 
     Example:
@@ -74,11 +145,29 @@ class Regularizer(Scheduled):
     learns: ClassVar[Mapping[str, Learned]] = {}
     drops: ClassVar[bool] = True
     renders_mean: bool = False
-    last: Draw | None = None
+    _latest: Draw | None = None
+    _by_thread: weakref.WeakKeyDictionary[threading.Thread, Draw | None] | None = None
+
+    @property
+    def last(self) -> Draw | None:
+        """The last draw of the calling thread; that of any thread if this one has not called the module."""
+        by_thread = self._by_thread
+        return self._latest if by_thread is None else by_thread.get(threading.current_thread(), self._latest)
+
+    @last.setter
+    def last(self, draw: Draw | None) -> None:
+        self._latest = draw
+        if torch.compiler.is_compiling():
+            self._by_thread = None  # a graph knows no threads
+        else:
+            with _LOCK:
+                if self._by_thread is None:
+                    self._by_thread = weakref.WeakKeyDictionary()
+                self._by_thread[threading.current_thread()] = draw
 
     def __getstate__(self) -> dict[str, Any]:
-        # Without the draw, which may be part of the graph of a step and then cannot be copied.
-        return {name: x for name, x in vars(self).items() if name != "last"}
+        # Without the draws, which may be part of the graph of a step and then cannot be copied.
+        return {name: x for name, x in vars(self).items() if name not in ("_latest", "_by_thread")}
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw for one training step, for which ``x`` is what the rasterizer would receive without a regularizer.
@@ -96,7 +185,7 @@ class Regularizer(Scheduled):
         """Return what is rendered at test time: ``x`` itself unless overridden."""
         return x
 
-    def multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
+    def alpha_factor(self, x: Params) -> tuple[Params, Multiplier] | None:
         """Return parameters, and the independent random factor on their alphas, that together reproduce the draws.
 
         Exact scores and penalties take this :class:`~ca_reg.functional.Multiplier`. None, the default, means that the
@@ -104,9 +193,9 @@ class Regularizer(Scheduled):
         """
         return None
 
-    def test_multiplied(self, x: Params) -> tuple[Params, Multiplier] | None:
-        """Return :meth:`multiplied` for test time; it differs only if training uses measurements of an earlier step."""
-        return self.multiplied(x)
+    def test_alpha_factor(self, x: Params) -> tuple[Params, Multiplier] | None:
+        """Return :meth:`alpha_factor` for a finished model; override it only if training caches measurements."""
+        return self.alpha_factor(x)
 
     def regularize(self, x: Params, generator: torch.Generator | None = None) -> Params:
         """Draw, store the draw in :attr:`last`, and apply it; trainers and hooks call this.
@@ -115,17 +204,18 @@ class Regularizer(Scheduled):
             ValueError: if ``x`` lacks a field that the regularizer needs.
         """
         self.check_needs(x)
-        self.last = self.draw(x, generator)
-        return self.replay(x, self.last)
+        self.last = draw = self.draw(x, generator)
+        return self.replay(x, draw)
 
     def forward(self, x: Given, *, drawn: Draw | None = None, generator: torch.Generator | None = None) -> Given:
         """Return what to render.
 
         Args:
-            x: activated opacities in [0, 1], shape (N,) or (N, 1), or all parameters with such opacities. If these have
-                no step, i.e. 0, that of :meth:`set_step` counts; inside ``torch.compile`` only for :meth:`rate_at`.
+            x: activated opacities in [0, 1], shape (N,) or (N, 1), or all parameters with such opacities. Without a
+                step in these, that of :meth:`set_step` counts; inside ``torch.compile`` only for :meth:`rate_at`.
             drawn: an earlier draw to replay instead of a new one; in training only.
-            generator: source of the draw; the global random state is then untouched.
+            generator: source of this draw; the global random state is then untouched. It belongs to the call and not to
+                the constructor, so that the random numbers of a step can depend on the step alone.
 
         Returns:
             The same type as ``x``; the very same object if nothing changes.
@@ -138,7 +228,7 @@ class Regularizer(Scheduled):
         given = x if isinstance(x, Params) else Params(x)
         self._check(given.opacities)
         # Reading the step would recompile the graph at every step; the graph reads the rate from a tensor.
-        step = given.step or (0 if torch.compiler.is_compiling() else self.step)
+        step = self.step if given.step is None and not torch.compiler.is_compiling() else given.step
         flat = given.opacities.reshape(-1) if given.opacities.ndim > 1 else given.opacities
         params = given._replace(opacities=flat, step=step)
         if not self.training:
@@ -169,7 +259,8 @@ class Regularizer(Scheduled):
     @property
     def keep(self) -> Tensor | None:
         """Which Gaussians the last draw kept, shape (N,) bool; None if it dropped none."""
-        return None if self.last is None else self.last.keep
+        last = self.last
+        return None if last is None else last.keep
 
     def mask_radii(self, radii: Tensor) -> Tensor:
         """Zero the radii of the Gaussians that the last call dropped, so that density control does not count them.

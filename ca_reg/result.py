@@ -1,21 +1,67 @@
-"""The results of a score: for one view, and for the mean over views."""
+"""The results of a score, for one view and for the mean over views, and the reasons why there is none."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
+import torch.distributed as dist
 from torch import Tensor
-
-from ca_reg.reason import Reason
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["CAResult", "CASettings", "CASummary", "LimitEstimate", "Method", "summarize"]
+__all__ = ["CAResult", "CASettings", "CASummary", "LimitEstimate", "Method", "Reason", "summarize"]
+
+
+class Reason(Enum):
+    """The outcome of a measurement: why a score has the value it has, as a message and a remedy.
+
+    Every member but ``OK`` and ``NO_EFFECT``, whose value is 0, comes with the value nan.
+
+    Convention: files store ``reason.name``, such as ``"EMPTY"``; people read ``str(reason)``.
+
+    Example:
+        >>> Reason.OK.message
+        'the value was measured'
+        >>> print(Reason.NO_VIEWS)
+        no view was measured; call update(opacity, view) before compute()
+    """
+
+    OK = ("the value was measured", "")
+    EMPTY = (
+        "no pixel counts: none is covered beyond the threshold",
+        "lower the threshold or the drop rate; right after an opacity reset, or in a scene that is nowhere opaque, "
+        "there is nothing to measure",
+    )
+    NOT_FINITE = (
+        "NaN or infinity in an alpha, or in a color where the alpha is not 0",
+        "look at the colors and opacities of the model: the training has diverged or the renderer is at fault",
+    )
+    OUT_OF_RANGE = (
+        "the variance is above that of any colors in [0, 1]",
+        "return images in [0, 1], not in 0..255; if they are, the colors of the model have diverged",
+    )
+    NO_EFFECT = (
+        "no pixel changed in any render, although Gaussians were left out",
+        "check that render_fn renders with the opacities that it is given, in place of the model's own",
+    )
+    NO_VIEWS = ("no view was measured", "call update(opacity, view) before compute()")
+
+    def __init__(self, message: str, remedy: str) -> None:
+        self.message = message
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        return f"{self.message}; {self.remedy}" if self.remedy else self.message
+
+
+_COUNTED = (Reason.EMPTY, Reason.NOT_FINITE, Reason.OUT_OF_RANGE, Reason.NO_EFFECT)
+COLUMNS = 3 + len(_COUNTED)
 
 Method = Literal["sampling", "adaptive", "exact", "exact_neutral"]
 """How a score was computed: see :class:`CASettings`."""
@@ -77,7 +123,7 @@ class _Score(CASettings):
         """The choices behind the score, which are the same for every view of one :class:`~ca_reg.CAScore`."""
         values = {field.name: getattr(self, field.name) for field in fields(CASettings)}
         if self.method == "adaptive":
-            values["samples"] = None
+            values["samples"] = None  # found anew for each view, so no choice
         return CASettings(**values)
 
     @property
@@ -124,8 +170,8 @@ class CAResult(_Score):
     """The co-adaptation score of one view.
 
     Args:
-        value: the score: variance of the renders, mean over RGB and over the visible pixels; nan unless ``reason`` is
-            ``Reason.OK``.
+        value: the score: variance of the renders, mean over RGB and over the visible pixels; nan where ``reason`` says
+            that there is none.
         std_error: standard error of ``value`` over the choice of masks; 0 for an exact score; nan below three samples,
             without a value, and if no render of an adaptive score differed although some Gaussians were dropped.
         variance: variance of every pixel, mean over RGB, shape (H, W), float64, visible or not.
@@ -149,6 +195,7 @@ class CAResult(_Score):
             ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
         """
         ax = new_axes() if ax is None else ax
+        # The root, because a few pixels hold most of the variance.
         heat = self.variance.sqrt().masked_fill(~self.visible, math.nan).cpu().numpy()
         ax.set_facecolor("0.6")
         picture = ax.imshow(heat, cmap="inferno", vmin=0.0)
@@ -165,9 +212,10 @@ class CASummary(_Score):
     """The mean co-adaptation score of several views.
 
     Args:
-        value: mean over the views that have a value; nan unless ``reason`` is ``Reason.OK``.
+        value: mean over the views that have a value; else nan, see ``reason``.
         std_error: standard error of ``value`` over the choice of masks, the views held fixed.
-        reason: ``NOT_FINITE`` if it holds for any view, ``EMPTY`` if for all, ``NO_VIEWS`` without views, else ``OK``.
+        reason: ``NOT_FINITE`` or ``OUT_OF_RANGE`` if it holds for any view, ``EMPTY`` or ``NO_EFFECT`` if for all,
+            ``NO_VIEWS`` without views, else ``OK``.
         views: number of views that were measured.
         empty_views: number of views without a visible pixel, which ``value`` leaves out.
     """
@@ -191,7 +239,7 @@ def summarize(results: Iterable[CAResult]) -> CASummary:
         >>> summarize(score(torch.ones(10), view=None, index=i) for i in range(2)).views
         2
     """
-    sums, settings = torch.zeros(5, dtype=torch.float64, device="cpu"), set()
+    sums, settings = torch.zeros(COLUMNS, dtype=torch.float64, device="cpu"), set()
     for result in results:
         sums += row_of(result)
         settings.add(result.settings)
@@ -201,24 +249,31 @@ def summarize(results: Iterable[CAResult]) -> CASummary:
 
 
 def row_of(result: CAResult) -> Tensor:
-    """Return value, squared standard error, 1, whether empty, whether not finite, (5,) float64, to be summed."""
+    """Encode a result as float64 numbers, (COLUMNS,), so that the results of views and ranks can be added.
+
+    They are its value, its squared standard error, 1, and for each reason of `_COUNTED` whether it is that.
+    """
     ok = result.reason is Reason.OK
-    row = [result.value, result.std_error**2] if ok else [0.0, 0.0]
-    row += [1.0, float(result.reason is Reason.EMPTY), float(result.reason is Reason.NOT_FINITE)]
+    row = [result.value, result.std_error**2, 1.0] if ok else [0.0, 0.0, 1.0]
+    row += [float(result.reason is reason) for reason in _COUNTED]
     return torch.tensor(row, dtype=torch.float64, device="cpu")
 
 
 def summary_of(sums: Tensor, settings: CASettings) -> CASummary:
-    """Return the mean over views, given the sum of their rows, (5,)."""
-    total, squared_error, views, empty, not_finite = sums.tolist()
+    """Return the mean over views, given the sum of their rows, (COLUMNS,)."""
+    total, squared_error, views, empty, not_finite, out_of_range, no_effect = sums.tolist()
     counted = views - empty
     if views == 0:
         reason = Reason.NO_VIEWS
-    elif not_finite > 0:
+    elif not_finite > 0:  # one broken view is a fault of the model or the renderer, an empty one is not
         reason = Reason.NOT_FINITE
+    elif out_of_range > 0:
+        reason = Reason.OUT_OF_RANGE
+    elif counted == 0:
+        reason = Reason.EMPTY
     else:
-        reason = Reason.OK if counted > 0 else Reason.EMPTY
-    ok = reason is Reason.OK
+        reason = Reason.NO_EFFECT if no_effect == counted else Reason.OK
+    ok = reason in (Reason.OK, Reason.NO_EFFECT)
     return CASummary(
         value=total / counted if ok else math.nan,
         std_error=math.sqrt(squared_error) / counted if ok else math.nan,
@@ -227,6 +282,13 @@ def summary_of(sums: Tensor, settings: CASettings) -> CASummary:
         empty_views=int(empty),
         **asdict(settings),
     )
+
+
+def view_position(count: int, group: dist.ProcessGroup | None = None) -> int:
+    """Return the position, among the views of all ranks, of the view that follows ``count`` others on this rank."""
+    if not (dist.is_available() and dist.is_initialized()):
+        return count
+    return dist.get_rank(group) + dist.get_world_size(group) * count
 
 
 def new_axes(count: int = 1) -> Any:

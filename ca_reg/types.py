@@ -41,9 +41,9 @@ class RenderFn(Protocol):
     floating-point torch tensors or numpy arrays, and a leading batch axis of 1 is dropped. Longer tuples are refused:
     in ``(color, radii, depth, alpha)`` nothing but the position tells depth from alpha.
 
-    A renderer that is faster on several sets of opacities at once may offer a method ``many(opacities, view)``. It
-    takes up to 8 sets, stacked along a new first axis, and returns two sequences, images and alphas. A score then calls
-    it instead.
+    A renderer that is faster on several sets of opacities at once may offer a method ``render_batch(opacities, view)``.
+    It takes up to 8 sets, stacked along a new first axis, and returns two sequences, images and alphas. A score then
+    calls it instead.
 
     Example:
         >>> def render_fn(opacity: Tensor, view: str) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ca_reg import PixelLists
+from ca_reg.lists import PixelLists
 
 from .gsplat import load_gsplat, unregularized
 
@@ -42,7 +42,7 @@ class GsplatView(NamedTuple):
 class GsplatModel:
     """Gaussians to be rendered by gsplat, without their opacities. Needs a CUDA device.
 
-    ``CAScore(model.render)`` samples; ``CAScore(exact=ListMoments(model.lists))`` is exact and needs gsplat 1.5 or
+    ``CAScore(model.render)`` samples; ``CAScore.exact(ListMoments(model.lists))`` is exact and needs gsplat 1.5 or
     newer. Both bypass a regularizer that wraps or replaces ``gsplat.rasterization``.
 
     Args:
@@ -57,11 +57,12 @@ class GsplatModel:
         antialiased: whether the model was trained with ``rasterize_mode="antialiased"``.
 
     Example:
-        >>> from ca_reg import CAScore, ListMoments
+        >>> from ca_reg import CAScore
+        >>> from ca_reg.lists import ListMoments
         >>> model = GsplatModel(means, quats, scales, sh, sh_degree=3)  # doctest: +SKIP
         >>> view = GsplatView(viewmat, K, 1008, 756)  # doctest: +SKIP
         >>> CAScore(model.render, p=0.2)(opacities, view).value  # doctest: +SKIP
-        >>> CAScore(exact=ListMoments(model.lists), p=0.2)(opacities, view).value  # doctest: +SKIP
+        >>> CAScore.exact(ListMoments(model.lists), p=0.2)(opacities, view).value  # doctest: +SKIP
     """
 
     means: Tensor

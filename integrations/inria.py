@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from ca_reg._check import check_count
 from ca_reg._random import seeded
-from ca_reg.chain import Foreign
+from ca_reg.chain import WrappedModule
 from ca_reg.types import RenderFn, Rendering, read_rendering
 
 from ._calls import (
@@ -123,7 +123,7 @@ class RasterizerHook(Hook):
         if not len(self._chain):
             raise ValueError("regularizer is empty; without one there is nothing to install.")
         for member in self._chain:
-            if isinstance(member, Foreign):
+            if isinstance(member, WrappedModule):
                 member.check_generator()
         check_count(seed, "seed", minimum=0)
         self._scope = scope

@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ca_reg import CAScore, CASummary, Params, RenderFn
-from ca_reg.result import row_of, summary_of
+from ca_reg import CAScore, Params
+from ca_reg.result import COLUMNS, CASummary, row_of, summary_of
 from ca_reg.score import view_position
+from ca_reg.types import RenderFn
 
 __all__ = ["CAScoreMetric"]
 
@@ -84,7 +85,7 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
     def __init__(self, score: CAScore | RenderFn, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.score = score if isinstance(score, CAScore) else CAScore(score)
-        self.add_state("sums", default=torch.zeros(5, dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("sums", default=torch.zeros(COLUMNS, dtype=torch.float64), dist_reduce_fx="sum")
         # A collection lets metrics of equal state share their updates, and scores are small enough to look equal in
         # its allclose, or all empty at first. Two digits in base 4096, because it compares with a relative tolerance.
         digits = torch.tensor(divmod(next(_numbers), 4096), dtype=torch.float64)

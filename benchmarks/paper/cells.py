@@ -239,8 +239,8 @@ def renders(model: TrainedModel, view: View, seed: int, draws: int = 5) -> dict[
     x = model.gaussians.params(view.camera, step=model.step)
     generator = torch.Generator(x.opacities.device).manual_seed(seed)
     drawn = torch.stack([model.chain.regularize(x, generator).opacities for _ in range(draws)])
-    images = MaskedRenders(model).many(drawn, view)[0]
-    factors = model.chain.multiplied(x)
+    images = MaskedRenders(model).render_batch(drawn, view)[0]
+    factors = model.chain.alpha_factor(x)
     assert factors is not None
     pictures = {"five": images.mean(0), "mean": model.moments(factors[0].opacities, view, factors[1]).mean,
                 "scaled": model.render(factors[0].opacities * factors[1].mean, view)[0]}  # fmt: skip

@@ -1,7 +1,6 @@
 """The pure functions behind the modules: they hold no state, change no argument and draw only when asked to."""
 
 from ca_reg._random import draw_numbers
-from ca_reg.functional.dropout import apply_dropout, draw_keep_mask, gaussian_dropout
 from ca_reg.functional.expected_losses import expected_absolute_error, expected_squared_error
 from ca_reg.functional.moments import (
     PixelMoments,
@@ -12,8 +11,16 @@ from ca_reg.functional.moments import (
     pixel_moments,
 )
 from ca_reg.functional.multipliers import Multiplier
-from ca_reg.functional.noise import apply_opacity_noise, draw_opacity_noise, opacity_noise
-from ca_reg.functional.scaling import expected_opacity, scale_opacity
+from ca_reg.functional.opacities import (
+    apply_dropout,
+    apply_opacity_noise,
+    draw_keep_mask,
+    draw_opacity_noise,
+    expected_opacity,
+    gaussian_dropout,
+    opacity_noise,
+    scale_opacity,
+)
 from ca_reg.functional.variance import ColorVariance, color_variance
 
 __all__ = [

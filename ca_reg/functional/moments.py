@@ -24,6 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ca_reg._check import check_tensor
 from ca_reg.functional.multipliers import Multiplier
 
 __all__ = [
@@ -204,10 +205,8 @@ def _background(background: Tensor | None, alphas: Tensor, colors: Tensor) -> Te
 
 def _check_lists(alphas: Tensor, colors: Tensor) -> None:
     """Raise unless alphas and colors are what :func:`pixel_moments` asks for."""
-    from kornia.core.check import KORNIA_CHECK_IS_TENSOR
-
     _check_alphas(alphas)
-    KORNIA_CHECK_IS_TENSOR(colors, "colors must be a torch tensor of shape (..., n, C).")
+    check_tensor(colors, "colors", "of shape (..., n, C)")
     if colors.shape[:-1] != alphas.shape:
         raise ValueError(
             f"colors must have the shape of alphas and a last axis of channels, {(*alphas.shape, 'C')}, "
@@ -227,9 +226,7 @@ def _check_finite(x: Tensor, name: str) -> None:
 
 def _check_alphas(alphas: Tensor) -> None:
     """Raise unless alphas is a float32 or float64 tensor (..., n) of values in [0, 1]."""
-    from kornia.core.check import KORNIA_CHECK_IS_TENSOR
-
-    KORNIA_CHECK_IS_TENSOR(alphas, "alphas must be a torch tensor of shape (..., n).")
+    check_tensor(alphas, "alphas", "of shape (..., n)")
     # The 8 or 11 significant bits of the 16-bit dtypes do not survive the products over long lists.
     if alphas.dtype not in (torch.float32, torch.float64):
         raise TypeError(

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ca_reg.reason import Reason
+from ca_reg._check import check_tensor
+from ca_reg.result import Reason
 
 __all__ = ["ColorVariance", "color_variance"]
 
@@ -30,7 +31,8 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
     """Measure the color variance CV of pixels from the splats that are blended into them (paper, appendix, CV metric).
 
     Per pixel and channel ``sum_i w_i (c_i - m)^2 / sum_i w_i`` with the weighted mean ``m``: the paper's
-    ``E[c^2] - E[c]^2`` without cancellation. Differentiable in both arguments.
+    ``E[c^2] - E[c]^2`` without cancellation, since the deviations are squared and not the colors. Differentiable in
+    both arguments.
 
     Convention: the splats may be in any order that both arguments share. The background is not a splat.
 
@@ -50,10 +52,10 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
         >>> cv.variance, cv.covered, cv.value
         (tensor([0.2500, 0.0000, 0.0000]), tensor([ True,  True, False]), tensor(0.1250))
     """
-    from kornia.core.check import KORNIA_CHECK_IS_TENSOR, KORNIA_CHECK_SHAPE
-
-    KORNIA_CHECK_IS_TENSOR(weights, "weights must be a torch tensor of shape (..., n).")
-    KORNIA_CHECK_SHAPE(colors, ["*", "n", "3"], "colors must have shape (..., n, 3), RGB last.")
+    check_tensor(weights, "weights", "of shape (..., n)")
+    check_tensor(colors, "colors", "of shape (..., n, 3)")
+    if colors.ndim < 2 or colors.shape[-1] != 3:
+        raise ValueError(f"colors must have shape (..., n, 3), RGB last, got {tuple(colors.shape)}.")
     if colors.shape[:-1] != weights.shape:
         raise ValueError(
             f"colors must have the shape of weights and a last axis of 3, {(*weights.shape, 3)}, "

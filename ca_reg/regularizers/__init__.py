@@ -1,25 +1,15 @@
-"""All regularizers, one per module, and the registry that ``--regularizer`` and the launcher look names up in."""
+"""The regularizers by name, as ``--regularizer`` and the launcher look them up."""
 
 from ca_reg.chain import Chain
 from ca_reg.registry import Registry
 from ca_reg.regularizer import Regularizer
-from ca_reg.regularizers.clustered import ClusteredDropout
-from ca_reg.regularizers.concrete import ConcreteDropout
-from ca_reg.regularizers.d2gs import D2GSDropout
-from ca_reg.regularizers.density import DensityDropout
-from ca_reg.regularizers.depth import DepthDropout
-from ca_reg.regularizers.drop_anchors import AnchorDropout
-from ca_reg.regularizers.drop_gaussian import DropGaussian
-from ca_reg.regularizers.drop_sh import SHDropout
-from ca_reg.regularizers.dropout import GaussianDropout
-from ca_reg.regularizers.geometry import GeometryDropout
-from ca_reg.regularizers.independent import IndependentDropout
-from ca_reg.regularizers.noise import OpacityNoise
-from ca_reg.regularizers.position_noise import PositionNoise
-from ca_reg.regularizers.scale_noise import ScaleNoise
+from ca_reg.regularizers.clustered import AnchorDropout, ClusteredDropout, SHDropout
+from ca_reg.regularizers.concrete import ConcreteDropout, SoftDropout
+from ca_reg.regularizers.depth import D2GSDropout, DepthDropout
+from ca_reg.regularizers.dropout import DropGaussian, GaussianDropout, IndependentDropout
+from ca_reg.regularizers.noise import OpacityNoise, PositionNoise, ScaleNoise, SHNoise
 from ca_reg.regularizers.segs import SEGSNoise
-from ca_reg.regularizers.sh_noise import SHNoise
-from ca_reg.regularizers.soft import SoftDropout
+from ca_reg.regularizers.surroundings import DensityDropout, GeometryDropout
 from ca_reg.schedules import SCHEDULES
 
 __all__ = ["REGULARIZERS", "GaussianDropout", "IndependentDropout", "OpacityNoise", "parse"]

@@ -1,17 +1,94 @@
-"""The paper's Gaussian dropout: the same rate for every Gaussian."""
+"""Dropout of Gaussians independently of each other: the paper's, and the base class of those with other rates."""
 
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
-from ca_reg._check import Rate
-from ca_reg.params import Draw, Params
-from ca_reg.regularizer import Given
-from ca_reg.regularizers.independent import IndependentDropout
-from ca_reg.schedules import Schedule
+from ca_reg import functional
+from ca_reg._check import Rate, check_rate, is_zero, rate_like
+from ca_reg.functional import Multiplier
+from ca_reg.regularizer import Draw, Params, Regularizer
+from ca_reg.schedules import LinearRamp, Schedule
 
-__all__ = ["GaussianDropout"]
+__all__ = ["DropGaussian", "GaussianDropout", "IndependentDropout"]
+
+
+class IndependentDropout(Regularizer):
+    """Drop each Gaussian at its own rate, independently of the others; a subclass defines the rates.
+
+    ``train()``: ``opacity * keep``, with ``compensate`` times ``1 / (1 - p)``. ``eval()``: with ``scale``
+    ``opacity * (1 - p)``, the mean over all masks; otherwise, and with ``compensate``, the opacities unchanged.
+
+    Args:
+        rate: in [0, 1), or a schedule of it, which ``self.rate_at(x.step)`` reads, for subclasses whose rates build on
+            one.
+        compensate: scale the survivors in training rather than all opacities in evaluation.
+        scale: scale the opacities in evaluation, as the paper does; most published schemes do not.
+
+    Example:
+        >>> class DropFaint(IndependentDropout):
+        ...     rate_name = "rate"
+        ...     def rates(self, x):
+        ...         return self.rate_at(x.step) * (1 - x.opacities.detach())
+        >>> DropFaint(0.4).eval()(torch.tensor([0.5, 1.0]))
+        tensor([0.4000, 1.0000])
+    """
+
+    def __init__(self, rate: float | Schedule | None = None, *, compensate: bool = False, scale: bool = True) -> None:
+        super().__init__(rate)
+        self.compensate = compensate
+        self.scale = scale
+        self.renders_mean = compensate or scale
+
+    def rates(self, x: Params) -> Rate:
+        """Return the drop rates in [0, 1) for ``x``: a number, or one for each Gaussian, shape (N,)."""
+        raise NotImplementedError
+
+    def test_rates(self, x: Params) -> Rate:
+        """Return the rates by which :meth:`expected` scales."""
+        return self.rates(x)
+
+    def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
+        """Draw which Gaussians are kept."""
+        rates = self.rates(x)
+        if is_zero(rates):
+            return Draw()
+        count, device = x.opacities.shape[0], x.opacities.device
+        keep = functional.draw_keep_mask(count, rates, generator=generator, device=device)
+        return Draw(keep=keep)
+
+    def replay(self, x: Params, draw: Draw) -> Params:
+        """Set the opacities of dropped Gaussians to 0; if asked to, compensate the others for the rates of ``x``."""
+        if draw.keep is None:
+            return x
+        # Only compensation needs the rates again; some are the ranks of a whole model.
+        rates = self.rates(x) if self.compensate else 0.0
+        opacities = functional.apply_dropout(x.opacities, draw.keep, p=rates, compensate=self.compensate)
+        return x._replace(opacities=opacities)
+
+    def expected(self, x: Params) -> Params:
+        """Scale by ``1 - p`` with ``scale`` and without ``compensate``."""
+        if self.compensate or not self.scale:
+            return x
+        opacities = functional.scale_opacity(x.opacities, self.test_rates(x))
+        return x if opacities is x.opacities else x._replace(opacities=opacities)
+
+    def alpha_factor(self, x: Params) -> tuple[Params, Multiplier]:
+        """Return the survivors' opacities, and a factor of 0 or 1: exact even if the rasterizer clamps alpha."""
+        return self._alpha_factor(x, self.rates(x))
+
+    def test_alpha_factor(self, x: Params) -> tuple[Params, Multiplier]:
+        """Return the same at the test-time rates."""
+        return self._alpha_factor(x, self.test_rates(x))
+
+    def _alpha_factor(self, x: Params, rates: Rate) -> tuple[Params, Multiplier]:
+        if self.compensate:
+            # Survivors may exceed 1: the renderer's clamp must see them before the factor does.
+            x = x._replace(opacities=x.opacities / (1.0 - rate_like(rates, x.opacities)))
+        return x, Multiplier.dropout(rates)
+
+    def _check_rate(self, rate: float, name: str) -> None:
+        check_rate(rate, name)
 
 
 class GaussianDropout(IndependentDropout):
@@ -21,14 +98,18 @@ class GaussianDropout(IndependentDropout):
     survivors are multiplied by ``1 / (1 - p)`` in training instead, and evaluation leaves the opacities as they are.
     The two schemes are not equivalent: compositing is not linear in the opacities, and rasterizers clamp the alpha of
     survivors, so that Gaussians of opacity above ``0.99 (1 - p)`` are more opaque in evaluation than in the mean over
-    all masks. The module has no parameters; put it between the activation of the opacities and the rasterizer.
+    all masks.
 
     Dropped Gaussians must leave no trace in density control: pass the radii through
     :meth:`~ca_reg.Regularizer.mask_radii`.
 
+    A draw comes from the global random state, or from a generator given to the call: ``dropout(opacity,
+    generator=generator)``. Under ``torch.vmap`` draw the masks outside, and map
+    :func:`~ca_reg.functional.apply_dropout` over them.
+
     Inside ``torch.compile`` one graph serves all steps, even with ``fullgraph=True``, and the next all numbers of
     Gaussians: the values of the opacities are then not checked, and a schedule draws even where its rate is 0. Inside
-    ``torch.utils.checkpoint`` draw without ``generator``, or draw outside and pass ``keep``. The same holds for
+    ``torch.utils.checkpoint`` draw without ``generator``, or draw outside and pass ``drawn``. The same holds for
     :class:`OpacityNoise`.
 
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call rejects negative ones as logits.
@@ -36,11 +117,6 @@ class GaussianDropout(IndependentDropout):
     Args:
         p: drop rate in [0, 1), or a schedule of it. The paper uses 0.2.
         compensate: scale the survivors in training rather than all opacities in evaluation.
-
-    Attributes:
-        keep: the last mask, True where the Gaussian was kept, (N,) bool; None if nothing was dropped.
-        p: the rate at the current step.
-        step: the training step, set with :meth:`set_step`; a module with a schedule saves it in ``state_dict``.
 
     Raises:
         TypeError: if ``p`` is neither a number nor callable.
@@ -52,7 +128,7 @@ class GaussianDropout(IndependentDropout):
         >>> in_training = dropout(opacity)
         >>> torch.equal(in_training, opacity * dropout.keep)
         True
-        >>> torch.equal(dropout(opacity, keep=dropout.keep), in_training)  # replay
+        >>> torch.equal(dropout(opacity, drawn=dropout.last), in_training)  # replay
         True
         >>> dropout.eval()(opacity)
         tensor([0.4000, 0.4000, 0.4000, 0.4000, 0.4000])
@@ -68,16 +144,34 @@ class GaussianDropout(IndependentDropout):
         """The drop rate at the current step."""
         return self._present_rate()
 
-    def forward(  # type: ignore[override]
-        self, opacity: Given, *, keep: Tensor | None = None, generator: torch.Generator | None = None
-    ) -> Given:
-        """Return the opacities to render.
-
-        As :meth:`Regularizer.forward <ca_reg.Regularizer.forward>`; ``keep``, (N,) bool, is an earlier mask to replay
-        instead of drawing one, in training only.
-        """
-        return super().forward(opacity, drawn=None if keep is None else Draw(keep=keep), generator=generator)
-
     def rates(self, x: Params) -> Rate:
         """Return the rate at the step."""
         return self.rate_at(x.step)
+
+
+class DropGaussian(GaussianDropout):
+    """Drop all Gaussians at the rate ``p t / steps`` at step t, and multiply survivors by ``1 / (1 - rate)``.
+
+    DropGaussian (CVPR 2025): uniform over all N Gaussians, no factor at test time. Survivors may exceed 1, which the
+    renderer clamps. It is :class:`~ca_reg.GaussianDropout` with ``compensate`` and a ramp, and has the same exact
+    multiplier.
+
+    Args:
+        p: rate at the end of the ramp, in [0, 1); 0.2 in the source.
+        steps: length of the ramp, after which the rate is constant; the source trains for 10,000 steps. Shorter
+            trainings should pass their own length: 3,000 steps of the default reach 0.06.
+
+    Example:
+        >>> import torch
+        >>> dropout = DropGaussian()
+        >>> dropout.set_step(5_000)
+        >>> opacity = torch.full((4,), 0.5)
+        >>> torch.allclose(dropout(opacity), opacity * dropout.keep / 0.9)
+        True
+        >>> dropout.eval()(opacity) is opacity
+        True
+    """
+
+    def __init__(self, p: float = 0.2, steps: int = 10_000) -> None:
+        check_rate(p)
+        super().__init__(LinearRamp(0.0, p, 0, steps), compensate=True)

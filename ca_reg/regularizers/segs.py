@@ -8,8 +8,7 @@ from torch.nn.functional import normalize
 
 from ca_reg import functional
 from ca_reg._check import is_zero
-from ca_reg.params import Draw, Params
-from ca_reg.regularizer import Regularizer
+from ca_reg.regularizer import Draw, Params, Regularizer
 from ca_reg.schedules import ExponentialDecay
 
 __all__ = ["SEGSNoise"]

@@ -204,7 +204,7 @@ def _measure(
         covered=out.alpha.double().mean().item(),
         cv=variance[covered].double().mean().item() if bool(covered.any()) else math.nan,
         **{f"depth_{name}": error for name, error in depth._asdict().items()},
-        ca_reason=str(ca.reason),
+        ca_reason=ca.reason.name,
     )
     if files:
         render = {"render" if photograph is None else f"render {measured.psnr:.2f} dB": image}

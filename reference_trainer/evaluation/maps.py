@@ -18,6 +18,10 @@ __all__ = ["color_variance_map", "first_order_map"]
 def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
     """Measure the variance of the colors blended at each pixel (paper, appendix, CV metric).
 
+    `ca_reg.functional.color_variance` without the lists of the pixels: a difference of mean squares, from two renders.
+    It is taken around the mean color of the image, so what it loses by cancellation is a rounding of the squared
+    distance from that color, not of the squared color.
+
     Returns:
         The variance, averaged over RGB, shape (H, W), and where any splat contributes, shape (H, W) bool; the variance
         is 0 elsewhere. The image's CV is the mean over the contributing pixels.
@@ -33,10 +37,13 @@ def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
         >>> round(variance[8, 8].item(), 2)  # weights 1/2 and 1/4: (1/3) (2/3)
         0.22
     """
-    drawn, squares = rasterize(splats), rasterize(splats._replace(colors=splats.colors.square()))
+    drawn = rasterize(splats)
     covered = drawn.alpha > 0
     weight = torch.where(covered, drawn.alpha, 1.0)
-    return (squares.image / weight - (drawn.image / weight).square()).mean(0).clamp_min(0.0), covered
+    center = drawn.image.sum((1, 2)) / drawn.alpha.sum().clamp_min(torch.finfo(weight.dtype).tiny)
+    offsets = splats.colors - center
+    first, second = (rasterize(splats._replace(colors=x)).image / weight for x in (offsets, offsets.square()))
+    return (second - first.square()).mean(0).clamp_min(0.0), covered
 
 
 @torch.no_grad()

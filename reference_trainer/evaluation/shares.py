@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ca_reg import CAResult, Reason, attribute, total_effects
+from ca_reg import CAResult, Reason, attribute
+from ca_reg.attribution import total_effects
 from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians

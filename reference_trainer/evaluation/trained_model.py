@@ -9,9 +9,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ca_reg import CAScore, Chain, GaussianDropout, Params, RenderFn
+from ca_reg import CAScore, Chain, GaussianDropout, Params
 from ca_reg.functional import Multiplier
 from ca_reg.regularizers import parse
+from ca_reg.types import RenderFn
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import arguments, render_gaussians
 from reference_trainer.render import (
@@ -137,7 +138,7 @@ class TrainedModel:
 
     def exact_ca_score(self, *, drop_rate: float | None = None, neutral: bool = False) -> CAScore:
         """Return the limit of `ca_score` for infinitely many samples, over the pixels of expected alpha above 0.8."""
-        return CAScore(exact=self.moments, p=self.dropout, drop_rate=drop_rate, neutral=neutral)
+        return CAScore.exact(self.moments, p=self.dropout, drop_rate=drop_rate, neutral=neutral)
 
 
 class MaskedRenders:
@@ -157,10 +158,10 @@ class MaskedRenders:
 
     def __call__(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
         """Render a view with given opacities (N,); image (3, H, W), alpha (H, W)."""
-        images, alphas = self.many(opacities[None], view)
+        images, alphas = self.render_batch(opacities[None], view)
         return images[0], alphas[0]
 
-    def many(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
+    def render_batch(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:
         """Render a view with K sets of opacities (K, N); images (K, 3, H, W), alphas (K, H, W)."""
         plain = self._model.gaussians.opacities
         if bool((opacities > plain).any()):  # the lists for the plain opacities would be too short

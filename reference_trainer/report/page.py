@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from ca_reg.dynamics import read_dynamics
+from ca_reg.monitor import read_dynamics
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ERROR_PICTURE_RANGE
 from reference_trainer.evaluation.pictures import heat_map
 from reference_trainer.evaluation.results import markdown_table

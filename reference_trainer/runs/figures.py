@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from torch.nn.functional import pad
 
-from ca_reg.dynamics import plot_dynamics
+from ca_reg.monitor import plot_dynamics
 from reference_trainer.evaluation.pictures import PANEL, save_png, side_by_side
 from reference_trainer.files import replacing
 from reference_trainer.scenes.images import read_image

@@ -90,7 +90,7 @@ class Step:
 
     def expect(self) -> None:
         """Render the view in expectation over the draws of the regularizer."""
-        multiplied = self.regularizer.multiplied(self.params)
+        multiplied = self.regularizer.alpha_factor(self.params)
         assert multiplied is not None, "the trainer has refused this"
         self.rendered, multiplier = multiplied
         moments = self.moments(self.view.camera, multiplier, self.rendered, observed=True)

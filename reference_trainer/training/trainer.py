@@ -234,7 +234,7 @@ class Trainer:
         """Raise a ValueError if a regularizer has no exact expectation."""
         with torch.no_grad():
             x = self.gaussians.params(self.views[0].camera)
-            names = [type(member).__name__ for member in self.regularizer if member.multiplied(x) is None]
+            names = [type(member).__name__ for member in self.regularizer if member.alpha_factor(x) is None]
         if names:
             raise ValueError(
                 f"analytic training needs draws that are independent factors of the opacities, which those of "

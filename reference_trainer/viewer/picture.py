@@ -80,9 +80,9 @@ class Subject:
             self._drawn = look, self._chosen(look)
         model, view = self._drawn[1], Viewpoint("", camera.to(self.model.gaussians.means.device))
         if look.mode == "co-adaptation":
-            score = CAScore(exact=model.moments, regularizer=_draws(look))
+            score = CAScore.exact(model.moments, regularizer=_draws(look))
             result = score(model.gaussians.opacities, view)
-            said = f"exact CA {result.value * 1e3:.2f}e-3" if result.value == result.value else result.reason.value
+            said = f"exact CA {result.value * 1e3:.2f}e-3" if result.value == result.value else str(result.reason)
             return ca_picture(result), f"{said}; variance 0 (black) to {CA_PICTURE_RANGE:g}, gray: not covered"
         out = model.test_rendering(view, depth=look.mode == "depth")
         if out.depth is None:

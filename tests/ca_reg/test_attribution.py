@@ -2,12 +2,15 @@
 
 import itertools
 import math
+from functools import partial
 
 import pytest
 import torch
 from oracles import random_scene
 
-from ca_reg import CAScore, ListMoments, OpacityNoise, Params, PixelLists, Reason, attribute, total_effects
+from ca_reg import CAScore, OpacityNoise, Reason, attribute
+from ca_reg.attribution import total_effects
+from ca_reg.lists import ListMoments, PixelLists
 from ca_reg.types import ExactMoments
 from reference_trainer.render import splat
 from reference_trainer.render.renderer import render_moments
@@ -41,7 +44,7 @@ class Scene:
         return PixelLists(gaussians, pixels, alphas, self.colors, HEIGHT, WIDTH, self.background)
 
     def score(self, rate, neutral=False):
-        return CAScore(exact=self.moments, drop_rate=rate, neutral=neutral, threshold=THRESHOLD)
+        return CAScore.exact(self.moments, drop_rate=rate, neutral=neutral, threshold=THRESHOLD)
 
     def draws(self, supports):
         """Colors over black (pixels, 3, ...) and alpha (pixels, ...) of every outcome, one axis per Gaussian in depth.
@@ -129,7 +132,7 @@ def test_a_total_effect_is_what_the_score_loses_when_one_factor_is_fixed(n, rate
 @pytest.mark.parametrize("regularizer", [None, OpacityNoise(0.5)])
 def test_inference_mode_does_not_keep_the_gradient_away(regularizer):
     scene = Scene(4)
-    score = CAScore(exact=scene.moments, regularizer=regularizer, threshold=THRESHOLD)
+    score = CAScore.exact(scene.moments, regularizer=regularizer, threshold=THRESHOLD)
     expected = total_effects(score, scene.opacity, None)
     with torch.inference_mode():
         opacity = scene.opacity * 1.0
@@ -165,7 +168,7 @@ def test_the_callables_are_asked_the_same(neutral, layout):
         asked.append((opacity, view, multiplier.mean, multiplier.variance, background))
         return scene.moments.shares(opacity, view, multiplier, turn(background, (2, 0, 1)), weights)
 
-    score = CAScore(exact=moments_fn, p=0.2, neutral=neutral, threshold=THRESHOLD, layout=layout)
+    score = CAScore.exact(moments_fn, p=0.2, neutral=neutral, threshold=THRESHOLD, layout=layout)
     opacity = scene.opacity[:, None].clone().requires_grad_()
     shares, result = attribute(score, shares_fn, opacity, "view")
     assert shares.sum().item() == pytest.approx(result.value, rel=1e-13)
@@ -178,7 +181,7 @@ def test_the_callables_are_asked_the_same(neutral, layout):
         effects = total_effects(score, opacity, "view").effects
     assert not effects.requires_grad
     assert opacity.grad is None
-    plain = CAScore(exact=scene.moments, p=0.2, neutral=neutral, threshold=THRESHOLD)
+    plain = CAScore.exact(scene.moments, p=0.2, neutral=neutral, threshold=THRESHOLD)
     torch.testing.assert_close(effects, total_effects(plain, scene.opacity, None).effects, **CLOSE)
 
 
@@ -189,9 +192,9 @@ def test_total_effects_come_through_the_reference_renderer():
         splats = splat(*gaussians[:3], opacity, gaussians.camera, colors=gaussians.colors)
         return render_moments(splats, multiplier, background=background)
 
-    score = CAScore(exact=moments_fn, neutral=True, threshold=0.3)
+    score = CAScore.exact(moments_fn, neutral=True, threshold=0.3)
     effects, result = total_effects(score, gaussians.opacities, None)
-    _, _, multiplier, background = score._exact(moments_fn, Params(gaussians.opacities), None)
+    _, _, multiplier, background = score.measure(gaussians.opacities, None)
 
     def value(variances):
         variance = moments_fn(gaussians.opacities, None, type(multiplier)(0.5, variances), background).variance
@@ -213,19 +216,19 @@ def test_without_a_value_all_are_zero_and_the_reason_says_why(reason):
         return moments._replace(variance=moments.variance * math.nan)
 
     if reason is Reason.EMPTY:
-        score = CAScore(exact=scene.moments, threshold=1.0)
+        score = CAScore.exact(scene.moments, threshold=1.0)
     else:
-        score = CAScore(exact=diverged, threshold=THRESHOLD)
+        score = CAScore.exact(diverged, threshold=THRESHOLD)
     shares, result = attribute(score, scene.moments.shares, scene.opacity, None)
     effects, same = total_effects(score, scene.opacity, None)
     assert result.reason is same.reason is reason
     assert shares.tolist() == effects.tolist() == [0.0] * 4
 
 
-@pytest.mark.parametrize("settings", [{}, {"relative_error": 0.1}])
-def test_a_sampled_score_cannot_be_attributed(settings):
+@pytest.mark.parametrize("make", [CAScore, partial(CAScore.adaptive, relative_error=0.1)])
+def test_a_sampled_score_cannot_be_attributed(make):
     scene = Scene(3)
-    score = CAScore(lambda opacity, view: None, **settings)
+    score = make(lambda opacity, view: None)
     for name, call in (
         ("attribute", lambda: attribute(score, scene.moments.shares, scene.opacity, None)),
         ("total_effects", lambda: total_effects(score, scene.opacity, None)),
@@ -249,7 +252,7 @@ def test_total_effects_need_a_gradient():
 
     for moments_fn in (constant, detached, elsewhere):
         with pytest.raises(ValueError, match=r"without a gradient in multiplier\.variance"):
-            total_effects(CAScore(exact=moments_fn, threshold=THRESHOLD), scene.opacity, None)
+            total_effects(CAScore.exact(moments_fn, threshold=THRESHOLD), scene.opacity, None)
 
 
 def test_bad_input():

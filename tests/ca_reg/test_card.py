@@ -5,18 +5,10 @@ from contextlib import nullcontext
 import pytest
 import torch
 
-from ca_reg import (
-    CAMonitor,
-    CAPenalty,
-    CAScore,
-    GaussianDropout,
-    ListMoments,
-    OpacityNoise,
-    attribute,
-    summarize,
-)
+from ca_reg import CAMonitor, CAPenalty, CAScore, GaussianDropout, OpacityNoise, attribute
 from ca_reg.functional import Multiplier
-from ca_reg.lists import PixelLists
+from ca_reg.lists import ListMoments, PixelLists
+from ca_reg.result import summarize
 from reference_trainer.training.randomness import deterministic
 
 N, SIDE = 24, 4
@@ -78,9 +70,9 @@ def test_scores_are_those_of_the_processor(scenes, kind):
     for scene in scenes:
         score = {
             "protocol": lambda s: CAScore(s.render, threshold=0.1),
-            "until it is known": lambda s: CAScore(s.render, threshold=0.1, relative_error=0.2),
-            "exact": lambda s: CAScore(exact=ListMoments(s.lists), threshold=0.1),
-            "neutral": lambda s: CAScore(exact=ListMoments(s.lists), threshold=0.1, neutral=True),
+            "until it is known": lambda s: CAScore.adaptive(s.render, threshold=0.1, relative_error=0.2),
+            "exact": lambda s: CAScore.exact(ListMoments(s.lists), threshold=0.1),
+            "neutral": lambda s: CAScore.exact(ListMoments(s.lists), threshold=0.1, neutral=True),
         }[kind](scene)
         score.update(scene.opacity, None)
         found.append(score.compute().value)
@@ -105,7 +97,7 @@ def test_shares_and_penalty_have_the_gradients_of_the_processor(scenes, card, re
     shares, gradients = [], []
     for scene in scenes:
         moments, opacity = ListMoments(scene.lists), scene.opacity.clone().requires_grad_()
-        score = CAScore(exact=moments, threshold=0.1)
+        score = CAScore.exact(moments, threshold=0.1)
         shares.append(attribute(score, moments.shares, scene.opacity, None)[0].cpu())
         with deterministic(card) if repeatable else nullcontext():
             image, _, term = CAPenalty(moments, Multiplier.dropout(0.2))(opacity, None)

@@ -48,7 +48,7 @@ def test_test_time_value_and_multiplier_are_the_mean_and_variance_over_all_masks
         drawn = rule.replay(x, Draw(keep, keep)).opacities
         mean, square = mean + weight * drawn, square + weight * drawn**2
     torch.testing.assert_close(rule.expected(x).opacities, mean, rtol=1e-14, atol=0)
-    raised, multiplier = rule.multiplied(x)
+    raised, multiplier = rule.alpha_factor(x)
     torch.testing.assert_close(raised.opacities * multiplier.mean, mean, rtol=1e-14, atol=0)
     torch.testing.assert_close(raised.opacities**2 * multiplier.variance, square - mean**2, rtol=1e-12, atol=1e-16)
 
@@ -115,9 +115,9 @@ def test_members_may_change_other_parameters_and_say_what_they_need():
 
 
 def test_a_chain_has_a_multiplier_only_if_every_member_has_one():
-    assert Chain(GaussianDropout(0.5), ScaleUp()).multiplied(Params(OPACITY)) is None
-    _, multiplier = Chain(GaussianDropout(0.5), ByOpacity()).multiplied(Params(OPACITY))
-    expected = ByOpacity().multiplied(Params(OPACITY))[1]
+    assert Chain(GaussianDropout(0.5), ScaleUp()).alpha_factor(Params(OPACITY)) is None
+    _, multiplier = Chain(GaussianDropout(0.5), ByOpacity()).alpha_factor(Params(OPACITY))
+    expected = ByOpacity().alpha_factor(Params(OPACITY))[1]
     torch.testing.assert_close(multiplier.mean, 0.5 * expected.mean)
 
 
@@ -167,7 +167,7 @@ def test_parameters_without_a_step_meet_the_one_that_a_member_was_told(wrap):
     drawn = module(x)
     assert (drawn.opacities == 0).any()
     assert drawn.step == x.step
-    assert torch.equal(dropout(x, keep=dropout.keep).opacities, drawn.opacities)
+    assert torch.equal(dropout(x, drawn=dropout.last).opacities, drawn.opacities)
     torch.testing.assert_close(module.eval()(x).opacities, 0.1 * x.opacities)
     earlier = x._replace(step=49)  # a step that is given counts
     assert module.train()(earlier) is earlier

@@ -7,9 +7,9 @@ import torch
 from oracles import brute_force, random_scene
 from torch import Tensor
 
-from ca_reg import CAScore, ListMoments, PixelLists
+from ca_reg import CAScore
 from ca_reg.functional import Multiplier, alpha_moments, contributions, pixel_moments
-from ca_reg.lists import _blocks
+from ca_reg.lists import ListMoments, PixelLists, _blocks
 from reference_trainer.render import splat
 from reference_trainer.render.renderer import render_moments
 
@@ -205,7 +205,7 @@ def test_lists_by_brute_force_agree_with_the_renderer():
     for name in ("mean", "variance", "alpha_mean"):
         torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-9, atol=1e-13)
     for neutral in (False, True):
-        a, b = (CAScore(exact=f, neutral=neutral, threshold=0.3)(opacity, None) for f in (moments, moments_fn))
+        a, b = (CAScore.exact(f, neutral=neutral, threshold=0.3)(opacity, None) for f in (moments, moments_fn))
         assert torch.equal(a.visible, b.visible)
         assert a.value == pytest.approx(b.value, rel=1e-9)
 

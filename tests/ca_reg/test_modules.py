@@ -1,10 +1,17 @@
 """The modules against their functional twins, and the state they keep."""
 
+import copy
+import pickle
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 from torch import nn
 
-from ca_reg import Constant, GaussianDropout, LinearRamp, OpacityNoise, StartStop, functional
+from ca_reg import CAScore, Chain, Draw, GaussianDropout, OpacityNoise, Params, functional
+from ca_reg.schedules import Constant, LinearRamp, StartStop
 
 OPACITY = torch.linspace(0.05, 0.95, 40)
 
@@ -42,8 +49,8 @@ def test_draws_are_replayed_bit_for_bit_without_drawing():
     keep, eps = dropout.keep, noise.noise
     dropout(OPACITY), noise(OPACITY)
     before = torch.get_rng_state()
-    assert torch.equal(dropout(OPACITY, keep=keep), first[0])
-    assert torch.equal(noise(OPACITY, noise=eps), first[1])
+    assert torch.equal(dropout(OPACITY, drawn=Draw(keep=keep)), first[0])
+    assert torch.equal(noise(OPACITY, drawn=Draw(eps)), first[1])
     assert dropout.keep is keep
     assert noise.noise is eps
     assert torch.equal(torch.get_rng_state(), before)
@@ -96,13 +103,13 @@ def test_a_draw_cannot_be_replayed_in_eval_nor_on_another_number_of_gaussians():
     dropout(OPACITY), noise(OPACITY)
     keep, eps = dropout.keep, noise.noise
     with pytest.raises(ValueError, match="draw again"):
-        dropout(OPACITY[:-1], keep=keep)
+        dropout(OPACITY[:-1], drawn=Draw(keep=keep))
     with pytest.raises(ValueError, match="draw again"):
-        noise(OPACITY[:-1], noise=eps)
+        noise(OPACITY[:-1], drawn=Draw(eps))
     with pytest.raises(ValueError, match="eval"):
-        dropout.eval()(OPACITY, keep=keep)
+        dropout.eval()(OPACITY, drawn=Draw(keep=keep))
     with pytest.raises(ValueError, match="eval"):
-        noise.eval()(OPACITY, noise=eps)
+        noise.eval()(OPACITY, drawn=Draw(eps))
 
 
 @pytest.mark.parametrize(
@@ -154,7 +161,7 @@ def test_mask_radii_zeroes_the_dropped_and_nothing_else(shape: tuple[int, ...], 
     dropout = GaussianDropout(p=0.5)
     radii = torch.arange(1, 1 + torch.Size(shape).numel()).reshape(shape).to(dtype)
     keep = torch.tensor([True, False, True, True, False, False])
-    dropout(torch.full((6,), 0.5), keep=keep)
+    dropout(torch.full((6,), 0.5), drawn=Draw(keep=keep))
     masked = dropout.mask_radii(radii)
     assert masked.dtype == dtype
     assert torch.equal(masked[keep], radii[keep])
@@ -164,3 +171,76 @@ def test_mask_radii_zeroes_the_dropped_and_nothing_else(shape: tuple[int, ...], 
     dropout.eval()
     dropout(torch.full((6,), 0.5))
     assert dropout.mask_radii(radii) is radii
+
+
+# --- steps, huge noise, threads ---
+
+
+def test_step_0_is_a_step():
+    module = GaussianDropout(LinearRamp(0.0, 0.5, 0, 100))
+    module.set_step(100)
+    opacity = torch.full((1000,), 0.5)
+    assert module(Params(opacity, step=0)).opacities is opacity
+    assert bool((module(Params(opacity)).opacities == 0).any())
+    assert CAScore(flat, regularizer=module, samples=2)(Params(opacity, step=0), None).value == 0
+    assert CAScore(flat, regularizer=module, samples=2)(Params(opacity), None).value > 0
+
+
+def flat(opacity, view):
+    return opacity.mean().expand(3, 2, 2), torch.ones(2, 2)
+
+
+@pytest.mark.parametrize("sigma", [1e39, 1e31, float("inf")])
+def test_noise_that_would_overflow_is_refused(sigma):
+    with pytest.raises(ValueError, match="sigma"):
+        OpacityNoise(sigma)
+    with pytest.raises(ValueError, match="sigma"):
+        functional.opacity_noise(torch.zeros(3), sigma)
+    with pytest.raises(ValueError, match="sigma"):
+        OpacityNoise(LinearRamp(0.0, 1e39, 0, 1)).set_step(1)
+
+
+def test_the_largest_noise_leaves_an_opacity_of_0_as_it_is():
+    assert not OpacityNoise(1e30)(torch.zeros(10_000)).any()
+
+
+@pytest.mark.parametrize("module", [GaussianDropout(0.5), Chain(OpacityNoise(0.1), GaussianDropout(0.5))])
+def test_each_thread_has_its_own_mask(module):
+    opacity = torch.full((64,), 0.5)
+    barrier = threading.Barrier(8)
+
+    def work(_):
+        barrier.wait()
+        wrong = 0
+        for _ in range(300):
+            dropped = module(opacity) == 0
+            time.sleep(0)  # let another thread draw
+            wrong += not torch.equal(module.keep, ~dropped)
+        return wrong
+
+    with ThreadPoolExecutor(8) as pool:
+        assert sum(pool.map(work, range(8))) == 0
+    # A thread that has never called it, such as one that runs hooks of a backward pass, sees the latest mask.
+    assert ThreadPoolExecutor(1).submit(lambda: module.keep).result() is not None
+
+
+def test_masks_survive_neither_copies_nor_pickles():
+    module = GaussianDropout(0.5)
+    module(torch.full((9,), 0.5))
+    for twin in (copy.deepcopy(module), pickle.loads(pickle.dumps(module))):
+        assert twin.keep is None
+        assert twin(torch.full((9,), 0.5)).shape == (9,)
+    assert module.keep is not None
+
+
+def test_masks_drawn_outside_are_mapped_over():
+    opacity, keep = torch.rand(4, 50), torch.rand(4, 50) > 0.5
+    assert torch.equal(torch.vmap(functional.apply_dropout)(opacity, keep), opacity * keep)
+
+
+def test_one_module_twice_in_a_chain_drops_twice():
+    dropout, opacity = GaussianDropout(0.5), torch.full((1000,), 0.5)
+    chain = Chain(nn.Sequential(dropout, dropout))
+    dropped = chain(opacity) == 0
+    assert torch.equal(chain.keep, ~dropped)
+    assert 0.65 < dropped.double().mean() < 0.85  # 3/4; 5 standard deviations are 0.07

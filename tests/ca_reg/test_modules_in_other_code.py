@@ -9,8 +9,9 @@ import torch
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from ca_reg import CAPenalty, Chain, GaussianDropout, LinearRamp, OpacityNoise
+from ca_reg import CAPenalty, Chain, GaussianDropout, OpacityNoise
 from ca_reg.functional import Multiplier
+from ca_reg.schedules import LinearRamp
 
 OPACITY = torch.linspace(0.05, 0.95, 40)
 RAMP = LinearRamp(0.0, 0.5, 0, 100)
@@ -213,8 +214,8 @@ def test_recomputation_repeats_the_draw_or_refuses(module, reentrant):
     x = OPACITY.clone().requires_grad_()
     torch.manual_seed(3)
     module(x).square().sum().backward()
-    draw = {"keep": module.keep} if isinstance(module, GaussianDropout) else {"noise": module.noise}
+    draw = {"drawn": module.last}
     assert torch.equal(gradient(), x.grad)
     assert torch.equal(gradient(**draw), x.grad)
-    with pytest.raises(RuntimeError, match=r"generator=.*torch\.utils\.checkpoint.*keep="):
+    with pytest.raises(RuntimeError, match=r"generator=.*torch\.utils\.checkpoint.*drawn="):
         gradient(generator=torch.Generator().manual_seed(3))

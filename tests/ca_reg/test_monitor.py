@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import subprocess
 import sys
 from io import BytesIO
 
@@ -12,10 +13,10 @@ import torch
 from PIL import Image
 
 from ca_reg import CAMonitor, CAScore
-from ca_reg.dynamics import plot_dynamics, read_dynamics
+from ca_reg.monitor import plot_dynamics, read_dynamics
 
 OPACITY = torch.linspace(0.1, 0.9, 30)
-COLORS = torch.rand(3, 30, generator=torch.Generator().manual_seed(0))
+COLORS = torch.rand(3, 30, generator=torch.Generator().manual_seed(0)) / 50  # in [0, 1] in all views
 VIEWS = {"train": [1.0, 2.0], "test": [3.0]}
 
 
@@ -41,6 +42,33 @@ def test_measures_on_its_turn_and_logs_what_it_returns(tmp_path):
     records = run(make(tmp_path), 1, 31)
     assert [record["step"] for record in records] == [10, 20, 30]
     assert lines(tmp_path) == records
+
+
+def test_the_last_step_is_measured_whatever_it_is(tmp_path):
+    assert [record["step"] for record in run(make(tmp_path, last_step=25), 1, 26)] == [10, 20, 25]
+
+
+def test_a_second_monitor_of_the_same_folder_is_refused_until_the_first_is_closed(tmp_path):
+    with make(tmp_path) as first:
+        first(10, OPACITY)
+        with pytest.raises(BlockingIOError, match="another CAMonitor"):
+            make(tmp_path, resume_step=10)
+        first(20, OPACITY)
+    run(make(tmp_path, resume_step=20), 21, 31)
+    assert [record["step"] for record in lines(tmp_path)] == [10, 20, 30]
+
+
+def test_another_process_is_refused_as_well(tmp_path):
+    code = (
+        "import sys, torch; from ca_reg import CAMonitor, CAScore; "
+        "score = CAScore(lambda opacity, view: (opacity[:48].view(3, 4, 4), torch.ones(4, 4))); "
+        "CAMonitor(score, sys.argv[1], views={'test': [None]})"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    with make(tmp_path):
+        done = subprocess.run(command, capture_output=True, text=True)
+    assert "BlockingIOError" in done.stderr
+    assert subprocess.run(command, capture_output=True).returncode == 0
 
 
 def test_the_values_are_those_of_the_score(tmp_path):

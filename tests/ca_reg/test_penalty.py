@@ -8,8 +8,9 @@ import torch
 from oracles import random_scene
 from torch.nn.functional import mse_loss
 
-from ca_reg import CAPenalty, Constant, LinearRamp
+from ca_reg import CAPenalty
 from ca_reg.functional import Multiplier, alpha_moments, expected_squared_error, pixel_moments, scale_opacity
+from ca_reg.schedules import Constant, LinearRamp
 from reference_trainer.render import render, splat
 from reference_trainer.render.renderer import render_moments
 

@@ -5,9 +5,10 @@ import sys
 import pytest
 import torch
 
-from ca_reg import GaussianDropout, LinearRamp, OpacityNoise, Regularizer
+from ca_reg import GaussianDropout, OpacityNoise, Regularizer
 from ca_reg.registry import Registry
 from ca_reg.regularizers import REGULARIZERS, parse
+from ca_reg.schedules import LinearRamp
 
 
 def test_names_arguments_schedules_and_sums():

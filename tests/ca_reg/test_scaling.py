@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import nn
 
-from ca_reg import GaussianDropout, LinearRamp, OpacityNoise
+from ca_reg import Draw, GaussianDropout, OpacityNoise
 from ca_reg.functional import expected_opacity, opacity_noise, scale_opacity
+from ca_reg.schedules import LinearRamp
 
 OPACITY = torch.tensor([0.02, 0.3, 0.6, 0.9, 0.999, 1.0], dtype=torch.float64)
 DRAWS = 100_000
@@ -66,7 +67,7 @@ def test_modules_with_the_noise_first_return_their_own_mean(compensate):
 def test_dropout_and_noise_commute_in_training():
     noise, dropout = OpacityNoise(0.8), GaussianDropout(0.4)
     one = dropout(noise(OPACITY))
-    assert torch.equal(noise(dropout(OPACITY, keep=dropout.keep), noise=noise.noise), one)
+    assert torch.equal(noise(dropout(OPACITY, drawn=dropout.last), drawn=noise.last), one)
 
 
 def test_the_module_scales_at_the_present_sigma_and_only_in_evaluation():
@@ -82,7 +83,7 @@ def test_the_module_scales_at_the_present_sigma_and_only_in_evaluation():
     assert torch.equal(drawn, plain)
     assert "scale=True" in repr(noise)
     with pytest.raises(ValueError, match="eval"):
-        noise.eval()(OPACITY, noise=torch.zeros(6))
+        noise.eval()(OPACITY, drawn=Draw(torch.zeros(6)))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from ca_reg import CAScore, Reason, summarize
+from ca_reg import CAScore, Reason
+from ca_reg.result import summarize
 from ca_reg.types import Rendering
 
 # --- a few splats, in float64, small enough to enumerate every mask ---

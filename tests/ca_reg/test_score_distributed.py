@@ -35,9 +35,9 @@ def make_scores(not_finite_view=None):
 
     return [
         CAScore(render_fn),
-        CAScore(render_fn, relative_error=0.3),
-        CAScore(exact=moments_fn),
-        CAScore(exact=moments_fn, neutral=True),
+        CAScore.adaptive(render_fn, relative_error=0.3),
+        CAScore.exact(moments_fn),
+        CAScore.exact(moments_fn, neutral=True),
     ]
 
 

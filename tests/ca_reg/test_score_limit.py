@@ -10,7 +10,8 @@ import pytest
 import torch
 from oracles import random_scene
 
-from ca_reg import CAMonitor, CAScore, Reason, summarize
+from ca_reg import CAMonitor, CAScore, Reason
+from ca_reg.result import summarize
 from ca_reg.types import read_moments
 from reference_trainer.render import render, splat
 from reference_trainer.render.renderer import render_moments
@@ -73,7 +74,7 @@ def rgb(image):
 @pytest.mark.parametrize("neutral", [False, True])
 @pytest.mark.parametrize("rate", RATES)
 def test_exact_equals_the_enumeration_of_all_masks(model, neutral, rate):
-    score = CAScore(exact=model.moments, neutral=neutral, drop_rate=rate, threshold=THRESHOLD)
+    score = CAScore.exact(model.moments, neutral=neutral, drop_rate=rate, threshold=THRESHOLD)
     result = score(model.opacity, None)
     variance, alpha, value = model.enumerate(rate, neutral)
     assert 10 < (alpha > THRESHOLD).sum() < alpha.numel() - 10
@@ -86,7 +87,7 @@ def test_exact_equals_the_enumeration_of_all_masks(model, neutral, rate):
 
 @pytest.mark.parametrize("p", [0.0, 0.2])
 def test_exact_drops_what_the_protocol_drops(p):
-    score = CAScore(exact=FEW[0].moments, p=p, threshold=THRESHOLD)
+    score = CAScore.exact(FEW[0].moments, p=p, threshold=THRESHOLD)
     assert score(FEW[0].opacity, None).value == pytest.approx(FEW[0].enumerate(1 - (1 - p) / 2)[2], rel=1e-10)
 
 
@@ -99,7 +100,7 @@ def test_neutral_does_not_see_the_background_and_exact_does():
 
     values = {
         neutral: [
-            CAScore(exact=over(b), neutral=neutral, threshold=THRESHOLD)(MANY.opacity, None).value
+            CAScore.exact(over(b), neutral=neutral, threshold=THRESHOLD)(MANY.opacity, None).value
             for b in (BACKGROUND, 1 - BACKGROUND)
         ]
         for neutral in (False, True)
@@ -112,7 +113,7 @@ def test_neutral_is_zero_where_all_gaussians_agree():
     model = Model(20, 1)
     model.scene.colors[:] = BACKGROUND.flip(0)
     plain, neutral = (
-        CAScore(exact=model.moments, neutral=n, threshold=THRESHOLD)(model.opacity, None) for n in (False, True)
+        CAScore.exact(model.moments, neutral=n, threshold=THRESHOLD)(model.opacity, None) for n in (False, True)
     )
     assert plain.value > 1e-3
     assert neutral.value < 1e-30
@@ -122,7 +123,7 @@ def test_neutral_is_zero_where_all_gaussians_agree():
 def test_exact_says_what_it_is_and_what_does_not_apply():
     model = FEW[0]
     for neutral, method in ((False, "exact"), (True, "exact_neutral")):
-        result = CAScore(exact=model.moments, neutral=neutral, threshold=THRESHOLD)(model.opacity, None)
+        result = CAScore.exact(model.moments, neutral=neutral, threshold=THRESHOLD)(model.opacity, None)
         data = json.loads(json.dumps(result.as_dict()))
         assert data["method"] == result.method == method
         assert data["std_error"] == 0.0
@@ -143,7 +144,7 @@ def test_exact_takes_both_layouts_mappings_and_numpy(layout, neutral):
         mean, variance = (rgb(x)[layout].numpy() for x in (found.mean, found.variance))
         return {"mean": mean, "variance": variance, "alpha_mean": found.alpha_mean[None].numpy()}
 
-    result = CAScore(exact=moments, layout=layout, neutral=neutral, threshold=THRESHOLD)(model.opacity, None)
+    result = CAScore.exact(moments, layout=layout, neutral=neutral, threshold=THRESHOLD)(model.opacity, None)
     assert result.value == pytest.approx(model.enumerate(0.5, neutral)[2], rel=1e-10)
 
 
@@ -156,13 +157,13 @@ def test_exact_needs_no_gradient_and_keeps_the_shape_of_the_opacities():
         shapes.append(opacity.shape)
         return model.moments(opacity, view, multiplier, background)
 
-    CAScore(exact=moments)(model.opacity[:, None].clone().requires_grad_(), None)
+    CAScore.exact(moments)(model.opacity[:, None].clone().requires_grad_(), None)
     assert shapes == [(8, 1)]
 
 
 def test_exact_without_visible_pixels_or_with_broken_colors_is_a_reason():
     model = FEW[0]
-    empty = CAScore(exact=model.moments, threshold=1.0)(model.opacity, None)
+    empty = CAScore.exact(model.moments, threshold=1.0)(model.opacity, None)
     assert empty.reason is Reason.EMPTY
     assert math.isnan(empty.value)
     assert math.isnan(empty.std_error)
@@ -171,7 +172,7 @@ def test_exact_without_visible_pixels_or_with_broken_colors_is_a_reason():
         found = model.moments(*arguments)
         return found._replace(variance=found.variance * math.nan)
 
-    assert CAScore(exact=broken, threshold=THRESHOLD)(model.opacity, None).reason is Reason.NOT_FINITE
+    assert CAScore.exact(broken, threshold=THRESHOLD)(model.opacity, None).reason is Reason.NOT_FINITE
 
 
 def test_what_is_not_moments_is_refused():
@@ -181,7 +182,7 @@ def test_what_is_not_moments_is_refused():
     without_alpha = {"mean": image, "variance": image}
     assert read_moments(without_alpha).alpha_mean is None
     with pytest.raises(TypeError, match="a score needs alpha_mean"):
-        CAScore(exact=lambda *arguments: without_alpha)(torch.rand(2), None)
+        CAScore.exact(lambda *arguments: without_alpha)(torch.rand(2), None)
     with pytest.raises(TypeError, match="without mean"):
         read_moments((image, image, image[0]))  # which is which cannot be told
     with pytest.raises(ValueError, match="one shape"):
@@ -198,7 +199,7 @@ def test_mean_over_views_of_exact_scores(neutral):
     def moments(opacity, view, *rest):
         return view.moments(opacity[: len(view.opacity)], None, *rest)
 
-    score = CAScore(exact=moments, neutral=neutral, threshold=THRESHOLD)
+    score = CAScore.exact(moments, neutral=neutral, threshold=THRESHOLD)
     opacity = torch.full((8,), 0.5, dtype=torch.float64)
     results = [score.update(opacity, model) for model in FEW]
     summary = score.compute()
@@ -211,9 +212,9 @@ def test_methods_are_not_averaged_with_one_another():
     model = FEW[0]
     scores = [
         CAScore(model.render, threshold=THRESHOLD),
-        CAScore(model.render, relative_error=0.5, threshold=THRESHOLD),
-        CAScore(exact=model.moments, threshold=THRESHOLD),
-        CAScore(exact=model.moments, neutral=True, threshold=THRESHOLD),
+        CAScore.adaptive(model.render, relative_error=0.5, threshold=THRESHOLD),
+        CAScore.exact(model.moments, threshold=THRESHOLD),
+        CAScore.exact(model.moments, neutral=True, threshold=THRESHOLD),
     ]
     for pair in itertools.combinations([score(model.opacity, None) for score in scores], 2):
         with pytest.raises(ValueError, match="one set of settings, got 2"):
@@ -221,7 +222,7 @@ def test_methods_are_not_averaged_with_one_another():
 
 
 def test_adaptive_views_are_averaged_though_they_took_different_numbers_of_renders():
-    score = CAScore(MANY.render, relative_error=0.08, threshold=THRESHOLD)
+    score = CAScore.adaptive(MANY.render, relative_error=0.08, threshold=THRESHOLD)
     results = [score.update(MANY.opacity, None) for _ in range(6)]
     assert len({result.samples for result in results}) > 1
     assert summarize(results) == score.compute()
@@ -229,7 +230,7 @@ def test_adaptive_views_are_averaged_though_they_took_different_numbers_of_rende
 
 
 def test_a_monitor_logs_exact_scores(tmp_path):
-    score = CAScore(exact=FEW[0].moments, threshold=THRESHOLD)
+    score = CAScore.exact(FEW[0].moments, threshold=THRESHOLD)
     with CAMonitor(score, tmp_path, views={"test": [None]}, every=1) as monitor:
         monitor(1, FEW[0].opacity)
     (line,) = (json.loads(x) for x in (tmp_path / "ca.jsonl").read_text().splitlines())
@@ -258,7 +259,7 @@ def test_more_renders_continue_the_masks_of_fewer():
     runs = [Recorder(MANY) for _ in range(3)]
     CAScore(runs[0])(MANY.opacity, None, index=4)
     CAScore(runs[1], samples=40)(MANY.opacity, None, index=4)
-    CAScore(runs[2], relative_error=1e-9, max_samples=40, threshold=THRESHOLD)(MANY.opacity, None, index=4)
+    CAScore.adaptive(runs[2], relative_error=1e-9, max_samples=40, threshold=THRESHOLD)(MANY.opacity, None, index=4)
     masks = [torch.stack(run.opacities) for run in runs]
     assert torch.equal(masks[0], masks[2][1:6])
     assert torch.equal(masks[2][0], 0.5 * MANY.opacity)  # the expected render comes first
@@ -268,13 +269,13 @@ def test_more_renders_continue_the_masks_of_fewer():
 @pytest.mark.parametrize("target", [0.3, 0.08, 0.05])
 def test_adaptive_stops_at_the_first_round_with_the_error_asked_for(target):
     recorder = Recorder(MANY)
-    result = CAScore(recorder, relative_error=target, threshold=THRESHOLD)(MANY.opacity, None)
+    result = CAScore.adaptive(recorder, relative_error=target, threshold=THRESHOLD)(MANY.opacity, None)
     assert result.samples == len(recorder.images) - 1  # the first is the expected render
     assert result.samples % 8 == 0
     assert (result.samples == 16) == (target == 0.3)
     assert result.std_error <= target * result.value
     for fewer in range(16, result.samples, 8):
-        before = CAScore(MANY.render, relative_error=1e-9, max_samples=fewer, threshold=THRESHOLD)
+        before = CAScore.adaptive(MANY.render, relative_error=1e-9, max_samples=fewer, threshold=THRESHOLD)
         earlier = before(MANY.opacity, None)
         assert earlier.samples == fewer
         assert earlier.std_error > target * earlier.value
@@ -282,7 +283,7 @@ def test_adaptive_stops_at_the_first_round_with_the_error_asked_for(target):
 
 def test_adaptive_value_and_error_in_plain_numpy():
     recorder = Recorder(MANY)
-    result = CAScore(recorder, relative_error=0.2, threshold=THRESHOLD)(MANY.opacity, None)
+    result = CAScore.adaptive(recorder, relative_error=0.2, threshold=THRESHOLD)(MANY.opacity, None)
     torch.testing.assert_close(recorder.opacities[0], 0.5 * MANY.opacity)
     region = recorder.alphas[0] > THRESHOLD  # of the expected render: no draw decides which pixels count
     images = np.stack(recorder.images[1:])
@@ -302,22 +303,22 @@ def test_adaptive_value_and_error_in_plain_numpy():
 
 
 def test_adaptive_gives_up_at_the_largest_number_and_says_how_far_it_came():
-    result = CAScore(MANY.render, relative_error=1e-6, max_samples=21, threshold=THRESHOLD)(MANY.opacity, None)
+    result = CAScore.adaptive(MANY.render, relative_error=1e-6, max_samples=21, threshold=THRESHOLD)(MANY.opacity, None)
     assert result.samples == 21
     assert result.std_error > 1e-6 * result.value
     assert result.reason is Reason.OK
 
 
 def test_adaptive_stops_at_once_where_there_is_nothing_to_refine():
-    empty = CAScore(MANY.render, relative_error=0.1, threshold=1.0)(MANY.opacity, None)
+    empty = CAScore.adaptive(MANY.render, relative_error=0.1, threshold=1.0)(MANY.opacity, None)
     assert (empty.samples, empty.reason) == (16, Reason.EMPTY)
-    still = CAScore(MANY.render, relative_error=0.1, threshold=THRESHOLD, drop_rate=0.0)(MANY.opacity, None)
+    still = CAScore.adaptive(MANY.render, relative_error=0.1, threshold=THRESHOLD, drop_rate=0.0)(MANY.opacity, None)
     assert (still.samples, still.value, still.std_error) == (16, 0.0, 0.0)
 
 
 def test_adaptive_approaches_the_exact_score_which_the_fixed_region_does_not():
-    exact = CAScore(exact=MANY.moments, threshold=THRESHOLD)(MANY.opacity, None)
-    adaptive = CAScore(MANY.render, relative_error=0.04, threshold=THRESHOLD)(MANY.opacity, None)
+    exact = CAScore.exact(MANY.moments, threshold=THRESHOLD)(MANY.opacity, None)
+    adaptive = CAScore.adaptive(MANY.render, relative_error=0.04, threshold=THRESHOLD)(MANY.opacity, None)
     # 5 standard errors, themselves known to 27 %: false alarm below 1e-3, and the seed is fixed.
     assert abs(adaptive.value - exact.value) < 5 * adaptive.std_error
     assert (adaptive.visible != exact.visible).double().mean() < 0.1
@@ -333,7 +334,7 @@ def test_renders_of_different_sizes_are_refused():
         return torch.rand(3, size, 4), torch.ones(size, 4)
 
     with pytest.raises(ValueError, match="one size"):
-        CAScore(render_fn, relative_error=0.1)(torch.ones(3), None)
+        CAScore.adaptive(render_fn, relative_error=0.1)(torch.ones(3), None)
 
 
 # --- how far a few renders are from the limit ---
@@ -354,7 +355,7 @@ def test_limit_is_the_exact_score_in_expectation(monkeypatch, samples, ddof):
         order = map(torch.tensor, draws)
         monkeypatch.setattr("ca_reg.functional.draw_keep_mask", lambda *args, order=order, **kwargs: next(order))
         found.append(score(model.opacity, None))
-    exact = CAScore(exact=model.moments, threshold=-1.0)(model.opacity, None).value
+    exact = CAScore.exact(model.moments, threshold=-1.0)(model.opacity, None).value
     assert np.mean([result.limit.value for result in found]) == pytest.approx(exact, rel=1e-12)
     assert np.mean([result.value for result in found]) == pytest.approx(exact * found[0].expected_fraction, rel=1e-12)
 
@@ -371,22 +372,22 @@ def test_the_paper_s_protocol_finds_four_fifths():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "message"),
+    ("make", "arguments", "error", "message"),
     [
-        ({}, ValueError, "render_fn, or exact"),
-        ({"exact": True}, TypeError, "exact must be callable"),
-        ({"render_fn": MANY.render, "neutral": True}, ValueError, "neutral needs exact"),
-        ({"exact": MANY.moments, "samples": 5}, ValueError, "samples does not apply to the method 'exact'"),
-        ({"exact": MANY.moments, "ddof": 1}, ValueError, "ddof does not apply"),
-        ({"exact": MANY.moments, "alpha_fn": MANY.render}, ValueError, "alpha_fn does not apply"),
-        ({"exact": MANY.moments, "relative_error": 0.1}, ValueError, "relative_error does not apply"),
-        ({"render_fn": MANY.render, "relative_error": 0.1, "samples": 9}, ValueError, "samples does not apply"),
-        ({"render_fn": MANY.render, "relative_error": 0.1, "ddof": 0}, ValueError, "ddof does not apply.* ddof is 1"),
-        ({"render_fn": MANY.render, "relative_error": 0.0}, ValueError, "relative_error must be above 0"),
-        ({"render_fn": MANY.render, "relative_error": 0.1, "max_samples": 15}, ValueError, "must be at least 16"),
-        ({"render_fn": MANY.render, "max_samples": 70}, ValueError, "give relative_error as well"),
+        (CAScore, {"render_fn": None}, TypeError, "render_fn must be callable"),
+        (CAScore, {"render_fn": MANY.render, "neutral": True}, TypeError, "neutral"),
+        (CAScore, {"render_fn": MANY.render, "max_samples": 70}, TypeError, "max_samples"),
+        (CAScore, {"render_fn": MANY.render, "samples": 3, "ddof": 3}, ValueError, "ddof must be below samples"),
+        (CAScore, {"render_fn": MANY.render, "samples": 1}, ValueError, "samples must be at least 2"),
+        (CAScore.exact, {"moments_fn": True}, TypeError, "moments_fn must be callable"),
+        (CAScore.exact, {"moments_fn": MANY.moments, "samples": 5}, TypeError, "samples"),
+        (CAScore.exact, {"moments_fn": MANY.moments, "drop_rate": 1.0}, ValueError, "drop_rate"),
+        (CAScore.adaptive, {"render_fn": MANY.render}, TypeError, "relative_error"),
+        (CAScore.adaptive, {"render_fn": MANY.render, "relative_error": 0.1, "ddof": 0}, TypeError, "ddof"),
+        (CAScore.adaptive, {"render_fn": MANY.render, "relative_error": 0.0}, ValueError, "relative_error must be abo"),
+        (CAScore.adaptive, {"render_fn": MANY.render, "relative_error": 0.1, "max_samples": 15}, ValueError, "16"),
     ],
 )  # fmt: skip
-def test_arguments_that_do_not_apply_are_refused(arguments, error, message):
+def test_arguments_that_do_not_apply_are_refused(make, arguments, error, message):
     with pytest.raises(error, match=message):
-        CAScore(**arguments)
+        make(**arguments)

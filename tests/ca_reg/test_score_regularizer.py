@@ -6,20 +6,10 @@ import pytest
 import torch
 from torch import nn
 
-from ca_reg import (
-    CAMonitor,
-    CAScore,
-    Chain,
-    Draw,
-    GaussianDropout,
-    IndependentDropout,
-    LinearRamp,
-    ListMoments,
-    Params,
-    PixelLists,
-    Regularizer,
-)
-from ca_reg.regularizers.scale_noise import ScaleNoise
+from ca_reg import CAMonitor, CAScore, Chain, Draw, GaussianDropout, IndependentDropout, Params, Regularizer
+from ca_reg.lists import ListMoments, PixelLists
+from ca_reg.regularizers.noise import ScaleNoise
+from ca_reg.schedules import LinearRamp
 
 OPACITY = torch.tensor([0.7, 0.5, 0.9], dtype=torch.float64)
 MEANS = torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 3]], dtype=torch.float64)
@@ -69,7 +59,7 @@ def test_an_exact_score_has_the_rates_of_the_regularizer(shape):
     rates = ByDepth().rates(Params(OPACITY, means=MEANS))
     masks = [torch.tensor(m) for m in itertools.product([False, True], repeat=3)]
     probabilities = [torch.where(m, 1 - rates, rates).prod().item() for m in masks]
-    score = CAScore(exact=ListMoments(lists), regularizer=ByDepth(), threshold=0.1)
+    score = CAScore.exact(ListMoments(lists), regularizer=ByDepth(), threshold=0.1)
     result = score(Params(OPACITY.reshape(shape), means=MEANS), None)
     assert result.value == pytest.approx(variance_over(masks, probabilities), rel=1e-12)
     assert (result.drop_rate, result.regularizer) == (None, "ByDepth(compensate=False, scale=True)")
@@ -82,7 +72,7 @@ def test_sampled_scores_draw_what_the_regularizer_draws():
     # The variance of a fair coin from 2000 throws: relative error below 1/2000 plus 4 (mean - 1/2)^2, five standard
     # deviations of which are 1.3 %. False alarm below 1e-6, and the seed is fixed.
     assert result.value == pytest.approx(exact, rel=0.015)
-    independent = CAScore(exact=ListMoments(lists), drop_rate=0.5, threshold=0.1)(OPACITY, None).value
+    independent = CAScore.exact(ListMoments(lists), drop_rate=0.5, threshold=0.1)(OPACITY, None).value
     assert abs(result.value - independent) > 0.05 * independent  # the neighbors' company shows
 
 
@@ -90,14 +80,14 @@ def test_sampled_scores_draw_what_the_regularizer_draws():
 def test_a_score_is_taken_at_the_step_of_the_regularizer(given):
     dropout = GaussianDropout(LinearRamp(0.0, 0.5, 0, 100))
     dropout.set_step(50)
-    expected = CAScore(exact=ListMoments(lists), drop_rate=0.25, threshold=0.1)(OPACITY, None).value
-    score = CAScore(exact=ListMoments(lists), regularizer=dropout, threshold=0.1)
+    expected = CAScore.exact(ListMoments(lists), drop_rate=0.25, threshold=0.1)(OPACITY, None).value
+    score = CAScore.exact(ListMoments(lists), regularizer=dropout, threshold=0.1)
     assert score(given, None).value == expected
     assert score(Params(OPACITY, step=1), None).value < expected  # a step that is given counts
 
 
 def test_a_monitor_takes_what_its_score_takes(tmp_path):
-    score = CAScore(exact=ListMoments(lists), regularizer=ByDepth(), threshold=0.1)
+    score = CAScore.exact(ListMoments(lists), regularizer=ByDepth(), threshold=0.1)
     x = Params(OPACITY.clone().requires_grad_(), means=MEANS)
 
     def psnr(opacity, view):
@@ -135,9 +125,9 @@ def test_what_a_score_cannot_render_is_refused():
 
 
 def test_an_adaptive_score_takes_the_region_of_the_expected_image():
-    score = CAScore(render, regularizer=ByDepth(), relative_error=0.2, threshold=0.1)
+    score = CAScore.adaptive(render, regularizer=ByDepth(), relative_error=0.2, threshold=0.1)
     result = score(Params(OPACITY, means=MEANS), None)
-    exact = CAScore(exact=ListMoments(lists), regularizer=ByDepth(), threshold=0.1)(Params(OPACITY, means=MEANS), None)
+    exact = CAScore.exact(ListMoments(lists), regularizer=ByDepth(), threshold=0.1)(Params(OPACITY, means=MEANS), None)
     assert abs(result.value - exact.value) < 5 * result.std_error + 0.6 * exact.value  # a single pixel: docs/studies.md
 
 

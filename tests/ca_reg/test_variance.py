@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from ca_reg import Reason, color_variance
+from ca_reg import Reason
+from ca_reg.functional import color_variance
 
 
 def test_agrees_with_the_papers_formula_in_float64():

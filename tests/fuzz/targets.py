@@ -11,7 +11,7 @@ import torch
 from fuzz import samples
 from fuzz.harness import Target
 
-from ca_reg.dynamics import read_dynamics
+from ca_reg.monitor import read_dynamics
 from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.evaluation.tables import comparison_table, evaluation_table, summary
 from reference_trainer.model.ply import load_ply

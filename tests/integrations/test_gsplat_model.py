@@ -12,11 +12,12 @@ from oracles import brute_force, random_scene
 from stand_ins import gsplat as gsplat_stand_in
 from stand_ins.gsplat import centered, intrinsics
 
-from ca_reg import CAScore, GaussianDropout, ListMoments
+from ca_reg import CAScore, GaussianDropout
 from ca_reg.functional import Multiplier
 from ca_reg.integrations import gsplat_model as module
 from ca_reg.integrations.gsplat import regularized
 from ca_reg.integrations.gsplat_model import GsplatModel, GsplatView
+from ca_reg.lists import ListMoments
 from reference_trainer.render import render
 
 WIDTH, HEIGHT = 18, 14
@@ -77,8 +78,8 @@ def test_exact_moments_are_those_of_all_masks(package):
 def test_the_exact_score_is_the_limit_of_the_sampled_one(package):
     scene = random_scene(40, WIDTH, HEIGHT, seed=6, size=0.2).to(torch.float32)
     model, view = model_of(scene)
-    exact = CAScore(exact=ListMoments(model.lists), drop_rate=0.3, threshold=0.3)(scene.opacities, view)
-    sampled = CAScore(model.render, drop_rate=0.3, threshold=0.3, relative_error=0.05, max_samples=64)
+    exact = CAScore.exact(ListMoments(model.lists), drop_rate=0.3, threshold=0.3)(scene.opacities, view)
+    sampled = CAScore.adaptive(model.render, drop_rate=0.3, threshold=0.3, relative_error=0.05, max_samples=64)
     result = sampled(scene.opacities, view)
     assert abs(exact.value - result.value) < 4 * result.std_error  # fixed seed; fails by chance once in 16,000 seeds
 
@@ -145,7 +146,7 @@ def test_gsplats_kernels_list_what_they_draw(antialiased):
     # alpha 0.9 at most: less than 1e-3 is missing.
     torch.testing.assert_close(moments.mean, image, rtol=0, atol=2e-3)
     torch.testing.assert_close(moments.alpha_mean, alpha, rtol=0, atol=2e-3)
-    exact = CAScore(exact=ListMoments(model.lists), drop_rate=0.5, threshold=0.3)(scene.opacities, view)
+    exact = CAScore.exact(ListMoments(model.lists), drop_rate=0.5, threshold=0.3)(scene.opacities, view)
     sampled = CAScore(model.render, drop_rate=0.5, threshold=0.3, samples=256, ddof=1)(scene.opacities, view)
     # The region of the one is where the mean alpha is above the threshold, of the other where every alpha is.
     both = exact.visible & sampled.visible

@@ -5,8 +5,9 @@ import torch
 from stand_ins.inria import PIPE, Model, make_rasterizer, make_render, rasterize
 from torch import nn
 
-from ca_reg import GaussianDropout, OpacityNoise, StartStop
+from ca_reg import GaussianDropout, OpacityNoise
 from ca_reg.integrations.inria import RasterizerHook
+from ca_reg.schedules import StartStop
 from reference_trainer.training.density.operations import DensityStatistics
 
 BLACK = torch.zeros(3)

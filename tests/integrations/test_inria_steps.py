@@ -12,8 +12,9 @@ from stand_ins.inria import PIPE, Model, make_rasterizer, make_render, rasterize
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ca_reg import GaussianDropout, LinearRamp, OpacityNoise, StartStop
+from ca_reg import GaussianDropout, OpacityNoise
 from ca_reg.integrations.inria import RasterizerHook
+from ca_reg.schedules import LinearRamp, StartStop
 
 BLACK = torch.zeros(3)
 

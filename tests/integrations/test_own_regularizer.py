@@ -8,10 +8,12 @@ from oracles import random_scene
 from stand_ins.gsplat import intrinsics, rasterization
 from stand_ins.inria import PIPE, Model, make_render, settings_of
 
-from ca_reg import Chain, Draw, IndependentDropout, Learned, LinearRamp, Params, Regularizer
+from ca_reg import Chain, Draw, IndependentDropout, Params, Regularizer
 from ca_reg.integrations._calls import RasterizerCall, forward_signature
 from ca_reg.integrations.gsplat import regularized
 from ca_reg.integrations.inria import RasterizerHook
+from ca_reg.regularizer import Learned
+from ca_reg.schedules import LinearRamp
 
 BLACK = torch.zeros(3)
 

@@ -16,7 +16,8 @@ import torch
 from oracles import random_scene
 from torch import Tensor
 
-from ca_reg import CAScore, MomentsFn, RenderFn
+from ca_reg import CAScore
+from ca_reg.types import MomentsFn, RenderFn
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.render import render_masks, splat
 from reference_trainer.render.renderer import render_moments
@@ -91,11 +92,11 @@ def gaussians_at_random(drop_rate: float, n: int = 12, size: float = 0.4) -> Cas
     class Renders:
         """Many masks at a time."""
 
-        def many(self, opacities: Tensor, view: None) -> tuple[Tensor, Tensor]:
+        def render_batch(self, opacities: Tensor, view: None) -> tuple[Tensor, Tensor]:
             return render_masks(whole, opacities, background=background)
 
         def __call__(self, opacity: Tensor, view: None) -> tuple[Tensor, Tensor]:
-            images, alphas = self.many(opacity[None], view)
+            images, alphas = self.render_batch(opacity[None], view)
             return images[0], alphas[0]
 
     def moments_fn(opacity: Tensor, view: None, multiplier: Any, behind: Tensor | None) -> Any:
@@ -115,9 +116,9 @@ MODELS: dict[str, Callable[[], Case]] = {
 
 def calibrate(name: str, case: Case, target: float, scores: int, *, max_samples: int = 100_000) -> Calibration:
     """Score a view with the seeds 0, 1, ..., and hold the scores against the exact one."""
-    limit = CAScore(exact=case.moments, **case.settings)(case.opacity, case.view)
+    limit = CAScore.exact(case.moments, **case.settings)(case.opacity, case.view)
     results = [
-        CAScore(case.render, relative_error=target, max_samples=max_samples, seed=seed, **case.settings)(
+        CAScore.adaptive(case.render, relative_error=target, max_samples=max_samples, seed=seed, **case.settings)(
             case.opacity, case.view
         )
         for seed in range(scores)

@@ -12,8 +12,7 @@ from typing import Any
 import torch
 from PIL import Image
 
-from ca_reg._log import read_log
-from ca_reg.monitor import LOG_NAME
+from ca_reg.monitor import LOG_NAME, read_log
 from reference_trainer.json_files import read_json
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import CHECKPOINT, RESULTS

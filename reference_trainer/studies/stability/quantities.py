@@ -260,7 +260,7 @@ def scene_quantities(
         behind = scene.background if background is None else background
         return render_moments(splats_of(replace(scene, opacities=opacity)), multiplier, background=behind)
 
-    score = CAScore(exact=exact, drop_rate=rate, threshold=0.5)(scene.opacities, None)
+    score = CAScore.exact(exact, drop_rate=rate, threshold=0.5)(scene.opacities, None)
     result["CA"] = torch.tensor([score.value], dtype=torch.float64)
 
     if keep is None:

@@ -10,9 +10,7 @@ from scipy.integrate import quad
 
 from ca_reg import Chain, GaussianDropout, Params
 from ca_reg.regularizers import parse
-from ca_reg.regularizers.binary_concrete import concrete_moments
-from ca_reg.regularizers.concrete import ConcreteDropout
-from ca_reg.regularizers.soft import SoftDropout
+from ca_reg.regularizers.concrete import ConcreteDropout, SoftDropout, concrete_moments
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -110,7 +108,7 @@ def test_the_test_time_value_and_the_multiplier_are_mean_and_variance_of_the_dra
     x = with_logits(60, torch.float64)
     generator = seeded(8)
     factors = torch.stack([rule.regularize(x, generator).opacities / x.opacities for _ in range(1_000)])
-    same, multiplier = rule.multiplied(x)
+    same, multiplier = rule.alpha_factor(x)
     assert same is x
     assert rule.renders_mean
     mean, variance = (

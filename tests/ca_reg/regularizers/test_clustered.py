@@ -50,6 +50,6 @@ def test_shares_of_draws():
 def test_test_time_is_the_model_itself_and_there_is_no_multiplier():
     x = params(cloud("spread"))
     assert ClusteredDropout(0.3).eval()(x) is x
-    assert ClusteredDropout(0.3).multiplied(x) is None
+    assert ClusteredDropout(0.3).alpha_factor(x) is None
     with pytest.raises(ValueError, match=r"p must be in \[0, 1\)"):
         ClusteredDropout(1.0)

@@ -5,8 +5,7 @@ import pytest
 import torch
 from clouds import KINDS, cloud, mean_distance, params, rank
 
-from ca_reg.regularizers.d2gs import D2GSDropout
-from ca_reg.regularizers.depth import DepthDropout
+from ca_reg.regularizers.depth import D2GSDropout, DepthDropout
 
 STEPS = (1, 500, 4_000, 25_000)
 
@@ -120,4 +119,4 @@ def test_test_time_is_the_model_itself():
     assert D2GSDropout().eval()(x) is x
     scaled = D2GSDropout(scale=True)
     torch.testing.assert_close(scaled.eval()(x).opacities, x.opacities * (1 - scaled.rates(x)))
-    torch.testing.assert_close(D2GSDropout().multiplied(x)[1].mean, 1 - D2GSDropout().rates(x))
+    torch.testing.assert_close(D2GSDropout().alpha_factor(x)[1].mean, 1 - D2GSDropout().rates(x))

@@ -5,7 +5,7 @@ import torch
 from clouds import KINDS, cloud, mean_distance, params, rank
 
 from ca_reg import Chain, OpacityNoise
-from ca_reg.regularizers.density import DensityDropout
+from ca_reg.regularizers.surroundings import DensityDropout
 
 
 @pytest.mark.parametrize("k", [1, 3, 7])
@@ -23,11 +23,11 @@ def test_test_time_is_that_of_the_paper_and_the_multiplier_exact():
     rule = DensityDropout()
     rates = rule.rates(x)
     torch.testing.assert_close(rule.expected(x).opacities, x.opacities * (1 - rates))
-    raised, multiplier = rule.multiplied(x)
+    raised, multiplier = rule.alpha_factor(x)
     torch.testing.assert_close(raised.opacities * multiplier.mean, x.opacities * (1 - rates))
     torch.testing.assert_close(multiplier.variance, rates * (1 - rates))
     assert DensityDropout(scale=False).expected(x) is x
-    torch.testing.assert_close(DensityDropout(compensate=True).multiplied(x)[0].opacities, x.opacities / (1 - rates))
+    torch.testing.assert_close(DensityDropout(compensate=True).alpha_factor(x)[0].opacities, x.opacities / (1 - rates))
 
 
 def test_the_test_time_value_does_not_depend_on_the_steps_before():

@@ -23,7 +23,7 @@ def test_rates_are_a_straight_line_in_the_rank_of_the_depth(kind, near, far):
 def test_test_time_is_the_model_itself():
     x = params(cloud("spread"))
     assert DepthDropout().eval()(x) is x
-    torch.testing.assert_close(DepthDropout().multiplied(x)[1].mean, 1 - DepthDropout().rates(x))
+    torch.testing.assert_close(DepthDropout().alpha_factor(x)[1].mean, 1 - DepthDropout().rates(x))
 
 
 def test_negative_factors_are_refused():

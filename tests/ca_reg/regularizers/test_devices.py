@@ -82,5 +82,5 @@ def test_precisions_are_kept_and_nothing_is_measured_in_half(name, of_opacities,
             rounding = 8 * max(torch.finfo(dtype).eps for dtype in (of_opacities, of_others))
             scale = float(getattr(expected, field).abs().max())
             torch.testing.assert_close(got.float(), getattr(expected, field), rtol=0, atol=rounding * scale)
-        if (multiplied := chain.multiplied(rough)) is not None:
+        if (multiplied := chain.alpha_factor(rough)) is not None:
             assert multiplied[0].opacities.dtype == of_opacities

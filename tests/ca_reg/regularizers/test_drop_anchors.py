@@ -6,7 +6,7 @@ import pytest
 import torch
 from clouds import KINDS, cloud, neighbor_distances, params
 
-from ca_reg.regularizers.drop_anchors import AnchorDropout
+from ca_reg.regularizers.clustered import AnchorDropout
 
 # Where several others are equally near, which of them go with an anchor is open.
 WITHOUT_TIES = [kind for kind in KINDS if kind not in ("duplicates", "one place")]
@@ -49,4 +49,4 @@ def test_the_rate_rises_to_theirs_and_nothing_is_scaled():
     rule = AnchorDropout()
     assert [rule.rate_at(step) for step in (0, 5_000, 10_000, 30_000)] == [0.0, 0.01, 0.02, 0.02]
     assert rule.eval()(x) is x
-    assert rule.multiplied(x) is None
+    assert rule.alpha_factor(x) is None

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from ca_reg import Draw
 from ca_reg.regularizers import parse
-from ca_reg.regularizers.drop_gaussian import DropGaussian
+from ca_reg.regularizers.dropout import DropGaussian
 
 
 @pytest.mark.parametrize("step", [1, 2_500, 10_000])
@@ -36,7 +37,8 @@ def test_the_first_step_and_evaluation_do_nothing():
     dropout.set_step(5_000)
     assert dropout.eval()(opacity) is opacity
     dropout.train()
-    assert float(dropout(opacity, keep=torch.ones(4, dtype=torch.bool))[0]) == pytest.approx(1.0)  # may be above 1
+    everything = Draw(keep=torch.ones(4, dtype=torch.bool))
+    assert float(dropout(opacity, drawn=everything)[0]) == pytest.approx(1.0)  # may be above 1
 
 
 def test_arguments():

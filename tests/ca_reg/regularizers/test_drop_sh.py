@@ -5,7 +5,7 @@ import torch
 from clouds import cloud, params
 
 from ca_reg import Params
-from ca_reg.regularizers.drop_sh import SHDropout
+from ca_reg.regularizers.clustered import SHDropout
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_models_of_a_lower_degree_are_left_alone_where_there_is_nothing_to_cut()
     low = x._replace(sh=x.sh[:, :4])
     assert SHDropout().regularize(low) is low
     assert SHDropout().eval()(x) is x
-    assert SHDropout().multiplied(x) is None
+    assert SHDropout().alpha_factor(x) is None
 
 
 def test_gradients_reach_what_is_shown_only():

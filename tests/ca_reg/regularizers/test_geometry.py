@@ -5,7 +5,7 @@ import pytest
 import torch
 from clouds import KINDS, cloud, neighbor_distances, params, rank
 
-from ca_reg.regularizers.geometry import GeometryDropout, surface_variation
+from ca_reg.regularizers.surroundings import GeometryDropout, surface_variation
 
 
 def _literal(points, k):

@@ -6,9 +6,7 @@ import torch
 
 from ca_reg import Chain, GaussianDropout, OpacityNoise, Params
 from ca_reg.regularizers import parse
-from ca_reg.regularizers.parameter_noise import ParameterNoise
-from ca_reg.regularizers.scale_noise import ScaleNoise
-from ca_reg.regularizers.sh_noise import SHNoise
+from ca_reg.regularizers.noise import ParameterNoise, ScaleNoise, SHNoise
 from ca_reg.schedules import StartStop
 
 KINDS = [(ScaleNoise, "scales", (3,)), (SHNoise, "sh", (9, 3))]
@@ -90,7 +88,7 @@ def test_bad_input_is_refused(kind, field, shape):
         kind(-0.1)
     with pytest.raises(ValueError, match=f"needs {field} of the Gaussians"):
         kind()(torch.full((4,), 0.5))
-    assert kind().multiplied(params(4)) is None
+    assert kind().alpha_factor(params(4)) is None
     assert not kind.drops
 
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 from clouds import KINDS, cloud, mean_distance, params
 
-from ca_reg import LinearRamp
-from ca_reg.regularizers.position_noise import PositionNoise
+from ca_reg.regularizers.noise import PositionNoise
+from ca_reg.schedules import LinearRamp
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -27,7 +27,7 @@ def test_gradients_pass_and_test_time_is_the_model_itself():
     PositionNoise(0.5).regularize(x).means.sum().backward()
     assert torch.equal(points.grad, torch.ones_like(points))
     assert PositionNoise(0.5).eval()(x) is x
-    assert PositionNoise(0.5).multiplied(x) is None
+    assert PositionNoise(0.5).alpha_factor(x) is None
 
 
 def test_schedules_and_refusals():

@@ -122,4 +122,4 @@ def test_bad_input_is_refused():
         SEGSNoise(last=0.0)
     with pytest.raises(ValueError, match="needs means, scales, quaternions"):
         SEGSNoise()(torch.full((3,), 0.5))
-    assert SEGSNoise().multiplied(params(3)) is None
+    assert SEGSNoise().alpha_factor(params(3)) is None

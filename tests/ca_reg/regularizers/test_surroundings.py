@@ -9,8 +9,8 @@ import torch
 from clouds import KINDS, cloud, params, rank
 
 from ca_reg import Chain
-from ca_reg.regularizers import REGULARIZERS, _surroundings, parse
-from ca_reg.regularizers._surroundings import Refreshed, relative_ranks
+from ca_reg.regularizers import REGULARIZERS, parse, surroundings
+from ca_reg.regularizers.surroundings import Refreshed, relative_ranks, surface_variation
 
 LOOKING = ("clustered(0.3)", "d2gs", "density", "drop_anchors", "geometry", "position_noise(0.3)")
 ALL = (*LOOKING, "d2gs(literal=True)", "depth", "drop_sh(until=[9_000])")
@@ -24,9 +24,9 @@ def _rule(text):
 @pytest.fixture
 def looks(monkeypatch):
     """The numbers of points of all searches for neighbors."""
-    found, search = [], _surroundings.nearest_neighbors
+    found, search = [], surroundings.nearest_neighbors
     monkeypatch.setattr(
-        _surroundings, "nearest_neighbors", lambda means, count: (found.append(len(means)), search(means, count))[1]
+        surroundings, "nearest_neighbors", lambda means, count: (found.append(len(means)), search(means, count))[1]
     )
     return found
 
@@ -167,3 +167,29 @@ def test_every_must_be_a_number_of_steps():
 def test_every_regularizer_has_a_row_in_the_docs():
     page = (Path(__file__).parents[3] / "docs" / "regularizers.md").read_text("utf-8")
     assert not [name for name in REGULARIZERS if f"\n| `{name}`" not in page]
+
+
+@pytest.mark.parametrize("text", ["geometry", "depth", "d2gs", "density", "drop_anchors(0.1)", "position_noise(0.1)"])
+def test_autocast_costs_no_precision(text):
+    """Centers around a place far from the origin, so that 16 bits could not tell their depths apart."""
+    x = params(cloud("spread", 300).float() + 100, step=10_000)
+    plain, cast = parse(text), parse(text)
+    expected = plain(x, generator=torch.Generator().manual_seed(0))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = cast(x, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(found.opacities, expected.opacities)
+    assert torch.equal(found.means, expected.means)
+
+
+def test_the_surroundings_are_measured_in_full_precision():
+    points = cloud("spread", 300).float()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = surface_variation(points, 10)
+    assert torch.equal(found, surface_variation(points, 10))
+
+
+def test_planes_are_told_from_volumes_in_chunks(monkeypatch):
+    points = cloud("spread", 300)
+    whole = surface_variation(points, 10)
+    monkeypatch.setattr("ca_reg.regularizers.surroundings.EIGEN_CHUNK", 7)
+    assert torch.equal(surface_variation(points, 10), whole)

@@ -77,7 +77,7 @@ def test_it_trains_on_its_expectation_or_says_that_it_has_none(name, options):
     expression = EXPRESSIONS.get(name, name)
     scene, config = load_scene(options, seed=0), TrainConfig(iterations=3, regularizer=expression, analytic=True)
     sampled = Trainer(scene, dataclasses.replace(config, analytic=False))
-    if sampled.regularizer.multiplied(sampled.gaussians.params(sampled.views[0].camera)) is None:
+    if sampled.regularizer.alpha_factor(sampled.gaussians.params(sampled.views[0].camera)) is None:
         with pytest.raises(ValueError, match="analytic training needs draws"):
             Trainer(scene, config)
         return

@@ -19,7 +19,7 @@ BLACK = torch.zeros(3, dtype=torch.float64)
 
 def expectation(gaussians, camera, chain):
     """What an analytic step renders."""
-    x, multiplier = chain.multiplied(gaussians.params(camera))
+    x, multiplier = chain.alpha_factor(gaussians.params(camera))
     return render_moments_of(x, multiplier, camera, BLACK, sh_degree=0)[0]
 
 
@@ -103,7 +103,7 @@ def test_the_co_adaptation_term_is_the_weighted_mean_variance(tiny_scene, busy):
 
 def test_the_multiplier_is_that_of_what_training_samples():
     opacities = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
-    x, multiplier = Chain(GaussianDropout(0.2), OpacityNoise(0.6)).multiplied(Params(opacities))
+    x, multiplier = Chain(GaussianDropout(0.2), OpacityNoise(0.6)).alpha_factor(Params(opacities))
     assert torch.equal(x.opacities, opacities)
     noise = OpacityNoise(0.6)
     generator = torch.Generator().manual_seed(0)

@@ -221,7 +221,7 @@ def test_the_expected_render_is_the_sum_over_all_draws(p, compensate, sigma, cli
     world, draws = scene(white), Draws(p, compensate, sigma, clip)
     mean, variance = enumerated(draws, 0, white)
     chain = Chain(GaussianDropout(p, compensate=compensate), OpacityNoise(sigma, clip=clip))
-    x, multiplier = chain.multiplied(two(world, 0, torch.float64).params(CAMERA))
+    x, multiplier = chain.alpha_factor(two(world, 0, torch.float64).params(CAMERA))
     out = render_moments_of(x, multiplier, CAMERA, world.background.double(), sh_degree=0)[0]
     close = {"rtol": 0, "atol": 1e-8 if sigma else 1e-13}
     torch.testing.assert_close(out.mean, mean, **close)

@@ -53,7 +53,7 @@ def test_the_co_adaptation_takes_the_noise_in(model):
     _, note = Subject(model, []).draw(Look("co-adaptation", drop_rate=0.3, noise=0.4), CAMERA)
     value = float(note.removeprefix("exact CA ").partition("e-3")[0]) * 1e-3
     draws = Chain(GaussianDropout(0.3), OpacityNoise(0.4))
-    score = CAScore(model.render, regularizer=draws, relative_error=1e-3)
+    score = CAScore.adaptive(model.render, regularizer=draws, relative_error=1e-3)
     sampled = score(model.gaussians.opacities, Viewpoint("", CAMERA))
     # Of 256 draws, the seed fixed; beyond 5 standard errors with a probability below 1e-5
     assert abs(value - sampled.value) < 5 * sampled.std_error + 0.005e-3

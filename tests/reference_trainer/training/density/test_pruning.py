@@ -168,7 +168,7 @@ def test_share_pruning_removes_the_highest_shares_per_weight(tiny_scene):
     strategy, optimizer = trainer.density, trainer.optimizer
     values = strategy.shares_per_weight(optimizer, 5)
     model = TrainedModel(trainer.gaussians.map(torch.Tensor.detach), trainer.background, sh_degree=trainer.sh_degree)
-    score, weights = CAScore(exact=model.moments, drop_rate=0.3), blend_weights(model, trainer.views)
+    score, weights = CAScore.exact(model.moments, drop_rate=0.3), blend_weights(model, trainer.views)
     scores = [score(model.gaussians.opacities, view).value for view in trainer.views]
     assert min(scores) > 0
     assert (values[weights > 0] * weights[weights > 0]).sum().item() == pytest.approx(sum(scores), rel=1e-3)

@@ -1,0 +1,67 @@
+"""The documented errors stay whatever turns assertions and kornia's checks off."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ERRORS = """
+import torch, ca_reg
+from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise, Params, expected_opacity, scale_opacity
+from ca_reg import functional as F
+from ca_reg.functional import Multiplier
+
+half = torch.full((5,), 0.5)
+wide = torch.full((3, 4), 0.5)
+dropout, noise = GaussianDropout(0.2), OpacityNoise(0.3)
+score = CAScore(lambda opacity, view: (opacity.flatten()[:3, None, None].expand(3, 4, 4), torch.ones(4, 4)))
+CASES = {
+    "dropout of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: dropout(wide)),
+    "dropout of a scalar": (ValueError, "shape (N,) or (N, 1)", lambda: dropout(torch.tensor(0.5))),
+    "dropout of a list": (TypeError, "opacity must be a torch tensor", lambda: dropout([0.5])),
+    "dropout of integers": (TypeError, "floating-point", lambda: dropout(torch.ones(3, dtype=torch.int64))),
+    "dropout of logits": (ValueError, "activated", lambda: GaussianDropout(0.2)(-half)),
+    "noise of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: noise(wide)),
+    "a rate of 1": (ValueError, "[0, 1)", lambda: GaussianDropout(1.0)),
+    "a mask of the wrong length": (ValueError, "one value per opacity", lambda: F.apply_dropout(half, half[:3] > 0)),
+    "a mask that is no tensor": (TypeError, "keep must be a torch tensor", lambda: F.apply_dropout(half, [True] * 5)),
+    "noise that is no tensor": (TypeError, "noise must be a torch tensor", lambda: F.apply_opacity_noise(half, 0.1)),
+    "scaling of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: scale_opacity(wide, 0.2)),
+    "the mean of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: expected_opacity(wide, 0.2)),
+    "a chain of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: Chain(noise, dropout)(wide)),
+    "a missing field": (ValueError, "needs means", lambda: ca_reg.regularizers.parse("density")(half)),
+    "a score of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: score(wide, None)),
+    "a score of numpy": (TypeError, "opacity must be a torch tensor", lambda: score(half.numpy(), None)),
+    "four channels": (ValueError, "(..., n, 3)", lambda: F.color_variance(torch.ones(2), torch.ones(2, 4))),
+    "weights in a list": (TypeError, "weights must be a torch tensor", lambda: F.color_variance([1.0], wide)),
+    "colors in a list": (TypeError, "colors must be a torch tensor", lambda: F.color_variance(half, [1.0])),
+    "alphas in a list": (
+        TypeError, "alphas must be a torch tensor", lambda: F.pixel_moments([0.5], wide, Multiplier.dropout(0.5))
+    ),
+    "moments of a list": (
+        TypeError, "colors must be a torch tensor", lambda: F.pixel_moments(half, [1.0], Multiplier.dropout(0.5))
+    ),
+    "an error of floats": (TypeError, "mean must be a torch tensor", lambda: F.expected_squared_error(0.5, half, half)),
+    "an error of two shapes": (
+        ValueError, "shape of mean", lambda: F.expected_absolute_error(half, half, torch.ones(4))
+    ),
+}
+for name, (kind, words, call) in CASES.items():
+    try:
+        call()
+    except Exception as error:
+        if not (isinstance(error, kind) and words in str(error)):
+            print(f"{name}: {type(error).__name__}: {error}")
+    else:
+        print(f"{name}: accepted")
+"""
+
+
+@pytest.mark.parametrize(("options", "variables"), [((), {}), (("-O",), {}), ((), {"KORNIA_CHECKS": "0"})])
+def test_every_error_is_raised(options, variables):
+    root = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": root, **variables}
+    done = subprocess.run([sys.executable, *options, "-c", ERRORS], capture_output=True, text=True, env=environment)
+    assert (done.stdout, done.stderr) == ("", "")
