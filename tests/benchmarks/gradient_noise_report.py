@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.gradient_noise_moments import CANDIDATES, LOSSES, GradientNoise, Moments
-from reference_trainer.evaluation.results import format_mean_std, markdown_table
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 
 __all__ = ["gradient_noise_figure", "gradient_noise_report", "gradient_noise_table"]
 

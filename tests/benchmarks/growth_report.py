@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.calls import PASSES
-from reference_trainer.evaluation.results import markdown_table
-from reference_trainer.runs.figures import new_figure
+from reference_trainer.evaluation.pictures import new_figure
+from reference_trainer.evaluation.tables import markdown_table
 
 __all__ = ["Fit", "fit_exponent", "fits", "growth_figure", "growth_tables"]
 

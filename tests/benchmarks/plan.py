@@ -18,8 +18,8 @@ import tyro
 from benchmarks.memory import PROCESS, process_status
 from benchmarks.plan_parts import parts_of_a_step
 from reference_trainer.evaluation.evaluate import evaluate
-from reference_trainer.evaluation.results import format_mean_std, markdown_table
-from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table
+from reference_trainer.runs.executors.processes import Processes
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.study import Study, run_study

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from benchmarks.score_variants import VARIANTS, score_view
-from reference_trainer.evaluation.results import markdown_table, mean_std
+from reference_trainer.evaluation.tables import markdown_table, mean_std
 from reference_trainer.runs.folder import CONFIG, read_run_settings
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.options import SceneOptions

@@ -11,9 +11,8 @@ from waiting import PATIENCE, until
 from benchmarks import plan as plan_module
 from benchmarks.plan import ALTERNATIVES, plan_study, plan_table, shortened, variants
 from benchmarks.plan_parts import parts_of_a_step
-from reference_trainer.runs.engines.engine import Task
-from reference_trainer.runs.engines.processes import Processes
-from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.executors.executor import Task, run_all
+from reference_trainer.runs.executors.processes import Processes
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
@@ -110,7 +109,7 @@ from pathlib import Path
 import sweep_tasks
 from reference_trainer.scenes.options import SceneOptions
 from benchmarks import plan
-from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.executors.processes import Processes
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
 plan._train = sweep_tasks.note_the_interruption_here

@@ -58,9 +58,9 @@ def test_a_regularizer_of_a_user_is_known_to_every_command(parts, capsys):
         main(["evaluate", str(run / "point_cloud.ply"), "--path", "synthetic", "--downscale", "8"])
     assert "is not imported because a file says so" in capsys.readouterr().err
     main(["evaluate", str(run / "point_cloud.ply"), "--path", "synthetic", "--downscale", "8", "--samples", "2",
-          "--regularizer", expression, "--out", "of_ply"])  # fmt: skip
-    of_ply = json.loads((parts / "of_ply" / "evaluation.json").read_text())
-    assert of_ply["mean"]["test"]["psnr"] == pytest.approx(before["mean"]["test"]["psnr"], abs=1e-3)
+          "--regularizer", expression, "--out", "load_ply_model"])  # fmt: skip
+    load_ply_model = json.loads((parts / "load_ply_model" / "evaluation.json").read_text())
+    assert load_ply_model["mean"]["test"]["psnr"] == pytest.approx(before["mean"]["test"]["psnr"], abs=1e-3)
 
 
 def test_every_name_is_listed_with_its_arguments(capsys):

@@ -16,8 +16,7 @@ from ca_reg._log import read_log
 from ca_reg.monitor import LOG_NAME
 from reference_trainer.json_files import read_json
 from reference_trainer.model.ply import load_ply
-from reference_trainer.runs.folder import CHECKPOINT, RESULTS
-from reference_trainer.runs.lock import LOCK
+from reference_trainer.runs.folder import CHECKPOINT, LOCK, RESULTS
 from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.checkpoint import load_checkpoint

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from reference_trainer.runs.figures import new_figure
+from reference_trainer.evaluation.pictures import new_figure
 from reference_trainer.studies.paper.claims import GAINS, Check
 from reference_trainer.studies.paper.comparison import Kept, differences, ranked
 from reference_trainer.studies.paper.verdict import interval

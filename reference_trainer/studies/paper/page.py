@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
-from reference_trainer.evaluation.results import format_mean_std, markdown_table
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.studies.paper.claims import CLAIMS, TIMED, Check
 from reference_trainer.studies.paper.comparison import Kept, differences, judged, name_of, ranked, tested
 from reference_trainer.studies.paper.rows import Row, Rows, label, value

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from reference_trainer.evaluation.results import machine, markdown_table
+from reference_trainer.evaluation.results import machine
+from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.render.engine import drawn_by, engines_on
 from reference_trainer.studies.stability.blends import blend_cases
 from reference_trainer.studies.stability.case import Case, Probe

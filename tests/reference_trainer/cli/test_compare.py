@@ -5,16 +5,16 @@ import torch
 
 from reference_trainer.cli import main
 from reference_trainer.runs import compare as compare_module
-from reference_trainer.runs.compare_report import Comparison
-from reference_trainer.runs.engines import choice as choice_module
-from reference_trainer.runs.engines.engine import Failure
-from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.compare import Comparison
+from reference_trainer.runs.executors import executors as choice_module
+from reference_trainer.runs.executors.executor import Failure
+from reference_trainer.runs.executors.processes import Processes
 from reference_trainer.scenes.options import SceneOptions
 
 
 def test_a_cluster_may_have_the_card(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(choice_module, "choose_engine", lambda *a, **k: Processes(1))
+    monkeypatch.setattr(choice_module, "choose_executor", lambda *a, **k: Processes(1))
     monkeypatch.setattr(compare_module, "compare", lambda *a: {tmp_path: Comparison({}, {})})
     main(["compare", "--out", str(tmp_path), "--device", "cuda", "--address", "head:6379"])
 

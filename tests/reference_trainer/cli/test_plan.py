@@ -6,7 +6,7 @@ import json
 import pytest
 
 from reference_trainer.cli import main
-from reference_trainer.cli.runs import given_fields
+from reference_trainer.cli.training import given_fields
 from reference_trainer.runs import run as run_module
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.plan import Plan

@@ -94,8 +94,8 @@ def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
 
     main(["evaluate", str(trained / "point_cloud.ply"), "--scene", "synthetic", "--downscale", "8",
           "--out", str(tmp_path / "p")])  # fmt: skip
-    of_ply = json.loads((tmp_path / "p" / "evaluation.json").read_text())
-    assert of_ply["views"] == results["views"]
+    load_ply_model = json.loads((tmp_path / "p" / "evaluation.json").read_text())
+    assert load_ply_model["views"] == results["views"]
 
     main(["render", str(trained)])
     assert len(list((trained / "render_test").glob("*.png"))) == 3

@@ -9,7 +9,7 @@ import torch
 
 from reference_trainer.evaluation import evaluate as evaluate_module
 from reference_trainer.evaluation.evaluate import evaluate
-from reference_trainer.evaluation.kept import KeptRecords, fingerprint
+from reference_trainer.evaluation.results import ResultStore, fingerprint
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.scenes.scene import Viewpoint
@@ -31,20 +31,20 @@ def nothing(text):
 def test_records_come_back_as_they_were(tmp_path):
     file = tmp_path / "a" / "kept.json"
     records = {"one": {"x": 0.1 + 0.2, "n": 3, "name": "\udc80 ä"}, "two": {"x": math.inf, "y": -0.0}}
-    kept = KeptRecords(file, "as before", nothing)
+    kept = ResultStore(file, "as before", nothing)
     for key, record in records.items():
         assert kept.get(key) is None
         kept.add(key, record)
     kept.add("three", {"x": math.nan})
     said = []
-    again = KeptRecords(file, "as before", said.append)
+    again = ResultStore(file, "as before", said.append)
     assert {key: again.get(key) for key in records} == records
     assert math.isnan(again.get("three")["x"])
     assert said == [f"3 measured before, kept: {file}"]
 
 
 def test_a_record_whose_picture_is_gone_is_not_used(tmp_path):
-    kept = KeptRecords(tmp_path / "kept.json", None, nothing)
+    kept = ResultStore(tmp_path / "kept.json", None, nothing)
     (tmp_path / "picture.png").touch()
     kept.add("view", {"x": 1.0})
     assert kept.get("view", [tmp_path / "picture.png"]) == {"x": 1.0}
@@ -53,9 +53,9 @@ def test_a_record_whose_picture_is_gone_is_not_used(tmp_path):
 
 def test_records_of_something_else_are_gone_before_anything_is_measured(tmp_path):
     file = tmp_path / "kept.json"
-    KeptRecords(file, {"seed": 0}, nothing).add("view", {"x": 1.0})
+    ResultStore(file, {"seed": 0}, nothing).add("view", {"x": 1.0})
     said = []
-    assert KeptRecords(file, {"seed": 1}, said.append).get("view") is None
+    assert ResultStore(file, {"seed": 1}, said.append).get("view") is None
     assert said == [f"records of an interrupted measurement in {file} are not used, they belong to another model, "
                     "scene, setting or machine: everything is measured anew"]  # fmt: skip
     assert not file.exists()  # and not found again by the first setting, whose pictures are being replaced
@@ -65,7 +65,7 @@ def test_a_damaged_file_is_told_and_never_half_read(tmp_path):
     """Every byte in turn is changed, and the file cut at every byte."""
     file = tmp_path / "kept.json"
     expected = {"view": {"x": 1.25, "name": "a"}, "other": {"x": math.nan, "name": "b"}}
-    kept = KeptRecords(file, 0, nothing)
+    kept = ResultStore(file, 0, nothing)
     for key, record in expected.items():
         kept.add(key, record)
     good = file.read_bytes()
@@ -74,7 +74,7 @@ def test_a_damaged_file_is_told_and_never_half_read(tmp_path):
         for damaged in (good[:at], good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :]):
             file.write_bytes(damaged)
             said = []
-            found = KeptRecords(file, 0, said.append)
+            found = ResultStore(file, 0, said.append)
             records = {key: found.get(key) for key in expected}
             if records == {"view": None, "other": None}:
                 assert "are not used" in said[0]
@@ -88,13 +88,13 @@ def test_a_damaged_file_is_told_and_never_half_read(tmp_path):
 def test_another_json_file(tmp_path, content):
     (tmp_path / "kept.json").write_text(content)
     said = []
-    assert KeptRecords(tmp_path / "kept.json", 0, said.append).get("view") is None
+    assert ResultStore(tmp_path / "kept.json", 0, said.append).get("view") is None
     assert "it is damaged" in said[0]
 
 
 def test_nothing_is_kept_where_nobody_asked(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    kept = KeptRecords(None, nothing, nothing)  # a fingerprint of a function would be a TypeError
+    kept = ResultStore(None, nothing, nothing)  # a fingerprint of a function would be a TypeError
     kept.add("view", {"x": 1.0})
     assert kept.get("view") is None
     assert list(tmp_path.iterdir()) == []

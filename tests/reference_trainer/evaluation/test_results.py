@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from reference_trainer.evaluation.results import format_mean_std, machine, markdown_table, mean_std, write_json
+from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 NAN = float("nan")
 

@@ -21,7 +21,7 @@ from reference_trainer.report import page as page_module
 from reference_trainer.report.findings import find
 from reference_trainer.report.page import write_report
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG, run_settings
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.config import TrainConfig
@@ -115,7 +115,7 @@ def test_the_views_come_with_their_pictures(pair):
         "train train_0",
         "train train_2",
     ]
-    model, scene = of_run(runs[1])
+    model, scene = load_run_model(runs[1])
     for view, entry in zip(two_of_each(scene), page.data["views"], strict=True):
         pose = np.array(entry["pose"]).reshape(3, 4)
         np.testing.assert_array_equal(pose, view.camera.world_to_camera[:3].numpy())
@@ -130,7 +130,7 @@ def test_the_views_come_with_their_pictures(pair):
 def test_the_models_are_those_of_the_runs(pair):
     runs, page = pair
     for run, packed in zip(runs, page.data["runs"], strict=True):
-        model, scene = of_run(run)
+        model, scene = load_run_model(run)
         gaussians, n = model.gaussians, len(model.gaussians)
         table = array(packed["geometry"], "<f4", n, 16)
         np.testing.assert_array_equal(table[:, :3], gaussians.means)
@@ -284,7 +284,7 @@ def assert_drawn(picture: np.ndarray, model: TrainedModel, view: View) -> None:
 @needs_browser
 def test_a_browser_shows_what_the_renderer_draws(turned, opened):
     runs, _ = turned
-    found = [of_run(run) for run in runs]
+    found = [load_run_model(run) for run in runs]
     for number, view in enumerate(two_of_each(found[0][1])):
         drawn = shown(opened, f"$('from').value = {number}; $('from').onchange()")
         for (model, _), picture in zip(found, drawn, strict=True):
@@ -295,7 +295,7 @@ def test_a_browser_shows_what_the_renderer_draws(turned, opened):
 @needs_browser
 def test_a_browser_shows_the_heat_and_hides_what_co_adapts_most(turned, opened):
     runs, path = turned
-    data, found = Parsed(path).data, [of_run(run) for run in runs]
+    data, found = Parsed(path).data, [load_run_model(run) for run in runs]
     views = two_of_each(found[0][1])
     low, high = (float(end) for end in data["ends"]["heat"])
     plain = shown(opened, "$('from').value = 0; $('from').onchange(); $('color').click()")

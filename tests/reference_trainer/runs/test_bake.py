@@ -6,7 +6,7 @@ import torch
 
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
-from reference_trainer.runs.bake import bake_ply
+from reference_trainer.runs.edit_ply import bake_ply
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ import torch
 
 from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
 from reference_trainer.model.ply import load_ply, save_ply
-from reference_trainer.runs.clean import clean_ply
+from reference_trainer.runs.edit_ply import clean_ply
 from reference_trainer.runs.folder import BAKED_PLY, PLY
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.options import OrbitOptions
 
 
@@ -16,7 +16,7 @@ def rows(means: torch.Tensor) -> list[tuple[float, ...]]:
 
 
 def test_those_that_co_adapt_most_for_what_they_contribute_go(run, options, tmp_path):
-    model, scene = of_run(run[0])
+    model, scene = load_run_model(run[0])
     said: list[str] = []
     found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.3, refine=0, say=said.append)
     cleaned = load_ply(tmp_path / "c.ply")

@@ -12,17 +12,16 @@ from stand_ins.engine import Here
 from subprocesses import PYTHONPATH
 
 from ca_reg.monitor import LOG_NAME
-from reference_trainer.cli.drawing import Drawing
-from reference_trainer.cli.runs import Demo
+from reference_trainer.cli.options import Drawing
+from reference_trainer.cli.training import Demo
 from reference_trainer.evaluation.pictures import save_png
 from reference_trainer.evaluation.tables import comparison_table, summary
 from reference_trainer.render import chosen_engine
 from reference_trainer.runs import compare as compare_module
 from reference_trainer.runs import compare_report, grid
-from reference_trainer.runs.compare import NAMED, compare, scene_folders, strategies
-from reference_trainer.runs.compare_report import REPORT, TABLE, Comparison, report
-from reference_trainer.runs.engines.choice import choose_engine
-from reference_trainer.runs.engines.engine import Failure
+from reference_trainer.runs.compare import NAMED, REPORT, TABLE, Comparison, compare, report, scene_folders, strategies
+from reference_trainer.runs.executors import choose_executor
+from reference_trainer.runs.executors.executor import Failure
 from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.grid import Running
 from reference_trainer.runs.measure import render_run
@@ -297,7 +296,7 @@ def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_
 
     out = tmp_path / "sweep"
     said: list[str] = []
-    running = Running(choose_engine(name, jobs=2), monitor_every=0, checkpoint_every=10, say=said.append)
+    running = Running(choose_executor(name, jobs=2), monitor_every=0, checkpoint_every=10, say=said.append)
     comparison = compare({out: options}, {"dropout": config}, [0, 1], running)[out]
     assert (out / "dropout" / "seed_1" / "killed").exists()
     assert sum("again with another (1 of 3)" in line for line in said) == 1

@@ -13,18 +13,17 @@ from filelock import FileLock
 from stand_ins.engine import Here
 
 from reference_trainer.runs.compare import compare
-from reference_trainer.runs.engines.engine import Value
-from reference_trainer.runs.folder import CHECKPOINT, RESULTS
+from reference_trainer.runs.executors.executor import Value
+from reference_trainer.runs.folder import CHECKPOINT, LOCK, RESULTS, FolderInUseError, run_lock
 from reference_trainer.runs.grid import Run, Running, run_grid
-from reference_trainer.runs.lock import LOCK, FolderInUseError, run_lock
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
 from reference_trainer.runs.run import run_experiment
 from reference_trainer.training.trainer import Trainer
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from reference_trainer.runs.lock import run_lock
+from reference_trainer.runs.folder import run_lock
 with run_lock(Path(sys.argv[1])):
     print("locked", flush=True)
     time.sleep(60)
@@ -130,7 +129,7 @@ def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, opti
     with pytest.raises(FolderInUseError):
         run_experiment(options, short, tmp_path, monitor_every=0)
     assert (tmp_path / CHECKPOINT).read_bytes() == before
-    model, _ = of_run(tmp_path)  # who only reads is not kept out
+    model, _ = load_run_model(tmp_path)  # who only reads is not kept out
     assert len(model.gaussians) > 0
     end(process)
     said = []

@@ -8,13 +8,12 @@ import torch
 from PIL import Image
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
-from reference_trainer.evaluation.kept import PARTIAL
+from reference_trainer.evaluation.results import PARTIAL
 from reference_trainer.evaluation.tables import evaluation_table
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import measure as measure_module
-from reference_trainer.runs.folder import BAKED_PLY, PLY
-from reference_trainer.runs.lock import FolderInUseError, run_lock
-from reference_trainer.runs.measure import measure, of_run, render_run
+from reference_trainer.runs.folder import BAKED_PLY, PLY, FolderInUseError, run_lock
+from reference_trainer.runs.measure import load_run_model, measure, render_run
 from reference_trainer.runs.run import run_experiment
 from reference_trainer.scenes.images import read_image
 from reference_trainer.training.config import TrainConfig
@@ -29,7 +28,7 @@ def test_the_flag_of_the_evaluation_and_that_of_the_training_are_the_same(run, s
     (plain, before), (out, results) = run, scaled
     one, other = (load_ply(folder / PLY).gaussians for folder in (plain, out))
     assert all(torch.equal(x, y) for (_, x), (_, y) in zip(one.named(), other.named(), strict=True))
-    model, scene = of_run(plain, regularizer="dropout(0.2) + noise(0.3, scale=True)")
+    model, scene = load_run_model(plain, regularizer="dropout(0.2) + noise(0.3, scale=True)")
     measure(model, both(scene), tmp_path, about={}, say=lambda text: None)
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]
@@ -60,19 +59,19 @@ def test_the_monitor_counts_the_pixels_inside_the_masks(masked, tmp_path):
 def test_noise_alone_has_a_ply_for_viewers_too(options, tmp_path):
     config = TrainConfig(iterations=1, regularizer="noise(0.8, clip=True, scale=True)")
     run_experiment(options, config, tmp_path, monitor_every=0)
-    model = of_run(tmp_path)[0]
+    model = load_run_model(tmp_path)[0]
     assert (model.dropout, model.factor) == (0.0, None)
     torch.testing.assert_close(load_ply(tmp_path / BAKED_PLY).gaussians.opacities, model.test_opacities)
 
 
 def test_a_run_is_not_rendered_as_if_trained_with_nonsense(run):
     with pytest.raises(ValueError, match="there is no regularizer 'noize'"):
-        of_run(run[0], regularizer="noize(0.8)")
+        load_run_model(run[0], regularizer="noize(0.8)")
 
 
 def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):
     out, results = run
-    model, scene = of_run(out)
+    model, scene = load_run_model(out)
     said: list[str] = []
     measure(model, both(scene), tmp_path / "new", about={"scene": "a name"}, say=said.append)
     found = json.loads((tmp_path / "new" / "evaluation.json").read_text())
@@ -87,7 +86,7 @@ def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):
 
 def test_the_folder_is_locked_until_the_last_file_has_changed(run, tmp_path, monkeypatch):
     """Otherwise a second evaluation that begins in between would lose its partial scores to the first."""
-    model, scene = of_run(run[0])
+    model, scene = load_run_model(run[0])
     touched = []
 
     def watched(change):
@@ -108,7 +107,7 @@ def test_the_folder_is_locked_until_the_last_file_has_changed(run, tmp_path, mon
 
 
 def test_the_seed_decides_the_masks(run, tmp_path):
-    model, scene = of_run(run[0])
+    model, scene = load_run_model(run[0])
     views = {"train": scene.train[:1]}
     one, same, other = (
         measure(model, views, tmp_path, about={}, samples=3, seed=seed, say=lambda text: None) for seed in (0, 0, 1)

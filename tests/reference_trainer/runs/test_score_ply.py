@@ -12,9 +12,9 @@ from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import BAKED_PLY, PLY
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
+from reference_trainer.runs.ply import load_ply_model, score_ply
 from reference_trainer.runs.run import save_for_viewers
-from reference_trainer.runs.score_ply import of_ply, score_ply
 from reference_trainer.scenes.options import OrbitOptions
 
 FEW = OrbitOptions(cameras=2, size=40)
@@ -40,15 +40,15 @@ def test_a_baked_ply_is_not_scaled_twice(run, options):
     """Three ways to the image of the test: baked and marked, plain with the rate, and the checkpoint."""
     out, _ = run
     scene = options.load()
-    baked, facts = of_ply(out / BAKED_PLY, background=scene.background)  # it says its rate itself
-    plain, _ = of_ply(out / PLY, background=scene.background, regularizer="dropout(0.2)")
-    trained, _ = of_run(out)
+    baked, facts = load_ply_model(out / BAKED_PLY, background=scene.background)  # it says its rate itself
+    plain, _ = load_ply_model(out / PLY, background=scene.background, regularizer="dropout(0.2)")
+    trained, _ = load_run_model(out)
     assert (facts.opacity_scale, facts.for_rendering) == (0.8, False)
     assert "0.8 baked in, taken out for CA; trained with: dropout(0.2)" in str(facts)
     assert baked.factor == plain.factor == trained.factor == 0.8
     torch.testing.assert_close(baked.gaussians.opacities, trained.gaussians.opacities, rtol=0, atol=2e-6)
     with pytest.raises(ValueError, match=r"was scaled for dropout 0\.2, not for dropout\(0\.5\)"):
-        of_ply(out / BAKED_PLY, background=scene.background, regularizer="dropout(0.5)")
+        load_ply_model(out / BAKED_PLY, background=scene.background, regularizer="dropout(0.5)")
     for view in scene.test:
         images = [model.render(model.test_opacities, view)[0] for model in (baked, plain, trained)]
         torch.testing.assert_close(images[0], images[2], rtol=0, atol=1e-5)
@@ -58,23 +58,23 @@ def test_a_baked_ply_is_not_scaled_twice(run, options):
 
 
 def test_a_ply_without_dropout_is_used_as_it_is(tmp_path, run):
-    model = of_run(run[0])[0]
+    model = load_run_model(run[0])[0]
     save_ply(model.gaussians, tmp_path / "model.ply")
-    assert of_ply(tmp_path / "model.ply", background=torch.zeros(3))[0].regularizer == ""
+    assert load_ply_model(tmp_path / "model.ply", background=torch.zeros(3))[0].regularizer == ""
 
 
 def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options, tmp_path):
     out, results = scaled
     scene = options.load()
-    model, facts = of_ply(out / BAKED_PLY, background=scene.background)
+    model, facts = load_ply_model(out / BAKED_PLY, background=scene.background)
     assert "those of the test, used as they are, for CA too" in str(facts)
-    trained = of_run(out)[0]
+    trained = load_run_model(out)[0]
     torch.testing.assert_close(model.test_opacities, trained.test_opacities, rtol=0, atol=1e-6)
     assert model.ca_score().settings == trained.ca_score().settings
     for view, scores in zip(scene.test, results["views"][3:], strict=True):
         image = model.render(model.test_opacities, view)[0].clamp(0, 1)
         assert psnr(image, view.image) == pytest.approx(scores["psnr"], abs=1e-3)
-    save_for_viewers(of_run(run[0])[0], tmp_path / "dropout.ply")
+    save_for_viewers(load_run_model(run[0])[0], tmp_path / "dropout.ply")
     assert (tmp_path / "dropout.ply").read_bytes() == (run[0] / BAKED_PLY).read_bytes()
 
 
@@ -84,25 +84,25 @@ def test_the_bands_that_are_used(tmp_path, band, used):
     if band is not None:
         gaussians.sh_rest[3, {1: 2, 2: 3}[band], 0] = 0.1  # the last coefficient of band 1, the first of band 2
     save_ply(gaussians, tmp_path / "a.ply", pad_to_degree=3)
-    facts = of_ply(tmp_path / "a.ply", background=torch.zeros(3))[1]
+    facts = load_ply_model(tmp_path / "a.ply", background=torch.zeros(3))[1]
     assert (facts.gaussians, facts.sh_degree, facts.sh_degree_used) == (4, 3, used)
     assert f"SH degree 3 (bands above {used} are zero); opacities: plain" in str(facts)
 
 
 def test_what_the_caller_says_comes_first(tmp_path):
     save_ply(ball(), tmp_path / "a.ply", regularizer="dropout(0.2)", step=5)
-    model, facts = of_ply(tmp_path / "a.ply", background=torch.zeros(3))
+    model, facts = load_ply_model(tmp_path / "a.ply", background=torch.zeros(3))
     assert (facts.regularizer, model.dropout, model.step) == ("dropout(0.2)", pytest.approx(0.2), 5)
-    model, _ = of_ply(tmp_path / "a.ply", background=torch.zeros(3), regularizer="dropout(0.5)")
+    model, _ = load_ply_model(tmp_path / "a.ply", background=torch.zeros(3), regularizer="dropout(0.5)")
     assert model.dropout == 0.5
     save_ply(ball(), tmp_path / "b.ply", regularizer="dropout(1.5)")
     with pytest.raises(ValueError, match=r"b\.ply says what it was trained with: .*p must be in .* Give --regularizer"):
-        of_ply(tmp_path / "b.ply", background=torch.zeros(3))
+        load_ply_model(tmp_path / "b.ply", background=torch.zeros(3))
 
 
 def test_a_baked_rate_of_many_digits_is_read_as_it_is(tmp_path):
     save_ply(ball(), tmp_path / "a.ply", bake_p=0.1234567)
-    model, facts = of_ply(tmp_path / "a.ply", background=torch.zeros(3))
+    model, facts = load_ply_model(tmp_path / "a.ply", background=torch.zeros(3))
     assert facts.regularizer == "dropout(0.1234567)"
     torch.testing.assert_close(model.gaussians.opacities, ball().opacities)
 

@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 from stand_ins.engine import Here
 
-from reference_trainer.runs.folder import CHECKPOINT
-from reference_trainer.runs.lock import FolderInUseError, run_lock
+from reference_trainer.runs.folder import CHECKPOINT, FolderInUseError, run_lock
 from reference_trainer.studies import study as study_module
 from reference_trainer.studies.study import Study, checkpoints, run_study
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pages import ROOT
 
-from reference_trainer.runs.figures import new_figure
+from reference_trainer.evaluation.pictures import new_figure
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.paper import figure as figure_module
 from reference_trainer.studies.paper.cells import Grid, declared, estimate, is_done, rows_of

@@ -12,9 +12,8 @@ import sweep_tasks
 from subprocesses import subprocess_environment
 from waiting import PATIENCE, until
 
-from reference_trainer.runs.engines.engine import Failure, Task, Value
-from reference_trainer.runs.engines.processes import Processes
-from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.executors.executor import Failure, Task, Value, run_all
+from reference_trainer.runs.executors.processes import Processes
 
 
 def gone(pid):

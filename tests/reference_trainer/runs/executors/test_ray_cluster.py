@@ -11,9 +11,8 @@ import sweep_tasks
 from subprocesses import PYTHONPATH
 from waiting import until
 
-from reference_trainer.runs.engines.engine import Failure, Task, Value
-from reference_trainer.runs.engines.ray_cluster import RayCluster
-from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.executors.executor import Failure, Task, Value, run_all
+from reference_trainer.runs.executors.ray_cluster import RayCluster
 
 
 @pytest.fixture(autouse=True)
@@ -56,12 +55,12 @@ class StandIn:
 
 
 def engine_on(stand_in, monkeypatch, jobs, **keywords):
-    """An engine that has started one task on a stand-in."""
+    """An executor that has started one task on a stand-in."""
     monkeypatch.setitem(sys.modules, "ray", stand_in)
-    engine = RayCluster(jobs, **keywords)
+    executor = RayCluster(jobs, **keywords)
     assert stand_in.asked == {}  # a sweep with nothing to do joins no cluster
-    engine.start(0, Task("task", print, ()))
-    return engine
+    executor.start(0, Task("task", print, ()))
+    return executor
 
 
 @pytest.mark.parametrize(
@@ -107,10 +106,10 @@ def test_the_address_of_a_running_cluster(option, variable, expected, monkeypatc
 def test_what_still_runs_is_interrupted_and_a_cluster_of_the_caller_is_left_running(joined_before, monkeypatch):
     stand_in = StandIn([4])
     stand_in.initialized = joined_before
-    engine = engine_on(stand_in, monkeypatch, 1)
+    executor = engine_on(stand_in, monkeypatch, 1)
     assert ("init" in stand_in.asked) != joined_before
     for _ in range(2):
-        engine.close()
+        executor.close()
     assert (stand_in.asked["cancelled"], stand_in.asked["waited"]) == ("reference", ["reference"])
     assert stand_in.shut == (0 if joined_before else 1)
 
@@ -118,11 +117,11 @@ def test_what_still_runs_is_interrupted_and_a_cluster_of_the_caller_is_left_runn
 def test_the_next_sweep_joins_a_cluster_again(monkeypatch):
     """It may have other machines by then, and the one that ended is not there any more."""
     stand_in = StandIn([4])
-    engine = engine_on(stand_in, monkeypatch, 2)
-    engine.close()
+    executor = engine_on(stand_in, monkeypatch, 2)
+    executor.close()
     stand_in.asked.clear()
     stand_in.processors = [8]
-    engine.start(0, Task("task", print, ()))
+    executor.start(0, Task("task", print, ()))
     assert stand_in.asked["init"]["address"] == "local"
     assert stand_in.asked["remote"]["num_cpus"] == 4
 
