@@ -70,7 +70,7 @@ def plan(
     """
     study = plan_study(scene, config=config, iterations=steps, seeds=seeds, alternatives=alternatives, device=device)
     # Every training has a fresh process, one after the other, because time and peak memory are measured.
-    run_study(study, out, engine=Processes(1))
+    run_study(study, out, executor=Processes(1))
 
 
 def shortened(config: TrainConfig, iterations: int) -> TrainConfig:

@@ -36,7 +36,7 @@ def test_what_is_compared(given, rates, monkeypatch, tmp_path):
     main(["compare", "--out", str(tmp_path), "--seeds", "2", "--jobs", "3", "--iterations", "7", *given])
     assert {name: (config.dropout, config.noise) for name, config in asked["configs"].items()} == rates
     assert {config.iterations for config in asked["configs"].values()} == {7}
-    assert (asked["seeds"], asked["running"].engine.jobs) == ([0, 1], 3)
+    assert (asked["seeds"], asked["running"].executor.jobs) == ([0, 1], 3)
     assert asked["scenes"] == {tmp_path: SceneOptions()}
 
 
@@ -56,4 +56,4 @@ def test_several_scenes_and_how_they_are_run(monkeypatch, tmp_path):
         tmp_path / "fern": SceneOptions("data/fern", downscale=2.0),
         tmp_path / "synthetic": SceneOptions("synthetic", downscale=2.0),
     }
-    assert (asked["running"].retries, asked["running"].checkpoint_every) == (1, 50)
+    assert (asked["running"].retries, asked["running"].monitoring.checkpoint_every) == (1, 50)

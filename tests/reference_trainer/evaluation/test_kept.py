@@ -116,7 +116,7 @@ def test_a_fingerprint_tells_everything_apart():
 
 
 @pytest.mark.parametrize("done", [0, 1, 3])
-def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path, monkeypatch, done):
+def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path, monkeypatch, done, said):
     views = {"train": tiny_scene.train, "around": [Viewpoint("000", tiny_scene.test[0].camera)]}
     file, pictures = tmp_path / "kept.json", tmp_path / "views"
     whole = evaluate(model, views, samples=2, pictures=tmp_path / "whole")
@@ -132,8 +132,7 @@ def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path
     with pytest.raises(KeyboardInterrupt):
         evaluate(model, views, samples=2, pictures=pictures, keep=file)
     monkeypatch.setattr(evaluate_module, "_measure", measure)
-    said = []
-    assert repr(evaluate(model, views, samples=2, pictures=pictures, keep=file, say=said.append)) == repr(whole)
+    assert repr(evaluate(model, views, samples=2, pictures=pictures, keep=file)) == repr(whole)
     assert sum(text.startswith("[") for text in said) == 4 - done
     names = sorted(path.relative_to(pictures) for path in pictures.rglob("*.png"))
     assert len(names) == 8
@@ -177,12 +176,11 @@ def changes(model, scene):
     "name",
     ["samples", "seed", "dropout", "scale", "background", "model", "photograph", "views", "metric", "weights"],
 )
-def test_what_changed_is_not_mixed_with_what_was_measured(model, tiny_scene, tmp_path, name):
+def test_what_changed_is_not_mixed_with_what_was_measured(model, tiny_scene, tmp_path, name, said):
     scene = dataclasses.replace(tiny_scene, train=tiny_scene.train[:2], test=tiny_scene.test[:1])
     changed, other, keywords = changes(model, scene)[name]
     before = {"samples": 2} | ({"perceptual": Brightness(1.0)} if name == "weights" else {})
     evaluate(model, both(scene), keep=tmp_path / "kept.json", **before)
-    said = []
-    evaluate(changed, both(other), keep=tmp_path / "kept.json", **({"samples": 2} | keywords), say=said.append)
+    evaluate(changed, both(other), keep=tmp_path / "kept.json", **({"samples": 2} | keywords))
     assert "everything is measured anew" in said[0]
     assert sum(text.startswith("[") for text in said) == len(other.train) + 1

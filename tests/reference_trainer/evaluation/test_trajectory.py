@@ -120,4 +120,4 @@ def test_the_nearest_camera_is_found_far_from_the_origin():
 
 def test_one_training_view_has_nothing_around_it():
     scene = scene_of(random_cameras(1))
-    assert measured_views(scene, lambda text: None) == {"train": scene.train}
+    assert measured_views(scene) == {"train": scene.train}

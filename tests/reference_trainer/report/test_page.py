@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from browser import CHROMIUM, Page
+from heard import hearing
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -60,8 +61,8 @@ def two_of_each(scene: Scene) -> list[View]:
 def pair(tmp_path_factory, run, scaled):
     """Two finished runs, of which only the second was measured while it trained, and the page about both."""
     runs, out = [run[0], scaled[0]], tmp_path_factory.mktemp("pair") / "report.html"
-    said: list[str] = []
-    assert write_report(runs, out, views=2, say=said.append) == out
+    with hearing() as said:
+        assert write_report(runs, out, views=2) == out
     assert str(out) in said[-1]
     return runs, Parsed(out)
 
@@ -168,7 +169,7 @@ def unfinished(folder: Path, options: SceneOptions, config: TrainConfig) -> Trai
 def test_what_a_run_lacks_is_left_out_with_a_word(tmp_path, options, short, opacity):
     none = dataclasses.replace(options, test="none")
     unfinished(tmp_path / "mine", none, dataclasses.replace(short, initial_opacity=opacity))
-    out = write_report([tmp_path / "mine"], say=lambda text: None)
+    out = write_report([tmp_path / "mine"])
     assert out == tmp_path / "mine" / "report.html"
     page = Parsed(out)
     assert page.data["scores"] == page.data["dynamics"] == ""
@@ -200,7 +201,7 @@ def test_a_damaged_log_is_told_from_none(tmp_path):
 def test_opacities_that_depend_on_the_camera_are_drawn_plain(tmp_path, options, short):
     config = dataclasses.replace(short, initial_opacity=0.9, regularizer="depth(0.4, scale=True)")
     trainer = unfinished(tmp_path, options, config)
-    page = Parsed(write_report([tmp_path], views=1, say=lambda text: None))
+    page = Parsed(write_report([tmp_path], views=1))
     assert "opacities depend on the camera" in page.data["notes"][0]
     (packed,) = page.data["runs"]
     drawn = array(packed["geometry"], "<f4", packed["count"], 16)[:, 3]
@@ -218,7 +219,7 @@ def test_what_is_no_run_or_no_pair_is_refused(run, found, tmp_path, monkeypatch)
     elsewhere = dataclasses.replace(found, scene=dataclasses.replace(found.scene, name="elsewhere"))
     monkeypatch.setattr(page_module, "find", lambda folder, *_, **__: found if folder == run[0] else elsewhere)
     with pytest.raises(ValueError, match=r"a report is about one scene.*synthetic.*elsewhere"):
-        write_report([run[0], tmp_path], tmp_path / "page.html", say=lambda text: None)
+        write_report([run[0], tmp_path], tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
 
@@ -226,7 +227,7 @@ def test_text_from_files_cannot_end_the_data(run, found, tmp_path, monkeypatch):
     bad = "</script><script>alert(1)</script>"
     monkeypatch.setattr(page_module, "find", lambda *_, **__: dataclasses.replace(found, label=bad))
     monkeypatch.setattr(page_module, "labels", lambda runs: [bad])
-    page = Parsed(write_report([run[0]], tmp_path / "page.html", say=lambda text: None))
+    page = Parsed(write_report([run[0]], tmp_path / "page.html"))
     assert sum(tag == "script" for tag, _ in page.tags) == 2
     assert page.data["runs"][0]["label"] == bad
 
@@ -251,7 +252,7 @@ def turned(tmp_path_factory, short):
                 part += spread * torch.randn(part.shape, generator=generator)
             trainer.gaussians.log_scales[::2] -= 2.0  # some are as thin as a pixel
         trainer.save(run / CHECKPOINT)
-    return runs, write_report(runs, views=2, say=lambda text: None)
+    return runs, write_report(runs, views=2)
 
 
 @pytest.fixture(scope="module")

@@ -8,24 +8,24 @@ from pathlib import Path
 import pytest
 import sweep_tasks
 import torch
-from stand_ins.engine import Here
+from stand_ins.executor import Here
 from subprocesses import PYTHONPATH
 
 from ca_reg.monitor import LOG_NAME
-from reference_trainer.cli.options import Drawing
+from reference_trainer.cli.options import RenderOptions
 from reference_trainer.cli.training import Demo
 from reference_trainer.evaluation.pictures import save_png
 from reference_trainer.evaluation.tables import comparison_table, summary
 from reference_trainer.render import chosen_engine
 from reference_trainer.runs import compare as compare_module
-from reference_trainer.runs import compare_report, grid
+from reference_trainer.runs import grid
 from reference_trainer.runs.compare import NAMED, REPORT, TABLE, Comparison, compare, report, scene_folders, strategies
 from reference_trainer.runs.executors import choose_executor
 from reference_trainer.runs.executors.executor import Failure
 from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.grid import Running
 from reference_trainer.runs.measure import render_run
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud
@@ -92,13 +92,13 @@ def test_the_options_hold_for_every_scene(tmp_path):
     }
 
 
-def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
+def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch, said):
     """One run of eight fails; every scene has its own table and its own failures."""
 
     def train(options, config, out, engine, how):
         assert engine == chosen_engine()
         lpips = str(Path("weights.pth").resolve())
-        assert how == {"device": "cpu", "monitor_every": 7, "checkpoint_every": 9, "lpips": lpips}
+        assert how == {"device": "cpu", "monitoring": Monitoring(7, checkpoint_every=9), "lpips": lpips}
         assert out.is_dir()
         assert out.is_absolute()
         if (options.path, config.dropout, config.seed) == ("synthetic", 0.2, 1):
@@ -110,8 +110,7 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
     engine = Here()
     scenes = scene_folders(["synthetic", "data/fern"], SceneOptions(), Path("out"))
     configs = {"baseline": TrainConfig(), "dropout": TrainConfig(dropout=0.2)}
-    said = []
-    running = Running(engine, monitor_every=7, checkpoint_every=9, lpips="weights.pth", say=said.append)
+    running = Running(engine, monitoring=Monitoring(7, checkpoint_every=9), lpips="weights.pth")
     comparisons = compare(scenes, configs, [0, 1], running)
 
     assert len({task.arguments[2] for task in engine.tasks}) == 8
@@ -145,21 +144,19 @@ def test_what_a_scene_lacks_is_said_once_before_any_run(changes, lacking, tmp_pa
     assert engine.tasks == []
 
 
-def test_failed_runs_are_listed_at_the_end(tmp_path):
-    said: list[str] = []
-    report({tmp_path: Comparison({}, {"a, seed 0": Failure("ValueError: no", "Traceback")})}, say=said.append)
+def test_failed_runs_are_listed_at_the_end(tmp_path, said):
+    report({tmp_path: Comparison({}, {"a, seed 0": Failure("ValueError: no", "Traceback")})})
     assert said[-2:] == [
         "1 of 1 runs FAILED; the same command tries them again:",
         f"FAILED a, seed 0: ValueError: no ({tmp_path / REPORT} has the traceback)",
     ]
 
 
-def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch):
+def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch, said):
     """Nothing is held out: exact CA is reported at the training views, between them and around them."""
     load = SceneOptions.load
     monkeypatch.setattr(SceneOptions, "load", lambda *a, **named: dataclasses.replace(load(*a, **named), test=()))
-    said: list[str] = []
-    results = run_experiment(options, short, tmp_path / "a" / "seed_0", say=said.append)
+    results = run_experiment(options, short, tmp_path / "a" / "seed_0")
     assert sum(line.startswith("No test views") for line in said) == 1
     assert list(results["mean"]) == ["train", "between", "around"]
     assert all(isinstance(results["mean"][split]["ca_exact"], float) for split in results["mean"])
@@ -169,7 +166,7 @@ def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch):
     for split in ("train", "between", "around"):
         assert row[f"{split} exact CA x1e-3"] == f"{1e3 * results['mean'][split]['ca_exact']:.4g}"
     assert not any(title.startswith("test") for title in row)
-    report({tmp_path: Comparison({"a": [results]}, {})}, say=said.append)
+    report({tmp_path: Comparison({"a": [results]}, {})})
     names = {f"{view['split']}_{view['name']}.png" for view in results["views"] if view["split"] != "train"}
     assert {path.name for path in tmp_path.glob("*.png")} == {"dynamics.png", *names}
     with pytest.raises(ValueError, match="no test view: give --what train"):
@@ -177,7 +174,7 @@ def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch):
 
 
 @pytest.mark.parametrize("lines", [None, ""])
-def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, lines):
+def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, lines, said):
     """As after --monitor-every 0, or fewer steps than that."""
     out = tmp_path / "my runs"
     results = made(20.0) | {"config": {"seed": 0}, "views": [{"split": "test", "name": f"{x}/r_0.png"} for x in "ab"]}
@@ -187,8 +184,7 @@ def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, li
             save_png(folder / "views" / "test" / f"{name}_panel.png", torch.rand(3, 8, width))
         if lines is not None:
             (folder / LOG_NAME).write_text(lines)
-    said: list[str] = []
-    report({out: Comparison({"baseline": [results], "dropout": [results]}, {})}, say=said.append)
+    report({out: Comparison({"baseline": [results], "dropout": [results]}, {})})
     assert any(line.startswith("no figure of CA and PSNR against the iteration: ") for line in said)
     assert sorted(path.name for path in out.glob("*.png")) == ["test_a_r_0.png", "test_b_r_0.png"]
     (page,) = (line for line in said if "ca-reg report" in line)
@@ -208,7 +204,7 @@ def test_a_worker_that_does_not_share_the_folder_does_not_train(tmp_path, option
     assert not (tmp_path / "a" / "seed_0").exists()
 
 
-@pytest.mark.parametrize("wrong", [{"retries": -1}, {"checkpoint_every": 0}, {"monitor_every": -1}])
+@pytest.mark.parametrize("wrong", [{"retries": -1}])
 def test_what_running_refuses(wrong):
     with pytest.raises(ValueError, match=rf"expected .*{next(iter(wrong))} of at least \d"):
         Running(Here(), **wrong)
@@ -222,17 +218,18 @@ def test_the_demo_is_a_comparison_of_all_strategies(tmp_path, monkeypatch):
         return {tmp_path: Comparison({}, {})}
 
     monkeypatch.setattr(compare_module, "compare", fake)
-    monkeypatch.setattr(compare_report, "report", lambda comparisons, say: None)
-    monkeypatch.setattr(Drawing, "begin", lambda self, device, trains: None)
+    monkeypatch.setattr(compare_module, "report", lambda comparisons: None)
+    monkeypatch.setattr(RenderOptions, "begin", lambda self, device, trains: None)
     Demo(tmp_path, iterations=4, seeds=2, jobs=2)()
     assert list(asked["configs"]) == ["baseline", "dropout", "noise", "both"]
     assert {config.iterations for config in asked["configs"].values()} == {4}
     assert asked["scenes"] == {tmp_path: SceneOptions("synthetic")}
-    assert (asked["running"].monitor_every, asked["running"].engine.jobs, asked["seeds"]) == (1, 2, [0, 1])
+    running = asked["running"]
+    assert (running.monitoring.every, running.executor.jobs, asked["seeds"]) == (1, 2, [0, 1])
 
 
 @pytest.mark.slow
-def test_a_comparison_from_photographs_to_figures(tmp_path, options):
+def test_a_comparison_from_photographs_to_figures(tmp_path, options, said):
     """Two strategies and two seeds; a third strategy loses all its Gaussians, one run is there already."""
     base = TrainConfig(iterations=6, densify_from=1, densify_every=2, densify_gradient=1e9)
     configs = {
@@ -240,10 +237,9 @@ def test_a_comparison_from_photographs_to_figures(tmp_path, options):
         "dropout": dataclasses.replace(base, dropout=0.2),
         "doomed": dataclasses.replace(base, prune_opacity=0.99),
     }
-    run_experiment(options, configs["dropout"], tmp_path / "dropout" / "seed_0", monitor_every=3)
+    run_experiment(options, configs["dropout"], tmp_path / "dropout" / "seed_0", monitoring=Monitoring(3))
     before = (tmp_path / "dropout" / "seed_0" / RESULTS).stat().st_mtime_ns
-    said: list[str] = []
-    running = Running(Here(), monitor_every=3, say=said.append)
+    running = Running(Here(), monitoring=Monitoring(3))
     comparison = compare({tmp_path: options}, configs, [0, 1], running)[tmp_path]
     assert (tmp_path / "dropout" / "seed_0" / RESULTS).stat().st_mtime_ns == before
     assert {name: [run["config"]["seed"] for run in runs] for name, runs in comparison.runs.items()} == {
@@ -268,7 +264,7 @@ def test_a_comparison_from_photographs_to_figures(tmp_path, options):
     assert stored["failures"] == {name: dataclasses.asdict(why) for name, why in comparison.failures.items()}
 
     said.clear()
-    report({tmp_path: comparison}, say=said.append)
+    report({tmp_path: comparison})
     for name in ("dynamics", "test_test_0", "test_test_1", "test_test_outside"):
         assert (tmp_path / f"{name}.png").stat().st_size > 1000, name
     assert (tmp_path / "baseline" / "seed_1" / LOG_NAME).exists()
@@ -283,7 +279,7 @@ def files_of(folder: Path) -> dict[Path, int]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["processes", "ray"])
 @pytest.mark.usefixtures("one_thread")
-def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_path, options, monkeypatch):
+def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_path, options, monkeypatch, said):
     """The worker of seed 1 is killed at its first checkpoint; a second call starts no worker and writes no run."""
     if name == "ray":
         pytest.importorskip("ray")
@@ -292,11 +288,10 @@ def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr("reference_trainer.runs.grid.train_run", sweep_tasks.train_and_be_killed_once)
     config = TrainConfig(iterations=60, dropout=0.2)
-    whole = run_experiment(options, dataclasses.replace(config, seed=1), tmp_path / "whole", monitor_every=0)
+    whole = run_experiment(options, dataclasses.replace(config, seed=1), tmp_path / "whole", monitoring=Monitoring(0))
 
     out = tmp_path / "sweep"
-    said: list[str] = []
-    running = Running(choose_executor(name, jobs=2), monitor_every=0, checkpoint_every=10, say=said.append)
+    running = Running(choose_executor(name, jobs=2), monitoring=Monitoring(0, checkpoint_every=10))
     comparison = compare({out: options}, {"dropout": config}, [0, 1], running)[out]
     assert (out / "dropout" / "seed_1" / "killed").exists()
     assert sum("again with another (1 of 3)" in line for line in said) == 1
@@ -306,7 +301,7 @@ def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_
 
     before = files_of(out / "dropout")
     nobody = Here()
-    again = compare({out: options}, {"dropout": config}, [0, 1], Running(nobody, say=said.append))[out]
+    again = compare({out: options}, {"dropout": config}, [0, 1], Running(nobody))[out]
     assert again == comparison
     assert nobody.tasks == []
     assert files_of(out / "dropout") == before

@@ -9,7 +9,7 @@ import torch
 from ca_reg.regularizers import REGULARIZERS
 from reference_trainer.runs.folder import PLY
 from reference_trainer.runs.ply import load_ply_model
-from reference_trainer.runs.run import load_run, model_of, run_experiment
+from reference_trainer.runs.run import Monitoring, load_run, model_of, run_experiment
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
@@ -34,7 +34,7 @@ def test_it_trains_is_saved_and_resumed_evaluated_and_named_in_the_ply(name, opt
     expression = EXPRESSIONS.get(name, name)
     config = dataclasses.replace(busy, dropout=0.0, noise=0.0, regularizer=expression)
     out = tmp_path / "run"
-    results = run_experiment(options, config, out, monitor_every=12)
+    results = run_experiment(options, config, out, monitoring=Monitoring(12))
     assert math.isfinite(results["mean"]["test"]["psnr"])
     trainer = load_run(out)
 

@@ -4,6 +4,7 @@ import shutil
 import signal
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from reference_trainer.evaluation.tables import evaluation_table, summary
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import run as run_module
 from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, CONFIG, PLAN, PLY, RESULTS, read_results
-from reference_trainer.runs.run import load_run, model_of, run_experiment
+from reference_trainer.runs.run import Monitoring, load_run, model_of, run_experiment
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.errors import TrainingStoppedError
@@ -21,7 +22,7 @@ from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.plan import Plan
 from reference_trainer.training.trainer import Trainer
 
-EVERY = {"monitor_every": 3, "checkpoint_every": 4}
+EVERY: dict[str, Any] = {"monitoring": Monitoring(3, checkpoint_every=4)}
 WHOLE = {
     "config": {"seed": 0},
     "gaussians": 1,
@@ -38,7 +39,7 @@ DAMAGED = ("[]", '{"mean": {}}', *(json.dumps(WHOLE | change) for change in (
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, options, short) -> tuple[Path, dict]:
     out = tmp_path_factory.mktemp("run")
-    return out, run_experiment(options, short, out, **EVERY, monitor_pictures=True)
+    return out, run_experiment(options, short, out, monitoring=Monitoring(3, pictures=True, checkpoint_every=4))
 
 
 @pytest.fixture
@@ -84,28 +85,28 @@ def test_everything_is_there(finished, options, short):
     assert [json.loads(line)["step"] for line in (out / LOG_NAME).read_text().splitlines()] == [3, 6, 9]
 
 
-def test_a_second_call_does_nothing(finished, options, short, monkeypatch):
+def test_a_second_call_does_nothing(finished, options, short, monkeypatch, said):
     out, results = finished
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
     monkeypatch.setattr(SceneOptions, "load", lambda *a, **k: pytest.fail("the scene was loaded again"))
-    said: list[str] = []
-    assert run_experiment(options, short, out, **EVERY, say=said.append) == results
+    assert run_experiment(options, short, out, **EVERY) == results
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
     assert said == [f"{out}: complete, nothing to do"]
 
 
-def test_ctrl_c_saves_where_it_is(finished, options, short, ctrl_c, tmp_path):
+def test_ctrl_c_saves_where_it_is(finished, options, short, ctrl_c, tmp_path, said):
     """Between two periodic checkpoints nothing is lost."""
     with ctrl_c(5):
         run_experiment(options, short, tmp_path, **EVERY)
-    said: list[str] = []
-    run_experiment(options, short, tmp_path, **EVERY, say=said.append)
+    run_experiment(options, short, tmp_path, **EVERY)
     assert f"{tmp_path}: continues from step 6" in said
     assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
 
 
 @pytest.mark.slow
-def test_sigterm_saves_and_then_ends_the_process_as_its_sender_expects(finished, options, short, monkeypatch, tmp_path):
+def test_sigterm_saves_and_then_ends_the_process_as_its_sender_expects(
+    finished, options, short, monkeypatch, tmp_path, said
+):
     original, received = Trainer.train_step, []
 
     def train_step(trainer: Trainer) -> tuple[float, float]:
@@ -113,13 +114,12 @@ def test_sigterm_saves_and_then_ends_the_process_as_its_sender_expects(finished,
             signal.raise_signal(signal.SIGTERM)
         return original(trainer)
 
-    said: list[str] = []
     before = signal.signal(signal.SIGTERM, lambda number, frame: received.append(load_run(tmp_path).step))
     try:
         with monkeypatch.context() as patch:
             patch.setattr(Trainer, "train_step", train_step)
             with pytest.raises(TrainingInterrupted):
-                run_experiment(options, short, tmp_path, **EVERY, say=said.append)
+                run_experiment(options, short, tmp_path, **EVERY)
     finally:
         signal.signal(signal.SIGTERM, before)
     assert received == [6]  # raised again, when the model had been saved
@@ -229,7 +229,7 @@ def test_an_interrupted_run_ends_like_an_uninterrupted_one(finished, interrupted
         assert one[key] == other[key]
 
 
-def test_a_killed_run_continues_from_its_last_checkpoint(finished, options, short, tmp_path):
+def test_a_killed_run_continues_from_its_last_checkpoint(finished, options, short, tmp_path, said):
     """No farewell: the checkpoint of step 4, and a log that is already further, with half a line at its end."""
     partial = Trainer(options.load(seed=0), short)
     partial.train(until=4)
@@ -238,15 +238,14 @@ def test_a_killed_run_continues_from_its_last_checkpoint(finished, options, shor
     shutil.copy(finished[0] / LOG_NAME, tmp_path)
     with (tmp_path / LOG_NAME).open("a") as log:
         log.write('{"step": 12, "ca')
-    said: list[str] = []
-    run_experiment(options, short, tmp_path, **EVERY, say=said.append)
+    run_experiment(options, short, tmp_path, **EVERY)
     assert f"{tmp_path}: continues from step 4" in said
     for file in (PLY, LOG_NAME):
         assert (tmp_path / file).read_bytes() == (finished[0] / file).read_bytes(), file
 
 
 def test_monitoring_has_no_influence(finished, options, short, tmp_path):
-    run_experiment(options, short, tmp_path, monitor_every=0, checkpoint_every=4)
+    run_experiment(options, short, tmp_path, monitoring=Monitoring(0, checkpoint_every=4))
     assert not (tmp_path / LOG_NAME).exists()
     assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
 
@@ -305,7 +304,7 @@ def test_divergence_keeps_the_last_checkpoint(options, short, monkeypatch, tmp_p
     broken_scene(options, monkeypatch)
     for _ in range(2):  # the second call fails in the same way and does no harm
         with pytest.raises(TrainingStoppedError, match="the loss became nan"):
-            run_experiment(options, short, tmp_path, monitor_every=0, checkpoint_every=1)
+            run_experiment(options, short, tmp_path, monitoring=Monitoring(0, checkpoint_every=1))
         trainer = load_run(tmp_path)
         assert 0 < trainer.step < 3
         assert all(torch.isfinite(x).all() for _, x in trainer.gaussians.named())
@@ -319,7 +318,7 @@ def test_a_model_that_vanishes_does_not_overwrite_the_checkpoint(options, short,
     config = dataclasses.replace(short, prune_opacity=0.99)
     for _ in range(2):
         with pytest.raises(TrainingStoppedError, match=r"pruned after step 4: .* step 3 is kept in .*\.pt"):
-            run_experiment(options, config, tmp_path, monitor_every=0, checkpoint_every=3)
+            run_experiment(options, config, tmp_path, monitoring=Monitoring(0, checkpoint_every=3))
         trainer = load_run(tmp_path)
         assert (trainer.step, len(trainer.gaussians)) == (3, 3000)
 
@@ -352,9 +351,8 @@ def test_summary(finished):
     assert "n/a" in lines[2]  # no perceptual metric
 
 
-def test_auto_trains_by_the_plan_and_keeps_it(options, short, tmp_path):
-    said: list[str] = []
-    results = run_experiment(options, short, tmp_path, **EVERY, auto=True, say=said.append)
+def test_auto_trains_by_the_plan_and_keeps_it(options, short, tmp_path, said):
+    results = run_experiment(options, short, tmp_path, **EVERY, auto=True)
     stored = Plan.from_dict(json.loads((tmp_path / PLAN).read_text()))
     assert stored.applied(short) == dataclasses.replace(short, sh_degree=2)
     assert results["config"] == json.loads((tmp_path / CONFIG).read_text())["config"]

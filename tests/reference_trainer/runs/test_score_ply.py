@@ -5,6 +5,7 @@ import json
 
 import pytest
 import torch
+from heard import hearing
 from PIL import Image
 
 from reference_trainer.evaluation import evaluate as evaluate_module
@@ -30,9 +31,9 @@ def ball(n=300, radius=1.0, degree=0, opacity=0.9):
 
 def orbit(gaussians, tmp_path, name, **keywords):
     """Save and score; returns the scores and what was said."""
-    said: list[str] = []
     save_ply(gaussians, tmp_path / f"{name}.ply")
-    result = score_ply(tmp_path / f"{name}.ply", FEW, tmp_path / name, say=said.append, **keywords)
+    with hearing() as said:
+        result = score_ply(tmp_path / f"{name}.ply", FEW, tmp_path / name, **keywords)
     return result, said
 
 
@@ -132,14 +133,13 @@ def test_what_is_written_for_an_orbit(tmp_path):
 
 
 @pytest.mark.parametrize("on", ["orbit", "scene"])
-def test_an_interrupted_measurement_continues_to_the_same_files(tmp_path, options, monkeypatch, on):
+def test_an_interrupted_measurement_continues_to_the_same_files(tmp_path, options, monkeypatch, on, said):
     save_ply(ball(), tmp_path / "ball.ply")
     original, done = evaluate_module._measure, []
 
     def measure(out, **keywords):
-        said: list[str] = []
         where = FEW if on == "orbit" else options
-        score_ply(tmp_path / "ball.ply", where, out, samples=2, say=said.append, **keywords)
+        score_ply(tmp_path / "ball.ply", where, out, samples=2, **keywords)
         return said
 
     def stopped(*arguments):
@@ -184,7 +184,7 @@ def test_another_model_in_the_same_file_is_measured_anew(tmp_path, monkeypatch):
 def test_a_baked_and_a_plain_ply_have_the_same_scores(tmp_path):
     plain, _ = orbit(ball(), tmp_path, "plain", regularizer="dropout(0.2)")
     save_ply(ball(), tmp_path / "baked.ply", bake_p=0.2)
-    baked = score_ply(tmp_path / "baked.ply", FEW, tmp_path / "baked", say=lambda text: None)
+    baked = score_ply(tmp_path / "baked.ply", FEW, tmp_path / "baked")
     unscaled, _ = orbit(ball(), tmp_path, "unscaled")
     for name in ("ca", "ca_exact", "ca_neutral", "cv", "covered"):
         assert baked.mean("orbit", name) == pytest.approx(plain.mean("orbit", name), rel=1e-4)
@@ -212,7 +212,7 @@ def test_the_background(tmp_path):
         orbit(ball(), tmp_path, "gray", background="gray")
 
 
-def test_a_place_is_told_from_an_object(tmp_path):
+def test_a_place_is_told_from_an_object(tmp_path, said):
     room = ball(n=200, radius=20.0)
     both = Gaussians(**{name: torch.cat([x, dict(room.named())[name]]) for name, x in ball(n=300).named()})
     said = orbit(ball(), tmp_path, "object")[1]
@@ -221,15 +221,13 @@ def test_a_place_is_told_from_an_object(tmp_path):
     said = orbit(both, tmp_path, "place")[1]
     assert "a place and not an object" in said[1]
     save_ply(both, tmp_path / "arc.ply")
-    said = []
-    score_ply(tmp_path / "arc.ply", dataclasses.replace(FEW, arc=40.0), tmp_path / "arc", say=said.append)
+    score_ply(tmp_path / "arc.ply", dataclasses.replace(FEW, arc=40.0), tmp_path / "arc")
     assert not any("a place and not an object" in line for line in said)
 
 
-def test_a_ply_on_its_scene(run, options, tmp_path):
+def test_a_ply_on_its_scene(run, options, tmp_path, said):
     out, results = run
-    said: list[str] = []
-    score_ply(out / PLY, options, tmp_path, regularizer="dropout(0.2)", say=said.append)
+    score_ply(out / PLY, options, tmp_path, regularizer="dropout(0.2)")
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]
     assert found["ply"]["regularizer"] == "dropout(0.2)"
@@ -247,8 +245,8 @@ def test_a_model_that_fits_no_photograph(tmp_path, photographs, request):
     heard = {}
     for name, gaussians in (("right", right), ("wrong", wrong)):
         save_ply(gaussians, tmp_path / f"{name}.ply")
-        heard[name] = []
-        score_ply(tmp_path / f"{name}.ply", options, tmp_path / name, samples=2, say=heard[name].append)
+        with hearing() as heard[name]:
+            score_ply(tmp_path / f"{name}.ply", options, tmp_path / name, samples=2)
     assert "a picture of one color" in heard["wrong"][-1]
     assert not any("one color" in text for text in heard["right"])
 
@@ -256,14 +254,14 @@ def test_a_model_that_fits_no_photograph(tmp_path, photographs, request):
 def test_a_ply_in_another_frame_is_refused_before_anything_is_written(tmp_path, options):
     save_ply(dataclasses.replace(ball(), means=ball().means + 1e4), tmp_path / "far.ply")
     with pytest.raises(ValueError, match="the cameras of synthetic do not see"):
-        score_ply(tmp_path / "far.ply", options, say=lambda text: None)
+        score_ply(tmp_path / "far.ply", options)
     assert [path.name for path in tmp_path.iterdir()] == ["far.ply"]
 
 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "count"), [("plant_20k_sh3zero", 20_000), ("spot_10k_mesh2splat_sh3zero", 10_000)])
 def test_models_of_other_people(name, count, data_root, tmp_path):
-    result = score_ply(data_root / "splats" / f"{name}.ply", FEW, tmp_path, say=lambda text: None)
+    result = score_ply(data_root / "splats" / f"{name}.ply", FEW, tmp_path)
     data = json.loads((tmp_path / "evaluation.json").read_text())
     assert (data["ply"]["gaussians"], data["ply"]["sh_degree_used"]) == (count, 0)
     for view in result.views:

@@ -17,7 +17,7 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.runs.measure import load_run_model
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.studies import error_runtime as module
 from reference_trainer.studies.error_runtime import (
@@ -235,7 +235,7 @@ def ball(tmp_path):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, options, short):
     folder = tmp_path_factory.mktemp("runs") / "scene" / "strategy" / "seed_0"
-    run_experiment(options, short, folder, monitor_every=0)
+    run_experiment(options, short, folder, monitoring=Monitoring(0))
     return folder
 
 

@@ -10,7 +10,7 @@ from browser import CHROMIUM, Page
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.measure import load_run_model
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes.orbit import orbit_views
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.viewer import window
@@ -94,7 +94,7 @@ def test_a_training_that_is_watched_ends_with_the_same_model(run, options, short
         viewer._controls[4].value = 0.0 if trainer.step < 9 else 20.0
         viewer.follow(trainer)
 
-    results = run_experiment(options, short, tmp_path, monitor_every=0, watch=watch)
+    results = run_experiment(options, short, tmp_path, monitoring=Monitoring(0), on_step=watch)
     assert len(client.shown) == short.iterations + len(results["views"])  # also while the result is measured
     assert (tmp_path / "point_cloud.ply").read_bytes() == (run[0] / "point_cloud.ply").read_bytes()
 

@@ -127,7 +127,7 @@ def test_the_next_sweep_joins_a_cluster_again(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_sweep_on_ray_with_a_worker_killed(tmp_path, monkeypatch):
+def test_a_sweep_on_ray_with_a_worker_killed(tmp_path, monkeypatch, said):
     """One task of four raises, the worker of another is killed in the middle; one tells about itself."""
     ray = pytest.importorskip("ray")
     monkeypatch.setenv("PYTHONPATH", PYTHONPATH)  # Ray passes it to its workers
@@ -144,8 +144,7 @@ def test_a_sweep_on_ray_with_a_worker_killed(tmp_path, monkeypatch):
         Task("failing", sweep_tasks.square, (3,)),
         Task("about", sweep_tasks.environment, ()),
     ]
-    said = []
-    outcomes = dict(run_all(RayCluster(2), tasks, say=said.append))
+    outcomes = dict(run_all(RayCluster(2), tasks))
     killer.join(timeout=10)
     assert not ray.is_initialized()
     assert (outcomes[0], outcomes[1]) == (Value(25), Value(4))

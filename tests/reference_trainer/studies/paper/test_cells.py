@@ -9,7 +9,7 @@ import pytest
 import torch
 from commands import refused
 from oracles import brute_force, random_scene
-from stand_ins.engine import Here
+from stand_ins.executor import Here
 
 from ca_reg.regularizers import REGULARIZERS
 from reference_trainer.cli import main
