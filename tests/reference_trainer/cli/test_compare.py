@@ -1,12 +1,14 @@
 """What `ca-reg compare` asks of the comparison."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from reference_trainer.cli import main
 from reference_trainer.runs import compare as compare_module
+from reference_trainer.runs import executors as choice_module
 from reference_trainer.runs.compare import Comparison
-from reference_trainer.runs.executors import executors as choice_module
 from reference_trainer.runs.executors.executor import Failure
 from reference_trainer.runs.executors.processes import Processes
 from reference_trainer.scenes.options import SceneOptions
@@ -48,6 +50,8 @@ def test_several_scenes_and_how_they_are_run(monkeypatch, tmp_path):
         return {tmp_path / "fern": Comparison({}, {"baseline, seed 0": Failure("ValueError: no", "")})}
 
     monkeypatch.setattr(compare_module, "compare", fake)
+    monkeypatch.chdir(tmp_path)
+    Path("data/fern").mkdir(parents=True)
     with pytest.raises(SystemExit) as exit_:
         main(["compare", "--out", str(tmp_path), "--path", "data/fern", "synthetic", "--downscale", "2",
               "--executor", "processes", "--retries", "1", "--checkpoint-every", "50"])  # fmt: skip

@@ -21,7 +21,7 @@ from reference_trainer.training.recipes import RECIPES
     [
         ([], ["demo", "train", "evaluate", "bake", "render", "compare", "warmup"]),
         (["demo"], ["--iterations", "--seeds", "--jobs", "--out"]),
-        (["warmup"], ["--engine", "{None,auto,torch,loops}"]),
+        (["warmup"], ["--engine", "{None,auto,numba,torch,triton}"]),
         (
             ["train"],
             [
@@ -42,7 +42,7 @@ from reference_trainer.training.recipes import RECIPES
         (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
         (["bake"], ["PATH", "--regularizer", "--out"]),
         (["view"], ["PATH", "--scene", "--arc", "--regularizer", "--port", "--device"]),
-        (["render"], ["--what", "--frames", "{test,train,flight}"]),
+        (["render"], ["--what", "--frames", "{auto,test,train,flight}"]),
         (
             ["compare"],
             [
@@ -96,7 +96,7 @@ def test_help_and_mistakes_need_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-@pytest.mark.parametrize("command", ["evaluate x", "render", "train", "compare", "study attribution x"])
+@pytest.mark.parametrize("command", ["train", "compare", "study attribution x"])
 def test_a_card_that_is_not_there(command, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)

@@ -10,8 +10,8 @@ from commands import plain, refused
 from reference_trainer.cli import main
 from reference_trainer.evaluation import tables
 from reference_trainer.runs import measure as measure_module
+from reference_trainer.runs import ply as ply_module
 from reference_trainer.runs import run as run_module
-from reference_trainer.runs import score_ply as score_module
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
@@ -33,10 +33,10 @@ def test_a_run_or_a_ply_is_shown_until_ctrl_c(what, trained, capsys, monkeypatch
     shown = []
 
     def draw(viewer):
-        shown.append(viewer._subject.draw(viewer._look, viewer._subject._views[0].camera)[0])
+        shown.append(viewer._model.render(viewer._options, viewer._model._views[0].camera)[0])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Viewer, "draw", draw)
+    monkeypatch.setattr(Viewer, "update", draw)
     main(["view", str(trained / what), "--port", "0"])
     assert re.search(r"The viewer is at http://127\.0\.0\.1:\d+, .*; Ctrl-C ends it\.", capsys.readouterr().out)
     assert shown[0].std() > 0
@@ -47,7 +47,9 @@ def test_the_scene_of_a_training_may_be_given_either_way(arguments, monkeypatch,
     asked = []
     monkeypatch.setattr(run_module, "run_experiment", lambda scene, config, out, **rest: asked.append(scene))
     monkeypatch.setattr(tables, "summary", lambda results: "")
-    main(["train", *arguments, "--views", "5", "--out", str(tmp_path)])
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "garden").mkdir()
+    main(["train", *arguments, "--views", "5", "--out", "out"])
     assert asked == [SceneOptions("garden", views=5)]
     assert "not both: got garden and fern" in refused(["train", "garden", "--path", "fern"], capsys)
 
@@ -62,23 +64,25 @@ def test_the_commands_that_a_training_ends_with_can_be_pasted(monkeypatch, capsy
     assert shlex.split(curves)[-3:] == ["tensorboard", "--logdir", out]
 
 
-def test_a_ply_is_known_by_its_name(monkeypatch):
+def test_a_ply_is_known_by_its_name(monkeypatch, tmp_path):
     asked: list = []
-    monkeypatch.setattr(score_module, "score_ply", lambda ply, *rest, **named: asked.append(str(ply)))
-    main(["evaluate", "somewhere/a.PLY"])
-    assert asked == ["somewhere/a.PLY"]
+    (tmp_path / "a.PLY").touch()
+    monkeypatch.setattr(ply_module, "score_ply", lambda ply, *rest, **named: asked.append(str(ply)))
+    main(["evaluate", str(tmp_path / "a.PLY")])
+    assert asked == [str(tmp_path / "a.PLY")]
 
 
-@pytest.mark.parametrize("engine", ["torch", "loops"])
+@pytest.mark.parametrize("engine", ["torch", "numba"])
 def test_the_engine_is_chosen_said_and_noted(engine, trained, capsys, tmp_path, monkeypatch):
-    if engine == "loops":
+    if engine == "numba":
         pytest.importorskip("numba")
     monkeypatch.setenv("CA_REG_ENGINE", "auto")  # which the option changes, for workers
     main(["evaluate", str(trained), "--samples", "2", "--engine", engine, "--out", str(tmp_path)])
     said = capsys.readouterr().out.splitlines()
-    assert [line.startswith(f"Engine: {engine}") for line in said].count(True) == 1
+    assert [line.startswith("Engine: ") for line in said].count(True) == 1
     noted = json.loads((tmp_path / "evaluation.json").read_text())["machine"]["engine"]
     assert f"Engine: {noted}" in said
+    assert (noted == "torch") == (engine == "torch")
 
 
 def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
@@ -94,8 +98,8 @@ def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
 
     main(["evaluate", str(trained / "point_cloud.ply"), "--scene", "synthetic", "--downscale", "8",
           "--out", str(tmp_path / "p")])  # fmt: skip
-    load_ply_model = json.loads((tmp_path / "p" / "evaluation.json").read_text())
-    assert load_ply_model["views"] == results["views"]
+    of_ply = json.loads((tmp_path / "p" / "evaluation.json").read_text())
+    assert of_ply["views"] == results["views"]
 
     main(["render", str(trained)])
     assert len(list((trained / "render_test").glob("*.png"))) == 3
@@ -123,7 +127,7 @@ def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path
 @pytest.mark.parametrize("flag", ["--path", "--scene"])
 def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch):
     asked: list = []
-    monkeypatch.setattr(score_module, "score_ply", lambda *given, **named: asked.append((given, named)))
+    monkeypatch.setattr(ply_module, "score_ply", lambda *given, **named: asked.append((given, named)))
     main(
         [
             "evaluate",

@@ -19,7 +19,16 @@ from reference_trainer.evaluation.tables import comparison_table, summary
 from reference_trainer.render import chosen_engine
 from reference_trainer.runs import compare as compare_module
 from reference_trainer.runs import grid
-from reference_trainer.runs.compare import NAMED, REPORT, TABLE, Comparison, compare, report, scene_folders, strategies
+from reference_trainer.runs.compare import (
+    COMPARISON,
+    NAMED,
+    TABLE,
+    Comparison,
+    compare,
+    report,
+    scene_folders,
+    strategies,
+)
 from reference_trainer.runs.executors import choose_executor
 from reference_trainer.runs.executors.executor import Failure
 from reference_trainer.runs.folder import RESULTS
@@ -124,7 +133,7 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch, said):
     assert fern.failures == {}
     assert list(synthetic.failures) == ["dropout, seed 1"]
     assert "synthetic, dropout, seed 1: FAILED, RuntimeError: all Gaussians were pruned" in said[5]
-    stored = json.loads(Path("out/synthetic", REPORT).read_text())
+    stored = json.loads(Path("out/synthetic", COMPARISON).read_text())
     assert stored["failures"]["dropout, seed 1"]["error"] == "RuntimeError: all Gaussians were pruned"
     assert "in train" in stored["failures"]["dropout, seed 1"]["traceback"]
     assert [row["seeds"] for row in cells(Path("out/fern", TABLE).read_text())] == ["2", "2"]
@@ -148,7 +157,7 @@ def test_failed_runs_are_listed_at_the_end(tmp_path, said):
     report({tmp_path: Comparison({}, {"a, seed 0": Failure("ValueError: no", "Traceback")})})
     assert said[-2:] == [
         "1 of 1 runs FAILED; the same command tries them again:",
-        f"FAILED a, seed 0: ValueError: no ({tmp_path / REPORT} has the traceback)",
+        f"FAILED a, seed 0: ValueError: no ({tmp_path / COMPARISON} has the traceback)",
     ]
 
 
@@ -259,7 +268,7 @@ def test_a_comparison_from_photographs_to_figures(tmp_path, options, said):
         mean, spread = (float(x) for x in rows[name]["test PSNR"].split(" ± "))
         assert mean == pytest.approx(statistics.mean(values), abs=0.05)
         assert spread == pytest.approx(statistics.stdev(values), rel=0.06)
-    stored = json.loads((tmp_path / REPORT).read_text())
+    stored = json.loads((tmp_path / COMPARISON).read_text())
     assert stored["runs"] == comparison.runs
     assert stored["failures"] == {name: dataclasses.asdict(why) for name, why in comparison.failures.items()}
 
