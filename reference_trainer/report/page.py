@@ -66,8 +66,9 @@ def write_report(
     """
     if views < 1:
         raise ValueError(f"expected at least 1 view of each split, got {views}.")
-    out, runs = report_file(runs, out), [run for folder in runs for run in runs_of(folder) or [folder]]
+    folders, runs = runs, [run for folder in runs for run in runs_of(folder) or [folder]]
     names, found = labels(runs), list[Findings]()
+    out = report_file(folders, out)
     for run, label in zip(runs, names, strict=True):
         _log.info("[%d/%d] %s", len(found) + 1, len(runs), run)
         found.append(find(run, label, views=views, device=device, trust=trust))

@@ -200,7 +200,8 @@ def report(comparisons: Mapping[Path, Comparison]) -> None:
     failed = [(out, name, why) for out, of in comparisons.items() for name, why in of.failures.items()]
     if failed:
         finished = sum(len(runs) for of in comparisons.values() for runs in of.runs.values())
-        _log.info("\n%d of %d runs FAILED; the same command tries them again:", len(failed), finished + len(failed))
+        _log.info("")
+        _log.info("%d of %d runs FAILED; the same command tries them again:", len(failed), finished + len(failed))
         for out, name, why in failed:
             _log.info("FAILED %s: %s (%s has the traceback)", name, why.error, out / COMPARISON)
 

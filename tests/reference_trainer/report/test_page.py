@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import re
+import shutil
 from base64 import b64decode
 from html.parser import HTMLParser
 from io import BytesIO
@@ -88,8 +89,8 @@ def test_the_tables_are_those_of_the_runs(pair):
     for run in runs:
         results = json.loads((run / "results.json").read_text())
         for view in results["views"]:
-            assert f"| {view['split']} {view['name']} | {view['psnr']:.4g} |" in page.data["perView"][run.name]
-        assert f"| {run.name} | 1 | {results['mean']['test']['psnr']:.4g} |" in page.data["scores"]
+            assert f"| {view['split']} {view['name']} | {view['psnr']:.2f} |" in page.data["perView"][run.name]
+        assert f"| {run.name} | 1 | {results['mean']['test']['psnr']:.2f} |" in page.data["scores"]
         assert f"{run.name}: 11 steps with dropout(0.2) + noise(0.3" in " ".join(page.data["about"])
         assert f"| {run.name} | " in page.data["attribution"]
     assert "| noise | 0.3 | 0.0 |" in page.data["settings"]
@@ -352,3 +353,22 @@ def test_no_request_leaves_the_page(turned, opened):
     assert opened.requests[0] == turned[1].as_uri()
     assert all(address.startswith("data:") for address in opened.requests[1:])
     assert not opened.complaints
+
+
+def test_no_file_but_a_report_is_overwritten(run, tmp_path):
+    (tmp_path / "thesis.html").write_text("<!doctype html>precious")
+    with pytest.raises(ValueError, match=r"thesis\.html is no report of ca-reg and is not overwritten"):
+        write_report([run[0]], tmp_path / "thesis.html")
+    assert (tmp_path / "thesis.html").read_text() == "<!doctype html>precious"
+    for _ in range(2):  # its own page may be written again
+        write_report([run[0]], tmp_path / "mine.html", views=1)
+
+
+def test_a_comparison_stands_for_the_first_seed_of_each_strategy(run, tmp_path):
+    for name, seeds in (("dropout", (2, 10)), ("baseline", (0, 1))):
+        for seed in seeds:
+            shutil.copytree(run[0], tmp_path / name / f"seed_{seed}")
+    write_json(tmp_path / "comparison.json", {"runs": {"baseline": [], "dropout": []}, "failures": {}})
+    out = write_report([tmp_path], views=1)
+    assert out == tmp_path / "report.html"
+    assert [each["label"] for each in Parsed(out).data["runs"]] == ["baseline/seed_0", "dropout/seed_2"]

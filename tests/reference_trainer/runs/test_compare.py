@@ -49,7 +49,11 @@ def cells(table: str) -> list[dict[str, str]]:
 
 def made(psnr: float | None, gaussians: int = 1000) -> dict:
     """The part of ``results.json`` that a table needs."""
-    return {"gaussians": gaussians, "seconds": 2.0, "mean": {"test": {"psnr": psnr, "ca": 2e-3, "lpips": None}}}
+    return {
+        "gaussians": gaussians,
+        "seconds": 2.0,
+        "mean": {"test": {"psnr": psnr, "ca_exact_half": 2e-3, "lpips": None}},
+    }
 
 
 def test_the_table_has_mean_and_sample_deviation():
@@ -57,9 +61,9 @@ def test_the_table_has_mean_and_sample_deviation():
     first, second = cells(comparison_table(runs))
     assert first["strategy"] == "baseline"
     assert first["seeds"] == "3"
-    assert first["test PSNR"] == "19.0 ± 1.0"
-    assert first["test CA x1e-3"] == "2 ± 0"
-    assert first["Gaussians"] == "2.0 ± 1.0k"
+    assert first["test PSNR"] == "19.00 ± 1.00"
+    assert first["test exact CA (1e-3)"] == "2.00 ± 0.00"
+    assert first["Gaussians"] == "2000 ± 1000"
     assert second["test PSNR"] == "21"
     assert "test LPIPS" not in first  # measured nowhere
     assert "train PSNR" not in first
@@ -67,7 +71,7 @@ def test_the_table_has_mean_and_sample_deviation():
 
 def test_a_quality_that_one_strategy_lacks():
     first, second = cells(comparison_table({"a": [made(None)], "b": [made(20.0)]}))
-    assert (first["test PSNR"], second["test PSNR"]) == ("n/a", "20")
+    assert (first["test PSNR"], second["test PSNR"]) == ("n/a", "20.00")
 
 
 def test_strategies_change_the_regularizers_only():
@@ -173,7 +177,7 @@ def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch, s
     assert "| between | n/a |" in summary(results)
     (row,) = cells(comparison_table({"a": [results]}))
     for split in ("train", "between", "around"):
-        assert row[f"{split} exact CA x1e-3"] == f"{1e3 * results['mean'][split]['ca_exact']:.4g}"
+        assert row[f"{split} exact CA (1e-3)"] == f"{1e3 * results['mean'][split]['ca_exact_half']:.2f}"
     assert not any(title.startswith("test") for title in row)
     report({tmp_path: Comparison({"a": [results]}, {})})
     names = {f"{view['split']}_{view['name']}.png" for view in results["views"] if view["split"] != "train"}
@@ -196,8 +200,8 @@ def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, li
     report({out: Comparison({"baseline": [results], "dropout": [results]}, {})})
     assert any(line.startswith("no figure of CA and PSNR against the iteration: ") for line in said)
     assert sorted(path.name for path in out.glob("*.png")) == ["test_a_r_0.png", "test_b_r_0.png"]
-    (page,) = (line for line in said if "ca-reg report" in line)
-    assert shlex.split(page)[-2:] == [str(out / strategy / "seed_0") for strategy in ("baseline", "dropout")]
+    (logs,) = (line for line in said if "tensorboard" in line)
+    assert shlex.split(logs.partition("curves: ")[2]) == ["tensorboard", "--logdir", str(out)]
 
 
 def test_a_worker_that_does_not_share_the_folder_does_not_train(tmp_path, options):

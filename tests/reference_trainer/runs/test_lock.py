@@ -132,6 +132,7 @@ def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, opti
     model, _ = load_run_model(tmp_path)  # who only reads is not kept out
     assert len(model.gaussians) > 0
     end(process)
+    said.clear()
     run_experiment(options, short, tmp_path, monitoring=Monitoring(0))
     assert said[0] == f"{tmp_path}: continues from step 6"
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
 from reference_trainer.evaluation.results import PARTIAL
-from reference_trainer.evaluation.tables import evaluation_table
+from reference_trainer.evaluation.tables import EXACT, evaluation_table
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import measure as measure_module
 from reference_trainer.runs.folder import BAKED_PLY, PLY, FolderInUseError, run_lock
@@ -120,11 +120,25 @@ def test_the_table_has_one_row_per_view_and_the_means():
     ]
     lines = evaluation_table(Evaluation(views, 9, "vgg").as_dict()).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    head = ["view", "PSNR", "SSIM", "LPIPS", "CA x1e-3", "CA std error x1e-3", "exact CA x1e-3", "neutral CA x1e-3",
-            "visible", "covered", "CV"]  # fmt: skip
+    head = ["view", "PSNR", "SSIM", "LPIPS", EXACT, "exact CA at its own drop rate (1e-3)",
+            "neutral CA at its own drop rate (1e-3)", "CA (5 renders) (1e-3)", "its std error (1e-3)", "visible",
+            "covered", "CV"]  # fmt: skip
     assert cells[0] == head
-    assert cells[2] == ["test v0", "20", "0.5", "0.25", "2", "0.1", "4", "5", "0.9", "0.7", "0.04"]
-    assert cells[4][:2] == ["mean test", "20.5"]
+    assert cells[2] == [
+        "test v0",
+        "20.00",
+        "0.500",
+        "0.250",
+        "4.50",
+        "4.00",
+        "5.00",
+        "2.00",
+        "0.10",
+        "0.900",
+        "0.700",
+        "0.0400",
+    ]
+    assert cells[4][:2] == ["mean test", "20.50"]
     plain = [dataclasses.replace(view, psnr=math.nan, lpips=math.nan) for view in views]
     mixed = Evaluation([*plain, dataclasses.replace(views[0], lpips=math.nan)], 9)
     head = evaluation_table(mixed.as_dict()).splitlines()[0]
@@ -148,7 +162,7 @@ def test_views_of_the_same_name_in_two_folders_are_all_rendered(run, tmp_path, m
     names = ("a/r_0.png", "b/r_0.png", "r_1.png")
     test = tuple(dataclasses.replace(v, name=n) for v, n in zip(trainer.scene.test, names, strict=True))
     trainer.scene = dataclasses.replace(trainer.scene, test=test)
-    monkeypatch.setattr(measure_module, "load_run", lambda *arguments: trainer)
+    monkeypatch.setattr(measure_module, "load_run", lambda *arguments, **trust: trainer)
     render_run(run[0], "test", tmp_path)
     for name, view in (("a_r_0", "test_0"), ("b_r_0", "test_1"), ("r_1", "test_outside")):
         assert (tmp_path / f"{name}.png").read_bytes() == (run[0] / "views" / "test" / f"{view}.png").read_bytes()

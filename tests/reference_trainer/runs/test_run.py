@@ -82,7 +82,7 @@ def test_everything_is_there(finished, options, short):
     assert results["gaussians"] == len(load_ply(out / PLY).gaussians) > 3000
     assert [view["name"] for view in results["views"]] == [name.split("/")[1] for name in names]
     assert results["mean"]["test"]["lpips"] is None
-    assert [json.loads(line)["step"] for line in (out / LOG_NAME).read_text().splitlines()] == [3, 6, 9]
+    assert [json.loads(line)["step"] for line in (out / LOG_NAME).read_text().splitlines()] == [3, 6, 9, 11]
 
 
 def test_a_second_call_does_nothing(finished, options, short, monkeypatch, said):
@@ -260,8 +260,70 @@ def test_tensorboard_shows_pictures_of_a_view_of_each_split_if_asked_to(finished
     assert set(shown[finished[0]].Tags()["images"]) == tags
     for tag in tags:
         images = shown[finished[0]].Images(tag)
-        assert [(image.step, image.width, image.height) for image in images] == [(step, 20, 15) for step in (3, 6, 9)]
+        assert [(image.step, image.width, image.height) for image in images] == [
+            (step, 20, 15) for step in (3, 6, 9, 11)
+        ]
     assert not shown[scaled[0]].Tags()["images"]
+    assert {"loss", "learning rate/means", "dropout rate", "psnr/test"} <= set(shown[finished[0]].Tags()["scalars"])
+    assert any(tag.startswith("settings") for tag in shown[finished[0]].Tags()["tensors"])
+
+
+def test_the_log_and_tensorboard_hold_the_score_of_the_tables(finished):
+    """The exact score at drop rate 1/2, although the training drops: what results.json calls ca_exact_half."""
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    out, results = finished
+    last = json.loads((out / LOG_NAME).read_text().splitlines()[-1])
+    expected = results["mean"]["test"]["ca_exact_half"]
+    assert (last["method"], last["drop_rate"]) == ("exact", 0.5)
+    assert last["ca/test"] == pytest.approx(expected, rel=1e-6)
+    shown = accumulator.EventAccumulator(str(out))
+    shown.Reload()
+    assert shown.Scalars("exact CA (1e-3)/test")[-1].value == pytest.approx(1e3 * expected, rel=1e-5)
+    assert "ca/test" not in shown.Tags()["scalars"]
+    assert f"| {1e3 * expected:.2f} |" in summary(results)
+    assert results["ca_settings"]["drop_rate"] == pytest.approx(0.6)
+    assert "CA (5 renders, drop rate 0.6) (1e-3)" in evaluation_table(results)
+
+
+@pytest.mark.parametrize("name", [PLY, RESULTS, "views"])
+def test_a_folder_of_somebody_elses_is_not_written_to(name, options, short, tmp_path):
+    (tmp_path / name).mkdir() if name == "views" else (tmp_path / name).write_text("precious")
+    if name == RESULTS:  # without the settings of a run it is nobody's
+        (tmp_path / BAKED_PLY).write_text("precious")
+    before = {path: path.read_text() for path in tmp_path.iterdir() if path.is_file()}
+    with pytest.raises(ValueError, match=f"holds .*{name}.* give another --out"):
+        run_experiment(options, short, tmp_path)
+    assert {path: path.read_text() for path in tmp_path.iterdir() if path.is_file()} == before
+
+
+def test_the_folder_of_the_scene_is_not_written_to(short, tmp_path):
+    with pytest.raises(ValueError, match="is the folder of the scene, to which nothing is written"):
+        run_experiment(SceneOptions(str(tmp_path)), short, tmp_path)
+
+
+@pytest.mark.parametrize("place", ["config.json", "checkpoint", "loss", "scene"])
+def test_a_run_imports_no_code_that_nobody_has_named(place, finished, tmp_path, monkeypatch):
+    """The module would leave a mark if it were imported."""
+    out = tmp_path / "run"
+    shutil.copytree(finished[0], out)
+    (tmp_path / "evilmod.py").write_text(f"open({str(tmp_path / 'mark')!r}, 'w')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    claim = json.loads((out / CONFIG).read_text())
+    text = {"loss": "photometric + evilmod:Evil", "scene": "evilmod:evil"}.get(place, "evilmod:Evil(0.2)")
+    if place == "checkpoint":
+        state = torch.load(out / CHECKPOINT, weights_only=True)
+        state["config"] = json.dumps(json.loads(state["config"]) | {"regularizer": text})
+        torch.save(state, out / CHECKPOINT)
+    else:
+        key = {"loss": "loss", "scene": "format"}.get(place, "regularizer")
+        claim["scene" if place == "scene" else "config"][key] = text
+        (out / CONFIG).write_text(json.dumps(claim))
+    with pytest.raises(ValueError, match=r"evilmod, which is not imported because a file says so.*--trust evilmod"):
+        load_run(out)
+    assert not (tmp_path / "mark").exists()
+    with pytest.raises(Exception, match="evilmod"):  # it has no such class, but now it was imported
+        load_run(out, trust=["evilmod"])
+    assert (tmp_path / "mark").exists()
 
 
 def test_another_run_in_the_same_folder_is_refused(finished, options, short):
@@ -347,8 +409,8 @@ def test_summary(finished):
     lines = summary(finished[1]).splitlines()
     assert [line.split("|")[1].strip() for line in lines] == ["views", ":---", "test", "train"]
     psnr = finished[1]["mean"]["test"]["psnr"]
-    assert f"{psnr:.4g}" in lines[2]
-    assert "n/a" in lines[2]  # no perceptual metric
+    assert f"| {psnr:.2f} |" in lines[2]
+    assert "LPIPS" not in lines[0]  # no perceptual metric
 
 
 def test_auto_trains_by_the_plan_and_keeps_it(options, short, tmp_path, said):

@@ -212,7 +212,7 @@ def test_the_background(tmp_path):
         orbit(ball(), tmp_path, "gray", background="gray")
 
 
-def test_a_place_is_told_from_an_object(tmp_path, said):
+def test_a_place_is_told_from_an_object(tmp_path):
     room = ball(n=200, radius=20.0)
     both = Gaussians(**{name: torch.cat([x, dict(room.named())[name]]) for name, x in ball(n=300).named()})
     said = orbit(ball(), tmp_path, "object")[1]
@@ -221,7 +221,8 @@ def test_a_place_is_told_from_an_object(tmp_path, said):
     said = orbit(both, tmp_path, "place")[1]
     assert "a place and not an object" in said[1]
     save_ply(both, tmp_path / "arc.ply")
-    score_ply(tmp_path / "arc.ply", dataclasses.replace(FEW, arc=40.0), tmp_path / "arc")
+    with hearing() as said:
+        score_ply(tmp_path / "arc.ply", dataclasses.replace(FEW, arc=40.0), tmp_path / "arc")
     assert not any("a place and not an object" in line for line in said)
 
 

@@ -51,7 +51,7 @@ def test_the_co_adaptation_is_that_of_the_chosen_rate(model, mask):
 
 def test_the_co_adaptation_takes_the_noise_in(model):
     _, note = ViewerModel(model, []).render(DisplayOptions("co-adaptation", drop_rate=0.3, noise=0.4), CAMERA)
-    value = float(note.removeprefix("exact CA ").partition("e-3")[0]) * 1e-3
+    value = float(note.removeprefix("exact CA at drop rate 0.3 with noise 0.4 ").partition("e-3")[0]) * 1e-3
     draws = Chain(GaussianDropout(0.3), OpacityNoise(0.4))
     score = CAScore(model.render, regularizer=draws, relative_error=1e-3)
     sampled = score(model.gaussians.opacities, Viewpoint("", CAMERA))
@@ -137,3 +137,10 @@ def test_depth_is_that_of_walls():
         .render(DisplayOptions("depth"), CAMERA)[1]
         .startswith("nothing")
     )
+
+
+def test_a_view_without_a_score_says_why_in_words(model):
+    faint = replace(model, gaussians=replace(model.gaussians, opacity_logits=model.gaussians.opacity_logits - 99))
+    _, note = ViewerModel(faint, []).render(DisplayOptions("co-adaptation"), CAMERA)
+    assert note.startswith("no pixel counts")
+    assert "('" not in note
