@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import inspect
+import io
 import logging
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -106,10 +109,20 @@ def _parse(arguments: Sequence[str]) -> Any:
     texts = {name: inspect.getdoc(type(command)) or "" for name, command in defaults.items()}
     short = {name: text.partition("\n\n")[0] for name, text in texts.items() if name not in arguments}
     commands: Any = tyro.extras.subcommand_type_from_defaults(defaults, descriptions=texts | short)
-    return tyro.cli(
-        commands,
-        prog="ca-reg",
-        description="Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting.",
-        args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
-    )
+    heard = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(heard):
+            return tyro.cli(
+                commands,
+                prog="ca-reg",
+                description="Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting.",
+                args=arguments,
+                config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
+            )
+    except SystemExit:
+        # What the options refuse themselves comes in a box with tyro's inner names: say it like all other errors.
+        text = " ".join(re.sub(r"[│╭╮╰╯─]", " ", heard.getvalue()).split())
+        if found := re.search(r"Error parsing \S+: (.*?) For full helptext", text):
+            raise ValueError(found[1]) from None
+        sys.stderr.write(heard.getvalue())
+        raise

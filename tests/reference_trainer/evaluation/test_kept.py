@@ -88,7 +88,7 @@ def test_another_json_file(tmp_path, content, said):
 
 def test_nothing_is_kept_where_nobody_asked(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    kept = ResultStore(None, nothing)  # a fingerprint of a function would be a TypeError
+    kept = ResultStore(None, print)  # a fingerprint of a function would be a TypeError
     kept.add("view", {"x": 1.0})
     assert kept.get("view") is None
     assert list(tmp_path.iterdir()) == []
