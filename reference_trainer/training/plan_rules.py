@@ -129,7 +129,9 @@ def dropout(scene: Scene, config: TrainConfig) -> PlanItem:
     reason = f"{views}; {where} dropout changed PSNR by {_range(gains)}"
     if pays:
         options = " ".join(f"--{name.replace('_', '-')} {value:g}" for name, value in RECOMMENDED.items())
-        reason += f"; {options} by {_range(CAPTURES['with opacity decay 0.995'])} with 3 views, the best setting known"
+        best = _range(CAPTURES["with opacity decay 0.995"])
+        reason = f"{views}; {options} changed PSNR by {best} on captures of 3 views; {where} dropout alone did by "
+        reason += _range(gains)
     if config.make_regularizer().drops:
         return PlanItem("dropout", "used", f"asked for; {reason}")
     return PlanItem("dropout", "recommended" if pays else "left out", f"not asked for; {reason}")
