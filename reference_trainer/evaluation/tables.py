@@ -219,10 +219,10 @@ def _best(head: Sequence[str], rows: Sequence[Sequence[str]]) -> set[tuple[int, 
     found = set()
     for j, title in enumerate(head):
         words = next((words for words in _HIGHEST_IS_BEST if title.endswith(words)), None)
-        figures = {i: float(row[j].split()[0]) for i, row in enumerate(rows) if row[j] != _ABSENT}
-        if words is None or title.startswith("train") or len(figures) < 2:
+        if words is None or title.startswith("train"):
             continue  # at training views the best fit is no merit
-        best = max(figures.values()) if _HIGHEST_IS_BEST[words] else min(figures.values())
+        figures = {i: float(row[j].split()[0]) for i, row in enumerate(rows) if row[j] != _ABSENT}
+        best = (max if _HIGHEST_IS_BEST[words] else min)(figures.values(), default=None)
         found |= {(i, j) for i, figure in figures.items() if figure == best}
     return found
 

@@ -118,14 +118,15 @@ def dropout(scene: Scene, config: TrainConfig) -> PlanItem:
     """Dropout is never switched on unasked: comparisons need a training without it. It is recommended where it paid."""
     count, apart = len(scene.train), _degrees_apart(scene)
     views = f"{count} views, {apart:.0f} degrees apart" if count > 1 else "1 view"
-    if count > 1 and apart > FAR_APART:
+    far = count > 1 and apart > FAR_APART
+    if far:
         gains, where = [*FAR_APART_GAINS.values()], f"where views were further than {FAR_APART} degrees apart"
     else:
         nearest = min(DROPOUT_GAINS, key=lambda n: abs(math.log(n / count)))
         gains, where = [*DROPOUT_GAINS[nearest].values()], f"with {nearest} views"
         if nearest == 3:
             gains += CAPTURES["dropout 0.2"]
-    pays = sorted(gains)[len(gains) // 2] >= WORTH
+    pays = not far and sorted(gains)[len(gains) // 2] >= WORTH  # the median: means would be those of the one failure
     reason = f"{views}; {where} dropout changed PSNR by {_range(gains)}"
     if pays:
         options = " ".join(f"--{name.replace('_', '-')} {value:g}" for name, value in RECOMMENDED.items())

@@ -225,8 +225,7 @@ class Trainer:
             ValueError: if the file is not a readable checkpoint, something in it is missing or does not fit, or it
                 belongs to another scene or other training views.
         """
-        state = read_state(load_checkpoint(path, device), scene, path)
-        check(state.config)
+        state = read_state(load_checkpoint(path, device), scene, path, check)
         try:
             trainer = cls(scene, state.config, device)
         except ValueError as error:

@@ -141,7 +141,7 @@ def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch, tmp_path):
                      "background": "auto", "trust": set()}  # fmt: skip
     assert (str(other), orbit, str(folder)) == ("a.ply", OrbitOptions(3, 64, "z-up", 90.0), "o")
     assert others == {"regularizer": None, "samples": 7, "seed": 1, "device": "cpu", "background": "white",
-                      "perceptual": None}  # fmt: skip
+                      "perceptual": None, "trust": set()}  # fmt: skip
 
 
 def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):

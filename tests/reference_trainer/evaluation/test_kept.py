@@ -126,6 +126,7 @@ def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path
     with pytest.raises(KeyboardInterrupt):
         evaluate(model, views, samples=2, pictures=pictures, partial=file)
     monkeypatch.setattr(evaluate_module, "_measure", measure)
+    said.clear()
     assert repr(evaluate(model, views, samples=2, pictures=pictures, partial=file)) == repr(whole)
     assert sum(text.startswith("[") for text in said) == 4 - done
     names = sorted(path.relative_to(pictures) for path in pictures.rglob("*.png"))
@@ -175,6 +176,7 @@ def test_what_changed_is_not_mixed_with_what_was_measured(model, tiny_scene, tmp
     changed, other, keywords = changes(model, scene)[name]
     before = {"samples": 2} | ({"perceptual": Brightness(1.0)} if name == "weights" else {})
     evaluate(model, both(scene), partial=tmp_path / "kept.json", **before)
+    said.clear()
     evaluate(changed, both(other), partial=tmp_path / "kept.json", **({"samples": 2} | keywords))
     assert "everything is measured anew" in said[0]
     assert sum(text.startswith("[") for text in said) == len(other.train) + 1

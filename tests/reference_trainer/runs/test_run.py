@@ -306,7 +306,8 @@ def test_a_run_imports_no_code_that_nobody_has_named(place, finished, tmp_path, 
     """The module would leave a mark if it were imported."""
     out = tmp_path / "run"
     shutil.copytree(finished[0], out)
-    (tmp_path / "evilmod.py").write_text(f"open({str(tmp_path / 'mark')!r}, 'w')\n")
+    mark = tmp_path / "mark"
+    (tmp_path / "evilmod.py").write_text(f"import pathlib; pathlib.Path({str(mark)!r}).touch()\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     claim = json.loads((out / CONFIG).read_text())
     text = {"loss": "photometric + evilmod:Evil", "scene": "evilmod:evil"}.get(place, "evilmod:Evil(0.2)")
@@ -320,10 +321,11 @@ def test_a_run_imports_no_code_that_nobody_has_named(place, finished, tmp_path, 
         (out / CONFIG).write_text(json.dumps(claim))
     with pytest.raises(ValueError, match=r"evilmod, which is not imported because a file says so.*--trust evilmod"):
         load_run(out)
-    assert not (tmp_path / "mark").exists()
-    with pytest.raises(Exception, match="evilmod"):  # it has no such class, but now it was imported
-        load_run(out, trust=["evilmod"])
-    assert (tmp_path / "mark").exists()
+    assert not mark.exists()
+    if place == "checkpoint":
+        with pytest.raises(ValueError, match="evilmod:Evil cannot be had"):  # there is no such class, but:
+            load_run(out, trust=["evilmod"])
+        assert mark.exists()
 
 
 def test_another_run_in_the_same_folder_is_refused(finished, options, short):

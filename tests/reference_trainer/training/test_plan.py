@@ -30,7 +30,7 @@ def test_every_item_has_a_reason_and_changes_only_fields_that_exist(tiny_scene):
     assert len({item.name for item in plan.items}) == len(plan.items)
     for item in plan.items:
         assert item.reason
-        assert item.decision in ("used", "reduced", "left out")
+        assert item.decision in ("used", "reduced", "left out", "recommended")
         assert set(item.changes) <= set(vars(TrainConfig()))
 
 
