@@ -18,12 +18,13 @@ from torch import Tensor
 from ca_reg import CAResult, Reason
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ca_picture
 from reference_trainer.evaluation.pictures import file_names, save_png, side_by_side
-from reference_trainer.evaluation.results import machine, markdown_table, write_json
+from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE, Heat, colored_by, concentration, mean_effects
+from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
 from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
 from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.scenes.scene import View, Viewpoint
 
@@ -80,7 +81,7 @@ def study_attribution(
     """
     if split not in ("train", "test"):
         raise ValueError(f"split must be 'train' or 'test', got {split!r}.")
-    model, scene = of_run(run, device)
+    model, scene = load_run_model(run, device)
     out = run / "attribution" if out is None else out
     views = [view.to(device) for view in (scene.train if split == "train" else scene.test)]
     if not views:

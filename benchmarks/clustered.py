@@ -16,7 +16,8 @@ import torch
 
 from ca_reg import CAScore
 from ca_reg.regularizers import parse
-from reference_trainer.evaluation.results import format_mean_std, markdown_table, write_json
+from reference_trainer.evaluation.results import write_json
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.evaluation.trained_model import MaskedRenders
 from reference_trainer.runs.run import load_run, model_of
 

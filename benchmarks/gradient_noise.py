@@ -26,7 +26,7 @@ from benchmarks.gradient_noise_moments import (
     dot,
 )
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask, expected_squared_error
-from reference_trainer.evaluation.results import format_mean_std, markdown_table
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
 from reference_trainer.runs.run import load_run

@@ -21,11 +21,12 @@ import tyro
 from benchmarks.calls import PASSES, draw_of, gradients, image, processor_clock
 from benchmarks.memory import peak_memory
 from benchmarks.workloads import WORKLOADS, WorkloadSpec, covered_pairs
-from reference_trainer.evaluation.results import machine, markdown_table, write_json
+from reference_trainer.evaluation.pictures import new_figure
+from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.render.engine import engines_on
-from reference_trainer.runs.figures import new_figure
 from reference_trainer.studies.study import in_turns
 
 __all__ = [

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from reference_trainer.evaluation.results import markdown_table
+from reference_trainer.evaluation.tables import markdown_table
 
 __all__ = ["circles", "comments_and_code", "imports", "main", "modules", "upward"]
 

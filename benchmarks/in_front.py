@@ -13,9 +13,9 @@ import tyro
 from torch import Tensor
 
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.results import markdown_table, mean_std
+from reference_trainer.evaluation.tables import markdown_table, mean_std
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.scene import View
 
 __all__ = ["in_front", "main"]
@@ -29,7 +29,7 @@ def main(run: Annotated[Path, tyro.conf.Positional], view: str, nearer: float) -
         view: name of the test view, without extension.
         nearer: depth up to which Gaussians are left out, world units.
     """
-    model, scene = of_run(run)
+    model, scene = load_run_model(run)
     front = in_front(model, next(each for each in scene.test if Path(each.name).stem == view), nearer)
     opacities = model.test_opacities
     chosen = {"all": opacities, "without those in front": opacities.masked_fill(front, 0.0)}

@@ -11,9 +11,8 @@ import torch
 
 from benchmarks.calls import draw_of, gradients, image
 from benchmarks.workloads import WorkloadSpec
-from reference_trainer.runs.engines.engine import Failure, Task
-from reference_trainer.runs.engines.processes import Processes
-from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.executors.executor import Failure, Task, run_all
+from reference_trainer.runs.executors.processes import Processes
 
 __all__ = ["PROCESS", "peak_memory", "process_status"]
 

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.results import markdown_table, mean_std
 from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
+from reference_trainer.evaluation.tables import markdown_table, mean_std
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import View

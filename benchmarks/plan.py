@@ -19,10 +19,10 @@ from torch import Tensor
 from benchmarks.calls import processor_clock
 from benchmarks.memory import PROCESS, process_status
 from reference_trainer.evaluation.evaluate import evaluate
-from reference_trainer.evaluation.results import format_mean_std, markdown_table
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render import render
-from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.executors.processes import Processes
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
@@ -120,7 +120,7 @@ def plan(
     """
     study = plan_study(scene, config=config, iterations=steps, seeds=seeds, alternatives=alternatives, device=device)
     # Every training has a fresh process, one after the other, because time and peak memory are measured.
-    run_study(study, out, engine=Processes(1))
+    run_study(study, out, executor=Processes(1))
 
 
 def shortened(config: TrainConfig, iterations: int) -> TrainConfig:

@@ -17,8 +17,8 @@ import tyro
 from torch import Tensor
 
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.results import format_mean_std, markdown_table, mean_std
 from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.runs.folder import CONFIG, read_run_settings

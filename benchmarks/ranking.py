@@ -21,7 +21,7 @@ from ca_reg import CAScore
 from ca_reg.functional import Multiplier
 from ca_reg.types import read_moments
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.results import markdown_table, mean_std
+from reference_trainer.evaluation.tables import markdown_table, mean_std
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.runs.folder import CONFIG, read_run_settings
 from reference_trainer.runs.run import load_run, model_of

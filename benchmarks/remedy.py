@@ -24,7 +24,7 @@ import torch
 import tyro
 
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.results import format_mean_std, markdown_table, mean_std
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import load_scene, synthetic_scene
 from reference_trainer.scenes.options import SceneOptions

@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks.calls import PASSES
 from benchmarks.stages import STAGES
 from benchmarks.training_step import MASKS, PARTS
-from reference_trainer.evaluation.results import markdown_table
+from reference_trainer.evaluation.tables import markdown_table
 
 __all__ = ["regressions", "speed_tables"]
 

@@ -13,22 +13,22 @@ from browser import Page
 from torch import Tensor
 
 from ca_reg import CAMonitor
-from reference_trainer.evaluation.evaluate import glance
+from reference_trainer.evaluation.evaluate import training_snapshot
 from reference_trainer.evaluation.pictures import as_pillow
 from reference_trainer.evaluation.trajectory import interpolate_cameras, measured_views
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.trainer import Trainer
-from reference_trainer.viewer.picture import Look, Subject
+from reference_trainer.viewer.picture import DisplayOptions, ViewerModel
 from reference_trainer.viewer.window import Viewer
 
 LOOKS = {
-    "render": Look(),
-    "render, one mask": Look(mask=True),
-    "co-adaptation": Look("co-adaptation"),
-    "depth": Look("depth"),
-    "heat": Look("heat"),
-    "heat, 10 % hidden": Look("heat", hidden=0.1),
+    "render": DisplayOptions(),
+    "render, one mask": DisplayOptions(mask=True),
+    "co-adaptation": DisplayOptions("co-adaptation"),
+    "depth": DisplayOptions("depth"),
+    "heat": DisplayOptions("heat"),
+    "heat, 10 % hidden": DisplayOptions("heat", hidden=0.1),
 }
 
 
@@ -41,13 +41,13 @@ def timed(function: Callable[[], object]) -> float:
 
 def frames(trainer: Trainer) -> None:
     """Print pictures per second at 400x300 along a flight through the training cameras, JPEG included."""
-    views = measured_views(trainer.scene, print)
-    subject = Subject(model_of(trainer), [view for group in views.values() for view in group])
+    views = measured_views(trainer.scene)
+    shown = ViewerModel(model_of(trainer), [view for group in views.values() for view in group])
     path = [camera.resized(400, 300) for camera in interpolate_cameras([v.camera for v in trainer.views], 24)]
-    print(f"{len(trainer.gaussians):,} Gaussians; heat, once: {timed(lambda: subject.heat):.1f} s")
+    print(f"{len(trainer.gaussians):,} Gaussians; heat, once: {timed(lambda: shown.heat):.1f} s")
 
-    def frame(look: Look, camera: object) -> None:
-        as_pillow(subject.draw(look, camera)[0]).save(BytesIO(), "JPEG", quality=90)
+    def frame(look: DisplayOptions, camera: object) -> None:
+        as_pillow(shown.render(look, camera)[0]).save(BytesIO(), "JPEG", quality=90)
 
     for name, look in LOOKS.items():
         frame(look, path[0])
@@ -58,7 +58,7 @@ def frames(trainer: Trainer) -> None:
 def first_picture(trainer: Trainer) -> None:
     """Print how long a page waits for its first picture after it has connected."""
     with Viewer(0) as viewer:
-        viewer.show(model_of(trainer), measured_views(trainer.scene, print))
+        viewer.show(model_of(trainer), measured_views(trainer.scene))
         send, sent = viewer._send, threading.Event()
         viewer._send = lambda window: (send(window), times.append(time.monotonic() - window.moved), sent.set())
         times: list[float] = []
@@ -73,7 +73,7 @@ def pictures(trainer: Trainer) -> None:
     views, model = {"train": trainer.views, "test": list(trainer.scene.test)}, model_of(trainer)
 
     def details(opacity: Tensor, view: View) -> dict[str, Tensor]:
-        return glance(model, view)
+        return training_snapshot(model, view)
 
     with tempfile.TemporaryDirectory() as folder, CAMonitor(model.ca_score(), folder, views=views) as monitor:
         both = []

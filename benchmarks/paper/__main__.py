@@ -17,10 +17,10 @@ from benchmarks.paper.comparison import Kept
 from benchmarks.paper.figure import gains_figure, ranking_figure
 from benchmarks.paper.page import details, page
 from benchmarks.paper.scenes import chosen_scenes
-from reference_trainer.cli.drawing import Device, Draw, Drawing
+from reference_trainer.cli.options import Device, Rendering, RenderOptions
 from reference_trainer.devices import check_device
 from reference_trainer.files import write_text
-from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.executors.processes import Processes
 from reference_trainer.runs.grid import Running
 from reference_trainer.scenes.options import SceneOptions
 
@@ -71,7 +71,7 @@ class Paper:
     """Trainings at a time."""
     device: Device = "cpu"
     lpips: Annotated[str | None, tyro.conf.arg(help='Perceptual metric: "installed", or a weights file.')] = None
-    drawing: Draw = field(default_factory=Drawing)
+    rendering: Rendering = field(default_factory=RenderOptions)
 
     def __call__(self) -> None:
         """Do what the options say; exits with code 1 if a training failed."""
@@ -90,8 +90,8 @@ class Paper:
         if self.list:
             print(listing(grid))
             return
-        self.drawing.begin(self.device, trains=True)
-        failed = run_cells(grid, Running(Processes(self.jobs), device=self.device, lpips=self.lpips, say=print))
+        self.rendering.begin(self.device, trains=True)
+        failed = run_cells(grid, Running(Processes(self.jobs), device=self.device, lpips=self.lpips))
         for name, claim in claims.items():
             print(f"\n{name}. {claim.says}\n\n{details(name, Kept(rows, self.recipe, self.iterations))}")
         for name, why in failed.items():

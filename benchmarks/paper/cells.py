@@ -19,12 +19,13 @@ from benchmarks.paper.rows import Row, Rows, config_of, label, resolved, value
 from benchmarks.paper.scenes import PaperScene
 from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.metrics import depth_errors, psnr
-from reference_trainer.evaluation.results import mean_std
+from reference_trainer.evaluation.tables import mean_std
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
-from reference_trainer.runs.engines.engine import Failure, Task, attempt
+from reference_trainer.runs.executors.executor import Failure, Task, attempt
 from reference_trainer.runs.folder import folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
+from reference_trainer.runs.run import Monitoring
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
@@ -147,7 +148,9 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
                 shutil.rmtree(run.out)
 
     def do(runs: list[Run], every: int) -> None:
-        for run, end in zip(runs, run_grid(runs, replace(running, monitor_every=every), done=keep), strict=True):
+        for run, end in zip(
+            runs, run_grid(runs, replace(running, monitoring=Monitoring(every, protocol=True)), done=keep), strict=True
+        ):
             failed.update({run.label: end} if isinstance(end, Failure) else {})
 
     against = dict.fromkeys(cell.scene for cell in left if "depth" in cell.needs)
@@ -219,13 +222,13 @@ def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, dev
         log = [json.loads(line) for line in (run / LOG_NAME).read_text("utf-8").splitlines()]
         row["path"] = {str(sixth): each["ca/test"] for sixth, each in enumerate(log[:SIXTHS], start=1)}
     if cell.needs & {"renders", "depth"}:
-        model, scene = of_run(run, device)
+        model, scene = load_run_model(run, device)
         views = [view.to(device) for view in scene.test]
         with threads_for(scene.pixels):
             if "renders" in cell.needs:
                 row["renders"] = _mean([renders(model, view, cell.seed) for view in views])
             if "depth" in cell.needs:
-                truth = None if views[0].depth is not None else of_run(dense, device)[0]
+                truth = None if views[0].depth is not None else load_run_model(dense, device)[0]
                 row["depth"] = _mean([depths(model, view, truth) for view in views])
     return {**_rounded(row), **origin}
 

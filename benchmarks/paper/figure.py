@@ -8,7 +8,7 @@ from pathlib import Path
 
 from benchmarks.paper.claims import GAINS, Check
 from benchmarks.paper.comparison import Kept, differences, interval, ranked
-from reference_trainer.runs.figures import new_figure
+from reference_trainer.evaluation.pictures import new_figure
 
 __all__ = ["gains_figure", "ranking_figure"]
 

@@ -22,7 +22,7 @@ from benchmarks.paper.comparison import (
     verdict,
 )
 from benchmarks.paper.rows import Row, Rows, label, value
-from reference_trainer.evaluation.results import format_mean_std, markdown_table
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 
 __all__ = ["claims_table", "details", "gains", "page", "scenes_table"]
 

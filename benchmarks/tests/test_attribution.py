@@ -18,7 +18,7 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.trainer import Trainer
@@ -49,7 +49,7 @@ def luminance(gaussians: Gaussians) -> torch.Tensor:
 
 def test_the_shares_in_the_file_add_up_to_the_score_that_is_printed(run, study):
     data, out, said = study
-    model, scene = of_run(run)
+    model, scene = load_run_model(run)
     exact = model.exact_ca_score(drop_rate=0.5)
     values = [exact(model.gaussians.opacities, view).value for view in scene.test]
     assert list(data["views"].values()) == values
@@ -73,7 +73,7 @@ def test_the_shares_in_the_file_add_up_to_the_score_that_is_printed(run, study):
 
 def test_the_plys_hold_the_same_gaussians_colored_by_rank(run, study):
     data, out, _ = study
-    model = of_run(run)[0]
+    model = load_run_model(run)[0]
     with np.load(out / "shares.npz") as file:
         shares, weights = (torch.from_numpy(file[name]) for name in ("shares", "blend_weights"))
     for name, values, ends in (
@@ -100,7 +100,7 @@ def test_the_plys_hold_the_same_gaussians_colored_by_rank(run, study):
 
 def test_every_view_has_a_picture_of_four_panels(run, study):
     _, out, _ = study
-    names = [view.name for view in of_run(run)[1].test]
+    names = [view.name for view in load_run_model(run)[1].test]
     assert sorted(path.stem for path in (out / "views").iterdir()) == sorted(names)
     with Image.open(out / "views" / f"{names[0]}.png") as picture:
         assert picture.height == 15 + 16
@@ -109,9 +109,9 @@ def test_every_view_has_a_picture_of_four_panels(run, study):
 
 
 def test_views_of_the_same_name_in_two_folders_keep_their_pictures(run, tmp_path, monkeypatch):
-    model, scene = of_run(run)
+    model, scene = load_run_model(run)
     views = tuple(dataclasses.replace(v, name=n) for v, n in zip(scene.test, ("a/r.png", "b/r.png"), strict=False))
-    monkeypatch.setattr(shares_module, "of_run", lambda *a: (model, dataclasses.replace(scene, test=views)))
+    monkeypatch.setattr(shares_module, "load_run_model", lambda *a: (model, dataclasses.replace(scene, test=views)))
     study_attribution(run, tmp_path, say=lambda text: None)
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["a_r.png", "b_r.png"]
 
@@ -162,7 +162,7 @@ def test_blend_weights_are_those_of_brute_force():
 
 
 def test_a_view_without_a_score_does_not_count(run):
-    model, scene = of_run(run)
+    model, scene = load_run_model(run)
     view = scene.test[0]
     pose = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ view.camera.world_to_camera  # turned around
     away = dataclasses.replace(view, camera=dataclasses.replace(view.camera, world_to_camera=pose))
@@ -177,7 +177,7 @@ def test_a_view_without_a_score_does_not_count(run):
 
 
 def test_shares_are_the_mean_over_the_views(run):
-    model, scene = of_run(run)
+    model, scene = load_run_model(run)
     parts = [mean_shares(model, [view], drop_rate=0.3)[0] for view in scene.train]
     shares, results = mean_shares(model, scene.train, drop_rate=0.3)
     torch.testing.assert_close(shares, torch.stack(parts).mean(0), rtol=1e-12, atol=0)
@@ -194,7 +194,7 @@ def test_concentration_counts_from_the_largest():
 
 def test_other_views_and_mistakes(run, tmp_path):
     data = study_attribution(run, tmp_path, split="train", drop_rate=0.25, say=lambda text: None)
-    assert sorted(data["views"]) == sorted(view.name for view in of_run(run)[1].train)
+    assert sorted(data["views"]) == sorted(view.name for view in load_run_model(run)[1].train)
     assert data["drop_rate"] == 0.25
     with pytest.raises(ValueError, match="split must be 'train' or 'test', got 'val'"):
         study_attribution(run, split="val")

@@ -1,7 +1,7 @@
 import torch
 
 from benchmarks.in_front import in_front, main
-from reference_trainer.runs.run import model_of, run_experiment
+from reference_trainer.runs.run import Monitoring, model_of, run_experiment
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
@@ -19,7 +19,8 @@ def test_what_is_behind_the_camera_is_not_in_front(tiny_scene, busy):
 
 def test_a_run(tmp_path, capsys):
     """Without nobody both rows are equal; without all the picture is the background."""
-    run_experiment(SceneOptions("synthetic", downscale=8), TrainConfig(iterations=5), tmp_path, monitor_every=0)
+    options = SceneOptions("synthetic", downscale=8)
+    run_experiment(options, TrainConfig(iterations=5), tmp_path, monitoring=Monitoring(0))
     found = []
     for nearer in (1e-9, 1e9):
         capsys.readouterr()

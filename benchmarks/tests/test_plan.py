@@ -4,15 +4,14 @@ import subprocess
 import sys
 
 import pytest
-from stand_ins.engine import Here
+from stand_ins.executor import Here
 from subprocesses import subprocess_environment
 from waiting import PATIENCE, until
 
 from benchmarks import plan as plan_module
 from benchmarks.plan import ALTERNATIVES, parts_of_a_step, plan_study, plan_table, shortened, variants
-from reference_trainer.runs.engines.engine import Task
-from reference_trainer.runs.engines.processes import Processes
-from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.executors.executor import Task, run_all
+from reference_trainer.runs.executors.processes import Processes
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.study import run_study
@@ -66,7 +65,7 @@ def test_a_shortened_schedule_keeps_its_proportions():
 @pytest.mark.slow
 def test_the_study_trains_what_it_says(tmp_path, options, short):
     study = plan_study(options, config=short, iterations=4, seeds=2, alternatives=["no densification"])
-    records = [*run_study(study, tmp_path, engine=Here(), say=lambda text: None).values()]
+    records = [*run_study(study, tmp_path, executor=Here(), say=lambda text: None).values()]
     assert [(record["variant"], record["config"]["seed"]) for record in records] == [
         (name, seed) for seed in (0, 1) for name in ("as asked", "SH bands", "no densification")
     ]
@@ -94,7 +93,7 @@ def test_a_training_that_fails_is_reported_and_the_others_go_on(options, short, 
 
     def trained():
         study = plan_study(options, config=short, iterations=4, seeds=2)
-        run_study(study, tmp_path, engine=Here(), say=lambda text: None)
+        run_study(study, tmp_path, executor=Here(), say=lambda text: None)
 
     monkeypatch.setattr(plan_module, "_train", train)
     with pytest.raises(RuntimeError, match=r"1 of 4 cases FAILED; .*\n  as asked, seed 1: MemoryError: no room"):
@@ -110,12 +109,12 @@ from pathlib import Path
 import sweep_tasks
 from reference_trainer.scenes.options import SceneOptions
 from benchmarks import plan
-from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs.executors.processes import Processes
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
 plan._train = sweep_tasks.note_the_interruption_here
 study = plan.plan_study(SceneOptions("synthetic", downscale=8.0), config=TrainConfig(iterations=1), seeds=1)
-run_study(study, Path("out"), engine=Processes(1))
+run_study(study, Path("out"), executor=Processes(1))
 """
 
 

@@ -15,7 +15,7 @@ from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.study import run_study
@@ -154,7 +154,7 @@ def test_the_weights_are_the_expected_alpha():
 def trained(tmp_path_factory, options, short):
     """Two short runs: dropout with noise, and neither."""
     folder = tmp_path_factory.mktemp("runs")
-    results = run_experiment(options, short, folder / "both" / "seed_0", monitor_every=0)
+    results = run_experiment(options, short, folder / "both" / "seed_0", monitoring=Monitoring(0))
     config = TrainConfig(iterations=6, densify_gradient=1e9, seed=4)
     plain = Trainer(load_scene(options, seed=4), config)
     plain.train()

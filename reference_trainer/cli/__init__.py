@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import inspect
+import io
 import logging
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,13 +19,11 @@ try:
 except ImportError as error:
     raise SystemExit("ca-reg: the command needs the trainer's packages: pip install 'ca_reg[trainer]'.") from error
 
-from reference_trainer.cli.drawing import Warmup
-from reference_trainer.cli.names import Names, Recipes, Version
-from reference_trainer.cli.ply import Bake, Clean
-from reference_trainer.cli.poses import Poses
-from reference_trainer.cli.report import Report, View
-from reference_trainer.cli.runs import Compare, Demo, Evaluate, Plan, Render, Train, given_fields
+from reference_trainer.cli.models import Bake, Clean, Evaluate, Render, Report, View
+from reference_trainer.cli.options import refuse_old_options
+from reference_trainer.cli.setup import Names, Poses, Recipes, Version, Warmup
 from reference_trainer.cli.studies import MOVED, Study
+from reference_trainer.cli.training import Compare, Demo, Plan, Train, given_fields
 from reference_trainer.devices import check_device
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
@@ -33,10 +34,12 @@ __all__ = ["main"]
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``ca-reg``; errors that a user can fix exit with one line and code 2, an interruption with 130."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    _show_log()
     try:
         command = _parse(arguments)
         computing = command.what if isinstance(command, Study) else command
+        if hasattr(computing, "check"):
+            computing.check()
         if hasattr(computing, "device"):
             check_device(computing.device, here=not (isinstance(command, Compare) and command.elsewhere))
         command()
@@ -51,10 +54,35 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(130)
 
 
+class _Shown(logging.Handler):
+    """Shows what happens on the output, tables fitted to the terminal, and warnings on the error output."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if record.levelno >= logging.WARNING:
+            print(text, file=sys.stderr, flush=True)
+        elif text.startswith("| "):
+            from reference_trainer.evaluation.tables import print_table
+
+            print_table(text)
+        else:
+            print(text, flush=True)
+
+
+def _show_log() -> None:
+    """Show the messages of the trainer; of other packages only warnings."""
+    root = logging.getLogger()
+    if not any(isinstance(handler, _Shown) for handler in root.handlers):
+        root.addHandler(_Shown())
+    logging.getLogger("reference_trainer").setLevel(logging.INFO)
+
+
 def _parse(arguments: Sequence[str]) -> Any:
     """Return the command with its options; exits if they cannot be parsed."""
     if arguments[:1] == ["study"] and (moved := MOVED.get("".join(arguments[1:2]))):
         raise ValueError(f"study {arguments[1]} is now {moved}, called from a checkout of the repository.")
+    usual = TrainConfig()
+    refuse_old_options(arguments, [usual.renderer, *(f"--{name}" for name in vars(usual))])
     peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
     peek.add_argument("--recipe", choices=list(RECIPES))
     peek.add_argument("--iterations", type=int, default=argparse.SUPPRESS)
@@ -83,10 +111,20 @@ def _parse(arguments: Sequence[str]) -> Any:
     texts = {name: inspect.getdoc(type(command)) or "" for name, command in defaults.items()}
     short = {name: text.partition("\n\n")[0] for name, text in texts.items() if name not in arguments}
     commands: Any = tyro.extras.subcommand_type_from_defaults(defaults, descriptions=texts | short)
-    return tyro.cli(
-        commands,
-        prog="ca-reg",
-        description="Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting.",
-        args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
-    )
+    heard = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(heard):
+            return tyro.cli(
+                commands,
+                prog="ca-reg",
+                description="Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting.",
+                args=arguments,
+                config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
+            )
+    except SystemExit:
+        # What the options refuse themselves comes in a box with tyro's inner names: say it like all other errors.
+        text = " ".join(re.sub(r"[│╭╮╰╯─]", " ", heard.getvalue()).split())
+        if found := re.search(r"Error parsing \S+: (.*?) For full helptext", text):
+            raise ValueError(found[1]) from None
+        sys.stderr.write(heard.getvalue())
+        raise

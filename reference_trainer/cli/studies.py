@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from reference_trainer.cli.drawing import Device
+from reference_trainer.cli.options import Device
 
 __all__ = ["MOVED", "ErrorRuntime", "Stability", "Study"]
 

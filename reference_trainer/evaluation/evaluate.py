@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,16 +15,17 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAResult, CAScore, attribute
-from reference_trainer.evaluation.kept import KeptRecords
 from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.maps import color_variance_map
 from reference_trainer.evaluation.metrics import DepthErrors, depth_errors, on_white, psnr, ssim
 from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
-from reference_trainer.evaluation.results import machine
+from reference_trainer.evaluation.results import ResultStore, machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.scenes.scene import View, Viewpoint
 
-__all__ = ["Evaluation", "ViewScores", "ca_picture", "error_picture", "evaluate", "glance"]
+__all__ = ["Evaluation", "ViewScores", "ca_picture", "error_picture", "evaluate", "training_snapshot"]
+
+_log = logging.getLogger(__name__)
 
 CA_PICTURE_RANGE = 0.02
 """Variance that maps to the brightest color of CA heat maps."""
@@ -41,7 +43,7 @@ class ViewScores:
     ``ca_neutral`` is ``ca_exact`` with every pixel composited on its own expected color, so that the background does
     not count. ``visible`` is the share of pixels that ``ca`` covers, ``covered`` the mean alpha of the test-time image.
     ``depth_abs_rel`` to ``depth_log10`` are the `DepthErrors` of the test-time image where the true depth is known.
-    ``ca_reason`` says why ``ca`` is nan, if it is.
+    ``ca_reason`` is the name of the `Reason` why ``ca`` has its value, or is nan.
     """
 
     name: str
@@ -108,8 +110,8 @@ def evaluate(
     seed: int = 0,
     perceptual: LPIPS | None = None,
     pictures: Path | None = None,
-    keep: Path | None = None,
-    say: Callable[[str], None] = lambda text: None,
+    partial: Path | None = None,
+    on_view: Callable[[], None] = lambda: None,
 ) -> Evaluation:
     """Measure a model at views, with their photographs or without.
 
@@ -123,10 +125,10 @@ def evaluate(
         seed: of the CA score's masks.
         perceptual: a perceptual metric, or None to leave it out.
         pictures: folder for two PNG files per view, ``<split>/<view>``: the render, and a panel of photograph, render,
-            error and CA map, or without a photograph of render, CA, exact CA and neutral CA; None for no pictures.
-        keep: file for the scores of finished views, see `KeptRecords`: an interrupted evaluation continues with the
+            error and exact CA map, or without a photograph of the render and the maps of all scores; None for none.
+        partial: file for the scores of finished views, see `ResultStore`: an interrupted evaluation continues with the
             next view. The caller removes it once the result is written.
-        say: receives the number and name of each view before it is measured, and the time left.
+        on_view: called before each view is measured.
 
     Returns:
         Scores per view and their means.
@@ -144,20 +146,21 @@ def evaluate(
     photographs = (view.image.to(model.background.device) for _, _, view in members if isinstance(view, View))
     # Weights may differ under one name: the metric of a photograph and its mirror image tells them apart.
     metric = perceptual and [perceptual.name, *(float(perceptual(x, x.flip(2))) for x in islice(photographs, 1))]
-    kept = KeptRecords(keep, (model, views, samples, seed, metric, machine()), say)
+    store = ResultStore(partial, (model, views, samples, seed, metric, machine()))
     done: list[ViewScores] = []
     start, measured = time.perf_counter(), 0
     for number, (split, index, view) in enumerate(members):
         files = [] if pictures is None else [pictures / split / f"{names[number]}{end}.png" for end in ("", PANEL)]
-        known = kept.get(f"{split} {index}", files)
+        known = store.get(f"{split} {index}", files)
         if known is not None:
             done.append(ViewScores(**known))
             continue
         seconds = (time.perf_counter() - start) / measured * (len(members) - number) if measured else None
         left = "" if seconds is None else f", about {seconds:.0f} s left"
-        say(f"[{number + 1}/{len(members)}] {split} {view.name}{left}")
+        _log.info("[%d/%d] %s %s%s", number + 1, len(members), split, view.name, left)
+        on_view()
         done.append(_measure(model, view.to(model.background.device), split, index, scores, perceptual, files))
-        kept.add(f"{split} {index}", asdict(done[-1]))
+        store.add(f"{split} {index}", asdict(done[-1]))
         measured += 1
     return Evaluation(done, len(model.gaussians), None if perceptual is None else perceptual.name)
 
@@ -209,17 +212,19 @@ def _measure(
     if files:
         render = {"render" if photograph is None else f"render {measured.psnr:.2f} dB": image}
         if photograph is None:
-            panels = render | _maps({"CA": ca, "exact": exact, "neutral": neutral})
+            own = {} if scores[2].settings == scores[3].settings else {f"exact CA{_at(exact)}": exact}
+            sampled = f"CA, {ca.samples} renders{_at(ca)}"
+            panels = render | _maps({"exact CA": exact_half, **own, sampled: ca, f"neutral CA{_at(neutral)}": neutral})
         else:
             error = error_picture(image, photograph)
-            panels = {"photograph": photograph} | render | {"error": error} | _maps({"CA": ca})
+            panels = {"photograph": photograph} | render | {"error": error} | _maps({"exact CA": exact_half})
         save_png(files[0], image)
         save_png(files[1], side_by_side([*panels.values()], [*panels]))
     return measured
 
 
 @torch.no_grad()
-def glance(model: TrainedModel, view: View) -> dict[str, Tensor]:
+def training_snapshot(model: TrainedModel, view: View) -> dict[str, Tensor]:
     """Return what is worth watching while a model trains: pictures of a view, and the shares of the exact score.
 
     Returns:
@@ -231,6 +236,11 @@ def glance(model: TrainedModel, view: View) -> dict[str, Tensor]:
     shares, result = attribute(score, model.shares, model.gaussians.opacities, view)
     pictures = {"render": image, "error": error_picture(image, view.image), "co-adaptation": ca_picture(result)}
     return pictures | {"log10 of share": shares[shares > 0].log10()}
+
+
+def _at(result: CAResult) -> str:
+    """Return what a title says of a drop rate other than 1/2, that of the score for people."""
+    return "" if result.drop_rate == 0.5 or result.drop_rate is None else f" at drop rate {result.drop_rate:g}"
 
 
 def _maps(results: Mapping[str, CAResult]) -> dict[str, Tensor]:

@@ -1,26 +1,47 @@
-"""Pictures of results: PNG files, animations, heat maps, side-by-side comparisons."""
+"""Pictures of results: PNG files, animations, heat maps, side-by-side comparisons, figures."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from ca_reg.monitor import LOG_NAME, plot_dynamics
 from reference_trainer.files import replacing
-from reference_trainer.scenes.images import IMAGE_SUFFIXES
+from reference_trainer.scenes.images import IMAGE_SUFFIXES, read_image
 
-__all__ = ["PANEL", "as_pillow", "file_names", "heat_colors", "heat_map", "save_gif", "save_png", "side_by_side"]
+if TYPE_CHECKING:  # an extra
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "PANEL",
+    "as_pillow",
+    "comparison_figure",
+    "dynamics_figure",
+    "file_names",
+    "heat_colors",
+    "heat_map",
+    "is_own_png",
+    "new_figure",
+    "save_gif",
+    "save_png",
+    "side_by_side",
+]
 
 PANEL = "_panel"
 """Suffix of a view's panel, after the name of its render."""
 
+_MADE_BY = "ca_reg"  # in the header of every PNG
 _GAP = 4  # pixels between pictures
 _LABEL_HEIGHT = 16  # pixels; Pillow's built-in font is about 11 high
 _UNDEFINED = "0.5"  # gray for values that are not finite; not a color of the map
@@ -59,9 +80,25 @@ def save_png(path: str | Path, image: Tensor) -> None:
 
     Raises ValueError if the shape is another or a value is NaN, and OSError if the file cannot be written.
     """
-    picture = as_pillow(image)
+    from PIL.PngImagePlugin import PngInfo
+
+    picture, note = as_pillow(image), PngInfo()
+    note.add_text("Software", _MADE_BY)
     with replacing(path) as place:
-        picture.save(place, format="PNG")
+        picture.save(place, format="PNG", pnginfo=note)
+
+
+def is_own_png(path: Path) -> bool:
+    """Whether a picture is from `save_png`, or there is none: what may be overwritten without asking."""
+    from PIL import Image
+
+    if not path.exists():
+        return True
+    try:
+        with Image.open(path) as picture:
+            return picture.info.get("Software") == _MADE_BY
+    except (OSError, ValueError):
+        return False
 
 
 def save_gif(path: str | Path, images: Sequence[Tensor]) -> None:
@@ -158,3 +195,53 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
         pen.text((left + 2, row * cell + 2), label, fill="black")
         sheet.paste(picture, (left, row * cell + _LABEL_HEIGHT))
     return torch.from_numpy(np.array(sheet)).permute(2, 0, 1) / 255
+
+
+@contextmanager
+def new_figure(path: Path) -> Iterator[Figure]:
+    """Yield an empty figure, and save it on exit in the format of the extension of ``path``, such as PNG or SVG."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(layout="constrained")
+    yield figure
+    with replacing(path) as place:
+        figure.savefig(place, dpi=110, format=path.suffix[1:])
+
+
+def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
+    """Draw CA and PSNR of several runs against the iteration (paper, training dynamics).
+
+    Args:
+        runs: folder of each run by label.
+        path: the PNG or SVG to write.
+    """
+    with new_figure(path) as figure:
+        figure.set_size_inches(10, 4.2)
+        ca_axes, _ = plot_dynamics(dict(runs), axes=figure.subplots(1, 2))
+        exact = [_logs_exact(folder) for folder in runs.values()]
+        if any(exact):  # logs of older versions hold the sampled score
+            ca_axes.set_ylabel("exact CA (1e-3)" if all(exact) else "CA (1e-3); exact, or of 5 renders in older runs")
+            ca_axes.yaxis.set_major_formatter(lambda x, position: f"{x * 1e3:g}")
+
+
+def _logs_exact(folder: Path) -> bool:
+    """Whether the log of a run holds the exact score at drop rate 1/2, by its last line."""
+    with suppress(OSError, ValueError, IndexError, AttributeError):
+        last = json.loads((folder / LOG_NAME).read_text("utf-8").splitlines()[-1])
+        return bool(last.get("method") == "exact" and last.get("drop_rate") == 0.5)
+    return False
+
+
+def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split: str = "test") -> None:
+    """Stack the panels (photograph, render, error, CA map) of one view under several strategies.
+
+    Args:
+        runs: folder of each run by label.
+        path: the PNG to write.
+        view: name of the view's files, see `file_names`.
+        split: of the view, such as ``"test"``.
+    """
+    panels = [read_image(folder / "views" / split / f"{view}{PANEL}.png")[0] for folder in runs.values()]
+    widest = max(panel.shape[2] for panel in panels)  # long labels widen the panels of narrow pictures
+    panels = [pad(panel, (0, widest - panel.shape[2]), value=1.0) for panel in panels]
+    save_png(path, side_by_side(panels, list(runs), columns=1))

@@ -1,27 +1,33 @@
-"""Results as data: JSON files, Markdown tables, means with their spread, and a description of the machine."""
+"""Results as data: JSON files, a store of what is measured so far, and a description of the machine."""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
+import logging
 import math
 import os
 import platform
-import re
-import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
 
 import ca_reg
 from reference_trainer.files import write_text
+from reference_trainer.json_files import read_json
 from reference_trainer.render import describe_engine
 
-__all__ = ["format_mean_std", "machine", "markdown_table", "mean_std", "write_json"]
+__all__ = ["PARTIAL", "ResultStore", "fingerprint", "machine", "write_json"]
 
-_ABSENT = "n/a"
-_FIGURE = re.compile(r"[-+]?\d|-?$")  # also a dash or nothing in its place
+PARTIAL = "evaluation.partial.json"
+"""Name of the `ResultStore` in the folder of an evaluation."""
+
+_log = logging.getLogger(__name__)
 
 
 def write_json(path: str | Path, data: object) -> None:
@@ -39,69 +45,6 @@ def write_json(path: str | Path, data: object) -> None:
     """
     text = json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     write_text(path, text)
-
-
-def mean_std(values: Iterable[float]) -> tuple[float, float]:
-    """Return mean and sample standard deviation (n - 1) of the finite values; nan if there are too few.
-
-    Example:
-        >>> mean_std([1.0, 3.0, math.nan])
-        (2.0, 1.4142135623730951)
-    """
-    finite = [float(value) for value in values if math.isfinite(value)]
-    mean = statistics.fmean(finite) if finite else math.nan
-    return mean, statistics.stdev(finite) if len(finite) > 1 else math.nan
-
-
-def format_mean_std(values: Iterable[float], *, unit: float = 1.0) -> str:
-    """Return mean and standard deviation as text: two digits of the deviation, the mean to the same place.
-
-    Values that are not finite are left out, and the text says how many remain; a mean without a deviation has four
-    digits, and no value at all gives ``"n/a"``. Values are in units of ``unit``: with 1e-3, 0.0023 is written 2.3.
-
-    Example:
-        >>> format_mean_std([20.39, 20.51, 20.63])
-        '20.51 ± 0.12'
-        >>> format_mean_std([0.00221, 0.00231, 0.00241], unit=1e-3)
-        '2.31 ± 0.10'
-        >>> format_mean_std([20.39, 20.63, math.nan])
-        '20.51 ± 0.17 (2 of 3)'
-    """
-    if not unit > 0:
-        raise ValueError(f"unit must be positive, got {unit}.")
-    scaled = [value / unit for value in values]
-    mean, std = mean_std(scaled)
-    count = sum(map(math.isfinite, scaled))
-    note = f" ({count} of {len(scaled)})" if 0 < count < len(scaled) else ""
-    if not count:
-        return _ABSENT
-    if not std > 0:
-        return f"{_number(mean)}{' ± 0' if std == 0 else ''}{note}"
-    # Round first: a deviation of 0.0999 becomes 0.10, with one decimal less.
-    decimals = max(0, 1 - math.floor(math.log10(float(f"{std:.1e}"))))
-    return f"{mean:.{decimals}f} ± {std:.{decimals}f}{note}"
-
-
-def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
-    """Return rows, mappings from column to content, as a Markdown table that ends with a line break.
-
-    Text is kept, floats get four digits; what is missing, None or not finite becomes ``n/a``. The columns, at least
-    one, are also the headers. Columns of words are left-aligned, as is the first; columns of figures right-aligned.
-
-    Example:
-        >>> print(markdown_table([{"run": "baseline", "PSNR": 19.36}, {"run": "dropout"}], ["run", "PSNR"]), end="")
-        | run | PSNR |
-        |:---|---:|
-        | baseline | 19.36 |
-        | dropout | n/a |
-    """
-    if not columns:
-        raise ValueError("a table needs at least one column.")
-    lines = [[_cell(row.get(column)) for column in columns] for row in rows]
-    words = {place for line in lines for place, cell in enumerate(line) if cell != _ABSENT and not _FIGURE.match(cell)}
-    rule = [":---" if place in {0, *words} else "---:" for place in range(len(columns))]
-    text = [f"| {' | '.join(line)} |" for line in [[_cell(column) for column in columns], *lines]]
-    return "\n".join([text[0], f"|{'|'.join(rule)}|", *text[1:], ""])
 
 
 def machine() -> dict[str, str | int]:
@@ -139,19 +82,6 @@ def _plain(data: object) -> object:
     return data
 
 
-def _cell(value: object) -> str:
-    """Return one table cell; a bar or a line break inside would split it."""
-    text = _number(value) if isinstance(value, float) else _ABSENT if value is None else str(value)
-    return " ".join(text.split()).replace("|", "\\|")
-
-
-def _number(value: float) -> str:
-    """Return a number with four significant digits, but with all digits before the decimal point."""
-    if not math.isfinite(value):
-        return _ABSENT
-    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
-
-
 def _cpu_name() -> str:
     """Return the processor's name; on Linux only /proc has it."""
     try:
@@ -160,3 +90,109 @@ def _cpu_name() -> str:
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
+
+
+class ResultStore:
+    """What was measured so far, by key; every record is on disk before the next one is measured.
+
+    Records made under another ``depends_on``, or in a damaged file, are deleted: the measurement starts anew, and says
+    so. The caller removes the file once the final result is written.
+
+    Args:
+        file: where to keep them; None keeps nothing.
+        depends_on: everything the records depend on, see `fingerprint`.
+
+    Raises:
+        OSError: if the file exists and cannot be read or removed.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder, "scores.partial.json")
+        ...     ResultStore(file, {"seed": 1}).add("view 0", {"psnr": 20.5})
+        ...     ResultStore(file, {"seed": 1}).get("view 0")
+        {'psnr': 20.5}
+    """
+
+    def __init__(self, file: Path | None, depends_on: object) -> None:
+        self._file = file
+        self._records: dict[str, dict[str, Any]] = {}
+        self._depends_on = "" if file is None else fingerprint(depends_on)
+        if file is None or not file.exists():
+            return
+        try:
+            content = read_json(file)
+            depends_on, digest, records = content["depends_on"], content["digest"], content["records"]
+            if _digest(records) != digest:
+                raise ValueError("its digest is another one")
+        except (ValueError, TypeError, KeyError):
+            reason = "it is damaged"
+        else:
+            if depends_on == self._depends_on:
+                self._records = records
+                _log.info("%d measured before, kept: %s", len(records), file)
+                return
+            reason = "they belong to another model, scene, setting or machine"
+        # Immediately, or a picture of the new measurement could be taken for that of an old record.
+        file.unlink()
+        _log.info(
+            "records of an interrupted measurement in %s are not used, %s: everything is measured anew", file, reason
+        )
+
+    def get(self, key: str, files: Iterable[Path] = ()) -> dict[str, Any] | None:
+        """Return a record, or None if there is none or one of the files written with it is gone."""
+        record = self._records.get(key)
+        return record if record is not None and all(file.is_file() for file in files) else None
+
+    def add(self, key: str, record: Mapping[str, Any]) -> None:
+        """Keep a record of strings and numbers, including nan and infinity.
+
+        Raises:
+            OSError: if it cannot be written; earlier records are kept.
+        """
+        if self._file is None:
+            return
+        self._records[key] = dict(record)
+        content = {"depends_on": self._depends_on, "digest": _digest(self._records), "records": self._records}
+        write_text(self._file, json.dumps(content, indent=1) + "\n")  # nan stays nan: this file is read by Python alone
+
+
+def fingerprint(x: object) -> str:
+    """Return a digest of tensors, numbers, strings and None, nested in dataclasses, mappings, lists and tuples.
+
+    Equal values give equal digests in every process; a tensor's device counts, because results depend on it.
+    Raises TypeError for anything else.
+
+    Example:
+        >>> fingerprint([torch.zeros(2), 3]) == fingerprint([torch.zeros(2), 3]) != fingerprint([torch.zeros(2), 4])
+        True
+    """
+    digest = hashlib.sha256()
+    for part in _parts(x):
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def _digest(records: object) -> str:
+    """Return a digest of records as JSON, the same before writing and after reading."""
+    return fingerprint(json.dumps(records))
+
+
+def _parts(x: object) -> Iterator[Any]:
+    """Yield buffers that encode a value unambiguously: a sequence is preceded by its length."""
+    if isinstance(x, Tensor):
+        yield f"{x.dtype} {tuple(x.shape)} {x.device};".encode()
+        yield x.detach().cpu().reshape(-1).contiguous().view(torch.uint8).numpy()
+    elif dataclasses.is_dataclass(x) and not isinstance(x, type):
+        yield f"{type(x).__name__} ".encode()
+        yield from _parts({field.name: getattr(x, field.name) for field in dataclasses.fields(x)})
+    elif isinstance(x, Mapping):
+        yield from _parts([part for item in x.items() for part in item])
+    elif isinstance(x, list | tuple):
+        yield f"[{len(x)};".encode()
+        for part in x:
+            yield from _parts(part)
+    elif x is None or isinstance(x, str | int | float):
+        yield f"{x!r};".encode()
+    else:
+        raise TypeError(f"a fingerprint is made of tensors, numbers, strings and None, got {type(x).__name__}.")

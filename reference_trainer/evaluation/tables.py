@@ -1,94 +1,263 @@
-"""Scores as Markdown tables, for one evaluation, a run or a comparison. CA is in units of 1e-3."""
+"""Scores as tables: Markdown in files and pipes, fitted to the width of a terminal.
+
+One co-adaptation score is for people: the exact one at drop rate 1/2, the same question for every model, called
+"exact CA" and given in units of 1e-3. All other scores carry what they depend on in their titles.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+import statistics
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from reference_trainer.evaluation.results import format_mean_std, markdown_table
+__all__ = [
+    "EXACT", "comparison_table", "evaluation_table", "format_mean_std", "markdown_table", "mean_std", "print_table",
+    "summary",
+]  # fmt: skip
 
-__all__ = ["comparison_table", "evaluation_table", "summary"]
+EXACT = "exact CA (1e-3)"
+"""Title of the score for people: the exact score at drop rate 1/2, with two decimals."""
 
-_TITLES = {
-    "psnr": "PSNR",
-    "ssim": "SSIM",
-    "lpips": "LPIPS",
-    "ca": "CA x1e-3",
-    "ca_std_error": "CA std error x1e-3",
-    "ca_exact": "exact CA x1e-3",
-    "ca_exact_half": "exact CA at 1/2 x1e-3",
-    "ca_neutral": "neutral CA x1e-3",
-    "visible": "visible",
-    "covered": "covered",
-    "cv": "CV",
-    "depth_abs_rel": "depth AbsRel",
-    "depth_rmse": "depth RMSE",
-    "depth_mae": "depth MAE",
-    "depth_log10": "depth log10",
-    "gaussians": "Gaussians",
+_ABSENT = "n/a"
+_FIGURE = re.compile(r"[-+]?\d|-?$")  # also a dash or nothing in its place
+_SHOWN: dict[str, tuple[str, int]] = {
+    "psnr": ("PSNR", 2),
+    "ssim": ("SSIM", 3),
+    "lpips": ("LPIPS", 3),
+    "ca_exact_half": (EXACT, 2),
+    "ca_exact": ("exact CA{at} (1e-3)", 2),
+    "ca_neutral": ("neutral CA{at} (1e-3)", 2),
+    "ca": ("CA ({renders}) (1e-3)", 2),
+    "ca_std_error": ("its std error (1e-3)", 2),
+    "visible": ("visible", 3),
+    "covered": ("covered", 3),
+    "cv": ("CV", 4),
+    "depth_abs_rel": ("depth AbsRel", 4),
+    "depth_rmse": ("depth RMSE", 4),
+    "depth_mae": ("depth MAE", 4),
+    "depth_log10": ("depth log10", 4),
+    "gaussians": ("Gaussians", 0),
+    "seconds": ("seconds", 0),
 }
+"""Title and decimals of every quantity, in the order of the columns; the decimals are the same down a column."""
 _NOT_EVERYWHERE = ("psnr", "ssim", "lpips", "depth_abs_rel", "depth_rmse", "depth_mae", "depth_log10")
+_HIGHEST_IS_BEST = {"PSNR": True, "SSIM": True, "LPIPS": False, EXACT: False, "depth AbsRel": False}
 
 
 def evaluation_table(data: Mapping[str, Any]) -> str:
     """Return one row per view and the means of the splits, without quantities that no view has.
 
-    The data are those of `Evaluation.as_dict`, or of a file that holds them, such as ``results.json``.
+    The data are those of `Evaluation.as_dict`, or of a file that holds them, such as ``results.json``. Scores at
+    another drop rate than 1/2 say so, if the data have ``ca_settings``.
     """
     rows = {f"{view['split']} {view['name']}": view for view in data["views"]}
     rows |= {f"mean {split}": mean for split, mean in data["mean"].items()}
-    left_out = {"ca_exact_half", "gaussians"} | {
+    absent = {
         name
         for name in _NOT_EVERYWHERE
         if all(math.isnan(x) for row in rows.values() if (x := row.get(name)) is not None)
     }
-    return _table("view", rows, [name for name in _TITLES if name not in left_out])
+    settings = data.get("ca_settings") or {}
+    rate = settings.get("drop_rate")
+    if rate == 0.5:
+        absent.add("ca_exact")  # it is the score for people
+    return _table("view", rows, [name for name in _SHOWN if name not in absent | {"gaussians", "seconds"}], settings)
 
 
-def summary(results: dict[str, Any]) -> str:
+def summary(results: Mapping[str, Any]) -> str:
     """Return the means of ``results.json`` as a short table."""
-    rows = {split: results | mean for split, mean in sorted(results["mean"].items())}
-    return _table("views", rows, ["psnr", "ssim", "lpips", "ca", "ca_exact", "cv", "gaussians", "seconds"])
+    rows = {split: {**results, **mean} for split, mean in sorted(results["mean"].items())}
+    names = ["psnr", "ssim", "lpips", "ca_exact_half", "cv", "gaussians", "seconds"]
+    if all(row.get("lpips") is None for row in rows.values()):
+        names.remove("lpips")
+    return _table("views", rows, names)
 
 
 def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     """Return one row per strategy with means and sample standard deviations over the seeds.
 
-    CA follows the paper's protocol, whose drop rate depends on p; "exact CA at 1/2" is the limit of infinitely many
-    samples at drop rate 1/2, whatever the model was trained with. Without test views, exact CA at, between and around
-    the training views takes its place.
+    Without test views, the exact CA at, between and around the training views takes the place of what is measured at
+    test views.
 
     Args:
         runs: for every strategy the content of ``results.json`` of each seed.
     """
-    shown = {"test": ["psnr", "ssim", "lpips", "ca", "ca_exact_half", "cv", "depth_abs_rel"], "train": ["psnr", "ca"]}
+    shown = {
+        "test": ["psnr", "ssim", "lpips", "ca_exact_half", "cv", "depth_abs_rel"],
+        "train": ["psnr", "ca_exact_half"],
+    }
     if not any("test" in run["mean"] for of in runs.values() for run in of):
-        shown = {"train": ["psnr", "ca", "ca_exact"], "between": ["ca_exact"], "around": ["ca_exact"]}
-    columns = {f"{split} {_TITLES[name]}": (split, name) for split, names in shown.items() for name in names}
+        exact = ["ca_exact_half"]
+        shown = {"train": ["psnr", *exact], "between": exact, "around": exact}
+    columns = {f"{split} {_SHOWN[name][0]}": (split, name) for split, names in shown.items() for name in names}
     rows: list[dict[str, object]] = []
     for strategy, of in runs.items():
         row: dict[str, object] = {"strategy": strategy, "seeds": len(of)}
         for title, (split, name) in columns.items():
             values = [run["mean"].get(split, {}).get(name) for run in of]
             if known := [value for value in values if value is not None]:
-                row[title] = format_mean_std(known, unit=_unit(name))
-        row["Gaussians"] = format_mean_std([run["gaussians"] for run in of], unit=1e3) + "k"
-        row["seconds"] = format_mean_std([run["seconds"] for run in of])
+                row[title] = format_mean_std(known, unit=_unit(name), decimals=_SHOWN[name][1])
+        for name in ("gaussians", "seconds"):
+            row[_SHOWN[name][0]] = format_mean_std([run[name] for run in of], decimals=0)
         rows.append(row)
     present = [title for title in columns if any(title in row for row in rows)]
     return markdown_table(rows, ["strategy", "seeds", *present, "Gaussians", "seconds"])
 
 
-def _table(first: str, rows: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
+def mean_std(values: Iterable[float]) -> tuple[float, float]:
+    """Return mean and sample standard deviation (n - 1) of the finite values; nan if there are too few.
+
+    Example:
+        >>> mean_std([1.0, 3.0, math.nan])
+        (2.0, 1.4142135623730951)
+    """
+    finite = [float(value) for value in values if math.isfinite(value)]
+    mean = statistics.fmean(finite) if finite else math.nan
+    return mean, statistics.stdev(finite) if len(finite) > 1 else math.nan
+
+
+def format_mean_std(values: Iterable[float], *, unit: float = 1.0, decimals: int | None = None) -> str:
+    """Return mean and standard deviation as text: two digits of the deviation, the mean to the same place.
+
+    Values that are not finite are left out, and the text says how many remain; a mean without a deviation has four
+    digits, and no value at all gives ``"n/a"``. Values are in units of ``unit``: with 1e-3, 0.0023 is written 2.3.
+    With ``decimals`` both have that many, so that a column reads from top to bottom.
+
+    Example:
+        >>> format_mean_std([20.39, 20.51, 20.63])
+        '20.51 ± 0.12'
+        >>> format_mean_std([0.00221, 0.00231, 0.00241], unit=1e-3)
+        '2.31 ± 0.10'
+        >>> format_mean_std([20.39, 20.63, math.nan], decimals=1)
+        '20.5 ± 0.2 (2 of 3)'
+    """
+    if not unit > 0:
+        raise ValueError(f"unit must be positive, got {unit}.")
+    scaled = [value / unit for value in values]
+    mean, std = mean_std(scaled)
+    count = sum(map(math.isfinite, scaled))
+    note = f" ({count} of {len(scaled)})" if 0 < count < len(scaled) else ""
+    if not count:
+        return _ABSENT
+    if decimals is None:
+        if not std > 0:
+            return f"{_number(mean)}{' ± 0' if std == 0 else ''}{note}"
+        # Round first: a deviation of 0.0999 becomes 0.10, with one decimal less.
+        decimals = max(0, 1 - math.floor(math.log10(float(f"{std:.1e}"))))
+    spread = "" if math.isnan(std) else f" ± {std:.{decimals}f}"
+    return f"{mean:.{decimals}f}{spread}{note}"
+
+
+def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
+    """Return rows, mappings from column to content, as a Markdown table that ends with a line break.
+
+    Text is kept, floats get four digits; what is missing, None or not finite becomes ``n/a``. The columns, at least
+    one, are also the headers. Columns of words are left-aligned, as is the first; columns of figures right-aligned.
+
+    Example:
+        >>> print(markdown_table([{"run": "baseline", "PSNR": 19.36}, {"run": "dropout"}], ["run", "PSNR"]), end="")
+        | run | PSNR |
+        |:---|---:|
+        | baseline | 19.36 |
+        | dropout | n/a |
+    """
+    if not columns:
+        raise ValueError("a table needs at least one column.")
+    lines = [[_cell(row.get(column)) for column in columns] for row in rows]
+    words = {place for line in lines for place, cell in enumerate(line) if cell != _ABSENT and not _FIGURE.match(cell)}
+    rule = [":---" if place in {0, *words} else "---:" for place in range(len(columns))]
+    text = [f"| {' | '.join(line)} |" for line in [[_cell(column) for column in columns], *lines]]
+    return "\n".join([text[0], f"|{'|'.join(rule)}|", *text[1:], ""])
+
+
+def print_table(markdown: str, *, width: int | None = None) -> None:
+    """Print a Markdown table; to a terminal as one that fits its width, with the best models and strategies in bold.
+
+    A table that is too wide is turned around if that helps: many quantities of few strategies are read as rows.
+
+    Args:
+        markdown: from `markdown_table`.
+        width: of the terminal, in characters; by default found out.
+    """
+    if not sys.stdout.isatty():
+        print(markdown, flush=True)
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(width=width, highlight=False)
+    head, rule, *rows = [
+        [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+        for line in markdown.strip().splitlines()
+    ]
+    aligned = ["left" if cell.startswith(":") else "right" for cell in rule]
+    best = _best(head, rows) if head[0] in ("strategy", "model") else set()
+    cells = [[Text(cell, "bold" if (i, j) in best else "") for j, cell in enumerate(row)] for i, row in enumerate(rows)]
+    title, *others = head
+    widths = [
+        max(map(len, column)) for column in zip(*([cell for cell in line] for line in [head, *rows]), strict=True)
+    ]
+    turned = [max(map(len, head)), *(max(map(len, row)) for row in rows)]
+    figures = all(align == "right" for align in aligned[1:])
+    if sum(widths) + 3 * len(widths) > console.width >= sum(turned) + 3 * len(turned) and figures:
+        cells = [[Text(name), *(row[j] for row in cells)] for j, name in enumerate(others, start=1)]
+        head, aligned = [title, *(row[0] for row in rows)], ["left", *["right"] * len(rows)]
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for name, align in zip(head, aligned, strict=True):
+        table.add_column(name, justify="left" if align == "left" else "right")
+    for line in cells:
+        table.add_row(*line)
+    console.print(table)
+
+
+def _best(head: Sequence[str], rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
+    """Return row and column of the best figure of every column at unseen views; all that share it."""
+    found = set()
+    for j, title in enumerate(head):
+        words = next((words for words in _HIGHEST_IS_BEST if title.endswith(words)), None)
+        if words is None or title.startswith("train"):
+            continue  # at training views the best fit is no merit
+        figures = {i: float(row[j].split()[0]) for i, row in enumerate(rows) if row[j] != _ABSENT}
+        best = (max if _HIGHEST_IS_BEST[words] else min)(figures.values(), default=None)
+        found |= {(i, j) for i, figure in figures.items() if figure == best}
+    return found
+
+
+def _table(
+    first: str, rows: Mapping[str, Mapping[str, Any]], names: Sequence[str], settings: Mapping[str, Any] | None = None
+) -> str:
     """Return labeled rows of quantities in their units; None and nan become n/a."""
+    settings = settings or {}
+    rate = settings.get("drop_rate")
+    drawn = "by its regularizer" if rate is None and settings else f"drop rate {rate:g}" if rate is not None else ""
+    renders = ", ".join(filter(None, [f"{settings.get('samples') or 5} renders", drawn]))
+    at = f" at {drawn}" if rate is not None else " at its own drop rate"
+    titles = {name: _SHOWN[name][0].format(at=at, renders=renders) for name in names}
     cells: list[dict[str, object]] = []
     for label, row in rows.items():
-        known = {_TITLES.get(name, name): row[name] / _unit(name) for name in names if row.get(name) is not None}
-        cells.append({first: label} | known)
-    return markdown_table(cells, [first, *(_TITLES.get(name, name) for name in names)])
+        known = {name: row[name] / _unit(name) for name in names if row.get(name) is not None}
+        shown = {titles[name]: f"{x:.{_SHOWN[name][1]}f}" for name, x in known.items() if math.isfinite(x)}
+        cells.append({first: label, **shown})
+    return markdown_table(cells, [first, *titles.values()])
 
 
 def _unit(name: str) -> float:
     """Return the unit in which a quantity is shown."""
     return 1e-3 if name.startswith("ca") else 1.0
+
+
+def _cell(value: object) -> str:
+    """Return one table cell; a bar or a line break inside would split it."""
+    text = _number(value) if isinstance(value, float) else _ABSENT if value is None else str(value)
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def _number(value: float) -> str:
+    """Return a number with four significant digits, but with all digits before the decimal point."""
+    if not math.isfinite(value):
+        return _ABSENT
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"

@@ -12,7 +12,7 @@ from torch import Tensor
 from ca_reg import CAScore, Chain, GaussianDropout, Params
 from ca_reg.functional import Multiplier
 from ca_reg.regularizers import parse
-from ca_reg.types import RenderFn
+from ca_reg.types import MomentsFn, RenderFn
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import arguments, render_gaussians
 from reference_trainer.render import (
@@ -136,9 +136,14 @@ class TrainedModel:
         renders = render_fn or MaskedRenders(self)
         return CAScore(renders, samples=samples, p=self.dropout, drop_rate=drop_rate, seed=seed)
 
-    def exact_ca_score(self, *, drop_rate: float | None = None, neutral: bool = False) -> CAScore:
-        """Return the limit of `ca_score` for infinitely many samples, over the pixels of expected alpha above 0.8."""
-        return CAScore.exact(self.moments, p=self.dropout, drop_rate=drop_rate, neutral=neutral)
+    def exact_ca_score(
+        self, *, drop_rate: float | None = None, neutral: bool = False, moments: MomentsFn | None = None
+    ) -> CAScore:
+        """Return the limit of `ca_score` for infinitely many samples, over the pixels of expected alpha above 0.8.
+
+        Pass ``moments``, a function like the method `moments`, if the model still changes.
+        """
+        return CAScore.exact(moments or self.moments, p=self.dropout, drop_rate=drop_rate, neutral=neutral)
 
 
 class MaskedRenders:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -13,6 +14,8 @@ from reference_trainer.scenes.scene import Scene, Viewpoint
 from reference_trainer.scenes.virtual_cameras import camera_between
 
 __all__ = ["interpolate_cameras", "measured_views"]
+
+_log = logging.getLogger(__name__)
 
 
 def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -38,16 +41,16 @@ def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     return path
 
 
-def measured_views(scene: Scene, say: Callable[[str], None]) -> dict[str, Sequence[Viewpoint]]:
+def measured_views(scene: Scene) -> dict[str, Sequence[Viewpoint]]:
     """Return the views of a scene that a model is measured at, by split: ``"train"`` and ``"test"``.
 
-    If all photographs are trained on, viewpoints without one replace the test views, and ``say`` is told so:
+    If all photographs are trained on, viewpoints without one replace the test views, and the log says so:
     ``"between"``, halfway from each training camera to its nearest neighbor, and ``"around"``, as far in the opposite
     direction. Orientations are inter- and extrapolated alike. A single camera has neither.
     """
     if scene.test:
         return {"train": scene.train, "test": scene.test}
-    say(
+    _log.info(
         "No test views: no quality at unseen views, only what needs no photograph there, such as exact CA, measured "
         "between and around the training views."
     )

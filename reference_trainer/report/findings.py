@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,12 @@ from reference_trainer.evaluation.evaluate import ca_picture, error_picture
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.shares import Heat, concentration
+from reference_trainer.evaluation.tables import EXACT
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.report.packing import jpeg, numbers
 from reference_trainer.rotations import rotation_matrices
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.load import evenly_spaced
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 
@@ -91,12 +92,12 @@ class Findings:
         held = concentration(self.heat.shares)
         half = held.pop("half")
         found = {f"held by the {name}": f"{part:.1%}" for name, part in held.items()}
-        score = f"{self.heat.shares.sum().item() * 1e3:.3f}"
-        return {"run": self.label, "exact CA at 1/2 x1e-3": score, **found, "half is held by": f"{half:.2%}"}
+        score = f"{self.heat.shares.sum().item() * 1e3:.2f}"
+        return {"run": self.label, EXACT: score, **found, "half is held by": f"{half:.2%}"}
 
 
 @torch.no_grad()
-def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
+def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Collection[str] = ()) -> Findings:
     """Draw a run's last checkpoint from its views, and attribute the exact score at drop rate 1/2 to its Gaussians.
 
     Args:
@@ -104,15 +105,16 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu") -> Findings:
         label: what the page calls it.
         views: how many of each split, evenly spaced.
         device: where to render.
+        trust: as for `load_run`.
 
     Raises:
         FileNotFoundError: if the folder holds no run.
     """
-    model, scene = of_run(run, device)
+    model, scene = load_run_model(run, device, trust=trust)
     notes: list[str] = []
     if model.depends_on_camera:
         notes.append(f"{label}: its test-time opacities depend on the camera; the model is drawn with the plain ones.")
-    found = sorted(measured_views(scene, lambda text: None).items(), key=lambda item: item[0] == "train")
+    found = sorted(measured_views(scene).items(), key=lambda item: item[0] == "train")
     chosen = {split: [of[i].to(device) for i in evenly_spaced(len(of), min(views, len(of)))] for split, of in found}
     flat = [view for of in chosen.values() for view in of]
     heat = None
@@ -134,5 +136,5 @@ def _pictures(model: TrainedModel, view: Viewpoint, result: CAResult | None) -> 
         said.append(f"PSNR {psnr(image, view.image, view.mask):.2f} dB")
     if result is not None and result.reason is Reason.OK:
         found["co-adaptation"] = jpeg(ca_picture(result))
-        said.append(f"exact CA at 1/2 {result.value * 1e3:.2f}e-3")
+        said.append(f"exact CA {result.value * 1e3:.2f}e-3")
     return found | {"caption": ", ".join(said)}

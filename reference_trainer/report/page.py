@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -16,20 +17,20 @@ import torch
 
 from ca_reg.monitor import read_dynamics
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ERROR_PICTURE_RANGE
-from reference_trainer.evaluation.pictures import heat_map
-from reference_trainer.evaluation.results import markdown_table
+from reference_trainer.evaluation.pictures import dynamics_figure, heat_map
 from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE
-from reference_trainer.evaluation.tables import comparison_table, evaluation_table
+from reference_trainer.evaluation.tables import comparison_table, evaluation_table, markdown_table
 from reference_trainer.files import write_text
 from reference_trainer.report.findings import Findings, find
 from reference_trainer.report.packing import data_uri, jpeg
-from reference_trainer.runs.figures import dynamics_figure
-from reference_trainer.runs.folder import CONFIG, RESULTS, read_results, read_run_settings
+from reference_trainer.runs.folder import CONFIG, RESULTS, read_results, read_run_settings, report_file, runs_of
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["labels", "write_report"]
+
+_log = logging.getLogger(__name__)
 
 
 def write_report(
@@ -38,7 +39,7 @@ def write_report(
     *,
     views: int = 8,
     device: str = "cpu",
-    say: Callable[[str], None] = print,
+    trust: Collection[str] = (),
 ) -> Path:
     """Write a page about runs on one scene that opens without a server or a network.
 
@@ -49,28 +50,28 @@ def write_report(
     lacks is left out, and the page says so.
 
     Args:
-        runs: their folders, finished or not.
+        runs: their folders, finished or not; the folder of a comparison stands for the first seed of each strategy.
         out: the file; by default ``report.html`` in the folder of the run, or in the deepest folder common to all.
         views: how many views of each split are shown and measured, evenly spaced.
         device: where to render.
-        say: receives the progress.
+        trust: as for `load_run`.
 
     Returns:
         The file.
 
     Raises:
-        ValueError: if there is no run, one is given twice, their scenes differ, a file is damaged, or ``out`` is a
-            folder.
+        ValueError: if there is no run, one is given twice, their scenes differ, a file is damaged, ``out`` is a folder
+            or somebody else's file, or a run names code that is not trusted.
         FileNotFoundError: if a folder holds no run.
     """
     if views < 1:
         raise ValueError(f"expected at least 1 view of each split, got {views}.")
-    if out is not None and out.is_dir():
-        raise ValueError(f"{out} is a folder: --out is the file to write, such as {out / 'report.html'}.")
+    folders, runs = runs, [run for folder in runs for run in runs_of(folder) or [folder]]
     names, found = labels(runs), list[Findings]()
+    out = report_file(folders, out)
     for run, label in zip(runs, names, strict=True):
-        say(f"[{len(found) + 1}/{len(runs)}] {run}")
-        found.append(find(run, label, views=views, device=device))
+        _log.info("[%d/%d] %s", len(found) + 1, len(runs), run)
+        found.append(find(run, label, views=views, device=device, trust=trust))
         if found[-1].scene.name != found[0].scene.name:
             raise ValueError(
                 f"a report is about one scene, whose models turn together, but {runs[0]} was trained on "
@@ -83,9 +84,8 @@ def write_report(
         data=json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c"),  # nothing ends the script
         script=_part("models.js") + _part("page.js"),
     )
-    out = out or Path(os.path.commonpath([run.absolute() for run in runs])) / "report.html"
     write_text(out, page)
-    say(f"The report is {out} ({out.stat().st_size / 1e6:.1f} MB): open it in a browser")
+    _log.info("The report is %s (%.1f MB): open it in a browser", out, out.stat().st_size / 1e6)
     return out
 
 

@@ -1,14 +1,21 @@
-"""Comparisons: the same training with different regularizers over several scenes and seeds."""
+"""Comparisons: the same training with different regularizers over several scenes and seeds, and their tables."""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
+import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from reference_trainer.runs.compare_report import Comparison, save
-from reference_trainer.runs.engines.engine import Failure
-from reference_trainer.runs.folder import RESULTS, folder_name
+from reference_trainer.evaluation.pictures import comparison_figure, dynamics_figure, file_names
+from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.tables import comparison_table
+from reference_trainer.files import write_text
+from reference_trainer.runs.executors.executor import Failure
+from reference_trainer.runs.folder import COMPARISON, RESULTS, check_output, folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
@@ -16,8 +23,10 @@ from reference_trainer.training.assembly import check, make_losses
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import LossTerm
 
-__all__ = ["NAMED", "compare", "scene_folders", "strategies"]
+__all__ = ["NAMED", "TABLE", "Comparison", "compare", "report", "save", "scene_folders", "strategies"]
 
+TABLE = "comparison.md"
+_log = logging.getLogger(__name__)
 
 NAMED: dict[str, set[str]] = {
     "baseline": set(),
@@ -114,8 +123,11 @@ def compare(
         For every folder the results of the finished runs and the failures of the others; both are also written there.
 
     Raises:
-        ValueError: if there is nothing to run, or a scene lacks what a term of the loss needs.
+        ValueError: if there is nothing to run, a scene lacks what a term of the loss needs, or a folder holds a table
+            or a figure of somebody else's.
     """
+    for folder, options in scenes.items():
+        check_output(folder, options.path, () if (folder / COMPARISON).exists() else (TABLE, "dynamics.png"))
     if not scenes or not configs or not seeds:
         raise ValueError(
             f"expected at least 1 scene, 1 strategy and 1 seed, got {len(scenes)}, {len(configs)} and {len(seeds)}."
@@ -150,3 +162,68 @@ def compare(
 def _label(name: str, seed: int) -> str:
     """Return the label of a run among those of its scene."""
     return f"{name}, seed {seed}"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The results of all runs on one scene.
+
+    Args:
+        runs: for every strategy the content of ``results.json`` of each finished seed.
+        failures: runs that did not finish, and why.
+    """
+
+    runs: dict[str, list[dict[str, Any]]]
+    failures: dict[str, Failure]
+
+
+def save(comparison: Comparison, out: Path) -> None:
+    """Write the results as JSON, and the table if any run finished.
+
+    Args:
+        comparison: the results.
+        out: folder of the comparison.
+    """
+    write_json(out / COMPARISON, {**dataclasses.asdict(comparison), "machine": machine()})
+    if comparison.runs:
+        write_text(out / TABLE, comparison_table(comparison.runs) + "\n")
+
+
+def report(comparisons: Mapping[Path, Comparison]) -> None:
+    """Log the table of every scene, draw the figures of its first seed, and name the runs that failed.
+
+    Args:
+        comparisons: the results by folder.
+    """
+    for out, comparison in comparisons.items():
+        _log.info(f"\n{out.name}:\n" if len(comparisons) > 1 else "")
+        if comparison.runs:
+            _report(comparison, out)
+    failed = [(out, name, why) for out, of in comparisons.items() for name, why in of.failures.items()]
+    if failed:
+        finished = sum(len(runs) for of in comparisons.values() for runs in of.runs.values())
+        _log.info("")
+        _log.info("%d of %d runs FAILED; the same command tries them again:", len(failed), finished + len(failed))
+        for out, name, why in failed:
+            _log.info("FAILED %s: %s (%s has the traceback)", name, why.error, out / COMPARISON)
+
+
+def _report(comparison: Comparison, out: Path) -> None:
+    """Log the table of one scene and draw its figures."""
+    _log.info(comparison_table(comparison.runs))
+    first = {name: out / name / f"seed_{of[0]['config']['seed']}" for name, of in comparison.runs.items()}
+    try:
+        dynamics_figure(first, out / "dynamics.png")
+        _log.info("CA and PSNR against the iteration: %s", out / "dynamics.png")
+    except (FileNotFoundError, ValueError) as error:  # runs of --monitor-every 0
+        _log.info("no figure of CA and PSNR against the iteration: %s", error)
+    views = next(iter(comparison.runs.values()))[0]["views"]
+    splits, drawn = {view["split"] for view in views}, list[Path]()
+    for split in sorted(splits - {"train"}) or splits:
+        for name in file_names([view["name"] for view in views if view["split"] == split]):
+            drawn.append(out / f"{split}_{name}.png")
+            comparison_figure(first, drawn[-1], view=name, split=split)
+    _log.info("every view under each strategy: %s%s", drawn[0], f" and {len(drawn) - 1} more" * (len(drawn) > 1))
+    _log.info(
+        "table and all numbers: %s, %s; curves: tensorboard --logdir %s", out / TABLE, COMPARISON, shlex.quote(str(out))
+    )

@@ -1,10 +1,18 @@
-"""The folder of a run: the names of its files, and the settings that claim it."""
+"""The folder of a run: the names of its files, the settings that claim it, and the lock for one process at a time.
+
+Imports no torch: the command line checks folders with it before it loads anything that takes seconds.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import errno
+import os
 import re
-from collections.abc import Collection
+import socket
+import warnings
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +22,9 @@ from reference_trainer.training.config import TrainConfig, saved_config
 from reference_trainer.training.plan import Plan
 
 __all__ = [
-    "BAKED_PLY", "CHECKPOINT", "CONFIG", "PLAN", "PLY", "RESULTS", "VIEWS",
-    "begun_with", "folder_name", "read_results", "read_run_settings", "run_settings",
+    "BAKED_PLY", "CHECKPOINT", "COMPARISON", "CONFIG", "LOCK", "PLAN", "PLY", "RESULTS", "VIEWS", "FolderInUseError",
+    "check_output", "check_run", "check_trusted", "folder_name", "modules_named", "read_results", "read_run_settings",
+    "report_file", "run_lock", "run_settings", "runs_of", "settings_of_run",
 ]  # fmt: skip
 
 CONFIG = "config.json"
@@ -25,6 +34,10 @@ PLY = "point_cloud.ply"
 BAKED_PLY = "point_cloud_for_viewers.ply"
 VIEWS = "views"  # here and in the folder of an evaluation
 RESULTS = "results.json"
+COMPARISON = "comparison.json"  # of several runs
+
+_OWN_PAGE = b'<meta name="generator" content="ca-reg report">'  # near the beginning of report/page.html
+_CODE = ("regularizer", "loss", "density", "renderer", "format")  # settings that may name a module:Class
 
 
 def folder_name(text: str) -> str:
@@ -66,7 +79,7 @@ def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
     return scene, saved_config(content["config"], f"{path}, config")
 
 
-def begun_with(
+def settings_of_run(
     out: Path, options: SceneOptions, config: TrainConfig, *, auto: bool, given: Collection[str]
 ) -> TrainConfig | None:
     """Return the settings that the run in a folder began with, None if none has begun.
@@ -79,12 +92,14 @@ def begun_with(
         given: the settings that no plan changes.
 
     Raises:
-        ValueError: if the folder holds a run with other settings, a checkpoint without settings, or a damaged file.
+        ValueError: if the folder holds a run with other settings, a checkpoint without settings, or a damaged file;
+            or no run, but files that a run would overwrite, or the photographs.
     """
     trained = (out / CHECKPOINT).exists()  # looked for first: another process writes it last
     if not (out / CONFIG).exists():
         if trained:
             raise ValueError(f"{out} holds a {CHECKPOINT} but no {CONFIG}: give another folder, or delete this one.")
+        check_output(out, options.path, (PLY, BAKED_PLY, RESULTS, VIEWS))
         return None
     if auto and (out / PLAN).exists():
         try:
@@ -103,6 +118,101 @@ def begun_with(
             f"{out} holds a run with other settings ({'; '.join(changed)}): give another folder, or delete this one."
         )
     return config
+
+
+def check_output(folder: Path, scene: str | Path | None, files: Collection[str]) -> None:
+    """Refuse to write into a folder of somebody else's.
+
+    Args:
+        folder: where to write.
+        scene: the folder of the photographs, which is never written to.
+        files: names of what would be overwritten, although nothing says that this program wrote it.
+
+    Raises:
+        ValueError: if ``folder`` is the scene, or holds one of the files.
+    """
+    if scene not in (None, "synthetic") and folder.exists() and folder.resolve() == Path(str(scene)).resolve():
+        raise ValueError(f"{folder} is the folder of the scene, to which nothing is written: give another --out.")
+    if foreign := [name for name in files if (folder / name).exists()]:
+        raise ValueError(
+            f"{folder} holds {', '.join(foreign)}, but nothing says that this command wrote it: give another --out."
+        )
+
+
+def check_run(folder: Path) -> None:
+    """Refuse a folder that holds no run, saying what it holds instead.
+
+    Raises:
+        FileNotFoundError: if it has no ``config.json``.
+    """
+    if (folder / CONFIG).is_file():
+        return
+    found = f"{folder} holds no run (no {CONFIG}): give the --out folder of ca-reg train"
+    if not folder.exists():
+        found = f"{folder} holds no run: there is no such folder; give the --out folder of ca-reg train"
+    elif folder.is_file():
+        found = f"{folder} is neither a run nor a PLY: give the --out folder of ca-reg train, or a standard 3DGS .ply"
+        if folder.suffix.lower() in (".pt", ".pth", ".ckpt"):
+            found += ", which the program that wrote this checkpoint can export"
+    elif inside := [path for path in runs_of(folder) if path != folder]:
+        found = f"{folder} holds no run itself, but {len(inside)} below it: give one, such as {inside[0]}"
+    raise FileNotFoundError(f"{found}.")
+
+
+def runs_of(folder: Path) -> list[Path]:
+    """Return the runs of a folder: itself, or of a comparison the first seed of every strategy, in its order."""
+    if (folder / CONFIG).is_file():
+        return [folder]
+    order: list[str] = []
+    with suppress(OSError, ValueError, AttributeError, TypeError):
+        order = [*read_json(folder / COMPARISON)["runs"]]
+    seeds = sorted(folder.glob(f"*/seed_*/{CONFIG}"), key=lambda path: int(path.parent.name[5:] or 0))
+    first: dict[str, Path] = {}
+    for path in seeds:
+        first.setdefault(path.parents[1].name, path.parent)
+    return [first[name] for name in sorted(first, key=lambda name: (name not in order, [*order, name].index(name)))]
+
+
+def report_file(runs: Sequence[Path], out: Path | None = None) -> Path:
+    """Return the file of a report: ``out``, or ``report.html`` in the run, or in the deepest folder common to all.
+
+    Raises:
+        ValueError: if it is a folder, or a file that is no report of this program.
+    """
+    if out is not None and out.is_dir():
+        raise ValueError(f"{out} is a folder: --out is the file to write, such as {out / 'report.html'}.")
+    file = out or Path(os.path.commonpath([run.absolute() for run in runs])) / "report.html"
+    if file.exists():
+        with file.open("rb") as content:
+            if _OWN_PAGE not in content.read(1_000):
+                raise ValueError(f"{file} is no report of ca-reg and is not overwritten: give another --out.")
+    return file
+
+
+def modules_named(settings: Any) -> set[str]:
+    """Return the modules that settings, or an expression, name as module:Class: using them would import these.
+
+    Example:
+        >>> sorted(modules_named(TrainConfig(regularizer="dropout(0.1) + mine.drops:Mine(0.2)")))
+        ['mine.drops']
+    """
+    texts = [settings] if isinstance(settings, str) else [getattr(settings, name, "") for name in _CODE]
+    # The registries read module.Class like module:Class; what stands in quotes or is a number names nothing.
+    bare = [re.sub(r"'[^']*'|\"[^\"]*\"", "''", text) for text in texts if isinstance(text, str)]
+    return {found[1] for text in bare for found in re.finditer(r"([A-Za-z_][\w.]*)[.:][A-Za-z_]\w*", text)}
+
+
+def check_trusted(where: Path, settings: Any, trust: Collection[str]) -> None:
+    """Refuse settings read from a file that would import a module which nobody has named on the command line.
+
+    Raises:
+        ValueError: with the module, and how to name it.
+    """
+    if unknown := sorted(modules_named(settings) - set(trust)):
+        raise ValueError(
+            f"{where} was trained with code of {', '.join(unknown)}, which is not imported because a file says so. If "
+            f"it is yours, say --trust {' '.join(unknown)}."
+        )
 
 
 def read_results(out: Path) -> dict[str, Any]:
@@ -132,3 +242,79 @@ def _is_row(row: Any) -> bool:
     return isinstance(row, dict) and all(
         isinstance(x, str if name in ("name", "split", "ca_reason") else float | None) for name, x in row.items()
     )
+
+
+LOCK = ".lock"
+_HOLDER = ".lock.holder"  # a separate file, because on Windows a locked file cannot be read
+_KNOWN_HOLDER = re.compile(r"process \d+ on [\w.-]+")
+_NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOLCK)
+
+
+class FolderInUseError(RuntimeError):
+    """Another process is at work in the folder of a run."""
+
+
+@contextmanager
+def run_lock(folder: Path) -> Iterator[None]:
+    """Lock a folder, made if missing, against other processes that ask for the same lock.
+
+    The operating system releases the lock when the process ends, however it ends: there are no stale locks, although
+    the empty file ``.lock`` stays. The lock is advisory: readers are not kept out. On a network file system that
+    supports locks it holds across machines; on one that does not, a warning is issued and the folder used unlocked.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        FolderInUseError: at once, if the folder is locked; nothing in it was touched.
+        OSError: if the lock file cannot be made.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder, run_lock(Path(folder)):
+        ...     with run_lock(Path(folder)):
+        ...         pass
+        Traceback (most recent call last):
+        ...
+        reference_trainer.runs.folder.FolderInUseError: ...: another process is at work there (process ...
+    """
+    from filelock import FileLock, Timeout
+
+    folder.mkdir(parents=True, exist_ok=True)
+    # Without locks in the system, filelock would fall back to a marker file, which outlives a killed process.
+    lock = FileLock(folder / LOCK, fallback_to_soft=False)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise FolderInUseError(
+            f"{folder}: another process is at work there ({_holder(folder)}). Nothing was changed: wait until it ends, "
+            f"stop it (on Ctrl-C it saves a checkpoint), or give another folder."
+        ) from None
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+        warnings.warn(
+            f"{folder} is on a file system without locks ({error.strerror}): take care that no other process works in "
+            f"it, or two runs overwrite each other's files.",
+            RuntimeWarning,
+            stacklevel=3,  # past contextlib
+        )
+    try:
+        if lock.is_locked:
+            with suppress(OSError):  # no run must fail over a note
+                (folder / _HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
+        yield
+    finally:
+        if lock.is_locked:
+            with suppress(OSError):
+                (folder / _HOLDER).unlink()
+            lock.release()
+
+
+def _holder(folder: Path) -> str:
+    """Return who holds the lock, as far as known."""
+    with suppress(OSError, ValueError), (folder / _HOLDER).open(encoding="utf-8") as file:
+        text = file.read(200)
+        if _KNOWN_HOLDER.fullmatch(text):
+            return text
+    return "which one is not known"

@@ -1,7 +1,8 @@
-"""Grids of runs on an engine: finished runs are kept, interrupted ones continue, failing ones do not stop the rest."""
+"""Grids of runs: finished ones are kept, interrupted ones continue, failing ones do not stop the rest."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,14 +11,15 @@ from typing import Any
 import torch
 
 from reference_trainer.render import chosen_engine, use_engine
-from reference_trainer.runs.engines.engine import Engine, Failure, Task, Value, attempt
-from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.executors.executor import Executor, Failure, Task, Value, attempt, run_all
 from reference_trainer.runs.folder import RESULTS
-from reference_trainer.runs.run import check_intervals, run_experiment
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["Run", "Running", "run_grid", "train_run"]
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -42,28 +44,23 @@ class Running:
     """How the runs of a grid are executed; this does not affect what is trained.
 
     Args:
-        engine: where to run.
+        executor: where to run.
         retries: how many dead workers of one run are replaced; each continues from the last checkpoint.
         device: where to train.
-        monitor_every: steps between measurements of CA and PSNR; 0 for none.
-        checkpoint_every: steps between checkpoints, the most that a dead worker costs.
+        monitoring: what is measured and saved on the way.
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
-        say: receives a line about every run and every worker that died.
 
     Raises:
-        ValueError: if ``retries`` is negative, or an interval out of range.
+        ValueError: if ``retries`` is negative.
     """
 
-    engine: Engine
+    executor: Executor
     retries: int = 3
     device: str = "cpu"
-    monitor_every: int = 500
-    checkpoint_every: int = 500
+    monitoring: Monitoring = Monitoring()  # noqa: RUF009, frozen
     lpips: str | None = None
-    say: Callable[[str], None] = lambda text: None
 
     def __post_init__(self) -> None:
-        check_intervals(self.monitor_every, self.checkpoint_every)
         if self.retries < 0:
             raise ValueError(f"expected retries of at least 0, got {self.retries}.")
 
@@ -87,7 +84,8 @@ def run_grid(
 
     def note(number: int, outcome: Value | Failure, when: str) -> None:
         outcomes[number] = outcome.value if isinstance(outcome, Value) else outcome
-        running.say(f"[{len(outcomes)}/{len(runs)}] {runs[number].label}: {_line(outcomes[number], when)}")
+        line = _line(outcomes[number], when)
+        _log.info("[%d/%d] %s: %s", len(outcomes), len(runs), runs[number].label, line)
         if isinstance(outcome, Value):
             done(runs[number], outcome.value)
 
@@ -98,11 +96,10 @@ def run_grid(
         else:
             run.out.mkdir(parents=True, exist_ok=True)
             lpips = running.lpips if running.lpips in (None, "installed") else str(Path(running.lpips).resolve())
-            how = {"device": running.device, "lpips": lpips, "monitor_every": running.monitor_every}
-            how["checkpoint_every"] = running.checkpoint_every
+            how = {"device": running.device, "lpips": lpips, "monitoring": running.monitoring}
             tasks[number] = Task(run.label, train_run, (*_where(run), chosen_engine(), how))
     numbers = list(tasks)
-    for index, outcome in run_all(running.engine, list(tasks.values()), retries=running.retries, say=running.say):
+    for index, outcome in run_all(running.executor, list(tasks.values()), retries=running.retries):
         note(numbers[index], outcome, "now")
     for number in numbers:  # a run that failed here because another sweep held its folder may be finished by now
         if isinstance(outcomes[number], Failure) and (runs[number].out / RESULTS).exists():

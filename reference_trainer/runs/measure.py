@@ -2,34 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import logging
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from ca_reg.regularizers import parse
 from reference_trainer.evaluation.evaluate import Evaluation, evaluate
-from reference_trainer.evaluation.kept import PARTIAL
 from reference_trainer.evaluation.lpips import LPIPS
-from reference_trainer.evaluation.pictures import file_names, save_gif, save_png
-from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.pictures import file_names, is_own_png, save_gif, save_png
+from reference_trainer.evaluation.results import PARTIAL, machine, write_json
 from reference_trainer.evaluation.tables import evaluation_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import remove_leftovers, write_text
-from reference_trainer.runs.folder import VIEWS
-from reference_trainer.runs.lock import run_lock
+from reference_trainer.runs.folder import VIEWS, check_output, run_lock
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene, Viewpoint
 from reference_trainer.threads import threads_for
 
-__all__ = ["measure", "of_run", "render_run"]
+__all__ = ["load_run_model", "measure", "render_run"]
 
-Say = Callable[[str], None]
+EVALUATION = "evaluation.json"
+_log = logging.getLogger(__name__)
 
 
-def of_run(run: Path, device: str = "cpu", *, regularizer: str | None = None) -> tuple[TrainedModel, Scene]:
+def load_run_model(
+    run: Path, device: str = "cpu", *, regularizer: str | None = None, trust: Collection[str] = ()
+) -> tuple[TrainedModel, Scene]:
     """Return a run's model at its last checkpoint, and its scene.
 
     Args:
@@ -37,12 +40,13 @@ def of_run(run: Path, device: str = "cpu", *, regularizer: str | None = None) ->
         device: where to render.
         regularizer: treat the model as if it had been trained with these, such as "noise(0.8, scale=True)" for a run
             with "noise(0.8)"; by default with those of the run.
+        trust: as for `load_run`.
 
     Raises:
         FileNotFoundError: if the folder holds no run.
-        ValueError: if the expression cannot be parsed.
+        ValueError: if the expression cannot be parsed, or the run names code that is not trusted.
     """
-    trainer = load_run(run, device)
+    trainer = load_run(run, device, trust=trust)
     model = model_of(trainer)
     if regularizer is not None:
         parse(regularizer)
@@ -59,7 +63,6 @@ def measure(
     samples: int = 5,
     seed: int = 0,
     perceptual: LPIPS | None = None,
-    say: Say = print,
 ) -> Evaluation:
     """Measure a model at views; write ``evaluation.json``, ``evaluation.md`` and pictures, and print the table.
 
@@ -73,53 +76,67 @@ def measure(
         samples: K of the CA score.
         seed: of its masks.
         perceptual: a perceptual metric.
-        say: receives the table and the progress.
+
+    Raises:
+        ValueError: if ``out`` holds files of these names that are not from here.
     """
-    keep, largest = out / PARTIAL, max(view.camera.width * view.camera.height for of in views.values() for view in of)
+    if not ((out / EVALUATION).exists() or (out / PARTIAL).exists()):
+        check_output(out, None, ("evaluation.md", VIEWS))
+    partial = out / PARTIAL
+    largest = max(view.camera.width * view.camera.height for of in views.values() for view in of)
     with run_lock(out), threads_for(largest):
         remove_leftovers(out / VIEWS)
-        result = evaluate(
-            model, views, samples=samples, seed=seed, perceptual=perceptual, pictures=out / VIEWS, keep=keep, say=say
-        )
+        shared: dict[str, Any] = {"samples": samples, "seed": seed}
+        result = evaluate(model, views, perceptual=perceptual, pictures=out / VIEWS, partial=partial, **shared)
         data = {
             **about,
             **result.as_dict(),
-            "ca_settings": asdict(model.ca_score(samples=samples, seed=seed).settings),
+            "ca_settings": asdict(model.ca_score(**shared).settings),
             "background": model.background.tolist(),
             "regularizer": model.regularizer,
             "machine": machine(),
         }
-        write_json(out / "evaluation.json", data)
+        write_json(out / EVALUATION, data)
         table = evaluation_table(data)
         write_text(out / "evaluation.md", table + "\n")
-        keep.unlink(missing_ok=True)
-    say(table)
-    say(f"Scores and pictures are in {out}")
+        partial.unlink(missing_ok=True)
+    _log.info(table)
+    _log.info("Scores and pictures are in %s", out)
     return result
 
 
 @torch.no_grad()
 def render_run(
-    run: Path, what: str, out: Path | None = None, *, frames: int = 60, device: str = "cpu", say: Say = print
+    run: Path,
+    what: str = "auto",
+    out: Path | None = None,
+    *,
+    frames: int = 60,
+    device: str = "cpu",
+    trust: Collection[str] = (),
 ) -> Path:
     """Render a run with its test-time opacities.
 
     Args:
         run: folder of the run.
-        what: ``"test"``, ``"train"``, or ``"flight"`` through the training cameras.
+        what: ``"test"``, ``"train"``, ``"flight"`` through the training cameras, or ``"auto"``: the test views, or if
+            there is none the training views.
         out: folder for PNG files, and for a flight also a GIF; ``<run>/render_<what>`` by default.
         frames: number of pictures of a flight.
         device: where to render.
-        say: receives where the pictures are.
+        trust: as for `load_run`.
 
     Returns:
         The folder.
 
     Raises:
-        ValueError: if there is no test view to render.
+        ValueError: if there is no test view to render, or a picture of somebody else's would be overwritten.
     """
-    model, scene = of_run(run, device)
-    folder = out or run / f"render_{what}"
+    model, scene = load_run_model(run, device, trust=trust)
+    if what == "auto":
+        what = "test" if scene.test else "train"
+        if not scene.test:
+            _log.info("The scene has no test view: these are the training views; --what flight moves between them.")
     views: Sequence[Viewpoint]
     if what == "flight":
         path = interpolate_cameras([view.camera for view in scene.train], frames)
@@ -128,13 +145,15 @@ def render_run(
         views = scene.test if what == "test" else scene.train
     if not views:
         raise ValueError(f"the scene of {run} has no test view: give --what train or --what flight.")
+    folder, names = out or run / f"render_{what}", file_names([view.name for view in views])
+    check_output(folder, None, [f"{name}.png" for name in names if not is_own_png(folder / f"{name}.png")])
     images = []
-    for name, view in zip(file_names([view.name for view in views]), views, strict=True):
+    for name, view in zip(names, views, strict=True):
         with threads_for(view.camera.width * view.camera.height):
             image = model.test_rendering(view.to(device)).image
         images.append(image.clamp(0, 1).cpu())
         save_png(folder / f"{name}.png", images[-1])
     if what == "flight":
         save_gif(folder / "flight.gif", images)
-    say(f"{len(images)} pictures are in {folder}")
+    _log.info("%d pictures are in %s", len(images), folder)
     return folder

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import signal
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,10 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAMonitor
-from reference_trainer.evaluation.evaluate import evaluate, glance
-from reference_trainer.evaluation.kept import PARTIAL
+from reference_trainer.evaluation.evaluate import evaluate, training_snapshot
 from reference_trainer.evaluation.lpips import LPIPS, load_lpips
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.results import PARTIAL, machine, write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.files import remove_leftovers
@@ -31,12 +32,15 @@ from reference_trainer.runs.folder import (
     PLY,
     RESULTS,
     VIEWS,
-    begun_with,
+    check_run,
+    check_trusted,
+    modules_named,
     read_results,
     read_run_settings,
+    run_lock,
     run_settings,
+    settings_of_run,
 )  # fmt: skip
-from reference_trainer.runs.lock import run_lock
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
@@ -48,16 +52,37 @@ from reference_trainer.training.interruption import TrainingInterrupted, Trainin
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["check_intervals", "load_run", "model_of", "run_experiment", "save_for_viewers"]
+__all__ = ["Monitoring", "load_run", "model_of", "run_experiment", "save_for_viewers"]
+
+_log = logging.getLogger(__name__)
+_CURVES_EVERY = 10  # steps between points of the loss; more would not be told apart in a curve
 
 
-def check_intervals(monitor_every: int, checkpoint_every: int) -> None:
-    """Raise a ValueError unless these numbers of steps are at least 0 and at least 1."""
-    if monitor_every < 0 or checkpoint_every < 1:
-        raise ValueError(
-            f"expected monitor_every of at least 0, for no measurements, and checkpoint_every of at least 1, got "
-            f"{monitor_every} and {checkpoint_every}."
-        )
+@dataclass(frozen=True)
+class Monitoring:
+    """What is measured and saved while a model trains; it does not affect what is trained.
+
+    Args:
+        every: steps between measurements of CA and PSNR, which also takes place after the last step; 0 for none.
+        protocol: whether to log the paper's CA of five renders in the place of the exact score of all tables.
+        pictures: whether each measurement also logs the ``details`` of `CAMonitor` (see `training_snapshot`).
+        checkpoint_every: steps between checkpoints, the most that a dead worker costs.
+
+    Raises:
+        ValueError: if an interval is out of range.
+    """
+
+    every: int = 500
+    protocol: bool = False
+    pictures: bool = False
+    checkpoint_every: int = 500
+
+    def __post_init__(self) -> None:
+        if self.every < 0 or self.checkpoint_every < 1:
+            raise ValueError(
+                f"expected monitor_every of at least 0, for no measurements, and checkpoint_every of at least 1, got "
+                f"{self.every} and {self.checkpoint_every}."
+            )
 
 
 def model_of(trainer: Trainer) -> TrainedModel:
@@ -99,13 +124,10 @@ def run_experiment(
     auto: bool = False,
     given: Collection[str] = (),
     device: torch.device | str = "cpu",
-    monitor_every: int = 500,
-    monitor_pictures: bool = False,
-    checkpoint_every: int = 500,
+    monitoring: Monitoring = Monitoring(),
     lpips: str | None = None,
     progress: bool = False,
-    watch: Callable[[Trainer], None] = lambda trainer: None,
-    say: Callable[[str], None] = lambda text: None,
+    on_step: Callable[[Trainer], None] = lambda trainer: None,
 ) -> dict[str, Any]:
     """Train on a scene and measure the result; continues where an earlier call stopped.
 
@@ -123,20 +145,17 @@ def run_experiment(
             none if it began without.
         given: with ``auto``, fields of ``config`` that the plan must not change although they are at their default.
         device: where to train.
-        monitor_every: steps between measurements of CA and PSNR; 0 for none. A training of fewer steps is measured at
-            its end.
-        monitor_pictures: whether each measurement also logs the ``details`` of `CAMonitor` (see `glance`).
-        checkpoint_every: steps between checkpoints.
+        monitoring: what is measured and saved on the way.
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         progress: whether to show a progress bar.
-        watch: called with the trainer, which it must not change, after every step and before each view is measured.
-        say: receives lines about what is happening.
+        on_step: called with the trainer, which it must not change, after every step and before each view is measured.
 
     Returns:
         The content of ``results.json``.
 
     Raises:
-        ValueError: if an interval is out of range, or the folder holds a run with other settings or a damaged file.
+        ValueError: if the folder holds a run with other settings, a damaged file, or files that this program did not
+            write.
         FolderInUseError: if another process is at work in the folder; nothing there was touched.
         TrainingStoppedError: if training cannot go on; the last checkpoint is kept, and the message names it.
         TrainingInterrupted: on Ctrl-C, after a checkpoint has been saved; a second Ctrl-C does not wait for it. On
@@ -144,62 +163,65 @@ def run_experiment(
         OSError: if a file cannot be written, such as on a full disk; its previous content is kept.
     """
     check(config)
-    check_intervals(monitor_every, checkpoint_every)
     perceptual = load_lpips(lpips, device=device)
-    begun_with(out, options, config, auto=auto, given=given)
+    settings_of_run(out, options, config, auto=auto, given=given)
     if (out / RESULTS).exists():
-        return _complete(out, say)
+        return _complete(out)
     # Before the folder is made, so that a mistyped scene does not claim it.
     scene = load_scene(options, seed=config.seed)
     for note in scene.notes:
-        say(note)
+        _log.info(note)
     with run_lock(out), threads_for(scene.pixels):
-        begun = begun_with(out, options, config, auto=auto, given=given)  # perhaps since, by another process
+        begun = settings_of_run(out, options, config, auto=auto, given=given)  # perhaps since, by another process
         if (out / RESULTS).exists():
-            return _complete(out, say)
-        settings = _planned(scene, config, out, auto=auto, given=given, say=say) if begun is None else begun
+            return _complete(out)
+        settings = _planned(scene, config, out, auto=auto, given=given) if begun is None else begun
         remove_leftovers(out, below=False)  # an evaluation of the run may be writing to a subfolder right now
         remove_leftovers(out / VIEWS)
         resumed = (out / CHECKPOINT).exists()
-        trainer = Trainer.load(out / CHECKPOINT, scene, device) if resumed else Trainer(scene, settings, device)
+        trainer = _load(out, scene, device, modules_named(config)) if resumed else Trainer(scene, settings, device)
         write_json(out / CONFIG, run_settings(options, settings))
         if resumed:
-            say(f"{out}: continues from step {trainer.step}")
+            _log.info("%s: continues from step %d", out, trainer.step)
         else:
             trainer.save(out / CHECKPOINT)
-        with _saved_at_the_end(trainer, out, say):
-            shared: dict[str, Any] = {"resumed": resumed, "progress": progress, "watch": watch, "say": say}
-            _train(trainer, out, monitor_every, checkpoint_every, pictures=monitor_pictures, **shared)
-
-        def go_on(text: str) -> None:  # keeps an open viewer page drawn while views are measured
-            say(text)
-            watch(trainer)
-
-        return _measure(trainer, out, perceptual, go_on)
+        with _saved_at_the_end(trainer, out):
+            _train(trainer, out, monitoring, resumed=resumed, progress=progress, on_step=on_step)
+        return _measure(trainer, out, perceptual, on_step)
 
 
-def load_run(folder: Path, device: torch.device | str = "cpu") -> Trainer:
+def load_run(folder: Path, device: torch.device | str = "cpu", *, trust: Collection[str] = ()) -> Trainer:
     """Load the trainer of a run, finished or not, with its scene.
+
+    Args:
+        folder: of the run.
+        device: where to render.
+        trust: modules that the run's settings may import. A folder may come from anybody, and what its settings name
+            as module:Class would be executed here.
 
     Raises:
         FileNotFoundError: if the folder holds no run.
-        ValueError: if its settings or its checkpoint are damaged, or do not belong together.
+        ValueError: if its settings or its checkpoint are damaged, do not belong together, or name other modules.
     """
-    if not (folder / CONFIG).exists():
-        raise FileNotFoundError(f"{folder} holds no run (no {CONFIG}): give the --out folder of ca-reg train.")
+    check_run(folder)
     options, config = read_run_settings(folder / CONFIG)
-    return Trainer.load(folder / CHECKPOINT, load_scene(options, seed=config.seed), device)
+    for settings in (options, config):
+        check_trusted(folder, settings, trust)
+    return _load(folder, load_scene(options, seed=config.seed), device, trust)
 
 
-def _complete(out: Path, say: Callable[[str], None]) -> dict[str, Any]:
+def _load(folder: Path, scene: Scene, device: torch.device | str, trust: Collection[str]) -> Trainer:
+    """Load the checkpoint of a run, whose settings may name no module but those in ``trust``."""
+    return Trainer.load(folder / CHECKPOINT, scene, device, refuse=lambda config: check_trusted(folder, config, trust))
+
+
+def _complete(out: Path) -> dict[str, Any]:
     """Return the results of a complete run."""
-    say(f"{out}: complete, nothing to do")
+    _log.info("%s: complete, nothing to do", out)
     return read_results(out)
 
 
-def _planned(
-    scene: Scene, config: TrainConfig, out: Path, *, auto: bool, given: Collection[str], say: Callable[[str], None]
-) -> TrainConfig:
+def _planned(scene: Scene, config: TrainConfig, out: Path, *, auto: bool, given: Collection[str]) -> TrainConfig:
     """Return the settings that a run begins with; with ``auto`` those of a plan, which is written."""
     if not auto:
         (out / PLAN).unlink(missing_ok=True)  # left by a run that stopped before its config.json was written
@@ -208,20 +230,22 @@ def _planned(
     write_json(out / PLAN, plan.as_dict())
     changing = [row for row in plan.rows() if row["change"] != "-"]
     for row in changing:
-        say(f"plan: {row['item']} {row['decision']} ({row['change']}): {row['reason']}")
-    say(f"plan: {len(changing)} settings changed, reasons in {out / PLAN}; --no-auto trains exactly as asked")
+        _log.info("plan: %s %s (%s): %s", row["item"], row["decision"], row["change"], row["reason"])
+    changed = "1 setting" if len(changing) == 1 else f"{len(changing)} settings"
+    _log.info("plan: %s changed, reasons in %s; --no-auto trains exactly as asked", changed, out / PLAN)
     return plan.applied(config, given=given)
 
 
 @contextmanager
-def _saved_at_the_end(trainer: Trainer, out: Path, say: Callable[[str], None]) -> Iterator[None]:
+def _saved_at_the_end(trainer: Trainer, out: Path) -> Iterator[None]:
     """Save a training that is interrupted; if it cannot go on, add to the error where the last checkpoint is."""
     checkpoint = out / CHECKPOINT
     try:
         yield
     except TrainingInterrupted as stop:
         trainer.save(checkpoint)
-        say(f"{out}: saved at step {trainer.step} of {trainer.config.iterations}; the same command continues there")
+        last = trainer.config.iterations
+        _log.info("%s: saved at step %d of %d; the same command continues there", out, trainer.step, last)
         if stop.signal == signal.SIGTERM:  # its sender expects the process to die of it
             sys.stdout.flush()
             signal.raise_signal(signal.SIGTERM)
@@ -234,73 +258,108 @@ def _saved_at_the_end(trainer: Trainer, out: Path, say: Callable[[str], None]) -
 def _train(
     trainer: Trainer,
     out: Path,
-    monitor_every: int,
-    checkpoint_every: int,
+    monitoring: Monitoring,
     *,
-    pictures: bool,
     resumed: bool,
     progress: bool,
-    watch: Callable[[Trainer], None],
-    say: Callable[[str], None],
+    on_step: Callable[[Trainer], None],
 ) -> None:
     """Train to the end, with monitoring and checkpoints."""
-    last = trainer.config.iterations
+    last, every = trainer.config.iterations, monitoring.every
 
-    def render_now(opacity: Tensor, view: View) -> tuple[Tensor, Tensor]:
-        return model_of(trainer).render(opacity, view)
+    def moments_now(opacity: Tensor, view: View, *rest: Any) -> Any:  # of the model as it is when it is measured
+        return model_of(trainer).moments(opacity, view, *rest)
 
     def quality(opacity: Tensor, view: View) -> float:  # the monitor's own test-time scaling knows only dropout
         return psnr(model_of(trainer).test_rendering(view).image.clamp(0, 1), view.image, view.mask)
 
     def details(opacity: Tensor, view: View) -> dict[str, Tensor]:
-        return glance(model_of(trainer), view)
+        return training_snapshot(model_of(trainer), view)
 
     monitored: AbstractContextManager[CAMonitor | None] = nullcontext()
-    if monitor_every:
+    if every:
+        model = model_of(trainer)
+        score = model.exact_ca_score(drop_rate=0.5, moments=moments_now)
+        if monitoring.protocol:
+            score = model.ca_score(render_fn=lambda opacity, view: model_of(trainer).render(opacity, view))
         views = {"train": trainer.views, "test": [view.to(trainer.device) for view in trainer.scene.test]}
         monitored = CAMonitor(
-            model_of(trainer).ca_score(render_fn=render_now),
+            score,
             out,
             views={name: group for name, group in views.items() if group},
-            every=min(monitor_every, last),
+            every=1,  # `due` decides, because the last step is measured, too
             psnr=quality,
-            details=details if pictures else None,
+            details=details if monitoring.pictures else None,
             resume_step=trainer.step if resumed else None,
         )
     with monitored as monitor:
         if monitor is not None:
-            say(f"{out}: CA and PSNR go to {' and '.join(monitor.backends)} every {monitor.every} steps")
-            if trainer.step > 0:  # the last measurement may be missing; one in the log is not repeated
+            where = " and ".join(monitor.backends)
+            _log.info("%s: CA and PSNR go to %s every %d steps and after the last", out, where, every)
+            _write_settings(monitor, trainer)
+            step = trainer.step
+            if step > 0 and (step % every == 0 or step == last):  # perhaps missing; what is logged is not repeated
                 monitor(trainer.step, trainer.gaussians.opacities)
 
         def after_step(trainer: Trainer) -> None:
+            step = trainer.step
             if monitor is not None:
-                monitor(trainer.step, trainer.gaussians.opacities)
-            if trainer.step % checkpoint_every == 0 or trainer.step == last:
+                if step % every == 0 or step == last:
+                    monitor(step, trainer.gaussians.opacities)
+                _write_curves(monitor, trainer)
+            if step % monitoring.checkpoint_every == 0 or step == last:
                 trainer.save(out / CHECKPOINT)
-            watch(trainer)
+            on_step(trainer)
 
         trainer.train(after_step=after_step, progress=progress)
 
 
-def _measure(trainer: Trainer, out: Path, perceptual: LPIPS | None, say: Callable[[str], None]) -> dict[str, Any]:
+def _write_settings(monitor: CAMonitor, trainer: Trainer) -> None:
+    """Show TensorBoard what is trained: the settings that are not at their default."""
+    if monitor.writer is not None:
+        usual = vars(TrainConfig())
+        chosen = {name: value for name, value in vars(trainer.config).items() if value != usual[name]}
+        text = "\n".join(f"    {name}: {value}" for name, value in ({"scene": trainer.scene.name} | chosen).items())
+        monitor.writer.add_text("settings", text, trainer.step)
+
+
+def _write_curves(monitor: CAMonitor, trainer: Trainer) -> None:
+    """Show TensorBoard the loss of the step and the rates that change."""
+    if monitor.writer is not None and trainer.step % _CURVES_EVERY == 0:
+        rate = trainer.config.means_rate_at(trainer.step - 1) * trainer.scene.extent
+        shown = {"loss": trainer.loss, "learning rate/means": rate, "dropout rate": model_of(trainer).dropout}
+        for name, value in shown.items():
+            monitor.writer.add_scalar(name, value, trainer.step)
+
+
+def _measure(
+    trainer: Trainer, out: Path, perceptual: LPIPS | None, on_step: Callable[[Trainer], None]
+) -> dict[str, Any]:
     """Evaluate the trained model; write it, its pictures and its scores, and return the results."""
     model = model_of(trainer)
     save_ply(model.gaussians, out / PLY, regularizer=model.regularizer, step=model.step)
     if model.depends_on_camera:
-        say(f"{out}: what is rendered at test time depends on the camera, so that there is no {BAKED_PLY}")
+        _log.info("%s: what is rendered at test time depends on the camera, so that there is no %s", out, BAKED_PLY)
     elif model.factor != 1:
         save_for_viewers(model, out / BAKED_PLY)
-    views, keep = measured_views(trainer.scene, say), out / PARTIAL
-    evaluation = evaluate(model, views, perceptual=perceptual, pictures=out / VIEWS, keep=keep, say=say)
+    partial = out / PARTIAL
+    evaluation = evaluate(
+        model,
+        measured_views(trainer.scene),
+        perceptual=perceptual,
+        pictures=out / VIEWS,
+        partial=partial,
+        on_view=lambda: on_step(trainer),  # keeps an open viewer page drawn while views are measured
+    )
     results = {
         "scene": trainer.scene.name,
         "config": dataclasses.asdict(trainer.config),
         "seconds": trainer.seconds,
         "processor_seconds": trainer.processor_seconds,
         **evaluation.as_dict(),
+        "ca_settings": dataclasses.asdict(model.ca_score().settings),
         "machine": machine(),
     }
-    keep.unlink(missing_ok=True)  # before results.json, because a complete run is not touched again
+    partial.unlink(missing_ok=True)  # before results.json, because a complete run is not touched again
     write_json(out / RESULTS, results)
     return read_results(out)

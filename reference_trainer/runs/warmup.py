@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import logging
 from dataclasses import replace
 
 import torch
@@ -12,15 +12,14 @@ from reference_trainer.render import describe_engine, render_moments, variance_s
 
 __all__ = ["warm_up"]
 
+_log = logging.getLogger(__name__)
+
 
 @functools.cache
-def warm_up(say: Callable[[str], None] = lambda text: None) -> tuple[str, ...]:
+def warm_up() -> tuple[str, ...]:
     """Use every loop once per process, if the CPU engine is the loops; those in the disk cache are loaded from it.
 
     A training step of each kind and a score of each kind compile exactly the variants of the loops that are needed.
-
-    Args:
-        say: told what is being done, if anything has to be compiled.
 
     Returns:
         The names of the loops that had to be compiled.
@@ -36,7 +35,7 @@ def warm_up(say: Callable[[str], None] = lambda text: None) -> tuple[str, ...]:
 
         def note(name: str, folder: str | None) -> None:
             if not names:
-                say(describe_compilation(folder))
+                _log.info(describe_compilation(folder))
                 bar.delay = 0.0
             names.append(name)
             bar.total = max(len(KERNELS), len(names))

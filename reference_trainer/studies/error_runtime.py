@@ -17,12 +17,12 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.maps import first_order_map
-from reference_trainer.evaluation.results import format_mean_std, markdown_table
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import is_ply
 from reference_trainer.render.engine import engines_on, using_engine
-from reference_trainer.runs.measure import of_run
-from reference_trainer.runs.score_ply import of_plain_ply
+from reference_trainer.runs.measure import load_run_model
+from reference_trainer.runs.ply import load_plain_ply_model
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.scenes.virtual_cameras import orbit_views
 from reference_trainer.studies.study import Record, Records, Study, checkpoints, in_turns, now
@@ -77,12 +77,12 @@ def _measure(source: Path, max_samples: int, seeds: int, device: str) -> Record:
     """Measure one source: the checkpoint of a run, or a PLY."""
     view: Viewpoint
     if is_ply(source):
-        model, _ = of_plain_ply(source, device=device)
+        model, _ = load_plain_ply_model(source, device=device)
         means, opacities = model.gaussians.means, model.gaussians.opacities
         (camera,) = orbit_views(means, opacities, count=1, width=PICTURE, height=PICTURE)
         view = Viewpoint("orbit", camera)
     else:
-        model, scene = of_run(source.parent, device)
+        model, scene = load_run_model(source.parent, device)
         view = (*scene.test, *scene.train)[0].to(device)
     return error_runtime(model, view, max_samples=max_samples, seeds=seeds)
 

@@ -12,14 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from reference_trainer.evaluation.kept import KeptRecords, fingerprint
-from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.pictures import new_figure
+from reference_trainer.evaluation.results import ResultStore, fingerprint, machine, write_json
 from reference_trainer.files import write_text
-from reference_trainer.runs.engines.engine import Engine, Failure, Task
-from reference_trainer.runs.engines.run_all import run_all
-from reference_trainer.runs.figures import new_figure
-from reference_trainer.runs.folder import CHECKPOINT
-from reference_trainer.runs.lock import run_lock
+from reference_trainer.runs.executors.executor import Executor, Failure, Task, run_all
+from reference_trainer.runs.folder import CHECKPOINT, run_lock
 
 if TYPE_CHECKING:  # an extra
     from matplotlib.figure import Figure
@@ -58,7 +55,7 @@ class Study:
     check: bool = False
 
 
-def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say = print) -> Records:
+def run_study(study: Study, out: Path, *, executor: Executor | None = None, say: Say = print) -> Records:
     """Measure the cases not measured yet; write all records, the tables and the figure, and print the tables.
 
     Every record is on disk, in ``NAME.records.json``, as soon as its case is measured. Later calls reuse it as long as
@@ -67,7 +64,7 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
     Args:
         study: the declaration.
         out: folder for the results.
-        engine: where to measure, several cases at a time; None for this process, one after the other.
+        executor: where to measure, several cases at a time; None for this process, one after the other.
         say: receives the progress and the tables.
 
     Returns:
@@ -76,17 +73,17 @@ def run_study(study: Study, out: Path, *, engine: Engine | None = None, say: Say
     Raises:
         ValueError: if there is no case, or what ``study.measure`` raises.
         FolderInUseError: if another process is at work in the folder; nothing there was touched.
-        RuntimeError: after the others are written, if cases failed on the engine; the same call tries them again.
+        RuntimeError: after the others are written, if cases failed on the executor; the same call tries them again.
     """
     if not study.cases:
         raise ValueError(f"expected at least 1 case of {study.name}, got none.")
     with run_lock(out):
         here, file = machine(), out / f"{study.name}.records.json"
-        kept = KeptRecords(file, study.name, say)
+        kept = ResultStore(file, study.name)
         keys = {name: f"{name} {fingerprint([here, _decisive(dict(case))])}" for name, case in study.cases.items()}
         missing = [name for name, key in keys.items() if kept.get(key) is None]
         failed = {}
-        for name, outcome in _measured(study, missing, engine, say):
+        for name, outcome in _measured(study, missing, executor, say):
             if isinstance(outcome, Failure):
                 failed[name] = outcome.error
             else:
@@ -129,17 +126,17 @@ def checkpoints(runs: Sequence[Path]) -> dict[str, Path]:
 
 
 def _measured(
-    study: Study, names: Sequence[str], engine: Engine | None, say: Say
+    study: Study, names: Sequence[str], executor: Executor | None, say: Say
 ) -> Iterator[tuple[str, Record | Failure]]:
-    """Measure cases; yield each when it is finished. Without an engine an error ends the study."""
+    """Measure cases; yield each when it is finished. Without an executor an error ends the study."""
     calls = {name: partial(study.measure, **study.cases[name]) for name in names}
-    if engine is None:
+    if executor is None:
         for number, (name, call) in enumerate(calls.items(), start=1):
             say(f"[{number}/{len(names)}] {name}")
             yield name, call()
         return
     tasks = [Task(name, call, ()) for name, call in calls.items()]
-    for number, (index, outcome) in enumerate(run_all(engine, tasks, say=say), start=1):
+    for number, (index, outcome) in enumerate(run_all(executor, tasks), start=1):
         failed = isinstance(outcome, Failure)
         say(f"[{number}/{len(names)}] {names[index]}{': FAILED' if failed else ''}")
         yield names[index], outcome if isinstance(outcome, Failure) else outcome.value

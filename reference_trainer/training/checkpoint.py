@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,25 +81,31 @@ class TrainingState(NamedTuple):
     models: list[dict[str, Any]]
 
 
-def read_state(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
+def read_state(
+    state: dict[str, Any],
+    scene: Scene,
+    where: Path,
+    refuse: Callable[[TrainConfig], None] = lambda config: None,
+) -> TrainingState:
     """Check that what `Trainer.save` wrote is complete and consistent, and belongs to the scene.
 
     Args:
         state: content of the checkpoint.
         scene: the scene to continue on.
         where: the file, for errors.
+        refuse: called with the settings before anything that they name is made; raises to refuse them.
 
     Raises:
         ValueError: if something is missing, unknown, or of another type or shape, a number is not finite or out of
             its range, or the checkpoint belongs to another scene or other training views.
     """
     try:
-        return _read(state, scene, where)
+        return _read(state, scene, where, refuse)
     except (TypeError, AttributeError, LookupError) as error:
         raise ValueError(f"{where} is a damaged checkpoint: {error}") from error
 
 
-def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
+def _read(state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[TrainConfig], None]) -> TrainingState:
     """Read a state; wrong types that are not checked for raise TypeError, AttributeError or LookupError."""
     others = ["others"] if "others" in state else []
     _refuse_other_entries(state, (*_ENTRIES, *_OF_A_MODEL, *others), f"{where}")
@@ -109,6 +115,7 @@ def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
     if state["train_views"] != names:
         raise ValueError(f"{where} was trained on the views {state['train_views']!r:.400}, the scene has {names}.")
     config = _config(state["config"], where)
+    refuse(config)
     step, times = state["step"], (state["seconds"], state["processor_seconds"])
     if type(step) is not int or not 0 <= step <= config.iterations:
         raise ValueError(f"{where}: step must be a whole number from 0 to {config.iterations}, got {step!r:.80}.")

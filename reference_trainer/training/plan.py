@@ -51,6 +51,22 @@ class Plan:
         except (KeyError, TypeError) as error:
             raise ValueError(f"expected a plan (plan.json of a run), got other data: {error}.") from error
 
+    def summary(self) -> str:
+        """Return what matters in a few lines: what changes, and whether dropout is recommended.
+
+        Example:
+            >>> print(Plan((PlanItem("SH bands", "reduced", "the others would stay 0", {"sh_degree": 0}),)).summary())
+            Training changes 1 setting: sh_degree=0 (the others would stay 0).
+        """
+        changing = [item for item in self.items if item.changes]
+        changes = [f"{name}={value} ({item.reason})" for item in changing for name, value in item.changes.items()]
+        what = f"{len(changes)} setting{'s' * (len(changes) != 1)}: {'; '.join(changes)}" if changes else "no setting"
+        lines = [f"Training changes {what}."]
+        for item in self.items:
+            if item.name == "dropout":
+                lines.append(f"Dropout is {item.decision}: {item.reason}.")
+        return "\n".join(lines)
+
     def rows(self) -> list[dict[str, object]]:
         """Return one row per item, for a table with the columns item, decision, change and reason."""
         return [

@@ -38,6 +38,7 @@ class Trainer:
         step: the number of steps taken.
         seconds: wall-clock time that they took.
         processor_seconds: CPU time that all threads spent on them: the fairer figure on a busy machine.
+        loss: of the last step, of all fields together; nan before the first.
         renderer: what draws all but moments.
         models: what is trained; the first is the one that is measured and written.
         optimizer: of the first model.
@@ -69,6 +70,7 @@ class Trainer:
         self.renderer.prepare(self.device)
         self.step = 0
         self.seconds = self.processor_seconds = 0.0
+        self.loss = math.nan
         self.views = [view.to(self.device) for view in scene.train]
         self.background = scene.background.to(self.device)
         self.models = [
@@ -173,6 +175,7 @@ class Trainer:
                 model.optimizer.set_means_rate(self.config.means_rate_at(self.step) * self.scene.extent)
                 model.optimizer.step()
         self.step += 1
+        self.loss = value
         steps.clear()  # each step refers to all: a cycle would keep their graphs until garbage collection
         return value, squared_error
 
@@ -203,20 +206,28 @@ class Trainer:
         save_checkpoint(path, state)
 
     @classmethod
-    def load(cls, path: Path, scene: Scene, device: torch.device | str = "cpu") -> Trainer:
+    def load(
+        cls,
+        path: Path,
+        scene: Scene,
+        device: torch.device | str = "cpu",
+        *,
+        refuse: Callable[[TrainConfig], None] = lambda config: None,
+    ) -> Trainer:
         """Continue from a checkpoint.
 
         Args:
             path: of the checkpoint.
             scene: the scene that it was trained on.
             device: where to train.
+            refuse: called with the settings in the file before anything is made of them; raises to refuse them.
 
         Raises:
             FileNotFoundError: if there is no such file.
             ValueError: if the file is not a readable checkpoint, something in it is missing or does not fit, or it
                 belongs to another scene or other training views.
         """
-        state = read_state(load_checkpoint(path, device), scene, path)
+        state = read_state(load_checkpoint(path, device), scene, path, refuse)
         try:
             trainer = cls(scene, state.config, device)
         except ValueError as error:

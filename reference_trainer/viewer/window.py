@@ -28,7 +28,7 @@ from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.threads import threads_for
 from reference_trainer.training.trainer import Trainer
-from reference_trainer.viewer.picture import Look, Mode, Subject
+from reference_trainer.viewer.picture import DisplayOptions, Mode, ViewerModel
 
 __all__ = ["Viewer"]
 
@@ -81,7 +81,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             raise OSError(f"port {port} cannot be used for the viewer ({reason}): give another one.") from error
         with contextlib.redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(HOST, port, label="ca_reg", verbose=False)
-        self._subject: Subject | None = None
+        self._model: ViewerModel | None = None
         self._windows: dict[int, _Window] = {}
         self._changed = threading.Event()
         self._rough_pixels, self._next_model = 40_000, 0.0
@@ -105,9 +105,9 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
     def show(self, model: TrainedModel, views: Mapping[str, Sequence[Viewpoint]]) -> None:
         """Show a model from now on. The first call's views, by split, become the cameras to jump to."""
         flat = [view.to(model.gaussians.means.device) for group in views.values() for view in group]
-        if self._subject is None:
+        if self._model is None:
             self._add_cameras(views, model.gaussians)
-        self._subject = Subject(model, flat)
+        self._model = ViewerModel(model, flat)
         for window in list(self._windows.values()):
             window.due = True
         self._changed.set()
@@ -116,7 +116,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         """Draw whatever pages need until Ctrl-C."""
         with contextlib.suppress(KeyboardInterrupt):
             while True:
-                self._changed.wait(self.draw())
+                self._changed.wait(self.update())
                 self._changed.clear()
 
     def follow(self, trainer: Trainer) -> None:
@@ -128,15 +128,15 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         if new:
             model = model_of(trainer)
             model = replace(model, gaussians=model.gaussians.map(torch.clone))
-            self.show(model, measured_views(trainer.scene, lambda text: None))
+            self.show(model, measured_views(trainer.scene))
         with contextlib.suppress(NotFiniteError):  # the training reports it itself
-            self.draw()
+            self.update()
         if new:
             end = time.perf_counter()
             self._next_model = end + (end - start) * (1 / TRAINING_SHARE - 1)
 
-    def draw(self) -> float | None:
-        """Draw every page that is due; return the seconds until the next one is, None if that takes a change."""
+    def update(self) -> float | None:
+        """Render for every page that is due; return the seconds until the next one is, None if that takes a change."""
         waits = []
         for window in list(self._windows.values()):
             still = time.monotonic() - window.moved
@@ -149,20 +149,20 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
 
     def _send(self, window: _Window) -> None:
         """Draw one picture and send it to a page."""
-        subject, view = self._subject, window.client.camera
-        if subject is None:
+        shown, view = self._model, window.client.camera
+        if shown is None:
             return
         start = time.perf_counter()
         camera = _camera(view, self._rough_pixels if window.rough else MOST)
         with threads_for(camera.width * camera.height):
             try:
-                image, note = subject.draw(self._look, camera)
+                image, note = shown.render(self._options, camera)
             except ValueError as error:
-                (image, _), note = subject.draw(Look(), camera), str(error)
+                (image, _), note = shown.render(DisplayOptions(), camera), str(error)
         if window.client.client_id not in self._windows:  # closed in the meantime
             return
         window.client.scene.set_background_image(np.asarray(as_pillow(image)), format="jpeg", jpeg_quality=90)
-        took, model = max(1e-3, time.perf_counter() - start), subject.model
+        took, model = max(1e-3, time.perf_counter() - start), shown.model
         if window.rough:
             pixels = self._rough_pixels * min(2.0, max(0.5, ROUGH_SECONDS / took))
             self._rough_pixels = int(min(MOST, max(FEWEST, pixels)))
@@ -171,9 +171,9 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             self._status.content = f"step {model.step:,}: {drawn}\n\n{note}"
 
     @property
-    def _look(self) -> Look:
+    def _options(self) -> DisplayOptions:
         mode, rate, noise, mask, hidden = (control.value for control in self._controls)
-        return Look(mode, rate, noise, mask, hidden / 100)
+        return DisplayOptions(mode, rate, noise, mask, hidden / 100)
 
     def _add_controls(self) -> None:
         """Fill the panel."""

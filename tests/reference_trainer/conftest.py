@@ -6,14 +6,22 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 import pytest
+from heard import hearing
 from tiny import busy as busy
 from tiny import options as options
 from tiny import short as short
 from tiny import tiny_scene as tiny_scene
 
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.training.interruption import TrainingInterrupted
 from reference_trainer.training.trainer import Trainer
+
+
+@pytest.fixture
+def said() -> Iterator[list[str]]:
+    """What the trainer says while a test runs."""
+    with hearing() as messages:
+        yield messages
 
 
 @pytest.fixture
@@ -40,7 +48,7 @@ def ctrl_c(monkeypatch) -> Callable[[int], AbstractContextManager[None]]:
 def run(tmp_path_factory, options, short):
     """The folder of a finished run of seconds, and its results."""
     out = tmp_path_factory.mktemp("run")
-    return out, run_experiment(options, short, out, monitor_every=0)
+    return out, run_experiment(options, short, out, monitoring=Monitoring(0))
 
 
 @pytest.fixture(scope="session")

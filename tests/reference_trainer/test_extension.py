@@ -42,7 +42,7 @@ def test_one_of_each_kind_is_a_class_in_a_file_of_the_user(kind, parts, capsys):
         losses[name] = json.loads((parts / name / "results.json").read_text())
     assert losses["toy"]["config"][kind] == ADDED[kind]
     assert losses["toy"]["mean"]["test"]["psnr"] != losses["plain"]["mean"]["test"]["psnr"]
-    assert load_run(parts / "toy").step == 4
+    assert load_run(parts / "toy", trust=PARTS).step == 4
 
 
 @pytest.mark.slow
@@ -51,9 +51,12 @@ def test_a_regularizer_of_a_user_is_known_to_every_command(parts, capsys):
     expression = ADDED["regularizer"]
     main(["compare", "--out", "c", *TRAIN[2:-1], "--strategies", "baseline", expression, "--seeds", "1"])
     (run,) = (parts / "c").glob("my_module*/seed_0")
-    main(["evaluate", str(run), "--samples", "2", "--out", "again"])
+    main(["evaluate", str(run), "--samples", "2", "--out", "again", "--trust", "my_module"])
     again, before = (json.loads((parts / p).read_text()) for p in ("again/evaluation.json", run / "results.json"))
     assert again["mean"]["test"]["psnr"] == before["mean"]["test"]["psnr"]
+    with pytest.raises(SystemExit):  # a folder cannot make anybody import a module
+        main(["report", "c"])
+    assert "say --trust my_module" in capsys.readouterr().err
     with pytest.raises(SystemExit):  # a file cannot make anybody import a module
         main(["evaluate", str(run / "point_cloud.ply"), "--path", "synthetic", "--downscale", "8"])
     assert "is not imported because a file says so" in capsys.readouterr().err

@@ -3,8 +3,8 @@ import os
 import pytest
 import torch
 
-from reference_trainer.runs.engines.processes import Processes
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.threads import chosen_threads, thread_count, threads_for
 from reference_trainer.training.trainer import Trainer
 
@@ -55,6 +55,6 @@ def test_a_run_of_small_pictures_uses_one(processors, four, options, short, tmp_
     seen = []
     original = Trainer.train_step
     monkeypatch.setattr(Trainer, "train_step", lambda self: (seen.append(torch.get_num_threads()), original(self))[1])
-    results = run_experiment(options, short, tmp_path, monitor_every=0)
+    results = run_experiment(options, short, tmp_path, monitoring=Monitoring(0))
     assert set(seen) == {1} == {results["machine"]["threads"]}
     assert torch.get_num_threads() == 4

@@ -15,9 +15,8 @@ from PIL import Image
 from ca_reg.monitor import LOG_NAME, read_log
 from reference_trainer.json_files import read_json
 from reference_trainer.model.ply import load_ply
-from reference_trainer.runs.folder import CHECKPOINT, RESULTS
-from reference_trainer.runs.lock import LOCK
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.folder import CHECKPOINT, LOCK, RESULTS
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
@@ -95,8 +94,7 @@ def run(settings: Settings, out: Path) -> None:
         settings.config,
         out,
         auto=settings.auto,
-        monitor_every=settings.monitor_every,
-        checkpoint_every=settings.checkpoint_every,
+        monitoring=Monitoring(settings.monitor_every, checkpoint_every=settings.checkpoint_every),
     )
 
 

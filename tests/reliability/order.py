@@ -16,7 +16,7 @@ from stand_ins.card import CARD, pretended_card
 from torch import Tensor
 
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.results import markdown_table
+from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions

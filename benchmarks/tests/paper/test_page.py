@@ -17,7 +17,7 @@ from benchmarks.paper.figure import gains_figure, ranking_figure
 from benchmarks.paper.page import claims_table, details, gains, page, scenes_table
 from benchmarks.paper.rows import Rows, resolved, value
 from benchmarks.paper.scenes import chosen_scenes
-from reference_trainer.runs.figures import new_figure
+from reference_trainer.evaluation.pictures import new_figure
 from reference_trainer.scenes.options import SceneOptions
 
 # What is kept

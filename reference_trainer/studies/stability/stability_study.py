@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.evaluation.results import machine, markdown_table
+from reference_trainer.evaluation.results import machine
+from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.render.engine import engines_on, using_engine
 from reference_trainer.studies.stability.cases import Case, Probe, all_cases
 from reference_trainer.studies.stability.quantities import SCENE_QUANTITIES

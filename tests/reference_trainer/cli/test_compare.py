@@ -1,20 +1,22 @@
 """What `ca-reg compare` asks of the comparison."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from reference_trainer.cli import main
 from reference_trainer.runs import compare as compare_module
-from reference_trainer.runs.compare_report import Comparison
-from reference_trainer.runs.engines import choice as choice_module
-from reference_trainer.runs.engines.engine import Failure
-from reference_trainer.runs.engines.processes import Processes
+from reference_trainer.runs import executors as choice_module
+from reference_trainer.runs.compare import Comparison
+from reference_trainer.runs.executors.executor import Failure
+from reference_trainer.runs.executors.processes import Processes
 from reference_trainer.scenes.options import SceneOptions
 
 
 def test_a_cluster_may_have_the_card(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(choice_module, "choose_engine", lambda *a, **k: Processes(1))
+    monkeypatch.setattr(choice_module, "choose_executor", lambda *a, **k: Processes(1))
     monkeypatch.setattr(compare_module, "compare", lambda *a: {tmp_path: Comparison({}, {})})
     main(["compare", "--out", str(tmp_path), "--device", "cuda", "--address", "head:6379"])
 
@@ -36,7 +38,7 @@ def test_what_is_compared(given, rates, monkeypatch, tmp_path):
     main(["compare", "--out", str(tmp_path), "--seeds", "2", "--jobs", "3", "--iterations", "7", *given])
     assert {name: (config.dropout, config.noise) for name, config in asked["configs"].items()} == rates
     assert {config.iterations for config in asked["configs"].values()} == {7}
-    assert (asked["seeds"], asked["running"].engine.jobs) == ([0, 1], 3)
+    assert (asked["seeds"], asked["running"].executor.jobs) == ([0, 1], 3)
     assert asked["scenes"] == {tmp_path: SceneOptions()}
 
 
@@ -48,6 +50,8 @@ def test_several_scenes_and_how_they_are_run(monkeypatch, tmp_path):
         return {tmp_path / "fern": Comparison({}, {"baseline, seed 0": Failure("ValueError: no", "")})}
 
     monkeypatch.setattr(compare_module, "compare", fake)
+    monkeypatch.chdir(tmp_path)
+    Path("data/fern").mkdir(parents=True)
     with pytest.raises(SystemExit) as exit_:
         main(["compare", "--out", str(tmp_path), "--path", "data/fern", "synthetic", "--downscale", "2",
               "--executor", "processes", "--retries", "1", "--checkpoint-every", "50"])  # fmt: skip
@@ -56,4 +60,4 @@ def test_several_scenes_and_how_they_are_run(monkeypatch, tmp_path):
         tmp_path / "fern": SceneOptions("data/fern", downscale=2.0),
         tmp_path / "synthetic": SceneOptions("synthetic", downscale=2.0),
     }
-    assert (asked["running"].retries, asked["running"].checkpoint_every) == (1, 50)
+    assert (asked["running"].retries, asked["running"].monitoring.checkpoint_every) == (1, 50)

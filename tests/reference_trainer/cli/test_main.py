@@ -21,7 +21,7 @@ from reference_trainer.training.recipes import RECIPES
     [
         ([], ["demo", "train", "evaluate", "bake", "render", "compare", "warmup"]),
         (["demo"], ["--iterations", "--seeds", "--jobs", "--out"]),
-        (["warmup"], ["--engine", "{None,auto,torch,numba}"]),
+        (["warmup"], ["--engine", "{None,auto,numba,torch,triton}"]),
         (
             ["train"],
             [
@@ -42,7 +42,7 @@ from reference_trainer.training.recipes import RECIPES
         (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
         (["bake"], ["PATH", "--regularizer", "--out"]),
         (["view"], ["PATH", "--scene", "--arc", "--regularizer", "--port", "--device"]),
-        (["render"], ["--what", "--frames", "{test,train,flight}"]),
+        (["render"], ["--what", "--frames", "{auto,test,train,flight}"]),
         (
             ["compare"],
             [
@@ -96,7 +96,7 @@ def test_help_and_mistakes_need_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-@pytest.mark.parametrize("command", ["evaluate x", "render", "train", "compare", "study attribution x"])
+@pytest.mark.parametrize("command", ["train", "compare", "study attribution x"])
 def test_a_card_that_is_not_there(command, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
@@ -104,9 +104,11 @@ def test_a_card_that_is_not_there(command, capsys, monkeypatch):
     assert re.fullmatch(r"ca-reg: --device cuda: PyTorch \S+ finds 0 CUDA devices; take cpu.", text)
 
 
-@pytest.mark.parametrize("command", ["view runs/none", "train --viewer"])
-def test_without_viser(command, capsys, monkeypatch):
+@pytest.mark.parametrize("command", ["view a.ply", "train --viewer"])
+def test_without_viser(command, capsys, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.ply").touch()
     assert refused(command.split(), capsys) == "ca-reg: the viewer needs viser: pip install 'ca_reg[viewer]'."
 
 
@@ -117,7 +119,7 @@ def test_a_port_that_is_not_free(capsys):
         text = refused(["train", "--viewer", str(port)], capsys)
     assert text.startswith(f"ca-reg: port {port} cannot be used for the viewer (")
     assert text.endswith("in use): give another one.")
-    assert "from 0 to 65535, got 65536" in refused(["view", "runs/none", "--port", "65536"], capsys)
+    assert "from 0 to 65535, got 65536" in refused(["train", "--viewer", "65536"], capsys)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +130,7 @@ def test_a_port_that_is_not_free(capsys):
 def test_a_device_that_is_none(device, message, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    text = refused(["render", "--device", device], capsys)
+    text = refused(["compare", "--device", device], capsys)
     assert message in text
     assert len(text) < 200
 
@@ -161,10 +163,10 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["study", "paper", "--path", "synthetic", "--seeds", "0"], "at least 1 seed, got 0"),
         (["compare", "--seeds", "0"], "at least 1 scene, 1 strategy and 1 seed"),
         (["compare", "--jobs", "0"], "at least 1 job, got 0"),
-        (["compare", "--path", "a/fern", "b/fern"], "scenes whose folders have different names"),
+        (["compare", "--path", "synthetic", "synthetic"], "scenes whose folders have different names"),
         (["compare", "--retries", "-1"], "retries of at least 0"),
         (["compare", "--executor", "processes", "--address", "auto"], "--address auto is that of a Ray cluster"),
-        (["evaluate", "nowhere"], "nowhere holds no run (no config.json): give the --out folder"),
+        (["evaluate", "nowhere"], "nowhere holds no run: there is no such folder; give the --out folder"),
         (["render", "nowhere"], "nowhere holds no run"),
         (["report", "nowhere", "--out", "."], ". is a folder: --out is the file to write, such as report.html"),
         (["evaluate", "nowhere.ply"], "nowhere.ply"),
@@ -182,7 +184,11 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["evaluate", "a.ply", "--background", "red"], "background must be auto, black or white, got 'red'"),
         (["evaluate", "a.ply", "--size", "0"], "size of at least 1 pixel"),
         (["view", "a.ply", "--arc", "nan"], "an arc in (0, 360] degrees, got cameras=8, size=384 and arc=nan"),
-        (["bake", "nowhere.ply"], "nowhere.ply"),
+        (["bake", "nowhere.ply"], "there is no file nowhere.ply: expected a standard 3DGS .ply"),
+        (["poses", "nowhere"], "there is no folder nowhere"),
+        (["plan", "nowhere"], "there is no scene folder nowhere"),
+        (["compare", "nowhere"], "there is no scene folder nowhere"),
+        (["train", "--engine", "loops"], "--engine loops is a name of earlier versions: this engine is called"),
         (["train", "--regularizer", "dropot(0.2)"], "there is no regularizer 'dropot'; choose one of"),
         (["train", "--loss", "photometric(2.0)"], "lambda_dssim must lie in [0, 1], got 2.0"),
         (["train", "--density", "none"], "there is no density strategy 'none'"),
@@ -233,3 +239,47 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
         assert b"ca-reg:" not in process.stderr.read()
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["evaluate runs/typo", "evaluate typo.ply", "render runs/typo", "report runs/typo", "view runs/typo",
+     "bake typo.ply", "clean typo.ply", "train typo", "plan typo", "compare typo", "poses typo"],
+)  # fmt: skip
+def test_a_mistyped_path_is_answered_before_anything_slow_is_imported(command):
+    code = f"""if True:
+        import sys
+        from reference_trainer.cli import main
+        try:
+            main({command.split()!r})
+        except SystemExit as end:
+            assert end.code == 2
+            assert "torch" not in sys.modules
+    """
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "typo" in result.stderr
+
+
+def test_a_checkpoint_of_another_program_is_no_ply(capsys, tmp_path):
+    (tmp_path / "x.pt").touch()
+    text = refused(["evaluate", str(tmp_path / "x.pt")], capsys)
+    assert "x.pt is neither a run nor a PLY" in text
+    assert "the program that wrote this checkpoint can export" in text
+
+
+def test_a_folder_of_runs_names_one(capsys, tmp_path):
+    run = tmp_path / "baseline" / "seed_0"
+    run.mkdir(parents=True)
+    (run / "config.json").write_text("{}")
+    assert f"holds no run itself, but 1 below it: give one, such as {run}" in refused(["render", str(tmp_path)], capsys)
+
+
+def test_the_options_of_a_training_stand_in_groups(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    text = plain(capsys.readouterr().out)
+    places = [text.index(f" {name} options ") for name in ("scene", "training", "rendering")]
+    assert places == sorted(places)
+    assert (
+        places[0] < text.index("--path ") < places[1] < text.index("--dropout ") < places[2] < text.index("--engine ")
+    )

@@ -2,11 +2,12 @@
 
 import dataclasses
 import json
+import re
 
 import pytest
 
 from reference_trainer.cli import main
-from reference_trainer.cli.runs import given_fields
+from reference_trainer.cli.training import given_fields
 from reference_trainer.runs import run as run_module
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.plan import Plan
@@ -26,7 +27,7 @@ def asked(monkeypatch) -> dict:
 
 
 def test_plan_prints_every_item_and_writes_it(capsys, tmp_path):
-    main(["plan", "synthetic", "--downscale", "8", "--out", str(tmp_path / "plan.json")])
+    main(["plan", "synthetic", "--downscale", "8", "--verbose", "--out", str(tmp_path / "plan.json")])
     said = capsys.readouterr().out
     plan = Plan.from_dict(json.loads((tmp_path / "plan.json").read_text()))
     assert len(plan.items) > 10
@@ -35,17 +36,21 @@ def test_plan_prints_every_item_and_writes_it(capsys, tmp_path):
         assert item.reason in said
 
 
-def test_plan_says_first_which_pictures_and_views(capsys):
+def test_plan_says_in_a_few_lines_what_matters(capsys):
+    """Pictures, views, what changes, and whether dropout is recommended, with losses where some were measured."""
     main(["plan", "synthetic", "--downscale", "8"])
-    assert capsys.readouterr().out.splitlines()[:4] == [
-        "photographs: built in, used at 20x15 pixels",
-        "3 training views: train_0, train_1, train_2",
-        "3 test views: test_0, test_1, test_outside",
-        "",
-    ]
+    photographs, train, test, changes, dropout, more = capsys.readouterr().out.splitlines()
+    assert photographs == "photographs: built in, used at 20x15 pixels"
+    assert train == "3 training views: train_0, train_1, train_2"
+    assert test == "3 test views: test_0, test_1, test_outside"
+    assert changes.startswith("Training changes ")
+    assert re.search(r"^Dropout is .*: not asked for; 3 views, .* by [-+]\d\.\d to [-+]\d\.\d dB", dropout)
+    assert "--verbose" in more
 
 
-def test_the_scene_may_be_given_either_way(monkeypatch):
+def test_the_scene_may_be_given_either_way(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "garden").mkdir()
     loaded: list[SceneOptions] = []
 
     def load(options, **_):
@@ -63,7 +68,7 @@ def test_an_option_at_its_default_is_still_the_users(capsys):
     arguments = ["plan", "--downscale", "8", "--iterations", "400"]
     main(arguments)
     assert "sh_degree=0" in capsys.readouterr().out
-    main([*arguments, "--sh-degree", "3"])
+    main([*arguments, "--sh-degree", "3", "--verbose"])
     assert "asked for (sh_degree=3)" in capsys.readouterr().out
 
 
@@ -87,7 +92,9 @@ def test_a_value_is_not_an_option():
     assert given_fields(["train", "--out", "seed", "--lpips", "noise"]) == frozenset()
 
 
-def test_plan_says_what_the_loader_did(tiny_scene, monkeypatch, capsys):
+def test_plan_says_what_the_loader_did(tiny_scene, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "garden").mkdir()
     noted = dataclasses.replace(tiny_scene, notes=("lens distortion is undone",))
     monkeypatch.setattr("reference_trainer.scenes.load.load_scene", lambda *_, **__: noted)
     main(["plan", "garden"])

@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 from commands import plain, refused
@@ -10,8 +11,8 @@ from commands import plain, refused
 from reference_trainer.cli import main
 from reference_trainer.evaluation import tables
 from reference_trainer.runs import measure as measure_module
+from reference_trainer.runs import ply as ply_module
 from reference_trainer.runs import run as run_module
-from reference_trainer.runs import score_ply as score_module
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
@@ -33,10 +34,10 @@ def test_a_run_or_a_ply_is_shown_until_ctrl_c(what, trained, capsys, monkeypatch
     shown = []
 
     def draw(viewer):
-        shown.append(viewer._subject.draw(viewer._look, viewer._subject._views[0].camera)[0])
+        shown.append(viewer._model.render(viewer._options, viewer._model._views[0].camera)[0])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Viewer, "draw", draw)
+    monkeypatch.setattr(Viewer, "update", draw)
     main(["view", str(trained / what), "--port", "0"])
     assert re.search(r"The viewer is at http://127\.0\.0\.1:\d+, .*; Ctrl-C ends it\.", capsys.readouterr().out)
     assert shown[0].std() > 0
@@ -47,7 +48,9 @@ def test_the_scene_of_a_training_may_be_given_either_way(arguments, monkeypatch,
     asked = []
     monkeypatch.setattr(run_module, "run_experiment", lambda scene, config, out, **rest: asked.append(scene))
     monkeypatch.setattr(tables, "summary", lambda results: "")
-    main(["train", *arguments, "--views", "5", "--out", str(tmp_path)])
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "garden").mkdir()
+    main(["train", *arguments, "--views", "5", "--out", "out"])
     assert asked == [SceneOptions("garden", views=5)]
     assert "not both: got garden and fern" in refused(["train", "garden", "--path", "fern"], capsys)
 
@@ -62,11 +65,12 @@ def test_the_commands_that_a_training_ends_with_can_be_pasted(monkeypatch, capsy
     assert shlex.split(curves)[-3:] == ["tensorboard", "--logdir", out]
 
 
-def test_a_ply_is_known_by_its_name(monkeypatch):
+def test_a_ply_is_known_by_its_name(monkeypatch, tmp_path):
     asked: list = []
-    monkeypatch.setattr(score_module, "score_ply", lambda ply, *rest, **named: asked.append(str(ply)))
-    main(["evaluate", "somewhere/a.PLY"])
-    assert asked == ["somewhere/a.PLY"]
+    (tmp_path / "a.PLY").touch()
+    monkeypatch.setattr(ply_module, "score_ply", lambda ply, *rest, **named: asked.append(str(ply)))
+    main(["evaluate", str(tmp_path / "a.PLY")])
+    assert asked == [str(tmp_path / "a.PLY")]
 
 
 @pytest.mark.parametrize("engine", ["torch", "numba"])
@@ -76,9 +80,10 @@ def test_the_engine_is_chosen_said_and_noted(engine, trained, capsys, tmp_path, 
     monkeypatch.setenv("CA_REG_ENGINE", "auto")  # which the option changes, for workers
     main(["evaluate", str(trained), "--samples", "2", "--engine", engine, "--out", str(tmp_path)])
     said = capsys.readouterr().out.splitlines()
-    assert [line.startswith(f"Engine: {engine}") for line in said].count(True) == 1
+    assert [line.startswith("Engine: ") for line in said].count(True) == 1
     noted = json.loads((tmp_path / "evaluation.json").read_text())["machine"]["engine"]
     assert f"Engine: {noted}" in said
+    assert (noted == "torch") == (engine == "torch")
 
 
 def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
@@ -121,32 +126,22 @@ def test_a_run_is_evaluated_with_the_mean_of_its_noise(trained, capsys, tmp_path
 
 
 @pytest.mark.parametrize("flag", ["--path", "--scene"])
-def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch):
+def test_a_ply_on_a_scene_or_an_orbit(flag, monkeypatch, tmp_path):
     asked: list = []
-    monkeypatch.setattr(score_module, "score_ply", lambda *given, **named: asked.append((given, named)))
-    main(
-        [
-            "evaluate",
-            "a.ply",
-            flag,
-            "garden",
-            "--images",
-            "images_8",
-            "--views",
-            "12",
-            "--regularizer",
-            "noise",
-        ]
-    )
+    monkeypatch.setattr(ply_module, "score_ply", lambda *given, **named: asked.append((given, named)))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.ply").touch()
+    (tmp_path / "garden").mkdir()
+    main(["evaluate", "a.ply", flag, "garden", "--images", "images_8", "--views", "12", "--regularizer", "noise"])
     main(["evaluate", "a.ply", "--cameras", "3", "--size", "64", "--world", "z-up", "--arc", "90",
           "--background", "white", "--samples", "7", "--seed", "1", "--out", "o"])  # fmt: skip
     ((ply, scene, out), named), ((other, orbit, folder), others) = asked
     assert (str(ply), scene.path, scene.images, scene.views, out) == ("a.ply", "garden", "images_8", 12, None)
     assert named == {"regularizer": "noise", "samples": 5, "seed": 0, "device": "cpu", "perceptual": None,
-                     "background": "auto"}  # fmt: skip
+                     "background": "auto", "trust": set()}  # fmt: skip
     assert (str(other), orbit, str(folder)) == ("a.ply", OrbitOptions(3, 64, "z-up", 90.0), "o")
     assert others == {"regularizer": None, "samples": 7, "seed": 1, "device": "cpu", "background": "white",
-                      "perceptual": None}  # fmt: skip
+                      "perceptual": None, "trust": set()}  # fmt: skip
 
 
 def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):
@@ -185,14 +180,16 @@ def test_options_override_the_recipe(recipe, monkeypatch, tmp_path):
 
     monkeypatch.setattr(run_module, "run_experiment", fake)
     monkeypatch.setattr(tables, "summary", lambda results: "")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fern").mkdir()
     chosen = ["--recipe", recipe] if recipe else []
     main(["train", *chosen, "--iterations", "3000", "--densify-from", "70", "--noise", "0.8", "--path", "fern",
-          "--images", "images_8", "--views", "5", "--out", str(tmp_path)])  # fmt: skip
+          "--images", "images_8", "--views", "5", "--out", "out"])  # fmt: skip
     given = {"iterations": 3_000, "densify_from": 70, "noise": 0.8}
     expected = with_recipe(recipe, **given) if recipe else TrainConfig(**given)  # at which nothing scales
     assert asked["config"] == expected
     assert asked["scene"] == SceneOptions("fern", images="images_8", views=5)
-    assert asked["out"] == tmp_path
+    assert asked["out"] == Path("out")
 
 
 def test_the_recipe_of_binocular_decays_opacities(monkeypatch, tmp_path):
@@ -206,3 +203,42 @@ def test_the_recipe_of_binocular_decays_opacities(monkeypatch, tmp_path):
 def test_other_settings_in_the_same_folder(trained, capsys):
     text = refused(["train", "--out", str(trained), "--dropout", "0.3", *SMALL], capsys)
     assert "holds a run with other settings (dropout: 0.2 -> 0.3)" in text
+
+
+def test_what_would_be_lost_is_refused(trained, capsys, tmp_path):
+    """The photographs, and files that are not from here."""
+    (tmp_path / "plan.json").write_text("precious")
+    (tmp_path / "test_0.png").write_text("a photograph")
+    garden = str(tmp_path)
+    assert "is the folder of the scene" in refused(["train", garden, "--out", garden], capsys)
+    assert "is no plan of ca-reg" in refused(["plan", "--out", str(tmp_path / "plan.json")], capsys)
+    assert "holds test_0.png" in refused(["render", str(trained), "--what", "test", "--out", garden], capsys)
+    assert (tmp_path / "test_0.png").read_text() == "a photograph"
+    for _ in range(2):  # its own pictures may be written again
+        main(["render", str(trained), "--what", "test"])
+
+
+def test_without_test_views_the_training_views_are_rendered(capsys, tmp_path):
+    out = tmp_path / "all"
+    main(["train", "--out", str(out), "--downscale", "8", "--test", "none", "--iterations", "1"])
+    main(["render", str(out)])
+    assert "--what flight" in capsys.readouterr().out
+    assert len(list((out / "render_train").glob("*.png"))) == 3
+    assert "no test view: give --what train" in refused(["render", str(out), "--what", "test"], capsys)
+
+
+def test_own_code_is_trusted_where_the_command_line_names_it(capsys, tmp_path, monkeypatch):
+    """What a training prints can be pasted; without --trust nothing of the run is imported."""
+    (tmp_path / "own_drop.py").write_text(
+        "from ca_reg import GaussianDropout\n\n\nclass Mine(GaussianDropout):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    out = tmp_path / "run"
+    main(["train", "--out", str(out), "--regularizer", "own_drop:Mine(0.2)", *SMALL])
+    page = shlex.split(capsys.readouterr().out.rpartition("a page: ")[2].partition(";")[0])
+    assert page == ["ca-reg", "report", str(out), "--trust", "own_drop"]
+    for command in (["report"], ["evaluate"], ["render"], ["evaluate", "--seed", "1"]):
+        assert "say --trust own_drop" in refused([command[0], str(out), *command[1:]], capsys)
+    assert "say --trust own_drop" in refused(["evaluate", str(out / "point_cloud.ply")], capsys)
+    main([*page[1:], "--views", "1"])
+    main(["evaluate", str(out), "--regularizer", "own_drop:Mine(0.2)", "--samples", "2"])

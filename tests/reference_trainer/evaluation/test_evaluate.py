@@ -275,13 +275,12 @@ def test_views_of_the_same_name_in_two_folders_keep_their_pictures(tiny_scene, g
         assert psnr(read_image(file)[0], view.image) == pytest.approx(scores.psnr, abs=0.05)  # 8 bits instead of floats
 
 
-def test_every_view_gets_its_pictures(tiny_scene, gaussians, tmp_path):
+def test_every_view_gets_its_pictures(tiny_scene, gaussians, tmp_path, said):
     """Also where names differ after a dot only, as in photographs named after the time of day."""
     names = ["12.30.01.jpg", "12.30.02.jpg", "sub/deep.png"]
     train = tuple(dataclasses.replace(v, name=n) for v, n in zip(tiny_scene.train, names, strict=True))
-    said: list[str] = []
     scene = dataclasses.replace(tiny_scene, train=train, test=tiny_scene.test[:1])
-    evaluate(TrainedModel(gaussians, scene.background), of_scene(scene), samples=2, pictures=tmp_path, say=said.append)
+    evaluate(TrainedModel(gaussians, scene.background), of_scene(scene), samples=2, pictures=tmp_path)
     found = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*"))
     stems = ["test/test_0", "train/12.30.01", "train/12.30.02", "train/deep"]
     assert found == sorted(f"{stem}{end}.png" for stem in stems for end in ("", "_panel"))

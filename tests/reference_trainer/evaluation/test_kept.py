@@ -9,7 +9,7 @@ import torch
 
 from reference_trainer.evaluation import evaluate as evaluate_module
 from reference_trainer.evaluation.evaluate import evaluate
-from reference_trainer.evaluation.kept import KeptRecords, fingerprint
+from reference_trainer.evaluation.results import ResultStore, fingerprint
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.scenes.scene import Viewpoint
@@ -24,48 +24,43 @@ def model(tiny_scene):
     )
 
 
-def nothing(text):
-    raise AssertionError(text)
-
-
-def test_records_come_back_as_they_were(tmp_path):
+def test_records_come_back_as_they_were(tmp_path, said):
     file = tmp_path / "a" / "kept.json"
     records = {"one": {"x": 0.1 + 0.2, "n": 3, "name": "\udc80 ä"}, "two": {"x": math.inf, "y": -0.0}}
-    kept = KeptRecords(file, "as before", nothing)
+    kept = ResultStore(file, "as before")
     for key, record in records.items():
         assert kept.get(key) is None
         kept.add(key, record)
     kept.add("three", {"x": math.nan})
-    said = []
-    again = KeptRecords(file, "as before", said.append)
+    assert said == []
+    again = ResultStore(file, "as before")
     assert {key: again.get(key) for key in records} == records
     assert math.isnan(again.get("three")["x"])
     assert said == [f"3 measured before, kept: {file}"]
 
 
 def test_a_record_whose_picture_is_gone_is_not_used(tmp_path):
-    kept = KeptRecords(tmp_path / "kept.json", None, nothing)
+    kept = ResultStore(tmp_path / "kept.json", None)
     (tmp_path / "picture.png").touch()
     kept.add("view", {"x": 1.0})
     assert kept.get("view", [tmp_path / "picture.png"]) == {"x": 1.0}
     assert kept.get("view", [tmp_path / "picture.png", tmp_path / "panel.png"]) is None
 
 
-def test_records_of_something_else_are_gone_before_anything_is_measured(tmp_path):
+def test_records_of_something_else_are_gone_before_anything_is_measured(tmp_path, said):
     file = tmp_path / "kept.json"
-    KeptRecords(file, {"seed": 0}, nothing).add("view", {"x": 1.0})
-    said = []
-    assert KeptRecords(file, {"seed": 1}, said.append).get("view") is None
+    ResultStore(file, {"seed": 0}).add("view", {"x": 1.0})
+    assert ResultStore(file, {"seed": 1}).get("view") is None
     assert said == [f"records of an interrupted measurement in {file} are not used, they belong to another model, "
                     "scene, setting or machine: everything is measured anew"]  # fmt: skip
     assert not file.exists()  # and not found again by the first setting, whose pictures are being replaced
 
 
-def test_a_damaged_file_is_told_and_never_half_read(tmp_path):
+def test_a_damaged_file_is_told_and_never_half_read(tmp_path, said):
     """Every byte in turn is changed, and the file cut at every byte."""
     file = tmp_path / "kept.json"
     expected = {"view": {"x": 1.25, "name": "a"}, "other": {"x": math.nan, "name": "b"}}
-    kept = KeptRecords(file, 0, nothing)
+    kept = ResultStore(file, 0)
     for key, record in expected.items():
         kept.add(key, record)
     good = file.read_bytes()
@@ -73,8 +68,8 @@ def test_a_damaged_file_is_told_and_never_half_read(tmp_path):
     for at in range(len(good)):
         for damaged in (good[:at], good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :]):
             file.write_bytes(damaged)
-            said = []
-            found = KeptRecords(file, 0, said.append)
+            said.clear()
+            found = ResultStore(file, 0)
             records = {key: found.get(key) for key in expected}
             if records == {"view": None, "other": None}:
                 assert "are not used" in said[0]
@@ -85,16 +80,15 @@ def test_a_damaged_file_is_told_and_never_half_read(tmp_path):
 
 
 @pytest.mark.parametrize("content", ["[]", "null", "{}", '{"depends_on": 1, "digest": 2, "records": 3}'])
-def test_another_json_file(tmp_path, content):
+def test_another_json_file(tmp_path, content, said):
     (tmp_path / "kept.json").write_text(content)
-    said = []
-    assert KeptRecords(tmp_path / "kept.json", 0, said.append).get("view") is None
+    assert ResultStore(tmp_path / "kept.json", 0).get("view") is None
     assert "it is damaged" in said[0]
 
 
 def test_nothing_is_kept_where_nobody_asked(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    kept = KeptRecords(None, nothing, nothing)  # a fingerprint of a function would be a TypeError
+    kept = ResultStore(None, print)  # a fingerprint of a function would be a TypeError
     kept.add("view", {"x": 1.0})
     assert kept.get("view") is None
     assert list(tmp_path.iterdir()) == []
@@ -116,7 +110,7 @@ def test_a_fingerprint_tells_everything_apart():
 
 
 @pytest.mark.parametrize("done", [0, 1, 3])
-def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path, monkeypatch, done):
+def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path, monkeypatch, done, said):
     views = {"train": tiny_scene.train, "around": [Viewpoint("000", tiny_scene.test[0].camera)]}
     file, pictures = tmp_path / "kept.json", tmp_path / "views"
     whole = evaluate(model, views, samples=2, pictures=tmp_path / "whole")
@@ -130,10 +124,10 @@ def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path
 
     monkeypatch.setattr(evaluate_module, "_measure", stopped)
     with pytest.raises(KeyboardInterrupt):
-        evaluate(model, views, samples=2, pictures=pictures, keep=file)
+        evaluate(model, views, samples=2, pictures=pictures, partial=file)
     monkeypatch.setattr(evaluate_module, "_measure", measure)
-    said = []
-    assert repr(evaluate(model, views, samples=2, pictures=pictures, keep=file, say=said.append)) == repr(whole)
+    said.clear()
+    assert repr(evaluate(model, views, samples=2, pictures=pictures, partial=file)) == repr(whole)
     assert sum(text.startswith("[") for text in said) == 4 - done
     names = sorted(path.relative_to(pictures) for path in pictures.rglob("*.png"))
     assert len(names) == 8
@@ -177,12 +171,12 @@ def changes(model, scene):
     "name",
     ["samples", "seed", "dropout", "scale", "background", "model", "photograph", "views", "metric", "weights"],
 )
-def test_what_changed_is_not_mixed_with_what_was_measured(model, tiny_scene, tmp_path, name):
+def test_what_changed_is_not_mixed_with_what_was_measured(model, tiny_scene, tmp_path, name, said):
     scene = dataclasses.replace(tiny_scene, train=tiny_scene.train[:2], test=tiny_scene.test[:1])
     changed, other, keywords = changes(model, scene)[name]
     before = {"samples": 2} | ({"perceptual": Brightness(1.0)} if name == "weights" else {})
-    evaluate(model, both(scene), keep=tmp_path / "kept.json", **before)
-    said = []
-    evaluate(changed, both(other), keep=tmp_path / "kept.json", **({"samples": 2} | keywords), say=said.append)
+    evaluate(model, both(scene), partial=tmp_path / "kept.json", **before)
+    said.clear()
+    evaluate(changed, both(other), partial=tmp_path / "kept.json", **({"samples": 2} | keywords))
     assert "everything is measured anew" in said[0]
     assert sum(text.startswith("[") for text in said) == len(other.train) + 1

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
 import torch
 
-from reference_trainer.evaluation.results import format_mean_std, machine, markdown_table, mean_std, write_json
+from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std, print_table
 
 NAN = float("nan")
 
@@ -102,3 +104,41 @@ def test_machine_can_be_written(tmp_path):
     assert facts["threads"] == torch.get_num_threads()
     assert facts["cores"] >= 1
     assert facts["cpu"]
+
+
+def test_decimals_are_the_same_down_a_column():
+    assert format_mean_std([20.391, 20.51, 20.63], decimals=2) == "20.51 ± 0.12"
+    assert format_mean_std([5.0], decimals=2) == "5.00"
+    assert format_mean_std([NAN], decimals=2) == "n/a"
+
+
+NAMES = [f"test quantity {i}" for i in range(12)]
+WIDE = markdown_table(
+    [
+        {"strategy": name, "test PSNR": f"{20 + row}.00"}
+        | {each: f"{row + i:.2f} ± 0.10" for i, each in enumerate(NAMES)}
+        for row, name in enumerate(("baseline", "dropout"))
+    ],
+    ["strategy", *NAMES, "test PSNR"],
+)
+
+
+@pytest.mark.parametrize("width", [60, 80, 300])
+def test_a_table_fits_the_terminal(width, capsys, monkeypatch):
+    """Every figure is there and no line is longer; the best strategy is bold."""
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm-256color")
+    print_table(WIDE, width=width)
+    out = capsys.readouterr().out
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", out)
+    assert max(map(len, plain.splitlines())) <= width
+    for i in range(12):
+        assert f"{i:.2f} ± 0.10" in plain
+    assert re.search(r"\x1b\[1m[^\x1b]*21\.00", out)
+    assert not re.search(r"\x1b\[1m[^\x1b]*20\.00", out)
+
+
+def test_a_table_is_markdown_in_a_pipe(capsys):
+    print_table(WIDE)
+    assert capsys.readouterr().out == WIDE + "\n"

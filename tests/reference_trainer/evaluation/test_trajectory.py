@@ -84,19 +84,19 @@ def scene_of(cameras, test=()) -> Scene:
     return Scene("scene", tuple(views), test, None, torch.zeros(3))
 
 
-def test_a_scene_with_test_views_is_measured_there():
+def test_a_scene_with_test_views_is_measured_there(said):
     scene = scene_of(random_cameras(2))
     scene = dataclasses.replace(scene, test=scene.train)
-    assert measured_views(scene, pytest.fail) == {"train": scene.train, "test": scene.test}
+    assert measured_views(scene) == {"train": scene.train, "test": scene.test}
+    assert said == []
 
 
-def test_without_test_views_a_model_is_measured_between_and_around_the_training_views():
+def test_without_test_views_a_model_is_measured_between_and_around_the_training_views(said):
     """Cameras at 0, 10 and 40 degrees of a circle, which is where the turns of the new ones are as well."""
     axis = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     degrees = (0.0, 10.0, 40.0)
     cameras = [camera(rotation(axis, x), torch.tensor([x, 0.0, 1.0]).double()) for x in degrees]
-    said: list[str] = []
-    found = measured_views(scene_of(cameras), said.append)
+    found = measured_views(scene_of(cameras))
     assert list(found) == ["train", "between", "around"]
     assert len(said) == 1
     assert said[0].startswith("No test views")
@@ -112,7 +112,7 @@ def test_the_nearest_camera_is_found_far_from_the_origin():
     angles = torch.arange(30).double() * 12
     places = torch.stack([1000 + angles.deg2rad().cos(), angles.deg2rad().sin(), torch.zeros(30)], 1)
     cameras = [camera(torch.eye(3).double(), place) for place in places]
-    between = measured_views(scene_of(cameras), lambda text: None)["between"]
+    between = measured_views(scene_of(cameras))["between"]
     steps = [(view.camera.position - places.to(view.camera.position)).norm(dim=1).min().item() for view in between]
     assert len(steps) >= 15
     assert max(steps) < 0.11  # half of a step of 2 sin(6 degrees), but for single precision
@@ -120,4 +120,4 @@ def test_the_nearest_camera_is_found_far_from_the_origin():
 
 def test_one_training_view_has_nothing_around_it():
     scene = scene_of(random_cameras(1))
-    assert measured_views(scene, lambda text: None) == {"train": scene.train}
+    assert measured_views(scene) == {"train": scene.train}

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import re
+import shutil
 from base64 import b64decode
 from html.parser import HTMLParser
 from io import BytesIO
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from browser import CHROMIUM, Page
+from heard import hearing
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -21,7 +23,7 @@ from reference_trainer.report import page as page_module
 from reference_trainer.report.findings import find
 from reference_trainer.report.page import write_report
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG, run_settings
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
@@ -61,8 +63,8 @@ def two_of_each(scene: Scene) -> list[View]:
 def pair(tmp_path_factory, run, scaled):
     """Two finished runs, of which only the second was measured while it trained, and the page about both."""
     runs, out = [run[0], scaled[0]], tmp_path_factory.mktemp("pair") / "report.html"
-    said: list[str] = []
-    assert write_report(runs, out, views=2, say=said.append) == out
+    with hearing() as said:
+        assert write_report(runs, out, views=2) == out
     assert str(out) in said[-1]
     return runs, Parsed(out)
 
@@ -88,8 +90,8 @@ def test_the_tables_are_those_of_the_runs(pair):
     for run in runs:
         results = json.loads((run / "results.json").read_text())
         for view in results["views"]:
-            assert f"| {view['split']} {view['name']} | {view['psnr']:.4g} |" in page.data["perView"][run.name]
-        assert f"| {run.name} | 1 | {results['mean']['test']['psnr']:.4g} |" in page.data["scores"]
+            assert f"| {view['split']} {view['name']} | {view['psnr']:.2f} |" in page.data["perView"][run.name]
+        assert f"| {run.name} | 1 | {results['mean']['test']['psnr']:.2f} |" in page.data["scores"]
         assert f"{run.name}: 11 steps with dropout(0.2) + noise(0.3" in " ".join(page.data["about"])
         assert f"| {run.name} | " in page.data["attribution"]
     assert "| noise | 0.3 | 0.0 |" in page.data["settings"]
@@ -116,7 +118,7 @@ def test_the_views_come_with_their_pictures(pair):
         "train train_0",
         "train train_2",
     ]
-    model, scene = of_run(runs[1])
+    model, scene = load_run_model(runs[1])
     for view, entry in zip(two_of_each(scene), page.data["views"], strict=True):
         pose = np.array(entry["pose"]).reshape(3, 4)
         np.testing.assert_array_equal(pose, view.camera.world_to_camera[:3].numpy())
@@ -131,7 +133,7 @@ def test_the_views_come_with_their_pictures(pair):
 def test_the_models_are_those_of_the_runs(pair):
     runs, page = pair
     for run, packed in zip(runs, page.data["runs"], strict=True):
-        model, scene = of_run(run)
+        model, scene = load_run_model(run)
         gaussians, n = model.gaussians, len(model.gaussians)
         table = array(packed["geometry"], "<f4", n, 16)
         np.testing.assert_array_equal(table[:, :3], gaussians.means)
@@ -169,7 +171,7 @@ def unfinished(folder: Path, options: SceneOptions, config: TrainConfig) -> Trai
 def test_what_a_run_lacks_is_left_out_with_a_word(tmp_path, options, short, opacity):
     none = dataclasses.replace(options, test="none")
     unfinished(tmp_path / "mine", none, dataclasses.replace(short, initial_opacity=opacity))
-    out = write_report([tmp_path / "mine"], say=lambda text: None)
+    out = write_report([tmp_path / "mine"])
     assert out == tmp_path / "mine" / "report.html"
     page = Parsed(out)
     assert page.data["scores"] == page.data["dynamics"] == ""
@@ -201,7 +203,7 @@ def test_a_damaged_log_is_told_from_none(tmp_path):
 def test_opacities_that_depend_on_the_camera_are_drawn_plain(tmp_path, options, short):
     config = dataclasses.replace(short, initial_opacity=0.9, regularizer="depth(0.4, scale=True)")
     trainer = unfinished(tmp_path, options, config)
-    page = Parsed(write_report([tmp_path], views=1, say=lambda text: None))
+    page = Parsed(write_report([tmp_path], views=1))
     assert "opacities depend on the camera" in page.data["notes"][0]
     (packed,) = page.data["runs"]
     drawn = array(packed["geometry"], "<f4", packed["count"], 16)[:, 3]
@@ -219,7 +221,7 @@ def test_what_is_no_run_or_no_pair_is_refused(run, found, tmp_path, monkeypatch)
     elsewhere = dataclasses.replace(found, scene=dataclasses.replace(found.scene, name="elsewhere"))
     monkeypatch.setattr(page_module, "find", lambda folder, *_, **__: found if folder == run[0] else elsewhere)
     with pytest.raises(ValueError, match=r"a report is about one scene.*synthetic.*elsewhere"):
-        write_report([run[0], tmp_path], tmp_path / "page.html", say=lambda text: None)
+        write_report([run[0], tmp_path], tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
 
@@ -227,7 +229,7 @@ def test_text_from_files_cannot_end_the_data(run, found, tmp_path, monkeypatch):
     bad = "</script><script>alert(1)</script>"
     monkeypatch.setattr(page_module, "find", lambda *_, **__: dataclasses.replace(found, label=bad))
     monkeypatch.setattr(page_module, "labels", lambda runs: [bad])
-    page = Parsed(write_report([run[0]], tmp_path / "page.html", say=lambda text: None))
+    page = Parsed(write_report([run[0]], tmp_path / "page.html"))
     assert sum(tag == "script" for tag, _ in page.tags) == 2
     assert page.data["runs"][0]["label"] == bad
 
@@ -252,7 +254,7 @@ def turned(tmp_path_factory, short):
                 part += spread * torch.randn(part.shape, generator=generator)
             trainer.gaussians.log_scales[::2] -= 2.0  # some are as thin as a pixel
         trainer.save(run / CHECKPOINT)
-    return runs, write_report(runs, views=2, say=lambda text: None)
+    return runs, write_report(runs, views=2)
 
 
 @pytest.fixture(scope="module")
@@ -285,7 +287,7 @@ def assert_drawn(picture: np.ndarray, model: TrainedModel, view: View) -> None:
 @needs_browser
 def test_a_browser_shows_what_the_renderer_draws(turned, opened):
     runs, _ = turned
-    found = [of_run(run) for run in runs]
+    found = [load_run_model(run) for run in runs]
     for number, view in enumerate(two_of_each(found[0][1])):
         drawn = shown(opened, f"$('from').value = {number}; $('from').onchange()")
         for (model, _), picture in zip(found, drawn, strict=True):
@@ -296,7 +298,7 @@ def test_a_browser_shows_what_the_renderer_draws(turned, opened):
 @needs_browser
 def test_a_browser_shows_the_heat_and_hides_what_co_adapts_most(turned, opened):
     runs, path = turned
-    data, found = Parsed(path).data, [of_run(run) for run in runs]
+    data, found = Parsed(path).data, [load_run_model(run) for run in runs]
     views = two_of_each(found[0][1])
     low, high = (float(end) for end in data["ends"]["heat"])
     plain = shown(opened, "$('from').value = 0; $('from').onchange(); $('color').click()")
@@ -352,3 +354,22 @@ def test_no_request_leaves_the_page(turned, opened):
     assert opened.requests[0] == turned[1].as_uri()
     assert all(address.startswith("data:") for address in opened.requests[1:])
     assert not opened.complaints
+
+
+def test_no_file_but_a_report_is_overwritten(run, tmp_path):
+    (tmp_path / "thesis.html").write_text("<!doctype html>precious")
+    with pytest.raises(ValueError, match=r"thesis\.html is no report of ca-reg and is not overwritten"):
+        write_report([run[0]], tmp_path / "thesis.html")
+    assert (tmp_path / "thesis.html").read_text() == "<!doctype html>precious"
+    for _ in range(2):  # its own page may be written again
+        write_report([run[0]], tmp_path / "mine.html", views=1)
+
+
+def test_a_comparison_stands_for_the_first_seed_of_each_strategy(run, tmp_path):
+    for name, seeds in (("dropout", (2, 10)), ("baseline", (0, 1))):
+        for seed in seeds:
+            shutil.copytree(run[0], tmp_path / name / f"seed_{seed}")
+    write_json(tmp_path / "comparison.json", {"runs": {"baseline": [], "dropout": []}, "failures": {}})
+    out = write_report([tmp_path], views=1)
+    assert out == tmp_path / "report.html"
+    assert [each["label"] for each in Parsed(out).data["runs"]] == ["baseline/seed_0", "dropout/seed_2"]

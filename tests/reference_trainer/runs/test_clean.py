@@ -5,9 +5,9 @@ import torch
 
 from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
 from reference_trainer.model.ply import load_ply, save_ply
-from reference_trainer.runs.clean import clean_ply
+from reference_trainer.runs.edit_ply import clean_ply
 from reference_trainer.runs.folder import BAKED_PLY, PLY
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.options import OrbitOptions
 
 
@@ -15,10 +15,9 @@ def rows(means: torch.Tensor) -> list[tuple[float, ...]]:
     return [tuple(row) for row in means.tolist()]
 
 
-def test_those_that_co_adapt_most_for_what_they_contribute_go(run, options, tmp_path):
-    model, scene = of_run(run[0])
-    said: list[str] = []
-    found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.3, refine=0, say=said.append)
+def test_those_that_co_adapt_most_for_what_they_contribute_go(run, options, tmp_path, said):
+    model, scene = load_run_model(run[0])
+    found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.3, refine=0, anyway=True)
     cleaned = load_ply(tmp_path / "c.ply")
     n = len(model.gaussians)
     values = share_per_weight(mean_shares(model, scene.train)[0], blend_weights(model, scene.train))
@@ -29,27 +28,26 @@ def test_those_that_co_adapt_most_for_what_they_contribute_go(run, options, tmp_
     assert cleaned.regularizer == model.regularizer
     assert [of.gaussians for of in found.values()] == [n, int(stay.sum())]
     table = next(text for text in said if "| as it was |" in text)
-    assert f"| {found['as it was'].mean('test', 'psnr'):.4g} |" in table
+    assert f"| {found['as it was'].mean('test', 'psnr'):.2f} |" in table
 
 
 def test_refining_closes_the_holes(run, options, tmp_path):
-    found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.3, refine=20, say=lambda text: None)
+    found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.3, refine=20, anyway=True)
     holes, closed = found["taken out"], found["after 20 steps"]
     assert closed.gaussians == holes.gaussians == len(load_ply(tmp_path / "c.ply").gaussians)
     assert closed.mean("train", "psnr") > holes.mean("train", "psnr")
 
 
-def test_without_a_scene_a_model_is_cleaned_as_large_as_it_was(run, tmp_path):
+def test_without_a_scene_a_model_is_cleaned_as_large_as_it_was(run, tmp_path, said):
     gaussians = load_ply(run[0] / PLY).gaussians
     small = dataclasses.replace(gaussians, means=gaussians.means / 100, log_scales=gaussians.log_scales - 4.6)
     small = dataclasses.replace(small, opacity_logits=small.opacity_logits + 4)  # a score from everywhere
     save_ply(small, tmp_path / "small.ply")
-    said: list[str] = []
     orbit = OrbitOptions(cameras=2, size=32)
-    found = clean_ply(tmp_path / "small.ply", orbit, tmp_path / "c.ply", say=said.append)
+    found = clean_ply(tmp_path / "small.ply", orbit, tmp_path / "c.ply")
     assert list(found) == ["as it was", "taken out"]
     assert any("nothing can close the holes" in text for text in said)
-    assert "orbit exact CA at 1/2 x1e-3" in said[-2]
+    assert "orbit exact CA (1e-3)" in said[-2]
     assert "PSNR" not in said[-2]
     means = load_ply(tmp_path / "c.ply").gaussians.means
     assert len(means) == len(small) - round(0.1 * len(small))
@@ -62,7 +60,21 @@ def test_what_cannot_be_cleaned_is_refused(run, scaled, options, tmp_path):
         with pytest.raises(ValueError, match="fraction must be in"):
             clean_ply(ply, options, out, **wrong)
     with pytest.raises(ValueError, match="those of the test"):
-        clean_ply(scaled[0] / BAKED_PLY, options, out, say=lambda text: None)
+        clean_ply(scaled[0] / BAKED_PLY, options, out)
     with pytest.raises(FileExistsError, match="exists already"):
         clean_ply(ply, options, ply)
     assert not out.exists()
+
+
+def test_a_model_that_was_trained_with_dropout_is_refused(run, options, tmp_path):
+    """There is little to remove, and what was measured became worse."""
+    with pytest.raises(ValueError, match=r"was trained with dropout\(0\.2\).* made it worse .*--anyway"):
+        clean_ply(run[0] / PLY, options, tmp_path / "c.ply")
+    assert not (tmp_path / "c.ply").exists()
+
+
+def test_a_worse_fit_is_said(run, options, tmp_path, said):
+    found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.9, refine=0, anyway=True)
+    before, after = (evaluation.mean("train", "psnr") for evaluation in found.values())
+    assert after < before - 1
+    assert any(f"fitted worse than before: {after:.2f} dB, for {before:.2f}" in text for text in said)

@@ -8,25 +8,33 @@ from pathlib import Path
 import pytest
 import sweep_tasks
 import torch
-from stand_ins.engine import Here
+from stand_ins.executor import Here
 from subprocesses import PYTHONPATH
 
 from ca_reg.monitor import LOG_NAME
-from reference_trainer.cli.drawing import Drawing
-from reference_trainer.cli.runs import Demo
+from reference_trainer.cli.options import RenderOptions
+from reference_trainer.cli.training import Demo
 from reference_trainer.evaluation.pictures import save_png
 from reference_trainer.evaluation.tables import comparison_table, summary
 from reference_trainer.render import chosen_engine
 from reference_trainer.runs import compare as compare_module
-from reference_trainer.runs import compare_report, grid
-from reference_trainer.runs.compare import NAMED, compare, scene_folders, strategies
-from reference_trainer.runs.compare_report import REPORT, TABLE, Comparison, report
-from reference_trainer.runs.engines.choice import choose_engine
-from reference_trainer.runs.engines.engine import Failure
+from reference_trainer.runs import grid
+from reference_trainer.runs.compare import (
+    COMPARISON,
+    NAMED,
+    TABLE,
+    Comparison,
+    compare,
+    report,
+    scene_folders,
+    strategies,
+)
+from reference_trainer.runs.executors import choose_executor
+from reference_trainer.runs.executors.executor import Failure
 from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.grid import Running
 from reference_trainer.runs.measure import render_run
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud
@@ -41,7 +49,11 @@ def cells(table: str) -> list[dict[str, str]]:
 
 def made(psnr: float | None, gaussians: int = 1000) -> dict:
     """The part of ``results.json`` that a table needs."""
-    return {"gaussians": gaussians, "seconds": 2.0, "mean": {"test": {"psnr": psnr, "ca": 2e-3, "lpips": None}}}
+    return {
+        "gaussians": gaussians,
+        "seconds": 2.0,
+        "mean": {"test": {"psnr": psnr, "ca_exact_half": 2e-3, "lpips": None}},
+    }
 
 
 def test_the_table_has_mean_and_sample_deviation():
@@ -49,17 +61,17 @@ def test_the_table_has_mean_and_sample_deviation():
     first, second = cells(comparison_table(runs))
     assert first["strategy"] == "baseline"
     assert first["seeds"] == "3"
-    assert first["test PSNR"] == "19.0 ± 1.0"
-    assert first["test CA x1e-3"] == "2 ± 0"
-    assert first["Gaussians"] == "2.0 ± 1.0k"
-    assert second["test PSNR"] == "21"
+    assert first["test PSNR"] == "19.00 ± 1.00"
+    assert first["test exact CA (1e-3)"] == "2.00 ± 0.00"
+    assert first["Gaussians"] == "2000 ± 1000"
+    assert second["test PSNR"] == "21.00"
     assert "test LPIPS" not in first  # measured nowhere
     assert "train PSNR" not in first
 
 
 def test_a_quality_that_one_strategy_lacks():
     first, second = cells(comparison_table({"a": [made(None)], "b": [made(20.0)]}))
-    assert (first["test PSNR"], second["test PSNR"]) == ("n/a", "20")
+    assert (first["test PSNR"], second["test PSNR"]) == ("n/a", "20.00")
 
 
 def test_strategies_change_the_regularizers_only():
@@ -93,13 +105,13 @@ def test_the_options_hold_for_every_scene(tmp_path):
     }
 
 
-def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
+def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch, said):
     """One run of eight fails; every scene has its own table and its own failures."""
 
     def train(options, config, out, engine, how):
         assert engine == chosen_engine()
         lpips = str(Path("weights.pth").resolve())
-        assert how == {"device": "cpu", "monitor_every": 7, "checkpoint_every": 9, "lpips": lpips}
+        assert how == {"device": "cpu", "monitoring": Monitoring(7, checkpoint_every=9), "lpips": lpips}
         assert out.is_dir()
         assert out.is_absolute()
         if (options.path, config.dropout, config.seed) == ("synthetic", 0.2, 1):
@@ -111,8 +123,7 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
     engine = Here()
     scenes = scene_folders(["synthetic", "data/fern"], SceneOptions(), Path("out"))
     configs = {"baseline": TrainConfig(), "dropout": TrainConfig(dropout=0.2)}
-    said = []
-    running = Running(engine, monitor_every=7, checkpoint_every=9, lpips="weights.pth", say=said.append)
+    running = Running(engine, monitoring=Monitoring(7, checkpoint_every=9), lpips="weights.pth")
     comparisons = compare(scenes, configs, [0, 1], running)
 
     assert len({task.arguments[2] for task in engine.tasks}) == 8
@@ -126,7 +137,7 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
     assert fern.failures == {}
     assert list(synthetic.failures) == ["dropout, seed 1"]
     assert "synthetic, dropout, seed 1: FAILED, RuntimeError: all Gaussians were pruned" in said[5]
-    stored = json.loads(Path("out/synthetic", REPORT).read_text())
+    stored = json.loads(Path("out/synthetic", COMPARISON).read_text())
     assert stored["failures"]["dropout, seed 1"]["error"] == "RuntimeError: all Gaussians were pruned"
     assert "in train" in stored["failures"]["dropout, seed 1"]["traceback"]
     assert [row["seeds"] for row in cells(Path("out/fern", TABLE).read_text())] == ["2", "2"]
@@ -146,20 +157,18 @@ def test_what_a_scene_lacks_is_said_once_before_any_run(changes, lacking, tmp_pa
     assert engine.tasks == []
 
 
-def test_failed_runs_are_listed_at_the_end(tmp_path):
-    said: list[str] = []
-    report({tmp_path: Comparison({}, {"a, seed 0": Failure("ValueError: no", "Traceback")})}, say=said.append)
+def test_failed_runs_are_listed_at_the_end(tmp_path, said):
+    report({tmp_path: Comparison({}, {"a, seed 0": Failure("ValueError: no", "Traceback")})})
     assert said[-2:] == [
         "1 of 1 runs FAILED; the same command tries them again:",
-        f"FAILED a, seed 0: ValueError: no ({tmp_path / REPORT} has the traceback)",
+        f"FAILED a, seed 0: ValueError: no ({tmp_path / COMPARISON} has the traceback)",
     ]
 
 
-def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch):
+def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch, said):
     """Nothing is held out: exact CA is reported at the training views, between them and around them."""
     options = dataclasses.replace(options, test="none")
-    said: list[str] = []
-    results = run_experiment(options, short, tmp_path / "a" / "seed_0", say=said.append)
+    results = run_experiment(options, short, tmp_path / "a" / "seed_0")
     assert sum(line.startswith("No test views") for line in said) == 1
     assert list(results["mean"]) == ["train", "between", "around"]
     assert all(isinstance(results["mean"][split]["ca_exact"], float) for split in results["mean"])
@@ -167,9 +176,9 @@ def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch):
     assert "| between | n/a |" in summary(results)
     (row,) = cells(comparison_table({"a": [results]}))
     for split in ("train", "between", "around"):
-        assert row[f"{split} exact CA x1e-3"] == f"{1e3 * results['mean'][split]['ca_exact']:.4g}"
+        assert row[f"{split} exact CA (1e-3)"] == f"{1e3 * results['mean'][split]['ca_exact_half']:.2f}"
     assert not any(title.startswith("test") for title in row)
-    report({tmp_path: Comparison({"a": [results]}, {})}, say=said.append)
+    report({tmp_path: Comparison({"a": [results]}, {})})
     names = {f"{view['split']}_{view['name']}.png" for view in results["views"] if view["split"] != "train"}
     assert {path.name for path in tmp_path.glob("*.png")} == {"dynamics.png", *names}
     with pytest.raises(ValueError, match="no test view: give --what train"):
@@ -177,7 +186,7 @@ def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch):
 
 
 @pytest.mark.parametrize("lines", [None, ""])
-def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, lines):
+def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, lines, said):
     """As after --monitor-every 0, or fewer steps than that."""
     out = tmp_path / "my runs"
     results = made(20.0) | {"config": {"seed": 0}, "views": [{"split": "test", "name": f"{x}/r_0.png"} for x in "ab"]}
@@ -187,12 +196,11 @@ def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, li
             save_png(folder / "views" / "test" / f"{name}_panel.png", torch.rand(3, 8, width))
         if lines is not None:
             (folder / LOG_NAME).write_text(lines)
-    said: list[str] = []
-    report({out: Comparison({"baseline": [results], "dropout": [results]}, {})}, say=said.append)
+    report({out: Comparison({"baseline": [results], "dropout": [results]}, {})})
     assert any(line.startswith("no figure of CA and PSNR against the iteration: ") for line in said)
     assert sorted(path.name for path in out.glob("*.png")) == ["test_a_r_0.png", "test_b_r_0.png"]
-    (page,) = (line for line in said if "ca-reg report" in line)
-    assert shlex.split(page)[-2:] == [str(out / strategy / "seed_0") for strategy in ("baseline", "dropout")]
+    (logs,) = (line for line in said if "tensorboard" in line)
+    assert shlex.split(logs.partition("curves: ")[2]) == ["tensorboard", "--logdir", str(out)]
 
 
 def test_a_worker_that_does_not_share_the_folder_does_not_train(tmp_path, options):
@@ -208,7 +216,7 @@ def test_a_worker_that_does_not_share_the_folder_does_not_train(tmp_path, option
     assert not (tmp_path / "a" / "seed_0").exists()
 
 
-@pytest.mark.parametrize("wrong", [{"retries": -1}, {"checkpoint_every": 0}, {"monitor_every": -1}])
+@pytest.mark.parametrize("wrong", [{"retries": -1}])
 def test_what_running_refuses(wrong):
     with pytest.raises(ValueError, match=rf"expected .*{next(iter(wrong))} of at least \d"):
         Running(Here(), **wrong)
@@ -222,17 +230,18 @@ def test_the_demo_is_a_comparison_of_all_strategies(tmp_path, monkeypatch):
         return {tmp_path: Comparison({}, {})}
 
     monkeypatch.setattr(compare_module, "compare", fake)
-    monkeypatch.setattr(compare_report, "report", lambda comparisons, say: None)
-    monkeypatch.setattr(Drawing, "begin", lambda self, device, trains: None)
+    monkeypatch.setattr(compare_module, "report", lambda comparisons: None)
+    monkeypatch.setattr(RenderOptions, "begin", lambda self, device, trains: None)
     Demo(tmp_path, iterations=4, seeds=2, jobs=2)()
     assert list(asked["configs"]) == ["baseline", "dropout", "noise", "both"]
     assert {config.iterations for config in asked["configs"].values()} == {4}
     assert asked["scenes"] == {tmp_path: SceneOptions("synthetic")}
-    assert (asked["running"].monitor_every, asked["running"].engine.jobs, asked["seeds"]) == (1, 2, [0, 1])
+    running = asked["running"]
+    assert (running.monitoring.every, running.executor.jobs, asked["seeds"]) == (1, 2, [0, 1])
 
 
 @pytest.mark.slow
-def test_a_comparison_from_photographs_to_figures(tmp_path, options):
+def test_a_comparison_from_photographs_to_figures(tmp_path, options, said):
     """Two strategies and two seeds; a third strategy loses all its Gaussians, one run is there already."""
     base = TrainConfig(iterations=6, densify_from=1, densify_every=2, densify_gradient=1e9)
     configs = {
@@ -240,10 +249,9 @@ def test_a_comparison_from_photographs_to_figures(tmp_path, options):
         "dropout": dataclasses.replace(base, dropout=0.2),
         "doomed": dataclasses.replace(base, prune_opacity=0.99),
     }
-    run_experiment(options, configs["dropout"], tmp_path / "dropout" / "seed_0", monitor_every=3)
+    run_experiment(options, configs["dropout"], tmp_path / "dropout" / "seed_0", monitoring=Monitoring(3))
     before = (tmp_path / "dropout" / "seed_0" / RESULTS).stat().st_mtime_ns
-    said: list[str] = []
-    running = Running(Here(), monitor_every=3, say=said.append)
+    running = Running(Here(), monitoring=Monitoring(3))
     comparison = compare({tmp_path: options}, configs, [0, 1], running)[tmp_path]
     assert (tmp_path / "dropout" / "seed_0" / RESULTS).stat().st_mtime_ns == before
     assert {name: [run["config"]["seed"] for run in runs] for name, runs in comparison.runs.items()} == {
@@ -263,12 +271,12 @@ def test_a_comparison_from_photographs_to_figures(tmp_path, options):
         mean, spread = (float(x) for x in rows[name]["test PSNR"].split(" ± "))
         assert mean == pytest.approx(statistics.mean(values), abs=0.05)
         assert spread == pytest.approx(statistics.stdev(values), rel=0.06)
-    stored = json.loads((tmp_path / REPORT).read_text())
+    stored = json.loads((tmp_path / COMPARISON).read_text())
     assert stored["runs"] == comparison.runs
     assert stored["failures"] == {name: dataclasses.asdict(why) for name, why in comparison.failures.items()}
 
     said.clear()
-    report({tmp_path: comparison}, say=said.append)
+    report({tmp_path: comparison})
     for name in ("dynamics", "test_test_0", "test_test_1", "test_test_outside"):
         assert (tmp_path / f"{name}.png").stat().st_size > 1000, name
     assert (tmp_path / "baseline" / "seed_1" / LOG_NAME).exists()
@@ -283,7 +291,7 @@ def files_of(folder: Path) -> dict[Path, int]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["processes", "ray"])
 @pytest.mark.usefixtures("one_thread")
-def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_path, options, monkeypatch):
+def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_path, options, monkeypatch, said):
     """The worker of seed 1 is killed at its first checkpoint; a second call starts no worker and writes no run."""
     if name == "ray":
         pytest.importorskip("ray")
@@ -292,11 +300,10 @@ def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr("reference_trainer.runs.grid.train_run", sweep_tasks.train_and_be_killed_once)
     config = TrainConfig(iterations=60, dropout=0.2)
-    whole = run_experiment(options, dataclasses.replace(config, seed=1), tmp_path / "whole", monitor_every=0)
+    whole = run_experiment(options, dataclasses.replace(config, seed=1), tmp_path / "whole", monitoring=Monitoring(0))
 
     out = tmp_path / "sweep"
-    said: list[str] = []
-    running = Running(choose_engine(name, jobs=2), monitor_every=0, checkpoint_every=10, say=said.append)
+    running = Running(choose_executor(name, jobs=2), monitoring=Monitoring(0, checkpoint_every=10))
     comparison = compare({out: options}, {"dropout": config}, [0, 1], running)[out]
     assert (out / "dropout" / "seed_1" / "killed").exists()
     assert sum("again with another (1 of 3)" in line for line in said) == 1
@@ -306,7 +313,7 @@ def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_
 
     before = files_of(out / "dropout")
     nobody = Here()
-    again = compare({out: options}, {"dropout": config}, [0, 1], Running(nobody, say=said.append))[out]
+    again = compare({out: options}, {"dropout": config}, [0, 1], Running(nobody))[out]
     assert again == comparison
     assert nobody.tasks == []
     assert files_of(out / "dropout") == before

@@ -8,8 +8,8 @@ import torch
 
 from ca_reg.regularizers import REGULARIZERS
 from reference_trainer.runs.folder import PLY
-from reference_trainer.runs.run import load_run, model_of, run_experiment
-from reference_trainer.runs.score_ply import of_ply
+from reference_trainer.runs.ply import load_ply_model
+from reference_trainer.runs.run import Monitoring, load_run, model_of, run_experiment
 from reference_trainer.scenes import load_scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
@@ -35,7 +35,7 @@ def test_it_trains_is_saved_and_resumed_evaluated_and_named_in_the_ply(name, opt
     expression = EXPRESSIONS.get(name, name)
     config = dataclasses.replace(busy, dropout=0.0, noise=0.0, regularizer=expression)
     out = tmp_path / "run"
-    results = run_experiment(options, config, out, monitor_every=12)
+    results = run_experiment(options, config, out, monitoring=Monitoring(12))
     assert math.isfinite(results["mean"]["test"]["psnr"])
     trainer = load_run(out)
 
@@ -61,7 +61,7 @@ def test_it_trains_is_saved_and_resumed_evaluated_and_named_in_the_ply(name, opt
         assert len(x) != len(scene.points.positions), "it should have been cloned, split and pruned"
         assert x.unique().numel() > len(x) // 2, "it should have learned"
 
-    model, facts = of_ply(out / PLY, background=scene.background)
+    model, facts = load_ply_model(out / PLY, background=scene.background)
     assert facts.regularizer == expression
     assert model.step == config.iterations
     for (parameter, x), (_, y) in zip(model.gaussians.named(), trainer.gaussians.named(), strict=True):

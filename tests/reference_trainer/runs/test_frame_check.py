@@ -7,7 +7,7 @@ import torch
 
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.runs.frame_check import check_frame
+from reference_trainer.runs.ply import check_frame
 from reference_trainer.scenes.scene import Scene, View
 
 FORWARD = Camera(torch.eye(4), 10.0, 10.0, 10.0, 5.0, 20, 10)  # 90 degrees wide, 53 high, looks along +z

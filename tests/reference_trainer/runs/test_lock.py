@@ -10,22 +10,21 @@ from pathlib import Path
 
 import pytest
 from filelock import FileLock
-from stand_ins.engine import Here
+from stand_ins.executor import Here
 
 from reference_trainer.runs.compare import compare
-from reference_trainer.runs.engines.engine import Value
-from reference_trainer.runs.folder import CHECKPOINT, RESULTS
+from reference_trainer.runs.executors.executor import Value
+from reference_trainer.runs.folder import CHECKPOINT, LOCK, RESULTS, FolderInUseError, run_lock
 from reference_trainer.runs.grid import Run, Running, run_grid
-from reference_trainer.runs.lock import LOCK, FolderInUseError, run_lock
-from reference_trainer.runs.measure import of_run
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.measure import load_run_model
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes import load_scene
 from reference_trainer.training.trainer import Trainer
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from reference_trainer.runs.lock import run_lock
+from reference_trainer.runs.folder import run_lock
 with run_lock(Path(sys.argv[1])):
     print("locked", flush=True)
     time.sleep(60)
@@ -117,25 +116,25 @@ def test_a_run_is_locked_from_its_first_file_to_its_last(tmp_path, options, shor
 
     monkeypatch.setattr(write, locked(write_json))
     monkeypatch.setattr(Trainer, "save", locked(save))
-    run_experiment(options, short, tmp_path, monitor_every=0)
+    run_experiment(options, short, tmp_path, monitoring=Monitoring(0))
     assert seen == ["write_json", "save", "save", "write_json"]  # settings, first and last checkpoint, results
     with run_lock(tmp_path):  # a complete run is read without the lock
-        run_experiment(options, short, tmp_path, monitor_every=0)
+        run_experiment(options, short, tmp_path, monitoring=Monitoring(0))
 
 
-def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, options, short, ctrl_c, elsewhere):
+def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, options, short, ctrl_c, elsewhere, said):
     with ctrl_c(5):
-        run_experiment(options, short, tmp_path, monitor_every=0)
+        run_experiment(options, short, tmp_path, monitoring=Monitoring(0))
     process = elsewhere(tmp_path)
     before = (tmp_path / CHECKPOINT).read_bytes()
     with pytest.raises(FolderInUseError):
-        run_experiment(options, short, tmp_path, monitor_every=0)
+        run_experiment(options, short, tmp_path, monitoring=Monitoring(0))
     assert (tmp_path / CHECKPOINT).read_bytes() == before
-    model, _ = of_run(tmp_path)  # who only reads is not kept out
+    model, _ = load_run_model(tmp_path)  # who only reads is not kept out
     assert len(model.gaussians) > 0
     end(process)
-    said = []
-    run_experiment(options, short, tmp_path, monitor_every=0, say=said.append)
+    said.clear()
+    run_experiment(options, short, tmp_path, monitoring=Monitoring(0))
     assert said[0] == f"{tmp_path}: continues from step 6"
 
 
@@ -147,12 +146,12 @@ def test_what_another_process_finished_while_the_scene_was_read_is_not_trained_a
     def load(_, seed):
         with monkeypatch.context() as patch:
             patch.setattr("reference_trainer.runs.run.load_scene", lambda _, seed: scene)
-            results.append(run_experiment(options, short, tmp_path, monitor_every=0))
+            results.append(run_experiment(options, short, tmp_path, monitoring=Monitoring(0)))
         return scene
 
     monkeypatch.setattr("reference_trainer.runs.run.load_scene", load)
     monkeypatch.setattr("reference_trainer.runs.run._train", train_once(monkeypatch))
-    assert run_experiment(options, short, tmp_path, monitor_every=0) == results[0]
+    assert run_experiment(options, short, tmp_path, monitoring=Monitoring(0)) == results[0]
 
 
 def train_once(monkeypatch):
@@ -171,7 +170,7 @@ def train_once(monkeypatch):
 
 def test_a_sweep_goes_on_without_the_run_that_is_at_work_elsewhere(tmp_path, options, short, elsewhere):
     elsewhere(tmp_path / "a" / "seed_0")
-    comparison = compare({tmp_path: options}, {"a": short}, [0, 1], Running(Here(), monitor_every=0))[tmp_path]
+    comparison = compare({tmp_path: options}, {"a": short}, [0, 1], Running(Here(), monitoring=Monitoring(0)))[tmp_path]
     assert [run["config"]["seed"] for run in comparison.runs["a"]] == [1]
     assert list(comparison.failures) == ["a, seed 0"]
     error = comparison.failures["a, seed 0"].error
@@ -179,7 +178,7 @@ def test_a_sweep_goes_on_without_the_run_that_is_at_work_elsewhere(tmp_path, opt
     assert not (tmp_path / "a" / "seed_0" / CHECKPOINT).exists()
 
 
-def test_what_another_sweep_finished_meanwhile_counts(tmp_path, options, short):
+def test_what_another_sweep_finished_meanwhile_counts(tmp_path, options, short, said):
     class Other(Here):
         """The other sweep has the first run, and finishes it while the second is done here."""
 
@@ -188,11 +187,10 @@ def test_what_another_sweep_finished_meanwhile_counts(tmp_path, options, short):
                 with run_lock(tmp_path / "0"):
                     super().start(number, task)
             else:
-                self.now = number, Value(run_experiment(options, short, tmp_path / "0", monitor_every=0))
+                self.now = number, Value(run_experiment(options, short, tmp_path / "0", monitoring=Monitoring(0)))
 
-    said = []
     runs = [Run(str(i), options, short, tmp_path / str(i)) for i in range(2)]
-    outcomes = run_grid(runs, Running(Other(), monitor_every=0, say=said.append))
+    outcomes = run_grid(runs, Running(Other(), monitoring=Monitoring(0)))
     assert outcomes[0] == outcomes[1]
     assert (tmp_path / "0" / RESULTS).exists()
     assert "FAILED, FolderInUseError" in said[0]

@@ -8,14 +8,13 @@ import torch
 from PIL import Image
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
-from reference_trainer.evaluation.kept import PARTIAL
-from reference_trainer.evaluation.tables import evaluation_table
+from reference_trainer.evaluation.results import PARTIAL
+from reference_trainer.evaluation.tables import EXACT, evaluation_table
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import measure as measure_module
-from reference_trainer.runs.folder import BAKED_PLY, PLY
-from reference_trainer.runs.lock import FolderInUseError, run_lock
-from reference_trainer.runs.measure import measure, of_run, render_run
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.folder import BAKED_PLY, PLY, FolderInUseError, run_lock
+from reference_trainer.runs.measure import load_run_model, measure, render_run
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes.images import read_image
 from reference_trainer.training.config import TrainConfig
 
@@ -29,8 +28,8 @@ def test_the_flag_of_the_evaluation_and_that_of_the_training_are_the_same(run, s
     (plain, before), (out, results) = run, scaled
     one, other = (load_ply(folder / PLY).gaussians for folder in (plain, out))
     assert all(torch.equal(x, y) for (_, x), (_, y) in zip(one.named(), other.named(), strict=True))
-    model, scene = of_run(plain, regularizer="dropout(0.2) + noise(0.3, scale=True)")
-    measure(model, both(scene), tmp_path, about={}, say=lambda text: None)
+    model, scene = load_run_model(plain, regularizer="dropout(0.2) + noise(0.3, scale=True)")
+    measure(model, both(scene), tmp_path, about={})
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]
     assert found["regularizer"] == "dropout(0.2) + noise(0.3, scale=True)"
@@ -45,7 +44,7 @@ def test_the_monitor_and_the_pictures_use_the_same_opacities(scaled, tmp_path):
     out, results = scaled
     (line,) = (out / "ca.jsonl").read_text().splitlines()
     assert json.loads(line)["psnr/test"] == pytest.approx(results["mean"]["test"]["psnr"])
-    folder = render_run(out, "test", tmp_path, say=lambda text: None)
+    folder = render_run(out, "test", tmp_path)
     for path in folder.iterdir():
         assert path.read_bytes() == (out / "views" / "test" / path.name).read_bytes()
 
@@ -59,22 +58,21 @@ def test_the_monitor_counts_the_pixels_inside_the_masks(masked, tmp_path):
 
 def test_noise_alone_has_a_ply_for_viewers_too(options, tmp_path):
     config = TrainConfig(iterations=1, regularizer="noise(0.8, clip=True, scale=True)")
-    run_experiment(options, config, tmp_path, monitor_every=0)
-    model = of_run(tmp_path)[0]
+    run_experiment(options, config, tmp_path, monitoring=Monitoring(0))
+    model = load_run_model(tmp_path)[0]
     assert (model.dropout, model.factor) == (0.0, None)
     torch.testing.assert_close(load_ply(tmp_path / BAKED_PLY).gaussians.opacities, model.test_opacities)
 
 
 def test_a_run_is_not_rendered_as_if_trained_with_nonsense(run):
     with pytest.raises(ValueError, match="there is no regularizer 'noize'"):
-        of_run(run[0], regularizer="noize(0.8)")
+        load_run_model(run[0], regularizer="noize(0.8)")
 
 
-def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):
+def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path, said):
     out, results = run
-    model, scene = of_run(out)
-    said: list[str] = []
-    measure(model, both(scene), tmp_path / "new", about={"scene": "a name"}, say=said.append)
+    model, scene = load_run_model(out)
+    measure(model, both(scene), tmp_path / "new", about={"scene": "a name"})
     found = json.loads((tmp_path / "new" / "evaluation.json").read_text())
     assert found["views"] == results["views"]
     assert found["mean"] == results["mean"]
@@ -87,7 +85,7 @@ def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path):
 
 def test_the_folder_is_locked_until_the_last_file_has_changed(run, tmp_path, monkeypatch):
     """Otherwise a second evaluation that begins in between would lose its partial scores to the first."""
-    model, scene = of_run(run[0])
+    model, scene = load_run_model(run[0])
     touched = []
 
     def watched(change):
@@ -102,17 +100,15 @@ def test_the_folder_is_locked_until_the_last_file_has_changed(run, tmp_path, mon
 
     for owner, name in ((Path, "unlink"), (measure_module, "write_json"), (measure_module, "write_text")):
         monkeypatch.setattr(owner, name, watched(getattr(owner, name)))
-    measure(model, {"test": scene.test[:1]}, tmp_path, about={}, say=lambda text: None)
+    measure(model, {"test": scene.test[:1]}, tmp_path, about={})
     assert touched == ["evaluation.json", "evaluation.md", "evaluation.partial.json"]
     assert not (tmp_path / PARTIAL).exists()
 
 
 def test_the_seed_decides_the_masks(run, tmp_path):
-    model, scene = of_run(run[0])
+    model, scene = load_run_model(run[0])
     views = {"train": scene.train[:1]}
-    one, same, other = (
-        measure(model, views, tmp_path, about={}, samples=3, seed=seed, say=lambda text: None) for seed in (0, 0, 1)
-    )
+    one, same, other = (measure(model, views, tmp_path, about={}, samples=3, seed=seed) for seed in (0, 0, 1))
     assert one.views[0].ca == same.views[0].ca != other.views[0].ca
     assert one.views[0].psnr == other.views[0].psnr
 
@@ -124,11 +120,25 @@ def test_the_table_has_one_row_per_view_and_the_means():
     ]
     lines = evaluation_table(Evaluation(views, 9, "vgg").as_dict()).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    head = ["view", "PSNR", "SSIM", "LPIPS", "CA x1e-3", "CA std error x1e-3", "exact CA x1e-3", "neutral CA x1e-3",
-            "visible", "covered", "CV"]  # fmt: skip
+    head = ["view", "PSNR", "SSIM", "LPIPS", EXACT, "exact CA at its own drop rate (1e-3)",
+            "neutral CA at its own drop rate (1e-3)", "CA (5 renders) (1e-3)", "its std error (1e-3)", "visible",
+            "covered", "CV"]  # fmt: skip
     assert cells[0] == head
-    assert cells[2] == ["test v0", "20", "0.5", "0.25", "2", "0.1", "4", "5", "0.9", "0.7", "0.04"]
-    assert cells[4][:2] == ["mean test", "20.5"]
+    assert cells[2] == [
+        "test v0",
+        "20.00",
+        "0.500",
+        "0.250",
+        "4.50",
+        "4.00",
+        "5.00",
+        "2.00",
+        "0.10",
+        "0.900",
+        "0.700",
+        "0.0400",
+    ]
+    assert cells[4][:2] == ["mean test", "20.50"]
     plain = [dataclasses.replace(view, psnr=math.nan, lpips=math.nan) for view in views]
     mixed = Evaluation([*plain, dataclasses.replace(views[0], lpips=math.nan)], 9)
     head = evaluation_table(mixed.as_dict()).splitlines()[0]
@@ -139,7 +149,7 @@ def test_the_table_has_one_row_per_view_and_the_means():
 @pytest.mark.parametrize(("what", "names"), [("test", ["test_0", "test_1", "test_outside"]), ("train", None)])
 def test_views_are_rendered_as_the_run_drew_them(run, what, names):
     out, _ = run
-    folder = render_run(out, what, say=lambda text: None)
+    folder = render_run(out, what)
     assert folder == out / f"render_{what}"
     found = sorted(path.stem for path in folder.iterdir())
     assert found == (names or [f"train_{i}" for i in range(3)])
@@ -152,16 +162,15 @@ def test_views_of_the_same_name_in_two_folders_are_all_rendered(run, tmp_path, m
     names = ("a/r_0.png", "b/r_0.png", "r_1.png")
     test = tuple(dataclasses.replace(v, name=n) for v, n in zip(trainer.scene.test, names, strict=True))
     trainer.scene = dataclasses.replace(trainer.scene, test=test)
-    monkeypatch.setattr(measure_module, "load_run", lambda *arguments: trainer)
-    render_run(run[0], "test", tmp_path, say=lambda text: None)
+    monkeypatch.setattr(measure_module, "load_run", lambda *arguments, **trust: trainer)
+    render_run(run[0], "test", tmp_path)
     for name, view in (("a_r_0", "test_0"), ("b_r_0", "test_1"), ("r_1", "test_outside")):
         assert (tmp_path / f"{name}.png").read_bytes() == (run[0] / "views" / "test" / f"{view}.png").read_bytes()
 
 
-def test_a_flight_begins_and_ends_at_training_cameras(run, tmp_path):
+def test_a_flight_begins_and_ends_at_training_cameras(run, tmp_path, said):
     out, _ = run
-    said: list[str] = []
-    folder = render_run(out, "flight", tmp_path / "flight", frames=5, say=said.append)
+    folder = render_run(out, "flight", tmp_path / "flight", frames=5)
     assert sorted(path.name for path in folder.iterdir()) == [f"{i:04d}.png" for i in range(5)] + ["flight.gif"]
     with Image.open(folder / "flight.gif") as animation:
         assert (animation.n_frames, animation.size) == (5, (20, 15))

@@ -4,6 +4,7 @@ import shutil
 import signal
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from reference_trainer.evaluation.tables import evaluation_table, summary
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import run as run_module
 from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, CONFIG, PLAN, PLY, RESULTS, read_results
-from reference_trainer.runs.run import load_run, model_of, run_experiment
+from reference_trainer.runs.run import Monitoring, load_run, model_of, run_experiment
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
@@ -21,7 +22,7 @@ from reference_trainer.training.interruption import TrainingInterrupted, Trainin
 from reference_trainer.training.plan import Plan
 from reference_trainer.training.trainer import Trainer
 
-EVERY = {"monitor_every": 3, "checkpoint_every": 4}
+EVERY: dict[str, Any] = {"monitoring": Monitoring(3, checkpoint_every=4)}
 WHOLE = {
     "config": {"seed": 0},
     "gaussians": 1,
@@ -38,7 +39,7 @@ DAMAGED = ("[]", '{"mean": {}}', *(json.dumps(WHOLE | change) for change in (
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, options, short) -> tuple[Path, dict]:
     out = tmp_path_factory.mktemp("run")
-    return out, run_experiment(options, short, out, **EVERY, monitor_pictures=True)
+    return out, run_experiment(options, short, out, monitoring=Monitoring(3, pictures=True, checkpoint_every=4))
 
 
 @pytest.fixture
@@ -81,31 +82,31 @@ def test_everything_is_there(finished, options, short):
     assert results["gaussians"] == len(load_ply(out / PLY).gaussians) > 3000
     assert [view["name"] for view in results["views"]] == [name.split("/")[1] for name in names]
     assert results["mean"]["test"]["lpips"] is None
-    assert [json.loads(line)["step"] for line in (out / LOG_NAME).read_text().splitlines()] == [3, 6, 9]
+    assert [json.loads(line)["step"] for line in (out / LOG_NAME).read_text().splitlines()] == [3, 6, 9, 11]
 
 
-def test_a_second_call_does_nothing(finished, options, short, monkeypatch):
+def test_a_second_call_does_nothing(finished, options, short, monkeypatch, said):
     out, results = finished
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
     monkeypatch.setattr("reference_trainer.runs.run.load_scene", lambda *_, **__: pytest.fail("it was loaded again"))
-    said: list[str] = []
-    assert run_experiment(options, short, out, **EVERY, say=said.append) == results
+    assert run_experiment(options, short, out, **EVERY) == results
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
     assert said == [f"{out}: complete, nothing to do"]
 
 
-def test_ctrl_c_saves_where_it_is(finished, options, short, ctrl_c, tmp_path):
+def test_ctrl_c_saves_where_it_is(finished, options, short, ctrl_c, tmp_path, said):
     """Between two periodic checkpoints nothing is lost."""
     with ctrl_c(5):
         run_experiment(options, short, tmp_path, **EVERY)
-    said: list[str] = []
-    run_experiment(options, short, tmp_path, **EVERY, say=said.append)
+    run_experiment(options, short, tmp_path, **EVERY)
     assert f"{tmp_path}: continues from step 6" in said
     assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
 
 
 @pytest.mark.slow
-def test_sigterm_saves_and_then_ends_the_process_as_its_sender_expects(finished, options, short, monkeypatch, tmp_path):
+def test_sigterm_saves_and_then_ends_the_process_as_its_sender_expects(
+    finished, options, short, monkeypatch, tmp_path, said
+):
     original, received = Trainer.train_step, []
 
     def train_step(trainer: Trainer) -> tuple[float, float]:
@@ -113,13 +114,12 @@ def test_sigterm_saves_and_then_ends_the_process_as_its_sender_expects(finished,
             signal.raise_signal(signal.SIGTERM)
         return original(trainer)
 
-    said: list[str] = []
     before = signal.signal(signal.SIGTERM, lambda number, frame: received.append(load_run(tmp_path).step))
     try:
         with monkeypatch.context() as patch:
             patch.setattr(Trainer, "train_step", train_step)
             with pytest.raises(TrainingInterrupted):
-                run_experiment(options, short, tmp_path, **EVERY, say=said.append)
+                run_experiment(options, short, tmp_path, **EVERY)
     finally:
         signal.signal(signal.SIGTERM, before)
     assert received == [6]  # raised again, when the model had been saved
@@ -229,7 +229,7 @@ def test_an_interrupted_run_ends_like_an_uninterrupted_one(finished, interrupted
         assert one[key] == other[key]
 
 
-def test_a_killed_run_continues_from_its_last_checkpoint(finished, options, short, tmp_path):
+def test_a_killed_run_continues_from_its_last_checkpoint(finished, options, short, tmp_path, said):
     """No farewell: the checkpoint of step 4, and a log that is already further, with half a line at its end."""
     partial = Trainer(load_scene(options, seed=0), short)
     partial.train(until=4)
@@ -238,15 +238,14 @@ def test_a_killed_run_continues_from_its_last_checkpoint(finished, options, shor
     shutil.copy(finished[0] / LOG_NAME, tmp_path)
     with (tmp_path / LOG_NAME).open("a") as log:
         log.write('{"step": 12, "ca')
-    said: list[str] = []
-    run_experiment(options, short, tmp_path, **EVERY, say=said.append)
+    run_experiment(options, short, tmp_path, **EVERY)
     assert f"{tmp_path}: continues from step 4" in said
     for file in (PLY, LOG_NAME):
         assert (tmp_path / file).read_bytes() == (finished[0] / file).read_bytes(), file
 
 
 def test_monitoring_has_no_influence(finished, options, short, tmp_path):
-    run_experiment(options, short, tmp_path, monitor_every=0, checkpoint_every=4)
+    run_experiment(options, short, tmp_path, monitoring=Monitoring(0, checkpoint_every=4))
     assert not (tmp_path / LOG_NAME).exists()
     assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
 
@@ -261,8 +260,72 @@ def test_tensorboard_shows_pictures_of_a_view_of_each_split_if_asked_to(finished
     assert set(shown[finished[0]].Tags()["images"]) == tags
     for tag in tags:
         images = shown[finished[0]].Images(tag)
-        assert [(image.step, image.width, image.height) for image in images] == [(step, 20, 15) for step in (3, 6, 9)]
+        assert [(image.step, image.width, image.height) for image in images] == [
+            (step, 20, 15) for step in (3, 6, 9, 11)
+        ]
     assert not shown[scaled[0]].Tags()["images"]
+    assert {"loss", "learning rate/means", "dropout rate", "psnr/test"} <= set(shown[finished[0]].Tags()["scalars"])
+    assert any(tag.startswith("settings") for tag in shown[finished[0]].Tags()["tensors"])
+
+
+def test_the_log_and_tensorboard_hold_the_score_of_the_tables(finished):
+    """The exact score at drop rate 1/2, although the training drops: what results.json calls ca_exact_half."""
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    out, results = finished
+    last = json.loads((out / LOG_NAME).read_text().splitlines()[-1])
+    expected = results["mean"]["test"]["ca_exact_half"]
+    assert (last["method"], last["drop_rate"]) == ("exact", 0.5)
+    assert last["ca/test"] == pytest.approx(expected, rel=1e-6)
+    shown = accumulator.EventAccumulator(str(out))
+    shown.Reload()
+    assert shown.Scalars("exact CA (1e-3)/test")[-1].value == pytest.approx(1e3 * expected, rel=1e-5)
+    assert "ca/test" not in shown.Tags()["scalars"]
+    assert f"| {1e3 * expected:.2f} |" in summary(results)
+    assert results["ca_settings"]["drop_rate"] == pytest.approx(0.6)
+    assert "CA (5 renders, drop rate 0.6) (1e-3)" in evaluation_table(results)
+
+
+@pytest.mark.parametrize("name", [PLY, RESULTS, "views"])
+def test_a_folder_of_somebody_elses_is_not_written_to(name, options, short, tmp_path):
+    (tmp_path / name).mkdir() if name == "views" else (tmp_path / name).write_text("precious")
+    if name == RESULTS:  # without the settings of a run it is nobody's
+        (tmp_path / BAKED_PLY).write_text("precious")
+    before = {path: path.read_text() for path in tmp_path.iterdir() if path.is_file()}
+    with pytest.raises(ValueError, match=f"holds .*{name}.* give another --out"):
+        run_experiment(options, short, tmp_path)
+    assert {path: path.read_text() for path in tmp_path.iterdir() if path.is_file()} == before
+
+
+def test_the_folder_of_the_scene_is_not_written_to(short, tmp_path):
+    with pytest.raises(ValueError, match="is the folder of the scene, to which nothing is written"):
+        run_experiment(SceneOptions(str(tmp_path)), short, tmp_path)
+
+
+@pytest.mark.parametrize("place", ["config.json", "checkpoint", "loss", "scene"])
+def test_a_run_imports_no_code_that_nobody_has_named(place, finished, tmp_path, monkeypatch):
+    """The module would leave a mark if it were imported."""
+    out = tmp_path / "run"
+    shutil.copytree(finished[0], out)
+    mark = tmp_path / "mark"
+    (tmp_path / "evilmod.py").write_text(f"import pathlib; pathlib.Path({str(mark)!r}).touch()\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    claim = json.loads((out / CONFIG).read_text())
+    text = {"loss": "photometric + evilmod:Evil", "scene": "evilmod:evil"}.get(place, "evilmod:Evil(0.2)")
+    if place == "checkpoint":
+        state = torch.load(out / CHECKPOINT, weights_only=True)
+        state["config"] = json.dumps(json.loads(state["config"]) | {"regularizer": text})
+        torch.save(state, out / CHECKPOINT)
+    else:
+        key = {"loss": "loss", "scene": "format"}.get(place, "regularizer")
+        claim["scene" if place == "scene" else "config"][key] = text
+        (out / CONFIG).write_text(json.dumps(claim))
+    with pytest.raises(ValueError, match=r"evilmod, which is not imported because a file says so.*--trust evilmod"):
+        load_run(out)
+    assert not mark.exists()
+    if place == "checkpoint":
+        with pytest.raises(ValueError, match="evilmod:Evil cannot be had"):  # there is no such class, but:
+            load_run(out, trust=["evilmod"])
+        assert mark.exists()
 
 
 def test_another_run_in_the_same_folder_is_refused(finished, options, short):
@@ -305,7 +368,7 @@ def test_divergence_keeps_the_last_checkpoint(options, short, monkeypatch, tmp_p
     broken_scene(options, monkeypatch)
     for _ in range(2):  # the second call fails in the same way and does no harm
         with pytest.raises(TrainingStoppedError, match="the loss became nan"):
-            run_experiment(options, short, tmp_path, monitor_every=0, checkpoint_every=1)
+            run_experiment(options, short, tmp_path, monitoring=Monitoring(0, checkpoint_every=1))
         trainer = load_run(tmp_path)
         assert 0 < trainer.step < 3
         assert all(torch.isfinite(x).all() for _, x in trainer.gaussians.named())
@@ -319,7 +382,7 @@ def test_a_model_that_vanishes_does_not_overwrite_the_checkpoint(options, short,
     config = dataclasses.replace(short, prune_opacity=0.99)
     for _ in range(2):
         with pytest.raises(TrainingStoppedError, match=r"pruned after step 4: .* step 3 is kept in .*\.pt"):
-            run_experiment(options, config, tmp_path, monitor_every=0, checkpoint_every=3)
+            run_experiment(options, config, tmp_path, monitoring=Monitoring(0, checkpoint_every=3))
         trainer = load_run(tmp_path)
         assert (trainer.step, len(trainer.gaussians)) == (3, 3000)
 
@@ -348,13 +411,12 @@ def test_summary(finished):
     lines = summary(finished[1]).splitlines()
     assert [line.split("|")[1].strip() for line in lines] == ["views", ":---", "test", "train"]
     psnr = finished[1]["mean"]["test"]["psnr"]
-    assert f"{psnr:.4g}" in lines[2]
-    assert "n/a" in lines[2]  # no perceptual metric
+    assert f"| {psnr:.2f} |" in lines[2]
+    assert "LPIPS" not in lines[0]  # no perceptual metric
 
 
-def test_auto_trains_by_the_plan_and_keeps_it(options, short, tmp_path):
-    said: list[str] = []
-    results = run_experiment(options, short, tmp_path, **EVERY, auto=True, say=said.append)
+def test_auto_trains_by_the_plan_and_keeps_it(options, short, tmp_path, said):
+    results = run_experiment(options, short, tmp_path, **EVERY, auto=True)
     stored = Plan.from_dict(json.loads((tmp_path / PLAN).read_text()))
     assert stored.applied(short) == dataclasses.replace(short, sh_degree=2)
     assert results["config"] == json.loads((tmp_path / CONFIG).read_text())["config"]

@@ -5,6 +5,7 @@ import json
 
 import pytest
 import torch
+from heard import hearing
 from PIL import Image
 
 from reference_trainer.evaluation import evaluate as evaluate_module
@@ -12,9 +13,9 @@ from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import BAKED_PLY, PLY
-from reference_trainer.runs.measure import of_run
+from reference_trainer.runs.measure import load_run_model
+from reference_trainer.runs.ply import load_ply_model, score_ply
 from reference_trainer.runs.run import save_for_viewers
-from reference_trainer.runs.score_ply import of_ply, score_ply
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import OrbitOptions
 
@@ -31,9 +32,9 @@ def ball(n=300, radius=1.0, degree=0, opacity=0.9):
 
 def orbit(gaussians, tmp_path, name, **keywords):
     """Save and score; returns the scores and what was said."""
-    said: list[str] = []
     save_ply(gaussians, tmp_path / f"{name}.ply")
-    result = score_ply(tmp_path / f"{name}.ply", FEW, tmp_path / name, say=said.append, **keywords)
+    with hearing() as said:
+        result = score_ply(tmp_path / f"{name}.ply", FEW, tmp_path / name, **keywords)
     return result, said
 
 
@@ -41,15 +42,15 @@ def test_a_baked_ply_is_not_scaled_twice(run, options):
     """Three ways to the image of the test: baked and marked, plain with the rate, and the checkpoint."""
     out, _ = run
     scene = load_scene(options)
-    baked, facts = of_ply(out / BAKED_PLY, background=scene.background)  # it says its rate itself
-    plain, _ = of_ply(out / PLY, background=scene.background, regularizer="dropout(0.2)")
-    trained, _ = of_run(out)
+    baked, facts = load_ply_model(out / BAKED_PLY, background=scene.background)  # it says its rate itself
+    plain, _ = load_ply_model(out / PLY, background=scene.background, regularizer="dropout(0.2)")
+    trained, _ = load_run_model(out)
     assert (facts.opacity_scale, facts.for_rendering) == (0.8, False)
     assert "0.8 baked in, taken out for CA; trained with: dropout(0.2)" in str(facts)
     assert baked.factor == plain.factor == trained.factor == 0.8
     torch.testing.assert_close(baked.gaussians.opacities, trained.gaussians.opacities, rtol=0, atol=2e-6)
     with pytest.raises(ValueError, match=r"was scaled for dropout 0\.2, not for dropout\(0\.5\)"):
-        of_ply(out / BAKED_PLY, background=scene.background, regularizer="dropout(0.5)")
+        load_ply_model(out / BAKED_PLY, background=scene.background, regularizer="dropout(0.5)")
     for view in scene.test:
         images = [model.render(model.test_opacities, view)[0] for model in (baked, plain, trained)]
         torch.testing.assert_close(images[0], images[2], rtol=0, atol=1e-5)
@@ -59,23 +60,23 @@ def test_a_baked_ply_is_not_scaled_twice(run, options):
 
 
 def test_a_ply_without_dropout_is_used_as_it_is(tmp_path, run):
-    model = of_run(run[0])[0]
+    model = load_run_model(run[0])[0]
     save_ply(model.gaussians, tmp_path / "model.ply")
-    assert of_ply(tmp_path / "model.ply", background=torch.zeros(3))[0].regularizer == ""
+    assert load_ply_model(tmp_path / "model.ply", background=torch.zeros(3))[0].regularizer == ""
 
 
 def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options, tmp_path):
     out, results = scaled
     scene = load_scene(options)
-    model, facts = of_ply(out / BAKED_PLY, background=scene.background)
+    model, facts = load_ply_model(out / BAKED_PLY, background=scene.background)
     assert "those of the test, used as they are, for CA too" in str(facts)
-    trained = of_run(out)[0]
+    trained = load_run_model(out)[0]
     torch.testing.assert_close(model.test_opacities, trained.test_opacities, rtol=0, atol=1e-6)
     assert model.ca_score().settings == trained.ca_score().settings
     for view, scores in zip(scene.test, results["views"][3:], strict=True):
         image = model.render(model.test_opacities, view)[0].clamp(0, 1)
         assert psnr(image, view.image) == pytest.approx(scores["psnr"], abs=1e-3)
-    save_for_viewers(of_run(run[0])[0], tmp_path / "dropout.ply")
+    save_for_viewers(load_run_model(run[0])[0], tmp_path / "dropout.ply")
     assert (tmp_path / "dropout.ply").read_bytes() == (run[0] / BAKED_PLY).read_bytes()
 
 
@@ -85,25 +86,25 @@ def test_the_bands_that_are_used(tmp_path, band, used):
     if band is not None:
         gaussians.sh_rest[3, {1: 2, 2: 3}[band], 0] = 0.1  # the last coefficient of band 1, the first of band 2
     save_ply(gaussians, tmp_path / "a.ply", pad_to_degree=3)
-    facts = of_ply(tmp_path / "a.ply", background=torch.zeros(3))[1]
+    facts = load_ply_model(tmp_path / "a.ply", background=torch.zeros(3))[1]
     assert (facts.gaussians, facts.sh_degree, facts.sh_degree_used) == (4, 3, used)
     assert f"SH degree 3 (bands above {used} are zero); opacities: plain" in str(facts)
 
 
 def test_what_the_caller_says_comes_first(tmp_path):
     save_ply(ball(), tmp_path / "a.ply", regularizer="dropout(0.2)", step=5)
-    model, facts = of_ply(tmp_path / "a.ply", background=torch.zeros(3))
+    model, facts = load_ply_model(tmp_path / "a.ply", background=torch.zeros(3))
     assert (facts.regularizer, model.dropout, model.step) == ("dropout(0.2)", pytest.approx(0.2), 5)
-    model, _ = of_ply(tmp_path / "a.ply", background=torch.zeros(3), regularizer="dropout(0.5)")
+    model, _ = load_ply_model(tmp_path / "a.ply", background=torch.zeros(3), regularizer="dropout(0.5)")
     assert model.dropout == 0.5
     save_ply(ball(), tmp_path / "b.ply", regularizer="dropout(1.5)")
     with pytest.raises(ValueError, match=r"b\.ply says what it was trained with: .*p must be in .* Give --regularizer"):
-        of_ply(tmp_path / "b.ply", background=torch.zeros(3))
+        load_ply_model(tmp_path / "b.ply", background=torch.zeros(3))
 
 
 def test_a_baked_rate_of_many_digits_is_read_as_it_is(tmp_path):
     save_ply(ball(), tmp_path / "a.ply", bake_p=0.1234567)
-    model, facts = of_ply(tmp_path / "a.ply", background=torch.zeros(3))
+    model, facts = load_ply_model(tmp_path / "a.ply", background=torch.zeros(3))
     assert facts.regularizer == "dropout(0.1234567)"
     torch.testing.assert_close(model.gaussians.opacities, ball().opacities)
 
@@ -133,14 +134,13 @@ def test_what_is_written_for_an_orbit(tmp_path):
 
 
 @pytest.mark.parametrize("on", ["orbit", "scene"])
-def test_an_interrupted_measurement_continues_to_the_same_files(tmp_path, options, monkeypatch, on):
+def test_an_interrupted_measurement_continues_to_the_same_files(tmp_path, options, monkeypatch, on, said):
     save_ply(ball(), tmp_path / "ball.ply")
     original, done = evaluate_module._measure, []
 
     def measure(out, **keywords):
-        said: list[str] = []
         where = FEW if on == "orbit" else options
-        score_ply(tmp_path / "ball.ply", where, out, samples=2, say=said.append, **keywords)
+        score_ply(tmp_path / "ball.ply", where, out, samples=2, **keywords)
         return said
 
     def stopped(*arguments):
@@ -185,7 +185,7 @@ def test_another_model_in_the_same_file_is_measured_anew(tmp_path, monkeypatch):
 def test_a_baked_and_a_plain_ply_have_the_same_scores(tmp_path):
     plain, _ = orbit(ball(), tmp_path, "plain", regularizer="dropout(0.2)")
     save_ply(ball(), tmp_path / "baked.ply", bake_p=0.2)
-    baked = score_ply(tmp_path / "baked.ply", FEW, tmp_path / "baked", say=lambda text: None)
+    baked = score_ply(tmp_path / "baked.ply", FEW, tmp_path / "baked")
     unscaled, _ = orbit(ball(), tmp_path, "unscaled")
     for name in ("ca", "ca_exact", "ca_neutral", "cv", "covered"):
         assert baked.mean("orbit", name) == pytest.approx(plain.mean("orbit", name), rel=1e-4)
@@ -222,15 +222,14 @@ def test_a_place_is_told_from_an_object(tmp_path):
     said = orbit(both, tmp_path, "place")[1]
     assert "a place and not an object" in said[1]
     save_ply(both, tmp_path / "arc.ply")
-    said = []
-    score_ply(tmp_path / "arc.ply", dataclasses.replace(FEW, arc=40.0), tmp_path / "arc", say=said.append)
+    with hearing() as said:
+        score_ply(tmp_path / "arc.ply", dataclasses.replace(FEW, arc=40.0), tmp_path / "arc")
     assert not any("a place and not an object" in line for line in said)
 
 
-def test_a_ply_on_its_scene(run, options, tmp_path):
+def test_a_ply_on_its_scene(run, options, tmp_path, said):
     out, results = run
-    said: list[str] = []
-    score_ply(out / PLY, options, tmp_path, regularizer="dropout(0.2)", say=said.append)
+    score_ply(out / PLY, options, tmp_path, regularizer="dropout(0.2)")
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]
     assert found["ply"]["regularizer"] == "dropout(0.2)"
@@ -248,8 +247,8 @@ def test_a_model_that_fits_no_photograph(tmp_path, photographs, request):
     heard = {}
     for name, gaussians in (("right", right), ("wrong", wrong)):
         save_ply(gaussians, tmp_path / f"{name}.ply")
-        heard[name] = []
-        score_ply(tmp_path / f"{name}.ply", options, tmp_path / name, samples=2, say=heard[name].append)
+        with hearing() as heard[name]:
+            score_ply(tmp_path / f"{name}.ply", options, tmp_path / name, samples=2)
     assert "a picture of one color" in heard["wrong"][-1]
     assert not any("one color" in text for text in heard["right"])
 
@@ -257,14 +256,14 @@ def test_a_model_that_fits_no_photograph(tmp_path, photographs, request):
 def test_a_ply_in_another_frame_is_refused_before_anything_is_written(tmp_path, options):
     save_ply(dataclasses.replace(ball(), means=ball().means + 1e4), tmp_path / "far.ply")
     with pytest.raises(ValueError, match="the cameras of synthetic do not see"):
-        score_ply(tmp_path / "far.ply", options, say=lambda text: None)
+        score_ply(tmp_path / "far.ply", options)
     assert [path.name for path in tmp_path.iterdir()] == ["far.ply"]
 
 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "count"), [("plant_20k_sh3zero", 20_000), ("spot_10k_mesh2splat_sh3zero", 10_000)])
 def test_models_of_other_people(name, count, data_root, tmp_path):
-    result = score_ply(data_root / "splats" / f"{name}.ply", FEW, tmp_path, say=lambda text: None)
+    result = score_ply(data_root / "splats" / f"{name}.ply", FEW, tmp_path)
     data = json.loads((tmp_path / "evaluation.json").read_text())
     assert (data["ply"]["gaussians"], data["ply"]["sh_degree_used"]) == (count, 0)
     for view in result.views:

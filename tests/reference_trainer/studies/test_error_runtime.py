@@ -16,8 +16,8 @@ from reference_trainer.evaluation import trained_model as model_module
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
-from reference_trainer.runs.measure import of_run
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.measure import load_run_model
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.studies import error_runtime as module
 from reference_trainer.studies.error_runtime import (
@@ -235,7 +235,7 @@ def ball(tmp_path):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, options, short):
     folder = tmp_path_factory.mktemp("runs") / "scene" / "strategy" / "seed_0"
-    run_experiment(options, short, folder, monitor_every=0)
+    run_experiment(options, short, folder, monitoring=Monitoring(0))
     return folder
 
 
@@ -245,7 +245,7 @@ def test_runs_and_ply_files_are_sources(run, ball, tmp_path, monkeypatch):
     study = error_runtime_study([run, ball], max_samples=16, seeds=1)
     results = run_study(study, tmp_path / "out", say=lambda text: None)
     assert list(results) == ["scene/strategy/seed_0", "ball"]
-    model, scene = of_run(run)
+    model, scene = load_run_model(run)
     exact = model.exact_ca_score(drop_rate=0.5)(model.gaussians.opacities, scene.test[0])
     assert results["scene/strategy/seed_0"]["view"] == scene.test[0].name
     assert results["scene/strategy/seed_0"]["score"] == pytest.approx(exact.value, rel=1e-4)

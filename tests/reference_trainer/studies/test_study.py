@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from stand_ins.engine import Here
+from stand_ins.executor import Here
 
-from reference_trainer.runs.folder import CHECKPOINT
-from reference_trainer.runs.lock import FolderInUseError, run_lock
+from reference_trainer.runs.folder import CHECKPOINT, FolderInUseError, run_lock
 from reference_trainer.studies import study as study_module
 from reference_trainer.studies.study import Study, checkpoints, in_turns, run_study
 
@@ -113,10 +112,10 @@ def test_on_an_engine_a_failing_case_does_not_stop_the_others(tmp_path):
     cases = {"a": {"text": "x", "times": -1}, "b": {"text": "y"}}
     said = []
     with pytest.raises(RuntimeError, match=r"1 of 2 cases FAILED; the same .* again:\n  a: ValueError: no -1 times"):
-        run_study(study(**cases), tmp_path, engine=Here(1), say=said.append)
+        run_study(study(**cases), tmp_path, executor=Here(1), say=said.append)
     assert said[:3] == ["[1/2] a: FAILED", "[2/2] b", "b: y\n"]
     assert json.loads((tmp_path / "letters.json").read_text())["failed"] == {"a": "ValueError: no -1 times"}
-    records = run_study(study(**cases | {"a": {"text": "z"}}), tmp_path, engine=Here(1), say=quiet)
+    records = run_study(study(**cases | {"a": {"text": "z"}}), tmp_path, executor=Here(1), say=quiet)
     assert measured == ["y", "z"]
     assert [record["text"] for record in records.values()] == ["z", "y"]
 

@@ -30,7 +30,7 @@ def test_every_item_has_a_reason_and_changes_only_fields_that_exist(tiny_scene):
     assert len({item.name for item in plan.items}) == len(plan.items)
     for item in plan.items:
         assert item.reason
-        assert item.decision in ("used", "reduced", "left out")
+        assert item.decision in ("used", "reduced", "left out", "recommended")
         assert set(item.changes) <= set(vars(TrainConfig()))
 
 
@@ -140,11 +140,18 @@ def test_what_dropout_gained_is_what_was_measured():
 @pytest.mark.parametrize(
     ("views", "apart", "config", "decision", "said"),
     [
-        (1, 0.0, TrainConfig(), "left out", r"^not asked for; 1 view: a rate of 0.1 or 0.2 pays; with 2 it .* on fern"),
-        (4, 20.0, TrainConfig(), "left out", r"^not asked for; 4 views, 20 degrees apart: a rate of .* pays; with 3"),
-        (4, 30.0, TrainConfig(), "left out", r"30 degrees apart: no rate pays; where views are further than 25"),
-        (12, 10.0, TrainConfig(dropout=0.2), "used", r"^asked for; 12 views, 10 degrees apart: no rate pays; with 9"),
-        (36, 10.0, TrainConfig(noise=0.8), "left out", r"36 views.*: no rate pays; with 48 it .* dB on the built-in"),
+        (1, 0.0, TrainConfig(), "recommended", r"^not asked for; 1 view; .*; with 2 views .* by \+1\.4 to \+1\.7 dB$"),
+        (
+            3,
+            20.0,
+            TrainConfig(),
+            "recommended",
+            r"3 views, 20 degrees apart; .* with 3 views .* by -3\.6 to \+1\.8 dB$",
+        ),
+        (3, 20.0, TrainConfig(), "recommended", r"; --dropout 0\.2 --opacity-decay 0\.995 .* by -0\.1 to \+1\.9 dB"),
+        (4, 30.0, TrainConfig(), "left out", r"30 degrees apart; where views were .* by -0\.1 to \+0\.4 dB$"),
+        (12, 10.0, TrainConfig(dropout=0.2), "used", r"^asked for; 12 views, 10 degrees apart; with 9 views"),
+        (36, 10.0, TrainConfig(noise=0.8), "left out", r"36 views.*; with 48 views .* by -0\.3 to -0\.1 dB"),
     ],
 )
 def test_what_is_said_of_dropout(tiny_scene, views, apart, config, decision, said):

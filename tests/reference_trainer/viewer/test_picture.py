@@ -14,7 +14,7 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
 from reference_trainer.scenes.scene import Viewpoint
-from reference_trainer.viewer.picture import Look, Subject
+from reference_trainer.viewer.picture import DisplayOptions, ViewerModel
 
 CAMERA = Camera(torch.eye(4), 40.0, 40.0, 20.0, 15.0, 40, 30)
 BESIDE = replace(CAMERA, world_to_camera=torch.eye(4).index_put((torch.tensor(0), torch.tensor(3)), torch.tensor(0.3)))
@@ -36,22 +36,22 @@ def drawn_with(model, opacities, camera=CAMERA):
 
 
 def test_a_render_is_that_of_the_test(model):
-    image, note = Subject(model, []).draw(Look(), CAMERA)
+    image, note = ViewerModel(model, []).render(DisplayOptions(), CAMERA)
     torch.testing.assert_close(image, drawn_with(model, 0.8 * model.gaussians.opacities))
     assert note == ""
 
 
 @pytest.mark.parametrize("mask", [False, True])  # which an exact map has no use for
 def test_the_co_adaptation_is_that_of_the_chosen_rate(model, mask):
-    image, _ = Subject(model, []).draw(Look("co-adaptation", drop_rate=0.3, mask=mask), CAMERA)
+    image, _ = ViewerModel(model, []).render(DisplayOptions("co-adaptation", drop_rate=0.3, mask=mask), CAMERA)
     moments, _ = render_moments_of(model.gaussians, Multiplier.dropout(0.3), CAMERA, model.background)
     variance = moments.variance.mean(0).masked_fill(moments.alpha_mean <= 0.8, math.nan)
     torch.testing.assert_close(image, heat_map(variance, CA_PICTURE_RANGE), rtol=0, atol=0.02)  # a step of the colors
 
 
 def test_the_co_adaptation_takes_the_noise_in(model):
-    _, note = Subject(model, []).draw(Look("co-adaptation", drop_rate=0.3, noise=0.4), CAMERA)
-    value = float(note.removeprefix("exact CA ").partition("e-3")[0]) * 1e-3
+    _, note = ViewerModel(model, []).render(DisplayOptions("co-adaptation", drop_rate=0.3, noise=0.4), CAMERA)
+    value = float(note.removeprefix("exact CA at drop rate 0.3 with noise 0.4 ").partition("e-3")[0]) * 1e-3
     draws = Chain(GaussianDropout(0.3), OpacityNoise(0.4))
     score = CAScore.adaptive(model.render, regularizer=draws, relative_error=1e-3)
     sampled = score(model.gaussians.opacities, Viewpoint("", CAMERA))
@@ -61,23 +61,23 @@ def test_the_co_adaptation_takes_the_noise_in(model):
 
 
 def test_a_mask_stays_while_somebody_turns_and_grows_with_the_rate(model):
-    subject, plain, kept = Subject(model, []), model.gaussians.opacities, []
+    shown, plain, kept = ViewerModel(model, []), model.gaussians.opacities, []
     for rate in (0.3, 0.6):
-        image, _ = subject.draw(Look(drop_rate=rate, mask=True), CAMERA)
-        keep = subject._drawn[1].gaussians.opacities > 0
+        image, _ = shown.render(DisplayOptions(drop_rate=rate, mask=True), CAMERA)
+        keep = shown._chosen_last[1].gaussians.opacities > 0
         # 400 draws: beyond 5 standard deviations with a probability below 1e-6; the seed is fixed
         assert abs(keep.float().mean().item() - (1 - rate)) < 5 * math.sqrt(rate * (1 - rate) / 400)
         torch.testing.assert_close(image, drawn_with(model, plain * keep))
-        beside, _ = subject.draw(Look(drop_rate=rate, mask=True), BESIDE)
+        beside, _ = shown.render(DisplayOptions(drop_rate=rate, mask=True), BESIDE)
         torch.testing.assert_close(beside, drawn_with(model, plain * keep, BESIDE))
         kept.append(keep)
     assert bool((kept[1] <= kept[0]).all())
 
 
 def test_noise_is_a_draw_of_the_plain_opacities(model):
-    subject = Subject(model, [])
-    subject.draw(Look(noise=0.1), CAMERA)
-    factors = subject._drawn[1].gaussians.opacities / model.gaussians.opacities
+    shown = ViewerModel(model, [])
+    shown.render(DisplayOptions(noise=0.1), CAMERA)
+    factors = shown._chosen_last[1].gaussians.opacities / model.gaussians.opacities
     inner = model.gaussians.opacities < 0.6  # which no draw within 6 standard deviations takes to 1
     # Standard error of a standard deviation from n draws: sigma / sqrt(2 n); beyond 5 of them below 1e-6, seed fixed
     n = int(inner.sum())
@@ -91,28 +91,30 @@ def test_those_that_co_adapt_most_are_hidden(model):
     values = torch.where(shares > 0, shares / blend_weights(model, views), 0)
     stay = values <= values.sort().values[299]
     assert stay.sum() == 300
-    image, note = Subject(model, views).draw(Look(hidden=0.25), CAMERA)
+    image, note = ViewerModel(model, views).render(DisplayOptions(hidden=0.25), CAMERA)
     torch.testing.assert_close(image, drawn_with(model, 0.8 * model.gaussians.opacities * stay))
     assert note == f"{shares[~stay].sum() / shares.sum():.0%} of the exact CA are hidden"
 
 
 def test_heat_is_brighter_where_more_co_adapts(model):
-    subject = Subject(model, [Viewpoint("", CAMERA)])
-    image, note = subject.draw(Look("heat"), CAMERA)
+    shown = ViewerModel(model, [Viewpoint("", CAMERA)])
+    image, note = shown.render(DisplayOptions("heat"), CAMERA)
     assert "0.1 (dark) to 10 times the mean" in note
-    gaussians, values = subject._drawn[1].gaussians, subject.heat.values
-    inside = (values > subject.heat.mean / 10) & (values < subject.heat.mean * 10)
+    gaussians, values = shown._chosen_last[1].gaussians, shown.heat.values
+    inside = (values > shown.heat.mean / 10) & (values < shown.heat.mean * 10)
     brightness = gaussians.sh_dc[inside, 0].sum(1)[values[inside].argsort()]
     assert inside.sum() > 50
     assert bool((brightness.diff() >= -1e-6).all())  # along the color map, up to steps of its table
-    torch.testing.assert_close(image, Subject(replace(model, gaussians=gaussians), []).draw(Look(), CAMERA)[0])
+    torch.testing.assert_close(
+        image, ViewerModel(replace(model, gaussians=gaussians), []).render(DisplayOptions(), CAMERA)[0]
+    )
 
 
 def test_heat_that_cannot_be_measured_is_refused(model):
     faint = replace(model, gaussians=replace(model.gaussians, opacity_logits=model.gaussians.opacity_logits - 9))
-    for look in (Look("heat"), Look(hidden=0.1)):
+    for look in (DisplayOptions("heat"), DisplayOptions(hidden=0.1)):
         with pytest.raises(ValueError, match="none of the 1 views has a score"):
-            Subject(faint, [Viewpoint("", CAMERA)]).draw(look, CAMERA)
+            ViewerModel(faint, [Viewpoint("", CAMERA)]).render(look, CAMERA)
 
 
 def test_depth_is_that_of_walls():
@@ -124,10 +126,21 @@ def test_depth_is_that_of_walls():
         points, torch.rand(len(points), 3), 0.05 * points[:, 2], sh_degree=0, opacity=0.95
     )
     thin = replace(gaussians, log_scales=gaussians.log_scales - torch.tensor([0.0, 0, 8]))
-    image, note = Subject(TrainedModel(thin, torch.ones(3)), []).draw(Look("depth"), CAMERA)
+    image, note = ViewerModel(TrainedModel(thin, torch.ones(3)), []).render(DisplayOptions("depth"), CAMERA)
     near, far = (float(word) for word in note.removeprefix("depth ").replace(" (bright) to", "").split())
     assert (near, far) == pytest.approx((2, 6), rel=0.02)
     assert image[:, 5, 5].sum() > image[:, 5, 35].sum() + 1
     torch.testing.assert_close(image[:, 25:], torch.full((3, 5, 40), 0.5))  # gray
     nothing = replace(thin, opacity_logits=thin.opacity_logits - 99)
-    assert Subject(TrainedModel(nothing, torch.ones(3)), []).draw(Look("depth"), CAMERA)[1].startswith("nothing")
+    assert (
+        ViewerModel(TrainedModel(nothing, torch.ones(3)), [])
+        .render(DisplayOptions("depth"), CAMERA)[1]
+        .startswith("nothing")
+    )
+
+
+def test_a_view_without_a_score_says_why_in_words(model):
+    faint = replace(model, gaussians=replace(model.gaussians, opacity_logits=model.gaussians.opacity_logits - 99))
+    _, note = ViewerModel(faint, []).render(DisplayOptions("co-adaptation"), CAMERA)
+    assert note.startswith("no pixel counts")
+    assert "('" not in note

@@ -9,13 +9,13 @@ from browser import CHROMIUM, Page
 
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.runs.measure import of_run
-from reference_trainer.runs.run import run_experiment
+from reference_trainer.runs.measure import load_run_model
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.scenes.virtual_cameras import orbit_views
 from reference_trainer.viewer import window
-from reference_trainer.viewer.picture import Look, Subject
+from reference_trainer.viewer.picture import DisplayOptions, ViewerModel
 from reference_trainer.viewer.window import MOST, Viewer, _camera, _pose
 
 
@@ -44,7 +44,7 @@ def viewer():
 
 
 def test_a_camera_of_the_page_is_the_one_that_was_jumped_to(run):
-    for view in of_run(run[0])[1].train:
+    for view in load_run_model(run[0])[1].train:
         camera = _camera(Client(view.camera).camera, MOST)
         torch.testing.assert_close(camera.world_to_camera, view.camera.world_to_camera, rtol=1e-5, atol=1e-5)
         assert (camera.width, camera.height) == (view.camera.width, view.camera.height)
@@ -55,18 +55,18 @@ def test_a_camera_of_the_page_is_the_one_that_was_jumped_to(run):
 def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer, monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(window, "time", SimpleNamespace(monotonic=lambda: clock[0], perf_counter=time.perf_counter))
-    model, scene = of_run(run[0])
-    viewer.show(model, measured_views(scene, print))
+    model, scene = load_run_model(run[0])
+    viewer.show(model, measured_views(scene))
     camera = scene.train[0].camera.resized(640, 480)
     client = Client(camera)
     viewer._connected(client)
     for _ in range(2):
-        assert viewer.draw() == pytest.approx(window.STILL)
+        assert viewer.update() == pytest.approx(window.STILL)
         assert client.shown[-1].shape[0] < 480
         clock[0] += 0.75 * window.STILL
-        assert viewer.draw() == pytest.approx(0.25 * window.STILL)  # there is nothing to do yet
+        assert viewer.update() == pytest.approx(0.25 * window.STILL)  # there is nothing to do yet
         clock[0] += 0.25 * window.STILL
-        assert viewer.draw() is None
+        assert viewer.update() is None
         expected = render_gaussians(
             model.gaussians, _camera(client.camera, MOST), model.background, opacities=0.8 * model.gaussians.opacities
         )
@@ -75,10 +75,10 @@ def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer
         viewer._moved()
     assert len(client.shown) == 4
     viewer._controls[0].value = "heat"
-    viewer._subject = Subject(model, [])  # no view has a score: a word instead of heat
+    viewer._model = ViewerModel(model, [])  # no view has a score: a word instead of heat
     viewer._moved()
     clock[0] += window.STILL
-    viewer.draw()
+    viewer.update()
     assert "none of the 0 views" in viewer._status.content
     np.testing.assert_array_equal(client.shown[-1], client.shown[-2])
 
@@ -95,13 +95,13 @@ def test_a_training_that_is_watched_ends_with_the_same_model(run, options, short
         viewer._controls[4].value = 0.0 if trainer.step < 9 else 20.0
         viewer.follow(trainer)
 
-    results = run_experiment(options, short, tmp_path, monitor_every=0, watch=watch)
+    results = run_experiment(options, short, tmp_path, monitoring=Monitoring(0), on_step=watch)
     assert len(client.shown) == short.iterations + len(results["views"])  # also while the result is measured
     assert (tmp_path / "point_cloud.ply").read_bytes() == (run[0] / "point_cloud.ply").read_bytes()
 
 
 def test_a_model_on_a_card_is_shown_from_an_orbit_around_it(run, viewer, card):
-    model, _ = of_run(run[0], str(card))
+    model, _ = load_run_model(run[0], str(card))
     cameras = orbit_views(model.gaussians.means, model.gaussians.opacities, count=3, width=32, height=24)
     viewer.show(model, {"orbit": [Viewpoint(str(number), camera) for number, camera in enumerate(cameras)]})
     first = cameras[0].position.cpu().numpy()
@@ -115,18 +115,18 @@ def test_a_training_that_nobody_looks_at_is_left_alone(viewer):
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium, such as Debian's package chromium")
 def test_a_browser_shows_what_was_drawn(run, viewer):
-    model, scene = of_run(run[0])
-    viewer.show(model, measured_views(scene, print))
+    model, scene = load_run_model(run[0])
+    viewer.show(model, measured_views(scene))
 
     def picture(page, mode):
         """Draw what is asked for until the page shows it below its panel; return it, and what it should be."""
         last = time.monotonic() + 60
         while time.monotonic() < last:
-            viewer.draw()
+            viewer.update()
             page.run("new Promise(requestAnimationFrame)")
             if viewer._windows and viewer._look.mode == mode:
                 (only,) = viewer._windows.values()
-                expected, _ = viewer._subject.draw(Look(mode), _camera(only.client.camera, MOST))
+                expected, _ = viewer._model.render(DisplayOptions(mode), _camera(only.client.camera, MOST))
                 shown = page.picture()[:, 330:, :500]
                 expected = expected[:, 330:, :500]
                 if shown.shape == expected.shape and (shown - expected).abs().mean() < 0.02:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,19 +20,29 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
-from reference_trainer.runs.frame_check import check_frame
+from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
+from reference_trainer.runs.folder import check_trusted
 from reference_trainer.runs.measure import measure
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import BACKGROUNDS, OrbitOptions, SceneOptions
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import bounding_sphere, orbit_views
 
-__all__ = ["Placed", "PlyFacts", "of_plain_ply", "of_ply", "place", "scaled", "score_ply"]
+__all__ = [
+    "ModelWithViews",
+    "PlyFacts",
+    "check_frame",
+    "load_for_views",
+    "load_plain_ply_model",
+    "load_ply_model",
+    "scaled",
+    "score_ply",
+]
+
+_log = logging.getLogger(__name__)
 
 SMALLEST_RADIUS = 0.25
 """Smaller models are enlarged to this radius: the renderer's near plane, at 0.2, would cut into them."""
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -67,8 +78,13 @@ class PlyFacts:
         )
 
 
-def of_ply(
-    ply: Path, *, background: Tensor, regularizer: str | None = None, device: str = "cpu"
+def load_ply_model(
+    ply: Path,
+    *,
+    background: Tensor,
+    regularizer: str | None = None,
+    device: str = "cpu",
+    trust: Collection[str] = (),
 ) -> tuple[TrainedModel, PlyFacts]:
     """Return the model of a standard 3DGS PLY, and what the file says about it.
 
@@ -81,6 +97,7 @@ def of_ply(
         background: color behind it, shape (3,).
         regularizer: what the model was trained with, overriding the PLY.
         device: where to render.
+        trust: modules that the PLY's comments may import, as for `load_run`.
 
     Raises:
         ValueError: if the PLY is damaged or holds no Gaussian, was scaled for another rate than ``regularizer`` says,
@@ -94,8 +111,9 @@ def of_ply(
     text = regularizer
     if text is None:
         text = loaded.regularizer
+        check_trusted(ply, text, trust)
         try:
-            parse(text, imports=False)
+            parse(text, imports=bool(trust))
         except ValueError as error:
             raise ValueError(f"{ply} says what it was trained with: {error} Give --regularizer.") from error
     if baked > 0 and not loaded.for_rendering:
@@ -114,9 +132,12 @@ def of_ply(
     return model, facts
 
 
-def of_plain_ply(ply: Path, *, regularizer: str | None = None, device: str = "cpu") -> tuple[TrainedModel, PlyFacts]:
-    """Do as `of_ply` over black, with a ValueError unless the opacities are plain."""
-    model, facts = of_ply(ply, background=torch.zeros(3), regularizer=regularizer, device=device)
+def load_plain_ply_model(
+    ply: Path, *, regularizer: str | None = None, device: str = "cpu", trust: Collection[str] = ()
+) -> tuple[TrainedModel, PlyFacts]:
+    """Do as `load_ply_model` over black, with a ValueError unless the opacities are plain."""
+    shared: dict[str, Any] = {"regularizer": regularizer, "device": device, "trust": trust}
+    model, facts = load_ply_model(ply, background=torch.zeros(3), **shared)
     if facts.for_rendering or facts.opacity_scale != 1:
         by = "those of the test" if facts.for_rendering else f"scaled by {facts.opacity_scale:g}"
         raise ValueError(f"the opacities of {ply} are {by} already: give the PLY with plain ones.")
@@ -124,7 +145,7 @@ def of_plain_ply(ply: Path, *, regularizer: str | None = None, device: str = "cp
 
 
 @dataclass(frozen=True)
-class Placed:
+class ModelWithViews:
     """A model and the views that it is measured at.
 
     Args:
@@ -142,29 +163,29 @@ class Placed:
     about: dict[str, object]
 
 
-def place(
+def load_for_views(
     ply: Path,
     where: SceneOptions | OrbitOptions,
     *,
     background: str = "auto",
     regularizer: str | None = None,
     device: str = "cpu",
-    say: Say = print,
-) -> Placed:
+    trust: Collection[str] = (),
+) -> ModelWithViews:
     """Load the model of a PLY and the views of a scene, or cameras on an orbit; arguments and errors of `score_ply`."""
     scene = load_scene(where) if isinstance(where, SceneOptions) else None
     if scene is None and background not in ("auto", *BACKGROUNDS):
         raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {background!r}.")
     color = torch.tensor(BACKGROUNDS.get(background, BACKGROUNDS["black"])) if scene is None else scene.background
-    model, facts = of_ply(ply, background=color, regularizer=regularizer, device=device)
-    say(f"{ply}: {facts}")
+    model, facts = load_ply_model(ply, background=color, regularizer=regularizer, device=device, trust=trust)
+    _log.info(f"{ply}: {facts}")
     about: dict[str, object] = {"ply": asdict(facts)}
     if isinstance(where, OrbitOptions):
-        return _on_orbit(model, where, about, say)
+        return _on_orbit(model, where, about)
     assert scene is not None
     for doubt in check_frame(model.gaussians, scene, ply):
-        say(doubt)
-    return Placed(model, 1.0, measured_views(scene, say), scene, about | {"scene": scene.name})
+        _log.info(doubt)
+    return ModelWithViews(model, 1.0, measured_views(scene), scene, about | {"scene": scene.name})
 
 
 def score_ply(
@@ -178,7 +199,7 @@ def score_ply(
     seed: int = 0,
     perceptual: LPIPS | None = None,
     device: str = "cpu",
-    say: Say = print,
+    trust: Collection[str] = (),
 ) -> Evaluation:
     """Measure the model of a PLY at the views of a scene or on an orbit; writes and prints what `measure` does.
 
@@ -187,39 +208,39 @@ def score_ply(
         where: the scene or the orbit.
         out: folder for the results; ``<ply>_evaluation`` by default.
         background: of an orbit, ``"black"`` (the default) or ``"white"``; a scene has its own.
-        regularizer: as in `of_ply`.
+        regularizer: as in `load_ply_model`.
         samples: K of the CA score.
         seed: of its masks.
         perceptual: a perceptual metric.
         device: where to render.
-        say: receives the progress, the table, and doubts whether the frames agree.
+        trust: as in `load_ply_model`.
 
     Raises:
-        ValueError: from `of_ply`, `check_frame` or `orbit_views`, or if the background is unknown.
+        ValueError: from `load_ply_model`, `check_frame` or `orbit_views`, or if the background is unknown.
         FileNotFoundError: if the PLY or the scene is missing.
     """
-    placed = place(ply, where, background=background, regularizer=regularizer, device=device, say=say)
-    folder, scene = out or ply.with_name(ply.stem + "_evaluation"), placed.scene
-    shared: dict[str, Any] = {"samples": samples, "seed": seed, "perceptual": perceptual, "say": say}
-    result = measure(placed.model, placed.views, folder, about=placed.about, **shared)
+    loaded = load_for_views(ply, where, background=background, regularizer=regularizer, device=device, trust=trust)
+    folder, scene = out or ply.with_name(ply.stem + "_evaluation"), loaded.scene
+    shared: dict[str, Any] = {"samples": samples, "seed": seed, "perceptual": perceptual}
+    result = measure(loaded.model, loaded.views, folder, about=loaded.about, **shared)
     if scene is None:
-        say(
+        _log.info(
             "An orbit sees the model from where no photograph may have been taken: compare these scores with others "
             "from the same cameras alone; for those of the scene's own views give the scene (--scene FOLDER)."
         )
     elif _worse_than_one_color(result, scene):
-        say(
+        _log.info(
             f"Every training view is further from its photograph than a picture of one color would be: {ply} is not "
             f"in the frame of {scene.name}, or not a model of it. The PSNR says nothing, CA is that of these views."
         )
     return result
 
 
-def _on_orbit(model: TrainedModel, orbit: OrbitOptions, about: dict[str, object], say: Say) -> Placed:
+def _on_orbit(model: TrainedModel, orbit: OrbitOptions, about: dict[str, object]) -> ModelWithViews:
     """Return the model, enlarged if it is tiny, and the viewpoints around it."""
     sphere = bounding_sphere(model.gaussians.means, model.gaussians.opacities)
     if sphere.surroundings and orbit.arc > 180:
-        say(
+        _log.info(
             "This is a place and not an object: an orbit shows it from sides that no photograph may have seen. Give "
             "its photographs (--path), or the side that was photographed (--arc 40)."
         )
@@ -237,7 +258,7 @@ def _on_orbit(model: TrainedModel, orbit: OrbitOptions, about: dict[str, object]
     )
     views = [Viewpoint(f"{index:03d}", camera) for index, camera in enumerate(cameras)]
     found = {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged}
-    return Placed(model, enlarged, {"orbit": views}, None, about | {"orbit": asdict(orbit) | found})
+    return ModelWithViews(model, enlarged, {"orbit": views}, None, about | {"orbit": asdict(orbit) | found})
 
 
 def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
@@ -256,3 +277,59 @@ def _worse_than_one_color(result: Evaluation, scene: Scene) -> bool:
 
     limits = {view.name: of_mean(view) for view in scene.train}
     return bool(limits) and all(v.psnr < limits[v.name] for v in result.views if v.split == "train")
+
+
+NEARLY_NONE = 0.01
+"""Fraction of the Gaussians below which a camera counts as blind to a model: stray ones may be anywhere."""
+
+
+def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[str]:
+    """Count, before anything is rendered, the Gaussians that the cameras of a scene see.
+
+    A Gaussian counts if its center is beyond the near plane (0.2) and inside the picture, and its opacity is at least
+    1/255: fainter ones are never drawn.
+
+    Args:
+        gaussians: the model.
+        scene: with the cameras, of both splits.
+        name: of the model, for messages.
+
+    Returns:
+        Doubts: one line about the cameras that see less than 1 %, nothing if all see more.
+
+    Raises:
+        ValueError: if no Gaussian can be drawn, or all cameras together see less than 1 %.
+    """
+    drawn = gaussians[gaussians.opacities >= MIN_ALPHA]
+    count, means = len(drawn), drawn.means
+    if not count:
+        raise ValueError(
+            f"{name}: none of the {len(gaussians):,} Gaussians has an opacity of 1/255, all are invisible."
+        )
+    views = [*scene.train, *scene.test]
+    before = torch.stack([view.camera.project(means)[1] >= NEAR_PLANE for view in views])
+    inside = torch.stack([view.camera.inside(*view.camera.project(means)) for view in views]) & before
+    seen = int(inside.any(0).sum())
+    if seen < NEARLY_NONE * count:
+        behind = int((~before).all(0).sum())
+        center = means.double().median(0).values
+        reach = (means - center).norm(dim=1).kthvalue(-(-98 * count // 100)).values  # without stray ones
+        rig = torch.stack([view.camera.position for view in views]).double()
+        forward = torch.stack([view.camera.forward for view in views]).double().mean(0)
+        raise ValueError(
+            f"the cameras of {scene.name} do not see {name}: of {count:,} Gaussians, {seen:,} ({seen / count:.2%}) are "
+            f"in any of the {len(views)} pictures, {behind:,} are behind all cameras. The model lies around "
+            f"{_text(center)} within {reach:.3g}; the cameras stand around {_text(rig.mean(0))} within "
+            f"{(rig - rig.mean(0)).norm(dim=1).max():.3g} and look towards {_text(forward)} on average. Both must be "
+            "in one frame: give the files that the model was trained with (see --format: COLMAP, LLFF and Blender "
+            "files of one scene may differ in their frame), or leave out the scene for cameras on an orbit."
+        )
+    blind = [view.name for view, n in zip(views, inside.sum(1).tolist(), strict=True) if n < NEARLY_NONE * count]
+    if not blind:
+        return []
+    return [f"{len(blind)} of {len(views)} cameras see less than {NEARLY_NONE:.0%} of {name}: {', '.join(blind)}."]
+
+
+def _text(point: Tensor) -> str:
+    """Return a point for a message."""
+    return f"({', '.join(f'{x:.3g}' for x in point.tolist())})"

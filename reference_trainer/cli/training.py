@@ -1,4 +1,4 @@
-"""Commands on runs: plan, train, evaluate, render, compare. One class per command, whose fields are its options."""
+"""Commands that train, and the plan of a training: one class per command, whose fields are its options."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from reference_trainer.cli.drawing import Device, Draw, Drawing
-from reference_trainer.cli.places import Orbit, PlyScene, place_of
-from reference_trainer.runs.engines.choice import EngineName
-from reference_trainer.scenes.options import OrbitOptions, SceneOptions
+from reference_trainer.cli.options import Device, Rendering, RenderOptions, check_scenes
+from reference_trainer.runs.executors import ExecutorName
+from reference_trainer.runs.folder import check_output, modules_named
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES
 
-__all__ = ["PORT", "Compare", "Demo", "Evaluate", "Plan", "Render", "Train", "given_fields"]
+__all__ = ["PORT", "Compare", "Demo", "Lpips", "Plan", "Train", "given_fields"]
 
 PORT = 8080
 """Default port of the viewer."""
@@ -28,11 +28,11 @@ PICTURES_FROM = 400
 """Smallest interval of measurements, in steps, at which pictures cost less than 2 % of a training: those of one
 measurement take the time of 7 steps (fern at 252x189, 40,110 Gaussians)."""
 
-Scene = Annotated[SceneOptions, tyro.conf.arg(name="")]
+Scene = Annotated[SceneOptions, tyro.conf.arg(name="scene")]
 Folder = Annotated[
     str | None, tyro.conf.Positional, tyro.conf.arg(help='Scene folder, or "synthetic"; the same as --path.')
 ]
-Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
+Config = Annotated[TrainConfig, tyro.conf.arg(name="training")]
 Recipe = Annotated[
     str | None,
     tyro.conf.arg(
@@ -70,8 +70,8 @@ def _chosen(scene: SceneOptions, folder: str | None) -> SceneOptions:
 class Demo:
     """Train the built-in scene with and without the regularizers.
 
-    From three views; needs no files and takes minutes. Gives a table of test quality and co-adaptation, a plot of the
-    dynamics, and pictures.
+    From three views; needs no files and takes minutes. Gives a table of test quality and co-adaptation, and a page
+    with the models, the pictures and a plot of the dynamics.
     """
 
     out: Path = Path("runs/demo")
@@ -82,7 +82,7 @@ class Demo:
     """Number of seeds."""
     jobs: int = 2
     """Runs at a time."""
-    drawing: Draw = field(default_factory=Drawing)
+    rendering: Rendering = field(default_factory=RenderOptions)
 
     def __call__(self) -> None:
         steps = self.iterations
@@ -93,7 +93,7 @@ class Demo:
             jobs=self.jobs,
             executor="processes",
             monitor_every=max(1, steps // 5),
-            drawing=self.drawing,
+            rendering=self.rendering,
         )
         what = f"the built-in scene (3 views) with {', '.join(comparison.strategies)}"
         print(f"Training {what}: {steps} steps each, {self.jobs} at a time.")
@@ -118,7 +118,7 @@ class Train:
     """Leave out what the scene does not need, as `ca-reg plan` says; what other options or the recipe set stays."""
     given: Given = frozenset()
     device: Device = "cpu"
-    drawing: Draw = field(default_factory=Drawing)
+    rendering: Rendering = field(default_factory=RenderOptions)
     monitor_every: int = 500
     """Steps between measurements of CA and PSNR for TensorBoard; 0 for none."""
     monitor_pictures: Literal["auto", "on", "off"] = "auto"
@@ -130,28 +130,35 @@ class Train:
     deterministic: bool = False
     """One thread and repeatable algorithms: the same result whatever the number of threads, and on CUDA every time."""
 
-    def __call__(self) -> None:
-        from reference_trainer.evaluation.tables import summary
-        from reference_trainer.runs.run import run_experiment
-        from reference_trainer.training.randomness import deterministic
-
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        scene = _chosen(self.scene, self.folder)
+        check_scenes([scene.path])
+        check_output(self.out, scene.path, ())
         if self.deterministic and self.config.renderer == "gsplat":
             raise ValueError(
-                "--deterministic needs --renderer builtin: gsplat's kernels add gradients in whatever order they come, "
-                "which PyTorch cannot change."
+                "--deterministic needs this package's own renderer: gsplat's kernels add gradients in whatever order "
+                "they come, which PyTorch cannot change."
             )
+
+    def __call__(self) -> None:
+        from reference_trainer.evaluation.tables import print_table, summary
+        from reference_trainer.runs.run import Monitoring, run_experiment
+        from reference_trainer.training.randomness import deterministic
+
         between = min(self.monitor_every, self.config.iterations)
         pictures = between >= PICTURES_FROM if self.monitor_pictures == "auto" else self.monitor_pictures == "on"
+        monitoring = Monitoring(self.monitor_every, pictures=pictures)
         with ExitStack() as stack:
             watched: dict[str, Any] = {}
             if self.viewer is not None:
                 from reference_trainer.viewer.window import Viewer
 
                 viewer = stack.enter_context(Viewer(*self.viewer or (PORT,)))
-                watched = {"watch": viewer.follow}
+                watched = {"on_step": viewer.follow}
                 print(viewer)
             if self.config.renderer == "builtin":
-                self.drawing.begin(self.device, trains=True)
+                self.rendering.begin(self.device, trains=True)
             if self.deterministic:
                 stack.enter_context(deterministic(self.device))
             results = run_experiment(
@@ -161,23 +168,27 @@ class Train:
                 auto=self.auto,
                 given=self.given,
                 device=self.device,
-                monitor_every=self.monitor_every,
-                monitor_pictures=pictures,
+                monitoring=monitoring,
                 lpips=self.lpips,
                 progress=True,
-                say=print,
                 **watched,
             )
-        print(summary(results))
-        out = shlex.quote(str(self.out))
-        print(f"Everything is in {self.out}; a page: ca-reg report {out}; curves: tensorboard --logdir {out}")
+        print_table(summary(results))
+        out, trust = shlex.quote(str(self.out)), _trust(self.config, self.scene)
+        print(f"Everything is in {self.out}; a page: ca-reg report {out}{trust}; curves: tensorboard --logdir {out}")
+
+
+def _trust(*settings: object) -> str:
+    """Return what a command on a run of these settings has to add, if they name modules of the user's."""
+    modules = sorted(set[str]().union(*map(modules_named, settings)))
+    return f" --trust {shlex.join(modules)}" if modules else ""
 
 
 @dataclass(frozen=True)
 class Plan:
     """Say what training will use of a scene, and why.
 
-    Also says what it leaves out; trains nothing.
+    Also says what it leaves out, and which setting is recommended; trains nothing.
     """
 
     folder: Folder = None
@@ -185,92 +196,35 @@ class Plan:
     config: Config = field(default_factory=TrainConfig)
     recipe: Recipe = None
     given: Given = frozenset()
+    verbose: bool = False
+    """List all decisions with their reasons."""
     out: Path | None = None
     """JSON file for the plan; by default none is written."""
 
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        check_scenes([_chosen(self.scene, self.folder).path])
+        if self.out is not None and self.out.exists() and '"items"' not in self.out.read_text("utf-8", "ignore"):
+            raise ValueError(f"{self.out} is no plan of ca-reg and is not overwritten: give another --out.")
+
     def __call__(self) -> None:
-        from reference_trainer.evaluation.results import markdown_table, write_json
+        from reference_trainer.evaluation.results import write_json
+        from reference_trainer.evaluation.tables import markdown_table, print_table
         from reference_trainer.scenes import load_scene
         from reference_trainer.training.plan import make_plan
 
-        scene = load_scene(_chosen(self.scene, self.folder), seed=self.config.seed)
+        options = _chosen(self.scene, self.folder)
+        scene = load_scene(options, seed=self.config.seed)
         plan = make_plan(scene, self.config, given=self.given)
-        print(f"{scene}\n")
-        print(markdown_table(plan.rows(), ["item", "decision", "change", "reason"]))
+        print(scene)
+        print(plan.summary())
+        if self.verbose:
+            print_table(f"\n{markdown_table(plan.rows(), ['item', 'decision', 'change', 'reason'])}")
+        else:
+            print(f"All {len(plan.items)} decisions, with what is left out by construction: --verbose")
         if self.out is not None:
             write_json(self.out, plan.as_dict())
             print(f"The plan is in {self.out}.")
-
-
-@dataclass(frozen=True)
-class Evaluate:
-    """Measure a run, or any 3DGS PLY: PSNR, SSIM, LPIPS, CA, CV.
-
-    Per view and mean, on the views of a scene. A PLY without a scene is measured from cameras on an orbit around it: CA
-    (protocol, exact, and exact without the background) and CV.
-    """
-
-    run: Annotated[Path, tyro.conf.Positional]
-    """Folder of a run of `ca-reg train`, or a standard 3DGS PLY."""
-    scene: Annotated[PlyScene, tyro.conf.arg(name="")] = field(default_factory=PlyScene)
-    orbit: Orbit = field(default_factory=OrbitOptions)
-    regularizer: str | None = None
-    """Render as if it had been trained with these: "dropout(0.2)" for a PLY that does not say so, or "noise(0.8,
-    scale=True)" for a run with noise 0.8, to render with the mean opacities."""
-    samples: int = 5
-    """Renders per view for the CA score."""
-    seed: int = 0
-    """Seed of the CA score's masks."""
-    lpips: Lpips = None
-    device: Device = "cpu"
-    out: Path | None = None
-    """Folder for the results; by default <run>/evaluation, <run>/evaluation_<regularizer> or <ply>_evaluation."""
-    drawing: Draw = field(default_factory=Drawing)
-
-    def __call__(self) -> None:
-        from reference_trainer.evaluation.lpips import load_lpips
-        from reference_trainer.evaluation.trajectory import measured_views
-        from reference_trainer.runs.folder import folder_name
-        from reference_trainer.runs.measure import measure, of_run
-        from reference_trainer.runs.score_ply import score_ply
-
-        place = place_of(self.run, self.scene, self.orbit)
-        if isinstance(place, OrbitOptions) and self.lpips is not None:
-            raise ValueError("without photographs there is no --lpips: give --path.")
-        self.drawing.begin(self.device)
-        shared: dict[str, Any] = {
-            "samples": self.samples, "seed": self.seed, "perceptual": load_lpips(self.lpips, device=self.device)
-        }  # fmt: skip
-        if place is None:
-            model, scene = of_run(self.run, self.device, regularizer=self.regularizer)
-            name = "evaluation" if self.regularizer is None else f"evaluation_{folder_name(self.regularizer)}"
-            views, out = measured_views(scene, print), self.out or self.run / name
-            measure(model, views, out, about={"scene": scene.name}, **shared)
-        else:
-            shared |= {"regularizer": self.regularizer, "device": self.device, "background": self.scene.background}
-            score_ply(self.run, place, self.out, **shared)
-
-
-@dataclass(frozen=True)
-class Render:
-    """Render a run's views as PNG, or a flight also as GIF."""
-
-    run: Annotated[Path, tyro.conf.Positional]
-    """Folder of a run of `ca-reg train`."""
-    what: Literal["test", "train", "flight"] = "test"
-    """Which views; "flight" moves through the training cameras."""
-    frames: int = 60
-    """Pictures of a flight."""
-    out: Path | None = None
-    """Folder for the pictures; by default <run>/render_<what>."""
-    device: Device = "cpu"
-    drawing: Draw = field(default_factory=Drawing)
-
-    def __call__(self) -> None:
-        from reference_trainer.runs.measure import render_run
-
-        self.drawing.begin(self.device)
-        render_run(self.run, self.what, self.out, frames=self.frames, device=self.device, say=print)
 
 
 @dataclass(frozen=True)
@@ -295,7 +249,7 @@ class Compare:
     """Scene folders, or "synthetic"; the same as --path."""
     path: tuple[str, ...] = ()
     """Scene folders, by default "synthetic"; the other options hold for all of them."""
-    scene: Annotated[EveryScene, tyro.conf.arg(name="")] = field(default_factory=EveryScene)
+    scene: Annotated[EveryScene, tyro.conf.arg(name="scene")] = field(default_factory=EveryScene)
     config: Config = field(default_factory=TrainConfig)
     recipe: Recipe = None
     strategies: tuple[str, ...] = ("baseline", "dropout", "noise", "both")
@@ -305,7 +259,7 @@ class Compare:
     """Number of seeds."""
     jobs: int = 1
     """Runs at a time, each in its own process with its share of the processors (of the whole cluster, on Ray)."""
-    executor: EngineName = "auto"
+    executor: ExecutorName = "auto"
     """What executes runs: "processes" of this machine, or "ray" (needs ca_reg[ray]); "auto" is Ray if there is an
     address."""
     address: str | None = None
@@ -319,7 +273,19 @@ class Compare:
     checkpoint_every: int = 500
     """Steps between checkpoints: what a dead worker costs at most."""
     lpips: Lpips = None
-    drawing: Draw = field(default_factory=Drawing)
+    rendering: Rendering = field(default_factory=RenderOptions)
+
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        if self.folders and self.path:
+            raise ValueError(
+                f"give the scenes as arguments or as --path, not both: got {self.folders} and {self.path}."
+            )
+        check_scenes(self._paths)
+
+    @property
+    def _paths(self) -> tuple[str, ...]:
+        return self.folders or self.path or ("synthetic",)
 
     @property
     def elsewhere(self) -> bool:
@@ -327,31 +293,29 @@ class Compare:
         return self.executor != "processes" and bool(self.address or os.environ.get("RAY_ADDRESS"))
 
     def __call__(self) -> None:
-        from reference_trainer.runs.compare import compare, scene_folders, strategies
-        from reference_trainer.runs.compare_report import report
-        from reference_trainer.runs.engines.choice import choose_engine
+        from reference_trainer.report.page import write_report
+        from reference_trainer.runs.compare import compare, report, scene_folders, strategies
+        from reference_trainer.runs.executors import choose_executor
         from reference_trainer.runs.grid import Running
+        from reference_trainer.runs.run import Monitoring
 
         chosen = strategies(
             self.strategies, self.config, dropout=self.config.dropout or 0.2, noise=self.config.noise or 0.8
         )
-        if self.folders and self.path:
-            raise ValueError(
-                f"give the scenes as arguments or as --path, not both: got {self.folders} and {self.path}."
-            )
-        paths = self.folders or self.path or ("synthetic",)
         running = Running(
-            choose_engine(self.executor, jobs=self.jobs, address=self.address, device=self.device),
+            choose_executor(self.executor, jobs=self.jobs, address=self.address, device=self.device),
             retries=self.retries,
             device=self.device,
-            monitor_every=self.monitor_every,
-            checkpoint_every=self.checkpoint_every,
+            monitoring=Monitoring(self.monitor_every, checkpoint_every=self.checkpoint_every),
             lpips=self.lpips,
-            say=print,
         )
         if self.config.renderer == "builtin":
-            self.drawing.begin(self.device, trains=True)
-        comparisons = compare(scene_folders(paths, self.scene, self.out), chosen, range(self.seeds), running)
-        report(comparisons, say=print)
+            self.rendering.begin(self.device, trains=True)
+        comparisons = compare(scene_folders(self._paths, self.scene, self.out), chosen, range(self.seeds), running)
+        report(comparisons)
+        trust = set[str]().union(*map(modules_named, (self.scene, *chosen.values())))  # named on this command line
+        here = self.device if not self.elsewhere else "cpu"
+        for folder in [folder for folder, comparison in comparisons.items() if comparison.runs]:
+            write_report([folder], device=here, trust=trust)
         if any(comparison.failures for comparison in comparisons.values()):
             sys.exit(1)

@@ -1,14 +1,14 @@
-"""An engine of a sweep without other processes."""
+"""An executor of a sweep without other processes."""
 
 from __future__ import annotations
 
-from reference_trainer.runs.engines.engine import Answer, Task, attempt
+from reference_trainer.runs.executors.executor import Answer, Task, attempt
 
 __all__ = ["Here"]
 
 
 class Here:
-    """An engine that does every task in this process, one at a time."""
+    """An executor that does every task in this process, one at a time."""
 
     def __init__(self, jobs: int = 1) -> None:
         assert jobs == 1

@@ -1,4 +1,4 @@
-"""Local processes as an engine: one process per task, so that a death affects one task only."""
+"""Local processes as an executor: one process per task, so that a death affects one task only."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
-from reference_trainer.runs.engines.engine import Answer, Death, Task, attempt
+from reference_trainer.runs.executors.executor import Answer, Death, Task, attempt
 from reference_trainer.threads import thread_count
 
 __all__ = ["Processes"]
@@ -41,7 +41,7 @@ class Processes:
         self._running: dict[Any, tuple[int, SpawnProcess]] = {}  # by pipe end, whose class depends on the platform
 
     def start(self, number: int, task: Task) -> None:
-        """Start a task; see `Engine`."""
+        """Start a task; see `Executor`."""
         here, there = _CONTEXT.Pipe()
         process = _CONTEXT.Process(target=_work, args=(there, task, self._threads), name=task.label)
         process.start()
@@ -49,7 +49,7 @@ class Processes:
         self._running[here] = number, process
 
     def wait(self) -> list[tuple[int, Answer]]:
-        """Wait for at least one task; see `Engine`."""
+        """Wait for at least one task; see `Executor`."""
         ended: list[tuple[int, Answer]] = []
         answering: list[Any] = wait([*self._running])
         for here in answering:

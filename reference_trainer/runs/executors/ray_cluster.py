@@ -1,11 +1,11 @@
-"""A Ray cluster as an engine: a temporary one on this machine, or a running one at an address."""
+"""A Ray cluster as an executor: a temporary one on this machine, or a running one at an address."""
 
 from __future__ import annotations
 
 import os
 from typing import Any
 
-from reference_trainer.runs.engines.engine import Answer, Death, Failure, Task, attempt
+from reference_trainer.runs.executors.executor import Answer, Death, Failure, Task, attempt
 from reference_trainer.threads import chosen_threads
 
 __all__ = ["RayCluster"]
@@ -51,13 +51,13 @@ class RayCluster:
         self._running: dict[Any, int] = {}
 
     def start(self, number: int, task: Task) -> None:
-        """Start a task; see `Engine`."""
+        """Start a task; see `Executor`."""
         if self._attempt is None:
             self._connect()
         self._running[self._attempt.options(name=task.label).remote(task, self._threads)] = number
 
     def wait(self) -> list[tuple[int, Answer]]:
-        """Wait for at least one task; see `Engine`."""
+        """Wait for at least one task; see `Executor`."""
         ended, _ = self._ray.wait(list(self._running))
         return [(self._running.pop(reference), self._answer(reference)) for reference in ended]
 
@@ -89,7 +89,7 @@ class RayCluster:
         share = min(sum(machines) // self.jobs, max(machines, default=1.0))
         processors = max(1, int(share))
         self._threads = chosen_threads() or processors
-        # Ray's own retries are off: `run_all` retries, counts and reports alike for every engine.
+        # Ray's own retries are off: `run_all` retries, counts and reports alike for every executor.
         self._attempt = ray.remote(num_cpus=processors, num_gpus=self._gpus, max_retries=0)(attempt)
 
     def _answer(self, reference: Any) -> Answer:

@@ -1,21 +1,21 @@
-"""The choice of a sweep's engine."""
+"""Where the runs of a sweep execute: processes on this machine or a Ray cluster, behind one protocol."""
 
 from __future__ import annotations
 
 import os
 from typing import Literal, TypeAlias
 
-from reference_trainer.runs.engines.engine import Engine
-from reference_trainer.runs.engines.processes import Processes
-from reference_trainer.runs.engines.ray_cluster import RayCluster
+from reference_trainer.runs.executors.executor import Executor
+from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.executors.ray_cluster import RayCluster
 
-__all__ = ["EngineName", "choose_engine"]
+__all__ = ["ExecutorName", "choose_executor"]
 
-EngineName: TypeAlias = Literal["auto", "processes", "ray"]
+ExecutorName: TypeAlias = Literal["auto", "processes", "ray"]
 
 
-def choose_engine(name: EngineName, *, jobs: int, address: str | None = None, device: str = "cpu") -> Engine:
-    """Return the engine of the given name.
+def choose_executor(name: ExecutorName, *, jobs: int, address: str | None = None, device: str = "cpu") -> Executor:
+    """Return the executor of the given name.
 
     Args:
         name: ``"auto"`` is Ray if ``address`` or ``$RAY_ADDRESS`` names a cluster, else local processes: on a single
@@ -29,7 +29,7 @@ def choose_engine(name: EngineName, *, jobs: int, address: str | None = None, de
         ImportError: if Ray is needed and not installed.
 
     Example:
-        >>> choose_engine("processes", jobs=2).jobs
+        >>> choose_executor("processes", jobs=2).jobs
         2
     """
     if name == "processes" and address is not None:

@@ -12,9 +12,8 @@ import sweep_tasks
 from subprocesses import subprocess_environment
 from waiting import PATIENCE, until
 
-from reference_trainer.runs.engines.engine import Failure, Task, Value
-from reference_trainer.runs.engines.processes import Processes
-from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.executors.executor import Failure, Task, Value, run_all
+from reference_trainer.runs.executors.processes import Processes
 
 
 def gone(pid):
@@ -41,12 +40,11 @@ def test_a_task_that_raises_is_an_outcome_with_its_traceback():
 
 
 @pytest.mark.slow
-def test_a_killed_worker_is_replaced_and_takes_no_other_task_with_it(tmp_path):
+def test_a_killed_worker_is_replaced_and_takes_no_other_task_with_it(tmp_path, said):
     killer = threading.Thread(target=kill_the_one_who_waits, args=(tmp_path,))
     killer.start()
-    said = []
     tasks = [Task("victim", sweep_tasks.wait_to_be_killed, (str(tmp_path), 5)), Task("other", sweep_tasks.square, (2,))]
-    outcomes = dict(run_all(Processes(2), tasks, say=said.append))
+    outcomes = dict(run_all(Processes(2), tasks))
     killer.join()
     assert outcomes == {0: Value(25), 1: Value(4)}
     assert len(said) == 1

@@ -1,11 +1,10 @@
-"""The queue, on an engine that does what it is told: no processes."""
+"""The queue, on an executor that does what it is told: no processes."""
 
 from collections import defaultdict
 
 import pytest
 
-from reference_trainer.runs.engines.engine import Death, Failure, Task, Value, attempt
-from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.executors.executor import Death, Failure, Task, Value, attempt, run_all
 
 
 class Told:
@@ -39,52 +38,51 @@ def tasks(count):
 
 @pytest.mark.parametrize("jobs", [1, 2, 7])
 def test_every_task_ends_once_and_no_more_run_than_asked(jobs):
-    engine = Told(jobs, {number: [Value(number)] for number in range(5)})
-    assert sorted(run_all(engine, tasks(5))) == [(number, Value(number)) for number in range(5)]
-    assert sorted(engine.started) == list(range(5))
-    assert engine.most == min(jobs, 5)
-    assert engine.closed
+    executor = Told(jobs, {number: [Value(number)] for number in range(5)})
+    assert sorted(run_all(executor, tasks(5))) == [(number, Value(number)) for number in range(5)]
+    assert sorted(executor.started) == list(range(5))
+    assert executor.most == min(jobs, 5)
+    assert executor.closed
 
 
 def test_a_failure_is_an_outcome_and_is_not_tried_again():
     failure = Failure("ValueError: no", "Traceback")
-    engine = Told(1, {0: [Value(0)], 1: [failure], 2: [Value(2)]})
-    assert dict(run_all(engine, tasks(3))) == {0: Value(0), 1: failure, 2: Value(2)}
-    assert engine.started == [0, 1, 2]
+    executor = Told(1, {0: [Value(0)], 1: [failure], 2: [Value(2)]})
+    assert dict(run_all(executor, tasks(3))) == {0: Value(0), 1: failure, 2: Value(2)}
+    assert executor.started == [0, 1, 2]
 
 
-def test_a_task_whose_worker_died_goes_to_the_end_of_the_queue():
-    said = []
-    engine = Told(1, {0: [Death("killed"), Death("killed"), Value(0)], 1: [Value(1)], 2: [Value(2)]})
-    assert list(run_all(engine, tasks(3), say=said.append)) == [(1, Value(1)), (2, Value(2)), (0, Value(0))]
-    assert engine.started == [0, 1, 2, 0, 0]
+def test_a_task_whose_worker_died_goes_to_the_end_of_the_queue(said):
+    executor = Told(1, {0: [Death("killed"), Death("killed"), Value(0)], 1: [Value(1)], 2: [Value(2)]})
+    assert list(run_all(executor, tasks(3))) == [(1, Value(1)), (2, Value(2)), (0, Value(0))]
+    assert executor.started == [0, 1, 2, 0, 0]
     assert said == [f"task 0: killed; again with another ({n} of 3)" for n in (1, 2)]
 
 
 @pytest.mark.parametrize("retries", [0, 1, 4])
 def test_a_task_that_kills_every_worker_is_given_up(retries):
-    engine = Told(2, defaultdict(list, {0: [Death(f"end {n}") for n in range(9)], 1: [Value(1)]}))
-    outcomes = dict(run_all(engine, tasks(2), retries=retries))
+    executor = Told(2, defaultdict(list, {0: [Death(f"end {n}") for n in range(9)], 1: [Value(1)]}))
+    outcomes = dict(run_all(executor, tasks(2), retries=retries))
     assert outcomes[1] == Value(1)
     assert outcomes[0].error == (f"end {retries} ({retries + 1} workers died)" if retries else "end 0")
-    assert engine.started.count(0) == retries + 1
+    assert executor.started.count(0) == retries + 1
 
 
 def test_the_engine_is_closed_when_nobody_asks_any_more():
-    engine = Told(1, {number: [Value(number)] for number in range(5)})
-    outcomes = run_all(engine, tasks(5))
+    executor = Told(1, {number: [Value(number)] for number in range(5)})
+    outcomes = run_all(executor, tasks(5))
     next(outcomes)
     outcomes.close()
-    assert engine.closed
-    assert engine.started == [0]
+    assert executor.closed
+    assert executor.started == [0]
 
 
 def test_the_engine_is_closed_on_an_interruption():
-    engine = Told(1, {0: []})
-    engine.wait = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
+    executor = Told(1, {0: []})
+    executor.wait = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
-        list(run_all(engine, tasks(1)))
-    assert engine.closed
+        list(run_all(executor, tasks(1)))
+    assert executor.closed
 
 
 def test_an_error_becomes_data_and_an_interruption_does_not():

@@ -2,9 +2,9 @@ import sys
 
 import pytest
 
-from reference_trainer.runs.engines.choice import choose_engine
-from reference_trainer.runs.engines.processes import Processes
-from reference_trainer.runs.engines.ray_cluster import RayCluster
+from reference_trainer.runs.executors import choose_executor
+from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.executors.ray_cluster import RayCluster
 
 
 @pytest.fixture(autouse=True)
@@ -20,33 +20,33 @@ def without_ray(monkeypatch):
 @pytest.mark.parametrize("name", ["auto", "processes"])
 @pytest.mark.usefixtures("without_ray")
 def test_without_ray_the_processes_of_this_machine_do(name):
-    engine = choose_engine(name, jobs=3)
-    assert isinstance(engine, Processes)
-    assert engine.jobs == 3
+    executor = choose_executor(name, jobs=3)
+    assert isinstance(executor, Processes)
+    assert executor.jobs == 3
 
 
 @pytest.mark.parametrize(("name", "address"), [("ray", None), ("ray", "auto"), ("auto", "10.0.0.1:6379")])
 @pytest.mark.usefixtures("without_ray")
 def test_without_ray_a_cluster_says_what_to_install(name, address):
     with pytest.raises(ImportError, match=r"pip install 'ca_reg\[ray\]'; --executor processes does without"):
-        choose_engine(name, jobs=1, address=address)
+        choose_executor(name, jobs=1, address=address)
 
 
 @pytest.mark.parametrize("name", ["ray", "auto"])
 def test_an_address_is_that_of_a_cluster(name, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", object())
-    assert isinstance(choose_engine(name, jobs=1, address="auto"), RayCluster)
+    assert isinstance(choose_executor(name, jobs=1, address="auto"), RayCluster)
     monkeypatch.setenv("RAY_ADDRESS", "10.0.0.1:6379")
-    assert isinstance(choose_engine(name, jobs=1), RayCluster)
-    assert isinstance(choose_engine("processes", jobs=1), Processes)
+    assert isinstance(choose_executor(name, jobs=1), RayCluster)
+    assert isinstance(choose_executor("processes", jobs=1), Processes)
 
 
 def test_processes_have_no_address():
     with pytest.raises(ValueError, match="--address auto is that of a Ray cluster"):
-        choose_engine("processes", jobs=1, address="auto")
+        choose_executor("processes", jobs=1, address="auto")
 
 
 @pytest.mark.parametrize("name", ["processes", "ray"])
 def test_no_job_is_refused(name):
     with pytest.raises(ValueError, match="at least 1 job, got 0"):
-        choose_engine(name, jobs=0)
+        choose_executor(name, jobs=0)

@@ -11,9 +11,8 @@ import sweep_tasks
 from subprocesses import PYTHONPATH
 from waiting import until
 
-from reference_trainer.runs.engines.engine import Failure, Task, Value
-from reference_trainer.runs.engines.ray_cluster import RayCluster
-from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.runs.executors.executor import Failure, Task, Value, run_all
+from reference_trainer.runs.executors.ray_cluster import RayCluster
 
 
 @pytest.fixture(autouse=True)
@@ -56,12 +55,12 @@ class StandIn:
 
 
 def engine_on(stand_in, monkeypatch, jobs, **keywords):
-    """An engine that has started one task on a stand-in."""
+    """An executor that has started one task on a stand-in."""
     monkeypatch.setitem(sys.modules, "ray", stand_in)
-    engine = RayCluster(jobs, **keywords)
+    executor = RayCluster(jobs, **keywords)
     assert stand_in.asked == {}  # a sweep with nothing to do joins no cluster
-    engine.start(0, Task("task", print, ()))
-    return engine
+    executor.start(0, Task("task", print, ()))
+    return executor
 
 
 @pytest.mark.parametrize(
@@ -107,10 +106,10 @@ def test_the_address_of_a_running_cluster(option, variable, expected, monkeypatc
 def test_what_still_runs_is_interrupted_and_a_cluster_of_the_caller_is_left_running(joined_before, monkeypatch):
     stand_in = StandIn([4])
     stand_in.initialized = joined_before
-    engine = engine_on(stand_in, monkeypatch, 1)
+    executor = engine_on(stand_in, monkeypatch, 1)
     assert ("init" in stand_in.asked) != joined_before
     for _ in range(2):
-        engine.close()
+        executor.close()
     assert (stand_in.asked["cancelled"], stand_in.asked["waited"]) == ("reference", ["reference"])
     assert stand_in.shut == (0 if joined_before else 1)
 
@@ -118,17 +117,17 @@ def test_what_still_runs_is_interrupted_and_a_cluster_of_the_caller_is_left_runn
 def test_the_next_sweep_joins_a_cluster_again(monkeypatch):
     """It may have other machines by then, and the one that ended is not there any more."""
     stand_in = StandIn([4])
-    engine = engine_on(stand_in, monkeypatch, 2)
-    engine.close()
+    executor = engine_on(stand_in, monkeypatch, 2)
+    executor.close()
     stand_in.asked.clear()
     stand_in.processors = [8]
-    engine.start(0, Task("task", print, ()))
+    executor.start(0, Task("task", print, ()))
     assert stand_in.asked["init"]["address"] == "local"
     assert stand_in.asked["remote"]["num_cpus"] == 4
 
 
 @pytest.mark.slow
-def test_a_sweep_on_ray_with_a_worker_killed(tmp_path, monkeypatch):
+def test_a_sweep_on_ray_with_a_worker_killed(tmp_path, monkeypatch, said):
     """One task of four raises, the worker of another is killed in the middle; one tells about itself."""
     ray = pytest.importorskip("ray")
     monkeypatch.setenv("PYTHONPATH", PYTHONPATH)  # Ray passes it to its workers
@@ -145,8 +144,7 @@ def test_a_sweep_on_ray_with_a_worker_killed(tmp_path, monkeypatch):
         Task("failing", sweep_tasks.square, (3,)),
         Task("about", sweep_tasks.environment, ()),
     ]
-    said = []
-    outcomes = dict(run_all(RayCluster(2), tasks, say=said.append))
+    outcomes = dict(run_all(RayCluster(2), tasks))
     killer.join(timeout=10)
     assert not ray.is_initialized()
     assert (outcomes[0], outcomes[1]) == (Value(25), Value(4))

@@ -1,13 +1,17 @@
-"""The interface between a sweep and where it runs: tasks, their outcomes, and the protocol of an engine."""
+"""Where the runs of a sweep execute: the protocol of an executor, and the queue that every executor serves."""
 
 from __future__ import annotations
 
+import logging
 import traceback
-from collections.abc import Callable, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
-__all__ = ["Answer", "Death", "Engine", "Failure", "Task", "Value", "attempt"]
+__all__ = ["Answer", "Death", "Executor", "Failure", "Task", "Value", "attempt", "run_all"]
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -59,10 +63,10 @@ class Death:
 Answer: TypeAlias = Value | Failure | Death
 
 
-class Engine(Protocol):
-    """Starts calls in other processes and reports how they ended; `run_all` queues and retries, for every engine.
+class Executor(Protocol):
+    """Starts calls in other processes and reports how they ended; `run_all` queues and retries, for every executor.
 
-    An engine serves one sweep after another. It starts nothing before the first task of each, so a sweep with nothing
+    An executor serves one sweep after another. It starts nothing before the first task of each, so a sweep with nothing
     left to do is free.
     """
 
@@ -101,3 +105,42 @@ def attempt(task: Task, threads: int) -> Value | Failure:
         return Value(task.function(*task.arguments))
     except Exception as error:  # one failing run must not stop the others
         return Failure(f"{type(error).__name__}: {error}", traceback.format_exc())
+
+
+def run_all(executor: Executor, tasks: Sequence[Task], *, retries: int = 3) -> Iterator[tuple[int, Value | Failure]]:
+    """Run tasks on an executor; yield the outcomes in the order in which they end, and close the executor.
+
+    A task that raises is not retried: it would raise again. One whose worker died goes to the end of the queue, so that
+    a task that kills its workers does not delay the others.
+
+    Args:
+        executor: where to run; closed at the end, also if the caller stops iterating or is interrupted.
+        tasks: what to run.
+        retries: how many dead workers of one task are replaced.
+
+    Yields:
+        The index of a task, and its outcome.
+    """
+    queue = deque(range(len(tasks)))
+    running = 0
+    deaths: Counter[int] = Counter()
+    try:
+        while queue or running:
+            while queue and running < executor.jobs:
+                number = queue.popleft()
+                executor.start(number, tasks[number])
+                running += 1
+            for number, answer in executor.wait():
+                running -= 1
+                if not isinstance(answer, Death):
+                    yield number, answer
+                elif deaths[number] < retries:
+                    deaths[number] += 1
+                    again = f"again with another ({deaths[number]} of {retries})"
+                    _log.warning("%s: %s; %s", tasks[number].label, answer.reason, again)
+                    queue.append(number)
+                else:
+                    times = f" ({retries + 1} workers died)" if retries else ""
+                    yield number, Failure(f"{answer.reason}{times}", "")
+    finally:
+        executor.close()

@@ -1,0 +1,268 @@
+"""Commands on trained models, of runs or as PLY files: one class per command, whose fields are its options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from reference_trainer.cli.options import (
+    Device,
+    Orbit,
+    PlyScene,
+    Rendering,
+    RenderOptions,
+    Trust,
+    check_model,
+    place_of,
+)
+from reference_trainer.cli.training import PORT, Lpips
+from reference_trainer.runs.folder import check_run, folder_name, modules_named, report_file, runs_of
+from reference_trainer.scenes.options import OrbitOptions, SceneOptions
+
+__all__ = ["Bake", "Clean", "Evaluate", "Render", "Report", "View"]
+
+ModelScene = Annotated[PlyScene, tyro.conf.arg(name="scene")]
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure a run, or any 3DGS PLY: PSNR, SSIM, LPIPS, CA, CV.
+
+    Per view and mean, on the views of a scene. A PLY without a scene is measured from cameras on an orbit around it: CA
+    (exact, of the paper's protocol, and without the background) and CV.
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run of `ca-reg train`, or a standard 3DGS PLY."""
+    scene: ModelScene = field(default_factory=PlyScene)
+    orbit: Orbit = field(default_factory=OrbitOptions)
+    regularizer: str | None = None
+    """Render as if it had been trained with these: "dropout(0.2)" for a PLY that does not say so, or "noise(0.8,
+    scale=True)" for a run with noise 0.8, to render with the mean opacities."""
+    samples: int = 5
+    """Renders per view for the CA score."""
+    seed: int = 0
+    """Seed of the CA score's masks."""
+    lpips: Lpips = None
+    trust: Trust = ()
+    device: Device = "cpu"
+    out: Path | None = None
+    """Folder for the results; by default <run>/evaluation, <run>/evaluation_<regularizer> or <ply>_evaluation."""
+    rendering: Rendering = field(default_factory=RenderOptions)
+
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        place = place_of(self.run, self.scene, self.orbit)
+        if isinstance(place, OrbitOptions) and self.lpips is not None:
+            raise ValueError("without photographs there is no --lpips: give --path.")
+        check_model(self.run, place)
+
+    def __call__(self) -> None:
+        from reference_trainer.evaluation.lpips import load_lpips
+        from reference_trainer.evaluation.trajectory import measured_views
+        from reference_trainer.runs.measure import load_run_model, measure
+        from reference_trainer.runs.ply import score_ply
+
+        place = place_of(self.run, self.scene, self.orbit)
+        self.rendering.begin(self.device)
+        trust = {*self.trust, *modules_named(self.regularizer or "")}
+        shared: dict[str, Any] = {
+            "samples": self.samples, "seed": self.seed, "perceptual": load_lpips(self.lpips, device=self.device)
+        }  # fmt: skip
+        if place is None:
+            model, scene = load_run_model(self.run, self.device, regularizer=self.regularizer, trust=trust)
+            name = "evaluation" if self.regularizer is None else f"evaluation_{folder_name(self.regularizer)}"
+            measure(model, measured_views(scene), self.out or self.run / name, about={"scene": scene.name}, **shared)
+        else:
+            shared |= {"regularizer": self.regularizer, "device": self.device, "background": self.scene.background}
+            score_ply(self.run, place, self.out, trust=trust, **shared)
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a run's views as PNG, or a flight also as GIF."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run of `ca-reg train`."""
+    what: Literal["auto", "test", "train", "flight"] = "auto"
+    """Which views: "auto" is the test views, or if none was held out the training views; "flight" moves through the
+    training cameras."""
+    frames: int = 60
+    """Pictures of a flight."""
+    out: Path | None = None
+    """Folder for the pictures; by default <run>/render_<what>."""
+    trust: Trust = ()
+    device: Device = "cpu"
+    rendering: Rendering = field(default_factory=RenderOptions)
+
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        check_run(self.run)
+
+    def __call__(self) -> None:
+        from reference_trainer.runs.measure import render_run
+
+        self.rendering.begin(self.device)
+        render_run(self.run, self.what, self.out, frames=self.frames, device=self.device, trust=self.trust)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write one HTML file about runs: scores, views, 3D models.
+
+    The models can be turned, in their colors or in co-adaptation heat. The file needs only a browser: no server, no
+    network. Several runs on one scene are shown side by side.
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs of `ca-reg train` on one scene, finished or not, or that of a comparison."""
+    out: Path | None = None
+    """The file; by default report.html in the folder of the run, or in the deepest one common to all runs."""
+    views: int = 8
+    """Views of each split that are shown, evenly spaced."""
+    trust: Trust = ()
+    device: Device = "cpu"
+    rendering: Rendering = field(default_factory=RenderOptions)
+
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        if self.out is not None and self.out.is_dir():
+            report_file(self.runs, self.out)
+        for run in self.runs:
+            if not runs_of(run):
+                check_run(run)
+        report_file(self.runs, self.out)
+
+    def __call__(self) -> None:
+        from reference_trainer.report.page import write_report
+
+        self.rendering.begin(self.device)
+        write_report(self.runs, self.out, views=self.views, device=self.device, trust=self.trust)
+
+
+@dataclass(frozen=True)
+class View:
+    """Explore a run, or any 3DGS PLY, live in a browser.
+
+    Shows render, co-adaptation, depth or heat, as this package renders them. Needs ca_reg[viewer]; Ctrl-C ends it.
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run of `ca-reg train`, finished or not, or a standard 3DGS PLY."""
+    scene: ModelScene = field(default_factory=PlyScene)
+    orbit: Orbit = field(default_factory=OrbitOptions)
+    regularizer: str | None = None
+    """Show it as if it had been trained with these, such as "dropout(0.2)"."""
+    port: int = PORT
+    """Port of the page on this machine; 0 for any free one."""
+    trust: Trust = ()
+    device: Device = "cpu"
+    rendering: Rendering = field(default_factory=RenderOptions)
+
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        check_model(self.run, place_of(self.run, self.scene, self.orbit))
+
+    def __call__(self) -> None:
+        from reference_trainer.evaluation.trajectory import measured_views
+        from reference_trainer.runs.measure import load_run_model
+        from reference_trainer.runs.ply import load_for_views
+        from reference_trainer.viewer.window import Viewer
+
+        where = place_of(self.run, self.scene, self.orbit)
+        trust = {*self.trust, *modules_named(self.regularizer or "")}
+        shared: dict[str, Any] = {"regularizer": self.regularizer, "device": self.device, "trust": trust}
+        with Viewer(self.port) as viewer:
+            self.rendering.begin(self.device, trains=True)  # so that no later picture waits for the compiler
+            if where is None:
+                model, scene = load_run_model(self.run, **shared)
+                viewer.show(model, measured_views(scene))
+            else:
+                loaded = load_for_views(self.run, where, background=self.scene.background, **shared)
+                viewer.show(loaded.model, loaded.views)
+            print(f"{viewer}; Ctrl-C ends it.", flush=True)
+            viewer.serve()
+
+
+@dataclass(frozen=True)
+class Bake:
+    """Give a PLY its test-time opacities, for other viewers.
+
+    Other viewers do not know that after dropout p, for example, opacities are to be scaled by 1 - p. A comment in the
+    file records that it was done.
+    """
+
+    ply: Annotated[Path, tyro.conf.Positional]
+    """A standard 3DGS PLY of a model that was trained with regularizers, opacities plain."""
+    regularizer: str | None = None
+    """What it was trained with, such as "dropout(0.2)"; PLYs of `ca-reg train` say so themselves."""
+    out: Path | None = None
+    """The file to write; by default <ply>_for_viewers.ply."""
+
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        check_model(self.ply, OrbitOptions())
+
+    def __call__(self) -> None:
+        from reference_trainer.runs.edit_ply import bake_ply
+
+        out = self.out or self.ply.with_name(f"{self.ply.stem}_for_viewers.ply")
+        regularizer = bake_ply(self.ply, out, regularizer=self.regularizer)
+        print(f"{out}: opacities are those of the test after {regularizer}, and marked so")
+
+
+@dataclass(frozen=True)
+class Clean:
+    """Remove the Gaussians of a PLY that co-adapt most; refine.
+
+    Most relative to what they contribute; prints a table of before and after. A few training steps on the photographs
+    of the scene close the holes; without a scene, on an orbit, they stay. For models that were trained without a
+    regularizer: after dropout there is little to remove, and such a model is refused unless you say --anyway.
+    """
+
+    ply: Annotated[Path, tyro.conf.Positional]
+    """A standard 3DGS PLY, opacities plain."""
+    scene: ModelScene = field(default_factory=PlyScene)
+    orbit: Orbit = field(default_factory=OrbitOptions)
+    fraction: float = 0.1
+    """Fraction of the Gaussians to remove."""
+    refine: int = 100
+    """Training steps afterwards; 0 for none."""
+    regularizer: str | None = None
+    """What it was trained with, such as "dropout(0.2)"; PLYs of `ca-reg train` say so themselves."""
+    anyway: bool = False
+    """Clean a model that was trained with dropout, too."""
+    out: Path | None = None
+    """The file to write; by default <ply>_clean.ply."""
+    trust: Trust = ()
+    device: Device = "cpu"
+    rendering: Rendering = field(default_factory=RenderOptions)
+
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        place = place_of(self.ply, self.scene, self.orbit)
+        if place is None:
+            raise ValueError(f"{self.ply} is no PLY: give the point_cloud.ply of a run.")
+        check_model(self.ply, place)
+
+    def __call__(self) -> None:
+        from reference_trainer.runs.edit_ply import clean_ply
+
+        place = place_of(self.ply, self.scene, self.orbit)
+        assert place is not None
+        self.rendering.begin(self.device, trains=isinstance(place, SceneOptions))
+        clean_ply(
+            self.ply,
+            place,
+            self.out or self.ply.with_name(f"{self.ply.stem}_clean.ply"),
+            fraction=self.fraction,
+            refine=self.refine,
+            background=self.scene.background,
+            regularizer=self.regularizer,
+            anyway=self.anyway,
+            device=self.device,
+            trust={*self.trust, *modules_named(self.regularizer or "")},
+        )

@@ -1,0 +1,143 @@
+"""Options that commands share: the rendering engine, the views of a model, what a folder may import; and their checks.
+
+Nothing here imports torch, which takes seconds: a mistyped path is answered before that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from reference_trainer.files import is_ply
+from reference_trainer.runs.folder import check_run
+from reference_trainer.scenes.options import OrbitOptions, SceneOptions
+
+__all__ = [
+    "BUILT_IN", "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_scenes",
+    "place_of", "refuse_old_options",
+]  # fmt: skip
+
+BUILT_IN = ("builtin",)  # names of this package's own renderer
+_ENGINES = {"numba": "loops"}  # until the renderer itself uses the new names
+
+_OLD = {
+    ("--renderer", "torch"): "the renderer of this package is called builtin: --renderer builtin",
+    ("--engine", "loops"): "this engine is called by what compiles it: --engine numba",
+    ("--fields", None): "models that train side by side are called models: --models",
+}
+"""Options, with the value that is refused or None for all, and what they are called now."""
+
+Device = Annotated[str, tyro.conf.arg(help='"cpu" or "cuda".')]
+Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="orbit")]
+Trust = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        help="Modules of your own that a run or a PLY names (my_module:MyDropout) and that may be imported: what a "
+        "file from elsewhere names is not executed."
+    ),
+]
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """The rendering engine, for all commands that render."""
+
+    engine: Literal["auto", "numba", "torch", "triton"] | None = None
+    """What renders: "numba" (compiled; float32 on a CPU), "torch" (anything), "triton" (float32 on a CUDA card), or
+    "auto", whichever fits. By default $CA_REG_ENGINE, or "auto"."""
+
+    def begin(self, device: str, *, trains: bool = False) -> None:
+        """Choose the engine of this process and its workers, and print which it is.
+
+        Args:
+            device: where to render.
+            trains: whether all loops will be needed: those not compiled yet are then compiled now, with progress.
+        """
+        from reference_trainer.render import describe_engine, use_engine
+
+        if self.engine is not None:
+            use_engine(_ENGINES.get(self.engine, self.engine))
+        print(f"Engine: {describe_engine(device)}", flush=True)
+        if trains and device == "cpu":
+            from reference_trainer.runs.warmup import warm_up
+
+            warm_up()
+
+
+Rendering = Annotated[RenderOptions, tyro.conf.arg(name="rendering")]
+
+
+@dataclass(frozen=True)
+class PlyScene(SceneOptions):
+    """The scene of a PLY, if it has one."""
+
+    path: Annotated[str, tyro.conf.arg(aliases=("--scene",))] = "orbit"
+    """For a PLY: scene folder, "synthetic" for the built-in scene, or "orbit" for cameras around the model."""
+    init: Annotated[str | None, tyro.conf.Suppress] = None  # the PLY is the model
+
+
+def place_of(source: Path, scene: PlyScene, orbit: OrbitOptions) -> SceneOptions | OrbitOptions | None:
+    """Return the scene or orbit of a PLY; None for the folder of a run, which has its own scene.
+
+    Raises:
+        ValueError: if options are given that do not apply.
+    """
+    if not is_ply(source):
+        if (scene, orbit) != (PlyScene(), OrbitOptions()):
+            raise ValueError(
+                f"{source} is no PLY, and a run is looked at on its own scene: leave out options of scene and orbit."
+            )
+        return None
+    if scene.path == "orbit":
+        if replace(scene, background="auto") != PlyScene():
+            raise ValueError("without photographs no option of a scene but --background applies: give --path.")
+        return orbit
+    if orbit != OrbitOptions():
+        raise ValueError(f"the options of an orbit do not apply to the scene {scene.path}: leave them, or --path, out.")
+    return scene
+
+
+def check_model(source: Path, place: SceneOptions | OrbitOptions | None) -> None:
+    """Refuse a run, a PLY or its scene that is not there.
+
+    Raises:
+        FileNotFoundError: saying what was expected.
+    """
+    if place is None:
+        check_run(source)
+    elif not source.is_file():
+        raise FileNotFoundError(f"there is no file {source}: expected a standard 3DGS .ply, or the folder of a run.")
+    elif isinstance(place, SceneOptions):
+        check_scenes([place.path])
+
+
+def check_scenes(paths: Sequence[str]) -> None:
+    """Refuse scene folders that are not there.
+
+    Raises:
+        FileNotFoundError: for the first.
+    """
+    for path in paths:
+        if path != "synthetic" and not Path(path).exists():
+            raise FileNotFoundError(f"there is no scene folder {path}; for the built-in scene, say 'synthetic'.")
+
+
+def refuse_old_options(arguments: Sequence[str], known: Sequence[str]) -> None:
+    """Refuse options and values of earlier versions by their new names.
+
+    Args:
+        arguments: of the command line.
+        known: options and values that are in use: what is old here may not be everywhere yet.
+
+    Raises:
+        ValueError: with the new name.
+    """
+    words = [part for word in arguments for part in (word.split("=", 1) if word.startswith("--") else [word])]
+    for (option, value), now in _OLD.items():
+        for word, after in zip(words, [*words[1:], ""], strict=True):
+            if word.replace("_", "-") == option and value in (None, after) and (value or option) not in known:
+                raise ValueError(f"{option}{f' {value}' if value else ''} is a name of earlier versions: {now}.")

@@ -1,0 +1,173 @@
+"""Write a finished model anew: with its test-time opacities, or without the Gaussians that co-adapt most."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+
+from torch import Tensor
+
+from reference_trainer.evaluation.evaluate import Evaluation, evaluate
+from reference_trainer.evaluation.shares import Heat, all_but_highest
+from reference_trainer.evaluation.tables import EXACT, markdown_table
+from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.model.ply import save_ply
+from reference_trainer.runs.ply import load_for_views, load_plain_ply_model, scaled
+from reference_trainer.runs.run import save_for_viewers
+from reference_trainer.scenes.options import OrbitOptions, SceneOptions
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.threads import threads_for
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.trainer import Trainer
+
+__all__ = ["bake_ply", "clean_ply", "refined"]
+
+_log = logging.getLogger(__name__)
+
+
+def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> str:
+    """Write a PLY with a model's test-time opacities, such as those times 1 - p after dropout p.
+
+    A header comment records what was done, so that no program of this package does it again. The layout is that of
+    `save_ply`; unknown properties are dropped.
+
+    Args:
+        source: the PLY of a model that was trained with regularizers, opacities plain.
+        target: the file to write; it must not exist.
+        regularizer: what it was trained with, such as ``"dropout(0.2)"``, if the PLY does not say.
+
+    Returns:
+        The expression of the regularizers.
+
+    Raises:
+        ValueError: if the regularizers are unknown or cannot be parsed, the test-time opacities are the plain ones or
+            depend on the camera, or those of the source are test-time ones already.
+        FileExistsError: if the target exists: plain opacities are needed to train on and are never overwritten.
+        FileNotFoundError: if there is no source.
+
+    Example:
+        >>> import tempfile
+        >>> import torch
+        >>> from reference_trainer.model.gaussians import Gaussians
+        >>> from reference_trainer.model.ply import load_ply, save_ply
+        >>> gaussians = Gaussians.from_points(torch.rand(5, 3), torch.rand(5, 3), torch.full((5,), 0.1), sh_degree=0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plain, baked = Path(folder, "plain.ply"), Path(folder, "baked.ply")
+        ...     save_ply(gaussians, plain)
+        ...     _ = bake_ply(plain, baked, regularizer="dropout(0.2)")
+        ...     load_ply(baked).opacity_scale
+        0.8
+    """
+    if target.exists():
+        raise FileExistsError(f"{target} exists already: give another --out, or delete it.")
+    model, facts = load_plain_ply_model(source, regularizer=regularizer)
+    if not facts.regularizer:
+        raise ValueError(f"{source} does not say what it was trained with: give --regularizer, such as 'dropout(0.2)'.")
+    if model.depends_on_camera:
+        raise ValueError(f"what is rendered after {facts.regularizer} depends on the camera: no file can hold it.")
+    if model.factor == 1:
+        raise ValueError(f"a model trained with {facts.regularizer} is rendered as it is: there is nothing to bake.")
+    save_for_viewers(model, target)
+    return facts.regularizer
+
+
+def clean_ply(
+    ply: Path,
+    where: SceneOptions | OrbitOptions,
+    out: Path,
+    *,
+    fraction: float = 0.1,
+    refine: int = 100,
+    background: str = "auto",
+    regularizer: str | None = None,
+    anyway: bool = False,
+    device: str = "cpu",
+    trust: Collection[str] = (),
+) -> dict[str, Evaluation]:
+    """Write a model without the Gaussians of highest share of the exact score per blend weight, and refined.
+
+    Shares (at drop rate 1/2) and weights are measured at the training views, or at those of the orbit. The removal
+    leaves holes, which a few training steps on the photographs close; without a scene or with ``refine=0`` they stay.
+    Logs a table of quality and co-adaptation before and after, and says so if the photographs are fitted worse.
+
+    Args:
+        ply: a standard 3DGS PLY.
+        where: its scene, or an orbit around it.
+        out: the file to write, opacities plain; it must not exist.
+        fraction: of the Gaussians to remove, in (0, 1); those without a share stay.
+        refine: training steps afterwards, without densification, with the regularizers of the model.
+        background: as in `score_ply`.
+        regularizer: as in `score_ply`.
+        anyway: clean a model that was trained with dropout, too, which made all measured ones worse.
+        device: where to render and train.
+        trust: as in `load_ply_model`.
+
+    Returns:
+        The evaluations by row of the table.
+
+    Raises:
+        ValueError: as `score_ply`, if ``fraction`` or ``refine`` is out of range, no view has a score, the PLY has
+            only test-time opacities, which cannot be trained, or the model was trained with dropout.
+        FileExistsError: if ``out`` exists.
+        FileNotFoundError: if the PLY or the scene is missing.
+    """
+    if not 0 < fraction < 1 or refine < 0:
+        raise ValueError(f"fraction must be in (0, 1) and refine at least 0, got {fraction} and {refine}.")
+    if out.exists():
+        raise FileExistsError(f"{out} exists already: give another --out, or delete it.")
+    loaded = load_for_views(ply, where, background=background, regularizer=regularizer, device=device, trust=trust)
+    model, scene = loaded.model, loaded.scene
+    if model.for_rendering:
+        raise ValueError(f"the opacities of {ply} are those of the test: give the PLY with plain ones.")
+    if model.chain.drops and not anyway:
+        raise ValueError(
+            f"{ply} was trained with {model.regularizer}, which leaves little to remove: cleaning such a model made it "
+            "worse (20.74 to 20.22 dB at the training views). Keep it as it is, or say --anyway."
+        )
+    views = [view.to(device) for view in loaded.views["orbit" if scene is None else "train"]]
+    stays = all_but_highest(Heat.of(model, views).values, fraction)
+    models = {"as it was": model, "taken out": replace(model, gaussians=model.gaussians[stays])}
+    if scene is None:
+        _log.info("Without photographs nothing can close the holes: for that give the scene (--scene FOLDER).")
+    elif refine:
+        models[f"after {refine} steps"] = refined(models["taken out"], scene, refine, device)
+    found = {name: evaluate(each, loaded.views) for name, each in models.items()}
+    *_, last = models.values()
+    save_ply(scaled(last.gaussians, 1 / loaded.enlarged), out, regularizer=last.regularizer, step=last.step)
+    _log.info(_table(found))
+    before, *_, after = (evaluation.mean("train", "psnr") for evaluation in found.values())
+    if after < before:
+        _log.warning("The photographs of the training are fitted worse than before: %.2f dB, for %.2f.", after, before)
+    _log.info("%s: %d of %d Gaussians", out, len(last.gaussians), len(stays))
+    return found
+
+
+def refined(model: TrainedModel, scene: Scene, steps: int, device: str = "cpu") -> TrainedModel:
+    """Return a model after some more training steps on a scene, at the final learning rate of the means.
+
+    No Gaussian is added or removed. Errors are those of `Trainer`.
+    """
+    usual, start = TrainConfig(), model.gaussians
+    config = replace(
+        usual, iterations=steps, regularizer=model.regularizer, sh_degree=start.sh_degree,
+        means_rate=usual.means_rate_final, densify_every=0, opacity_reset_every=0,
+    )  # fmt: skip
+    trainer = Trainer(replace(scene, start=start), config, device)
+    with threads_for(scene.pixels):
+        trainer.train()
+    return replace(model, gaussians=trainer.gaussians.map(Tensor.detach))
+
+
+def _table(found: dict[str, Evaluation]) -> str:
+    """Return a table with the means of every split, one row per model."""
+    rows: list[dict[str, object]] = []
+    for name, evaluation in found.items():
+        row: dict[str, object] = {"model": name, "Gaussians": evaluation.gaussians}
+        for split in dict.fromkeys(view.split for view in evaluation.views):
+            psnr, exact = evaluation.mean(split, "psnr"), evaluation.mean(split, "ca_exact_half") * 1e3
+            row |= {f"{split} PSNR": f"{psnr:.2f}", f"{split} {EXACT}": f"{exact:.2f}"}
+        rows.append(row)
+    known = [title for title in rows[0] if any(row[title] != "nan" for row in rows)]
+    return markdown_table(rows, known)
