@@ -33,7 +33,7 @@ COMMANDS = [
 ]
 QUICK = {
     "train": ["--iterations", "4", "--images", "images"],
-    "compare": ["--iterations", "2", "--images", "images"],
+    "compare": ["--iterations", "2", "--images", "images", "--seeds", "1"],  # a process for each run
 }
 
 
