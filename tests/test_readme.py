@@ -155,7 +155,7 @@ def test_the_launcher(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "argv ['-s', 'my_scene']" in done.stdout
-    assert "GaussianDropout" in done.stderr
+    assert "3 renders regularized, steps 1 to 3" in done.stderr
 
 
 def test_the_citation_is_that_of_the_package():

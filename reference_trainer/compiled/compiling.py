@@ -89,7 +89,7 @@ def _name(function: Callable[..., Any]) -> str:
     return f"{function.__module__.rpartition('.')[2]}.{function.__name__.lstrip('_')}"
 
 
-class _UserCache(UserWideCacheLocator):  # type: ignore[misc]
+class _UserCache(UserWideCacheLocator):
     """The folder ``ca_reg`` of the user's cache, with one folder in it for each folder of sources.
 
     numba's own default is ``__pycache__`` beside the source. pip does not remove what it did not install: after an
@@ -102,7 +102,7 @@ class _UserCache(UserWideCacheLocator):  # type: ignore[misc]
         self._cache_path = str(Path(of_user, self.get_suitable_cache_subpath(file)))
 
 
-class _UserCacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
+class _UserCacheFiles(CompileResultCacheImpl):
     _locator_classes = (UserProvidedCacheLocator, _UserCache)  # the first is NUMBA_CACHE_DIR
 
 
