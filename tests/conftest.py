@@ -7,6 +7,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import signal
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -73,6 +74,20 @@ def full_disk() -> Callable[[int], AbstractContextManager[None]]:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
     return limited
+
+
+def pytest_collection_finish(session):
+    """Compile the loops before the first test of a run on several processes: one does, the others wait."""
+    if not hasattr(session.config, "workerinput") or not any("reference_trainer" in i.nodeid for i in session.items):
+        return
+    try:
+        from filelock import FileLock
+    except ImportError:  # without ca_reg[trainer] there are no loops
+        return
+    from reference_trainer.runs.warmup import warm_up
+
+    with FileLock(Path(tempfile.gettempdir(), "ca_reg_tests_compile.lock")):
+        warm_up()
 
 
 def pytest_configure(config):

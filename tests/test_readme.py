@@ -33,7 +33,7 @@ COMMANDS = [
 ]
 QUICK = {
     "train": ["--iterations", "4", "--images", "images"],
-    "compare": ["--iterations", "2", "--images", "images"],
+    "compare": ["--iterations", "2", "--images", "images", "--seeds", "1"],  # a process for each run
 }
 
 
@@ -61,10 +61,10 @@ def test_the_chain_drops_and_leaves_the_global_random_state_alone(gaussians):
     generator = torch.Generator().manual_seed(0)
     found = run("chain", gaussians=gaussians, radii=torch.ones(1000), step=5_000, generator=generator)
     assert torch.equal(torch.random.get_rng_state(), before)
-    dropped = found.opacity.squeeze(1) == 0
-    assert torch.equal(found.radii == 0, dropped)
+    dropped = found.radii == 0
+    assert (found.opacity[dropped] == 0).all()
     assert dropped.float().mean() == pytest.approx(0.1, abs=0.05)  # half-way up the ramp
-    assert found.opacity[~dropped].unique().numel() > 800  # and noise on the others
+    assert found.opacity[~dropped].unique().numel() > 500  # and noise on the others
 
 
 def test_gsplat(monkeypatch):
@@ -83,16 +83,16 @@ def test_gsplat(monkeypatch):
 
 
 def test_the_score(gaussians, capsys):
-    """One pixel behind each Gaussian: with half of them left out, its variance is on average (0.5 / 2)^2."""
+    """A pixel for each Gaussian, 0.5 or left out: its variance over 5 renders is on average 4/5 of 0.5^2 / 4."""
 
     def rasterize(of, opacity, view):
         assert of is gaussians
-        return opacity.view(1, 25, 40).expand(3, -1, -1), opacity.view(25, 40)
+        return opacity.view(1, 25, 40).expand(3, -1, -1), torch.ones(25, 40)
 
     found = run("score", gaussians=gaussians, rasterize=rasterize, view=None)
     value, std_error = (float(x) for x in capsys.readouterr().out.split()[:2])
     assert (value, std_error) == pytest.approx((found.result.value, found.result.std_error))
-    assert value > 0
+    assert value == pytest.approx(0.8 * 0.5**2 / 4, rel=0.05)  # 1,000 pixels, 5 renders: 2 % of standard error
 
 
 def camera_file(scene):
@@ -155,7 +155,7 @@ def test_the_launcher(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "argv ['-s', 'my_scene']" in done.stdout
-    assert "GaussianDropout" in done.stderr
+    assert "3 renders regularized, steps 1 to 3" in done.stderr
 
 
 def test_the_citation_is_that_of_the_package():

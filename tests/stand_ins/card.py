@@ -115,7 +115,7 @@ class _Module:
     """What PyTorch asks the module of a device."""
 
     is_initialized = is_available = staticmethod(lambda: True)
-    device_count = staticmethod(lambda: 2)
+    device_count = staticmethod(lambda: 1)
     current_device = staticmethod(lambda: 0)
     manual_seed_all = staticmethod(lambda seed: None)
     _is_in_bad_fork = staticmethod(lambda: False)
