@@ -21,5 +21,5 @@ def masked(options, monkeypatch) -> SceneOptions:
         return dataclasses.replace(view, image=view.image.where(mask > 0, noise), mask=mask)
 
     scene = dataclasses.replace(scene, train=tuple(map(half, scene.train)), test=tuple(map(half, scene.test)))
-    monkeypatch.setattr(SceneOptions, "load", lambda *_, **__: scene)
+    monkeypatch.setattr("reference_trainer.scenes.load._load", lambda *_: scene)
     return options

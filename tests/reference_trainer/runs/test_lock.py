@@ -146,11 +146,11 @@ def test_what_another_process_finished_while_the_scene_was_read_is_not_trained_a
 
     def load(self, seed):
         with monkeypatch.context() as patch:
-            patch.setattr(type(options), "load", lambda self, seed: scene)
+            patch.setattr("reference_trainer.scenes.load._load", lambda *_: scene)
             results.append(run_experiment(options, short, tmp_path, monitor_every=0))
         return scene
 
-    monkeypatch.setattr(type(options), "load", load)
+    monkeypatch.setattr("reference_trainer.scenes.load._load", load)
     monkeypatch.setattr("reference_trainer.runs.run._train", train_once(monkeypatch))
     assert run_experiment(options, short, tmp_path, monitor_every=0) == results[0]
 

@@ -87,7 +87,7 @@ def test_everything_is_there(finished, options, short):
 def test_a_second_call_does_nothing(finished, options, short, monkeypatch):
     out, results = finished
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
-    monkeypatch.setattr(SceneOptions, "load", lambda *a, **k: pytest.fail("the scene was loaded again"))
+    monkeypatch.setattr("reference_trainer.scenes.load._load", lambda *_: pytest.fail("the scene was loaded again"))
     said: list[str] = []
     assert run_experiment(options, short, out, **EVERY, say=said.append) == results
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
@@ -298,7 +298,7 @@ def broken_scene(options: SceneOptions, monkeypatch) -> None:
     image[0, 0, 0] = torch.nan
     bad = dataclasses.replace(scene.train[1], image=image)
     scene = dataclasses.replace(scene, train=(scene.train[0], bad, scene.train[2]))
-    monkeypatch.setattr(SceneOptions, "load", lambda self, seed: scene)
+    monkeypatch.setattr("reference_trainer.scenes.load._load", lambda *_: scene)
 
 
 def test_divergence_keeps_the_last_checkpoint(options, short, monkeypatch, tmp_path):
