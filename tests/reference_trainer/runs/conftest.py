@@ -21,6 +21,6 @@ def masked(options, monkeypatch) -> SceneOptions:
         return dataclasses.replace(view, image=view.image.where(mask > 0, noise), mask=mask)
 
     scene = dataclasses.replace(scene, train=tuple(map(half, scene.train)), test=tuple(map(half, scene.test)))
-    for module in ("run", "score_ply"):
+    for module in ("run", "ply"):
         monkeypatch.setattr(f"reference_trainer.runs.{module}.load_scene", lambda *_, **__: scene)
     return options
