@@ -80,7 +80,8 @@ def resume(arguments: Sequence[str], script: Sequence[str]) -> None:
         script: the launched script, or ``-m`` and its module; that of this process, if it has one, takes its place.
     """
     own = Path(sys.argv[0])
-    hook: Hook = _parse([*arguments, *([str(own)] if own.suffix == ".py" and own.is_file() else script)]).hook
+    this = [str(own)] if own.suffix == ".py" and own.is_file() else script
+    hook: Hook = _parse([*arguments, *this], in_child=True).hook
     hook.install()
     folder = folder_of_reports()
 
@@ -98,7 +99,7 @@ def _uninstall(hook: Hook) -> None:
         hook.uninstall()
 
 
-def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+def _parse(arguments: Sequence[str] | None, *, in_child: bool = False) -> argparse.Namespace:
     """Parse and check the options before anything runs; adds the `hook` that they ask for."""
     parser = argparse.ArgumentParser(
         prog="python -m ca_reg.integrations.run",
@@ -150,7 +151,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"{options.script} is one of gsplat's, for which there is no --{meaningless[0].replace('_', '-')}")
     if options.patience < 0:
         parser.error("--patience must be at least 0")
-    if options.report is not None:
+    if options.report is not None and not in_child:
         options.report = options.report.absolute()  # the script may change the working directory
         if not options.report.parent.is_dir():
             parser.error(f"there is no folder {options.report.parent} for the report")
