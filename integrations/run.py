@@ -31,7 +31,7 @@ from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
 from ._calls import MODULES
 from ._environment import Watch, explain_download, folder_of_reports, in_children, old_aliases, reports_of_children
-from ._report import Hook, Tally
+from ._report import Hook
 from ._sources import find_script, read_script, run_script, set_command_line
 from .gsplat import Installation
 from .inria import DEFAULT_MODEL, RasterizerHook, Scope, Steps
@@ -55,6 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with ExitStack() as undo:
         if hook is not None:
             # Entered before the report, which reads what these processes have left.
+            # A process may have another script; of the launcher's own options it needs all that stand before this one.
             name = ["-m", options.script] if options.module else [str(options.script.resolve())]
             own = arguments[: len(arguments) - len(options.arguments) - (2 if options.module else 1)]
             undo.enter_context(in_children(f"{__package__}.run:resume", own, name))
@@ -87,8 +88,9 @@ def resume(arguments: Sequence[str], script: Sequence[str]) -> None:
 
     def report() -> None:
         if hook.used:  # data loaders, say, render nothing
-            found = {"script": own.name, "renders": hook.tally.as_dict(), "problem": hook.problem()}
-            Path(folder, f"{os.getpid()}.json").write_text(json.dumps(found), encoding="utf-8")
+            found = {"renders": hook.tally.as_dict(), "done": hook.tally.lines(), "problem": hook.problem()}
+            path = Path(folder, f"{os.getpid()}.json")
+            path.write_text(json.dumps({"script": own.name, **found}), encoding="utf-8")
 
     atexit.register(report)
 
@@ -227,8 +229,8 @@ def _reported(options: argparse.Namespace, hook: Hook | None, watch: Watch) -> I
         elif hook.used or not started:
             lines += hook.tally.lines()
         for child in started:
-            done = Tally.from_dict(child["renders"] or {}).lines()
-            lines.append(f"{child['script']}, a process that it started: {'; '.join(done)}")
+            done = "; ".join(child.get("done", ["nothing"]))
+            lines.append(f"{child['script']}, a process that it started: {done}")
         lines += [f"WARNING: a process that it started was not hooked: {command}" for command in watch.missed]
         for line in [*lines, *([f"ERROR: {problem}"] if problem else [])]:
             print(f"[ca_reg] {line}", file=sys.stderr)
