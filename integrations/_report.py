@@ -81,12 +81,6 @@ class Tally:
         """Return the counts for JSON."""
         return vars(self) | {"skipped": {reason.name.lower(): count for reason, count in self.skipped.items()}}
 
-    @classmethod
-    def from_dict(cls, counts: dict[str, Any]) -> Tally:
-        """Restore counts from JSON."""
-        skipped = Counter({Skip[name.upper()]: count for name, count in counts.get("skipped", {}).items()})
-        return cls(**{**counts, "skipped": skipped})
-
     def lines(self) -> list[str]:
         """Return the counts in words, one per line."""
         steps = "" if self.first_step is None else f", steps {self.first_step} to {self.last_step}"

@@ -31,7 +31,7 @@ from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
 from ._calls import MODULES
 from ._environment import Watch, explain_download, folder_of_reports, in_children, old_aliases, reports_of_children
-from ._report import Hook, Tally
+from ._report import Hook
 from ._sources import find_script, read_script, run_script, set_command_line
 from .gsplat import Installation
 from .inria import DEFAULT_MODEL, RasterizerHook, Scope, Steps
@@ -55,6 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with ExitStack() as undo:
         if hook is not None:
             # Entered before the report, which reads what these processes have left.
+            # A process may have another script; of the launcher's own options it needs all that stand before this one.
             name = ["-m", options.script] if options.module else [str(options.script.resolve())]
             own = arguments[: len(arguments) - len(options.arguments) - (2 if options.module else 1)]
             undo.enter_context(in_children(f"{__package__}.run:resume", own, name))
@@ -80,14 +81,16 @@ def resume(arguments: Sequence[str], script: Sequence[str]) -> None:
         script: the launched script, or ``-m`` and its module; that of this process, if it has one, takes its place.
     """
     own = Path(sys.argv[0])
-    hook: Hook = _parse([*arguments, *([str(own)] if own.suffix == ".py" and own.is_file() else script)]).hook
+    this = [str(own)] if own.suffix == ".py" and own.is_file() else script
+    hook: Hook = _parse([*arguments, *this], in_child=True).hook
     hook.install()
     folder = folder_of_reports()
 
     def report() -> None:
         if hook.used:  # data loaders, say, render nothing
-            found = {"script": own.name, "renders": hook.tally.as_dict(), "problem": hook.problem()}
-            Path(folder, f"{os.getpid()}.json").write_text(json.dumps(found), encoding="utf-8")
+            found = {"renders": hook.tally.as_dict(), "done": hook.tally.lines(), "problem": hook.problem()}
+            path = Path(folder, f"{os.getpid()}.json")
+            path.write_text(json.dumps({"script": own.name, **found}), encoding="utf-8")
 
     atexit.register(report)
 
@@ -98,7 +101,7 @@ def _uninstall(hook: Hook) -> None:
         hook.uninstall()
 
 
-def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+def _parse(arguments: Sequence[str] | None, *, in_child: bool = False) -> argparse.Namespace:
     """Parse and check the options before anything runs; adds the `hook` that they ask for."""
     parser = argparse.ArgumentParser(
         prog="python -m ca_reg.integrations.run",
@@ -150,7 +153,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"{options.script} is one of gsplat's, for which there is no --{meaningless[0].replace('_', '-')}")
     if options.patience < 0:
         parser.error("--patience must be at least 0")
-    if options.report is not None:
+    if options.report is not None and not in_child:
         options.report = options.report.absolute()  # the script may change the working directory
         if not options.report.parent.is_dir():
             parser.error(f"there is no folder {options.report.parent} for the report")
@@ -226,8 +229,8 @@ def _reported(options: argparse.Namespace, hook: Hook | None, watch: Watch) -> I
         elif hook.used or not started:
             lines += hook.tally.lines()
         for child in started:
-            done = Tally.from_dict(child["renders"] or {}).lines()
-            lines.append(f"{child['script']}, a process that it started: {'; '.join(done)}")
+            done = "; ".join(child.get("done", ["nothing"]))
+            lines.append(f"{child['script']}, a process that it started: {done}")
         lines += [f"WARNING: a process that it started was not hooked: {command}" for command in watch.missed]
         for line in [*lines, *([f"ERROR: {problem}"] if problem else [])]:
             print(f"[ca_reg] {line}", file=sys.stderr)

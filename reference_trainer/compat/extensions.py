@@ -130,6 +130,7 @@ class GridEncoder(nn.Module):
         offsets = [0]
         for level in range(num_levels):
             corners = math.ceil(base_resolution * per_level_scale**level) + (not align_corners)
+            # Coarse grids have a row for every corner; finer ones share the rows of a table of this size.
             rows = min(2**log2_hashmap_size, corners**input_dim)
             offsets.append(offsets[-1] + GRANULE * math.ceil(rows / GRANULE))
         self.register_buffer("offsets", torch.tensor(offsets, dtype=torch.int32))

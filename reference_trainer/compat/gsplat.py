@@ -192,6 +192,7 @@ def _colors(given: SimpleNamespace, number: int) -> dict[str, Any]:
 @torch.no_grad()
 def _extents(splats: Splats, per_axis: bool) -> Tensor:
     """Return half the sides of the rectangles that gsplat draws splats in, whole pixels, shape (M, 2)."""
+    # Since 1.5 a splat ends where its alpha falls to 1/255, on each axis; before, at three of its longest deviations.
     if per_axis:
         xx, _, yy = splats.projection.covariances.unbind(-1)
         extent = (2 * (splats.opacities / MIN_ALPHA).clamp_min(1).log()).sqrt().clamp_max(EXTENT)

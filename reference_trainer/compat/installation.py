@@ -123,6 +123,7 @@ def _modules(sources: Sources, outputs: tuple[str, ...] | None, rasterizer: str 
     modules = {name: rasterizer_module(name, names, outputs) for name, names in rasterizers.items()} | extensions
     for name in sorted(sources.imports - modules.keys()):
         package, compiled, _ = f"{name}.".partition("._C.")
+        # Many import more compiled code than they call (hierarchical-3d-gaussians).
         if compiled and "." not in package and package not in modules and find_spec(package) is None:
             inner = make_module(f"{package}._C", __getattr__=Refusing(f"{package}._C").__getattr__)
             modules |= {package: make_module(package, _C=inner), f"{package}._C": inner}

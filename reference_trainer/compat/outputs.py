@@ -42,6 +42,7 @@ _NAMES = {
 }
 _KINDS = {name: kind for kind, names in _NAMES.items() for name in names}
 _SCORES = {"accum_weights", "accum_count", "accum_blend", "accum_dist", "depths", "my_radii"}  # by Taming 3DGS's names
+# Prefixes and suffixes that say only that a value was rendered, or that it is a picture.
 _TELLING_NOTHING = re.compile(r"^(.*\.)?((rendered|render|rend|out)_)?|_(image|img|map)$")
 
 
@@ -163,6 +164,7 @@ def names_of_results() -> tuple[str, ...] | None:
         True
     """
     frame: FrameType | None = sys._getframe(1)
+    # A hook of this package, or torch's call of a module, may stand between the caller and the rasterizer.
     while frame is not None and _is_between(frame.f_globals.get("__name__", "")):
         frame = frame.f_back
     if frame is None:

@@ -97,6 +97,7 @@ def heaviest(splats: Splats) -> tuple[Tensor, Tensor]:
     """
     rows = pad_entries(geometry_rows(splats))
     lists = splats.lists
+    # Indices share a table with the weights, so that one pass reorders both: float32 counts splats exactly to 2^24.
     found = rows.new_zeros(lists.rows * lists.columns, 2, PIXELS)
     found[:, 0] = -1
     for block in blocks(lists, rows.device):

@@ -241,6 +241,7 @@ class GaussianRasterizer(nn.Module):
             background=settings.bg,
             depth=inverse or true_depth,
         )
+        # Both trainers densify by these: signed gradients of a large splat cancel between its two sides.
         if means2D_densify is not None:
             absolute = means2D_densify.index_select(0, splats.indices)[:, :2] * means2D.new_tensor(half[:2])
             rendering = with_absolute_gradients(rendering, absolute, settings.bg)
@@ -270,7 +271,8 @@ class GaussianRasterizer(nn.Module):
             found["metric_counts"] = means3D.new_zeros(n).index_copy(0, splats.indices, count).int()
         if not parts.isdisjoint(("heaviest", "largest_weight")):
             index, weight = heaviest(splats)
-            index = torch.cat([splats.indices, splats.indices.new_tensor([-1])])[index]  # -1 stays -1
+            # From the M splats in view to the N Gaussians; -1, for no splat, finds the appended -1.
+            index = torch.cat([splats.indices, splats.indices.new_tensor([-1])])[index]
             found |= {"heaviest": index[None].int(), "largest_weight": weight[None]}
         labels = (*(names or kinds), "radii")  # for a caller that names only one value
         return tuple(_output(kind, label, found, drawn) for kind, label in zip(kinds, labels, strict=False))

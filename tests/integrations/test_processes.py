@@ -94,7 +94,7 @@ def test_a_process_that_trains_past_the_hook_fails_the_run(repository):
         (["-I", "-c", "0"], {}, True),
         (["-c", "0"], {"PYTHONPATH": ""}, True),
         (["-c", "0"], {}, False),
-        (["-m", "ca_reg.integrations.run", "--help"], {}, False),
+        (["-c", "0", "-m", "ca_reg.integrations.run"], {"PYTHONPATH": ""}, False),
     ],
 )
 def test_a_process_that_cannot_be_hooked_is_named(command, changes, named):

@@ -16,8 +16,9 @@ from stand_ins.inria import Model, make_rasterizer, make_render
 
 from ca_reg import Chain
 from ca_reg.integrations._sources import find_script
+from ca_reg.integrations.gsplat import Installation
 from ca_reg.integrations.inria import RasterizerHook
-from ca_reg.integrations.run import main
+from ca_reg.integrations.run import _parse, main
 
 
 def test_a_script_is_regularized_and_the_report_says_how(repository, tmp_path, capsys):
@@ -95,7 +96,7 @@ def test_the_report_comes_however_the_script_ends(repository, tmp_path, capsys, 
 
 @pytest.mark.parametrize(("name", "offered"), [("my_rasterization", True), ("websockets_of_mine", False)])
 def test_a_missing_extension_is_named_with_the_ways_out(repository, capsys, name, offered):
-    (repository / "train.py").write_text(f"import {name}._C\n")
+    (repository / "train.py").write_text(f"import {name}\n")
     with pytest.raises(ModuleNotFoundError):
         main(["--cpu", str(repository / "train.py")])
     problem = capsys.readouterr().err.partition("ERROR: ")[2]
@@ -292,6 +293,14 @@ def test_a_script_that_calls_gsplat_is_told_from_the_others(tmp_path, capsys, re
     assert draws(plain) == draws(regularized.out)
     assert launch("--scope", "all", "--dropout", 0.5, script) == 2
     assert "is one of gsplat's, for which there is no --scope" in capsys.readouterr().err
+
+
+def test_with_a_rasterizer_by_name_gsplat_is_an_optional_back_end(tmp_path):
+    script = tmp_path / "train.py"
+    script.write_text("try:\n    import gsplat\nexcept ImportError:\n    gsplat = None\n")
+    options = _parse(["--dropout", "0.2", "--rasterizer", "mine:Rasterizer", str(script)])
+    assert isinstance(options.hook, RasterizerHook)
+    assert isinstance(_parse(["--dropout", "0.2", str(script)]).hook, Installation)
 
 
 def test_an_installed_command_is_a_script_as_well(tmp_path, monkeypatch):
