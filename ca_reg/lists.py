@@ -151,7 +151,7 @@ class ListMoments:
         check_opacity(opacity)
         lists = self.lists_fn(opacity, view)
         if not isinstance(lists, PixelLists):
-            raise TypeError(f"lists_fn must return ca_reg.PixelLists, got {type(lists).__name__}.")
+            raise TypeError(f"lists_fn must return ca_reg.lists.PixelLists, got {type(lists).__name__}.")
         check_count(lists.height, "height", minimum=1)
         check_count(lists.width, "width", minimum=1)
         n = opacity.shape[0]

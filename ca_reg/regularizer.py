@@ -161,9 +161,10 @@ class Regularizer(Scheduled):
             self._by_thread = None  # a graph knows no threads
         else:
             with _LOCK:
-                if self._by_thread is None:
-                    self._by_thread = weakref.WeakKeyDictionary()
-                self._by_thread[threading.current_thread()] = draw
+                # A new dictionary, because a shallow copy of the module shares the old one.
+                by_thread = weakref.WeakKeyDictionary(self._by_thread or {})
+                by_thread[threading.current_thread()] = draw
+                self._by_thread = by_thread
 
     def __getstate__(self) -> dict[str, Any]:
         # Without the draws, which may be part of the graph of a step and then cannot be copied.

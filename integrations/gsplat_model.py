@@ -102,7 +102,7 @@ class GsplatModel:
         return colors[0].permute(2, 0, 1), alphas[0, ..., 0]
 
     def lists(self, opacity: Tensor, view: GsplatView) -> PixelLists:
-        """List what every pixel composites, without early termination, for :class:`~ca_reg.ListMoments`.
+        """List what every pixel composites, without early termination, for :class:`~ca_reg.lists.ListMoments`.
 
         Differentiable, as the rasterizer is, in everything but which Gaussian covers which pixel. Arguments and errors
         are those of :meth:`render`.

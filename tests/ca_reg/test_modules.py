@@ -227,10 +227,12 @@ def test_each_thread_has_its_own_mask(module):
 def test_masks_survive_neither_copies_nor_pickles():
     module = GaussianDropout(0.5)
     module(torch.full((9,), 0.5))
-    for twin in (copy.deepcopy(module), pickle.loads(pickle.dumps(module))):
+    keep = module.keep
+    for twin in (copy.deepcopy(module), pickle.loads(pickle.dumps(module)), copy.copy(module)):
         assert twin.keep is None
         assert twin(torch.full((9,), 0.5)).shape == (9,)
-    assert module.keep is not None
+        twin.eval()(torch.full((9,), 0.5))
+    assert module.keep is keep
 
 
 def test_masks_drawn_outside_are_mapped_over():

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from ca_reg import CAScore, GaussianDropout, OpacityNoise
+from ca_reg import CAScore, Draw, GaussianDropout, OpacityNoise
 from ca_reg import functional as F
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import render
@@ -75,8 +75,8 @@ def score(bad):
 
 
 FUNCTIONS = {
-    "GaussianDropout, opacity": lambda bad: GaussianDropout(0.2)(spoiled(alphas, bad), keep=keep),
-    "OpacityNoise, opacity": lambda bad: OpacityNoise(0.2)(spoiled(alphas, bad), noise=noise),
+    "GaussianDropout, opacity": lambda bad: GaussianDropout(0.2)(spoiled(alphas, bad), drawn=Draw(keep=keep)),
+    "OpacityNoise, opacity": lambda bad: OpacityNoise(0.2)(spoiled(alphas, bad), drawn=Draw(noise)),
     "pixel_moments, alphas": lambda bad: F.pixel_moments(spoiled(alphas, bad), colors, HALF),
     "pixel_moments, colors": lambda bad: F.pixel_moments(alphas, spoiled(colors, bad), HALF),
     "pixel_moments, background": lambda bad: F.pixel_moments(alphas, colors, HALF, background=torch.full((3,), bad)),
