@@ -1,4 +1,4 @@
-"""Schemes against a reference, paired by seed, under the protocol of docs/remedy.md.
+"""Schemes against a reference, paired by seed, under the protocol of benchmarks/remedy.md.
 
     python -m benchmarks.remedy choose "dropout=0.2" "dropout=0.2; loss=photometric + co_adaptation" \
         --scenes synthetic fern --seeds 2
@@ -7,7 +7,7 @@ The first arm is the reference. An arm is a list of settings of the training, su
 ``choose`` measures held-out views that are like training views, and never a test view; ``final`` the test views. What
 is measured is kept: the same command continues, and further arms, scenes and seeds are added. ``table FILE`` prints
 those of a file, against the first arm or ``--reference``: benchmarks/data/remedy.json and remedy_final.json have what
-docs/remedy.md shows.
+benchmarks/remedy.md shows.
 """
 
 from __future__ import annotations

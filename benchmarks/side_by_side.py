@@ -4,7 +4,7 @@
         --forks forks --iterations 300 --trainers AbsGS MVGS
 
 ``forks`` has the repositories as folders of the names in `trainers.TRAINERS`; what they import, but for CUDA, is
-installed. Every run has a folder of its own below ``--out``; the file, of rows as of `ca-reg study paper`, is written
+installed. Every run has a folder of its own below ``--out``; the file, of rows as of `benchmarks.paper`, is written
 after each, and none is repeated.
 """
 

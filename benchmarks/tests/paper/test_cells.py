@@ -96,11 +96,18 @@ def test_unknown_names_are_refused(tmp_path):
         chosen_scenes(["fern"], tmp_path, SceneOptions("mine"))
 
 
-def test_options_that_would_change_nothing_are_refused(capsys):
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--list", "--images", "images_8"], "options of a scene apply to one of your own"),
+        (["--path", "synthetic", "--seeds", "0"], "at least 1 seed, got 0"),
+    ],
+)
+def test_mistakes_are_refused_in_one_line(arguments, expected, capsys):
     with pytest.raises(SystemExit) as exit_:
-        main(["--list", "--images", "images_8"])
+        main(arguments)
     assert exit_.value.code == 2
-    assert "options of a scene apply to one of your own" in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
 
 
 def test_one_claim_on_a_scene_of_ones_own(tmp_path, capsys):

@@ -12,13 +12,14 @@ from pages import ROOT
 from benchmarks.paper import figure as figure_module
 from benchmarks.paper.cells import Grid, declared, estimate, is_done, rows_of
 from benchmarks.paper.claims import CLAIMS, Check, Claim, chosen
-from benchmarks.paper.comparison import Kept, judged
+from benchmarks.paper.comparison import Kept, differences, judged
 from benchmarks.paper.figure import gains_figure, ranking_figure
 from benchmarks.paper.page import claims_table, details, gains, page, scenes_table
 from benchmarks.paper.rows import Rows, resolved, value
 from benchmarks.paper.scenes import chosen_scenes
 from reference_trainer.evaluation.pictures import new_figure
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.training.plan_rules import DROPOUT_GAINS, FAR_APART_GAINS
 
 # What is kept
 
@@ -230,3 +231,15 @@ def test_the_ranking_draws_the_best_setting_first_and_the_score_beside_it(kept, 
 )
 def test_the_pages_show_what_is_kept(path):
     assert page(path.read_text("utf-8"), Kept(ROOT / "benchmarks" / "data" / "paper")) == path.read_text("utf-8")
+
+
+def test_what_dropout_gained_is_what_was_measured():
+    """The figures of the rule against the kept rows of the study."""
+    kept = Kept(ROOT / "benchmarks" / "data" / "paper")
+    folders = {"the built-in scene": "synthetic", "DTU scan24": "dtu-scan24", "DTU scan65": "dtu-scan65"}
+    for number, measured in (*DROPOUT_GAINS.items(), (3, FAR_APART_GAINS)):
+        views = {} if number == 3 else {"views": number}
+        for (name, rate), gain in measured.items():
+            check = Check("test psnr", {"regularizer": f"dropout({rate})"} | views, views)
+            found = differences(check, folders.get(name, name), kept)
+            assert gain == pytest.approx(np.mean(found), abs=0.051)

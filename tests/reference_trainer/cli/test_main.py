@@ -96,7 +96,7 @@ def test_help_and_mistakes_need_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-@pytest.mark.parametrize("command", ["train", "compare", "study attribution x"])
+@pytest.mark.parametrize("command", ["train", "compare", "study error-runtime x"])
 def test_a_card_that_is_not_there(command, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
@@ -160,7 +160,6 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["compare", "--downscale", "nan"], "downscale must be a finite number of at least 1, got nan"),
         (["train", "--monitor-every", "-1"], "expected monitor_every of at least 0"),
         (["compare", "--monitor-every", "-1"], "expected monitor_every of at least 0"),
-        (["study", "paper", "--path", "synthetic", "--seeds", "0"], "at least 1 seed, got 0"),
         (["compare", "--seeds", "0"], "at least 1 scene, 1 strategy and 1 seed"),
         (["compare", "--jobs", "0"], "at least 1 job, got 0"),
         (["compare", "--path", "synthetic", "synthetic"], "scenes whose folders have different names"),
@@ -235,7 +234,7 @@ def test_the_real_arguments_are_the_default(monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_a_reader_that_has_seen_enough_is_no_error():
-    code = "from reference_trainer.cli import main; main(['study', 'attribution', '--help'])"
+    code = "from reference_trainer.cli import main; main(['study', 'error-runtime', '--help'])"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
         assert b"ca-reg:" not in process.stderr.read()
