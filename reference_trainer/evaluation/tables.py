@@ -76,7 +76,7 @@ def summary(results: Mapping[str, Any]) -> str:
     return _table("views", rows, names)
 
 
-def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]], *, first: str = "strategy") -> str:
     """Return one row per strategy with means and sample standard deviations over the seeds.
 
     Without test views, the exact CA at, between and around the training views takes the place of what is measured at
@@ -84,6 +84,7 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
 
     Args:
         runs: for every strategy the content of ``results.json`` of each seed.
+        first: title of the first column; under "run" every row is a single one, and there is no column of seeds.
     """
     shown = {
         "test": ["psnr", "ssim", "lpips", "ca_exact_half", "cv", "depth_abs_rel"],
@@ -95,7 +96,7 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     columns = {f"{split} {_SHOWN[name][0]}": (split, name) for split, names in shown.items() for name in names}
     rows: list[dict[str, object]] = []
     for strategy, of in runs.items():
-        row: dict[str, object] = {"strategy": strategy, "seeds": len(of)}
+        row: dict[str, object] = {first: strategy, "seeds": len(of)}
         for title, (split, name) in columns.items():
             values = [run["mean"].get(split, {}).get(name) for run in of]
             if known := [value for value in values if value is not None]:
@@ -104,7 +105,7 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
             row[_SHOWN[name][0]] = format_mean_std([run[name] for run in of], decimals=0)
         rows.append(row)
     present = [title for title in columns if any(title in row for row in rows)]
-    return markdown_table(rows, ["strategy", "seeds", *present, "Gaussians", "seconds"])
+    return markdown_table(rows, [first, *(["seeds"] if first != "run" else []), *present, "Gaussians", "seconds"])
 
 
 def mean_std(values: Iterable[float]) -> tuple[float, float]:

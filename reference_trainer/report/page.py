@@ -123,7 +123,7 @@ def _data(runs: dict[str, Path], found: Sequence[Findings]) -> dict[str, Any]:
     return {
         "about": [str(found[0].scene), *_trained(found)],
         "notes": notes + missing,
-        "scores": comparison_table({label: [of] for label, of in results.items()}) if results else "",
+        "scores": comparison_table({label: [of] for label, of in results.items()}, first="run") if results else "",
         "settings": _settings(runs),
         "dynamics": dynamics,
         "perView": {label: evaluation_table(of) for label, of in results.items()},
