@@ -324,7 +324,7 @@ class CAScore:
         if factor is None:
             raise ValueError(
                 f"the draws of {type(self.regularizer).__name__} are no independent factors of the opacities, which an "
-                "exact or adaptive score needs: give samples instead."
+                "exact or adaptive score needs: sample with CAScore(render_fn)."
             )
         return factor
 
@@ -478,7 +478,7 @@ class ExactScore(CAScore):
             read = read_moments(self.moments_fn(opacity.clone(), view, multiplier, background), layout=self.layout)
             if read.alpha_mean is None:
                 raise TypeError("a score needs alpha_mean, the expected accumulated alpha, for its visible region.")
-            return read, read.alpha_mean
+            return read, read.alpha_mean.to(read.variance.device)
 
         broken, background = False, None
         if settings.method == "exact_neutral":
@@ -488,7 +488,6 @@ class ExactScore(CAScore):
             neutral = (black / torch.where(total > 0, total, 1.0)).nan_to_num(0.0, 0.0, 0.0)
             background = neutral if self.layout == "CHW" else neutral.permute(1, 2, 0)
         image, alpha = moments(background)
-        alpha = alpha.to(image.variance.device)
         visible = alpha > settings.threshold
         for colors in image[:2]:
             colors, odd = finite_colors(colors, alpha, alpha, settings.threshold)

@@ -266,5 +266,5 @@ def test_arguments_are_checked():
         moments(scene.opacity, None, Multiplier(1.0, torch.ones(N + 1)), None)
     with pytest.raises(ValueError, match=r"weights must have the shape of the image, \(3, 5\)"):
         moments.shares(scene.opacity, None, DROPOUT, None, torch.ones(WIDTH, HEIGHT))
-    with pytest.raises(TypeError, match=r"must return ca_reg\.PixelLists, got tuple"):
+    with pytest.raises(TypeError, match=r"must return ca_reg\.lists\.PixelLists, got tuple"):
         ListMoments(lambda o, v: tuple(scene.lists(o, v)))(scene.opacity, None, DROPOUT, None)

@@ -138,14 +138,14 @@ def test_the_protocol_is_the_score_of_uniform_dropout():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("make", "arguments", "message"),
     [
-        ({"regularizer": ByDepth(), "p": 0.2}, "do not apply to the draws of a regularizer"),
-        ({"regularizer": ByDepth(), "drop_rate": 0.5}, "do not apply"),
-        ({"regularizer": ByDepth()}, r"ByDepth needs means .* Params\(opacities, means"),
-        ({"regularizer": Pair(), "relative_error": 0.1}, "give samples instead"),
+        (CAScore, {"regularizer": ByDepth(), "p": 0.2}, "do not apply to the draws of a regularizer"),
+        (CAScore, {"regularizer": ByDepth(), "drop_rate": 0.5}, "do not apply"),
+        (CAScore, {"regularizer": ByDepth()}, r"ByDepth needs means .* Params\(opacities, means"),
+        (CAScore.adaptive, {"regularizer": Pair(), "relative_error": 0.1}, r"sample with CAScore\(render_fn\)"),
     ],
 )
-def test_what_does_not_go_together_is_refused(arguments, message):
+def test_what_does_not_go_together_is_refused(make, arguments, message):
     with pytest.raises(ValueError, match=message):
-        CAScore(render, **arguments)(OPACITY, None)
+        make(render, **arguments)(OPACITY, None)

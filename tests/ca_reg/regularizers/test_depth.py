@@ -29,3 +29,12 @@ def test_test_time_is_the_model_itself():
 def test_negative_factors_are_refused():
     with pytest.raises(ValueError, match="far must be finite and at least 0"):
         DepthDropout(far=-0.1)
+
+
+def test_depths_are_along_the_third_axis_of_the_camera():
+    x = params(cloud("spread"))
+    view = x.view_matrix.numpy()
+    depths = (x.means.numpy() @ view[:3, :3].T + view[:3, 3])[:, 2]
+    torch.testing.assert_close(x.depths, torch.from_numpy(depths))
+    with pytest.raises(ValueError, match="view_matrix"):
+        _ = x._replace(view_matrix=None).depths
