@@ -24,6 +24,7 @@ _LAUNCHER = f"{__package__}.run"
 _PYTHON = re.compile(r"(?:^|[/\s;&|])python[\d.]*(?:\.exe)?(?=\s|$)")
 _ISOLATED = re.compile(r"\s-[a-zA-Z]*[IES]")  # such a Python reads neither PYTHONPATH nor sitecustomize
 _MODELS = (".ply", ".pth", ".pt", ".ckpt", ".npz")
+_POINTS = ("input.ply", "points3D.ply", "points3d.ply")  # the initial points, which the INRIA family copies
 _NETWORK = {"urllib", "urllib3", "requests", "huggingface_hub"}
 
 # Python imports this module when it starts. It waits for torch, as processes without torch render nothing, and then
@@ -144,7 +145,7 @@ class Watch:
         """Process an audit event of Python."""
         if event == "open":
             path, mode = str(arguments[0]), str(arguments[1])
-            if "w" in mode and path.endswith(_MODELS):
+            if "w" in mode and path.endswith(_MODELS) and not path.endswith(_POINTS):
                 self.saved = path
         elif event == "os.system":
             self._check(os.fsdecode(arguments[0]), os.environ)

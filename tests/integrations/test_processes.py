@@ -131,8 +131,8 @@ load_weights(url="https://example.org/vgg16.pth")
 
 @pytest.mark.parametrize("saves", [True, False])
 def test_a_download_of_the_scripts_own_is_explained(repository, tmp_path, capsys, saves):
-    model = tmp_path / "point_cloud.ply"
-    save = f"Path({str(model)!r}).open('wb').close()" if saves else ""
+    model = tmp_path / ("point_cloud.ply" if saves else "input.ply")  # the latter are its initial points
+    save = f"Path({str(model)!r}).open('wb').close()"
     (repository / "evaluate.py").write_text(DOWNLOAD.format(save=save))
     with pytest.raises(URLError):
         main([str(repository / "evaluate.py")])
