@@ -96,7 +96,7 @@ class ModelState:
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
-        >>>         >>> scene, config = synthetic_scene(width=16, height=12, points=50), TrainConfig()
+        >>> scene, config = synthetic_scene(width=16, height=12, points=50), TrainConfig()
         >>> state = ModelState(scene, config, make_density(config), make_regularizer(config))
         >>> len(state.gaussians)
         50
