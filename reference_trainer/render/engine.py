@@ -23,7 +23,7 @@ __all__ = [
     "ENGINES", "Engine", "chosen_engine", "describe_engine", "drawn_by", "engine_for", "engines_on", "use_engine"
 ]  # fmt: skip
 
-ENGINES = ("auto", "torch", "loops")
+ENGINES = ("auto", "torch", "loops", "triton")
 _VARIABLE = "CA_REG_ENGINE"
 _TORCH = TorchEngine()
 
@@ -84,11 +84,12 @@ def use_engine(name: str) -> None:
     """Choose the engine of this process and of those that it starts (through the environment, ``CA_REG_ENGINE``).
 
     Args:
-        name: ``torch``, ``loops``, or ``auto``, the default: the loops for float32 on a CPU where numba is installed.
+        name: ``torch``, ``loops``, ``triton``, or ``auto``, the default: for float32 the loops on a CPU where numba is
+            installed, and triton on a card where Triton is, which comes with torch there.
 
     Raises:
         ValueError: if there is no such engine.
-        ImportError: if loops are asked for and numba is missing.
+        ImportError: if loops are asked for and numba is missing, or triton and Triton.
 
     Example:
         >>> use_engine("torch")
@@ -100,6 +101,8 @@ def use_engine(name: str) -> None:
         raise ValueError(f"there is no engine {name!r}; choose one of {', '.join(ENGINES)}.")
     if name == "loops" and _loop_engine() is None:
         raise ImportError("the compiled loops need numba: pip install 'ca_reg[trainer]', or use the engine torch.")
+    if name == "triton" and _triton_engine() is None:
+        raise ImportError("the kernels need Triton: pip install triton (Linux), or use the engine torch.")
     os.environ[_VARIABLE] = name
 
 
@@ -116,14 +119,22 @@ def chosen_engine() -> str:
 
 
 def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engine:
-    """Return the loops for float32 on a CPU, if chosen and available, else torch; errors are `chosen_engine`'s."""
-    if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
+    """Return the engine that draws: for float32 that of the device, if chosen and available, else torch.
+
+    On a CPU, Triton draws only if chosen and interpreted (``TRITON_INTERPRET=1``). Errors are `chosen_engine`'s.
+    """
+    chosen = chosen_engine()
+    if chosen == "torch" or dtype != torch.float32:
         return _TORCH
-    return _loop_engine() or _TORCH
+    if _runs_triton(device, chosen):
+        return _triton_engine() or _TORCH
+    return (_loop_engine() if device.type == "cpu" else None) or _TORCH
 
 
 def engines_on(device: torch.device) -> tuple[str, ...]:
-    """Return the engines that draw float32 on a device: "loops" only on a CPU, and where numba works."""
+    """Return the engines that draw float32 on a device: "loops" only on a CPU, "triton" only on a card."""
+    if _runs_triton(device, "auto") and _triton_engine() is not None:
+        return ("triton", "torch")
     return ("loops", "torch") if device.type == "cpu" and _loop_engine() is not None else ("torch",)
 
 
@@ -143,8 +154,11 @@ def drawn_by(engine: str) -> Iterator[None]:
 
 def describe_engine(device: torch.device | str) -> str:
     """Describe for people which engine draws a model (float32) on a device, which need not be present."""
-    if engine_for(torch.device(device)).name == "torch":
-        return "torch"
+    name = engine_for(torch.device(device)).name
+    if name == "torch":
+        return name
+    if name == "triton":
+        return f"triton ({version('triton')}{', interpreted' if torch.device(device).type == 'cpu' else ''})"
     count = torch.get_num_threads()
     return f"loops (numba {version('numba')}, {count} thread{'s' if count > 1 else ''})"
 
@@ -160,3 +174,26 @@ def _loop_engine() -> Engine | None:
         warnings.warn(f"numba is installed but cannot be imported ({error}): the engine torch draws.", stacklevel=2)
         return None
     return LoopEngine()
+
+
+def _runs_triton(device: torch.device, chosen: str) -> bool:
+    """Return whether Triton is to draw on a device; of NVIDIA's cards those since Turing, which Triton supports."""
+    if device.type == "cpu":
+        return chosen == "triton" and os.environ.get("TRITON_INTERPRET") == "1"
+    if device.type != "cuda" or chosen == "loops":
+        return False
+    known = torch.cuda.is_available() and torch.version.hip is None
+    return not known or torch.cuda.get_device_capability(device) >= (7, 5)
+
+
+@functools.cache
+def _triton_engine() -> Engine | None:
+    """Return the kernels, or None if Triton is missing or does not work."""
+    if importlib.util.find_spec("triton") is None:
+        return None
+    try:
+        from reference_trainer.render.triton.engine import TritonEngine
+    except ImportError as error:
+        warnings.warn(f"triton is installed but cannot be imported ({error}): the engine torch draws.", stacklevel=2)
+        return None
+    return TritonEngine()

@@ -1,0 +1,233 @@
+"""Front-to-back compositing, its gradient, absolute gradients, and pictures of many masks.
+
+A pixel's transmittance is negative from the splat on that terminates it (`MIN_TRANSMITTANCE`): one register instead of
+two, and the largest of a tile says whether it is finished, which is asked every 32 entries.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from reference_trainer.render.splats import Splats
+from reference_trainer.render.triton import tiles
+from reference_trainer.render.triton.tiles import FAINT, ROW, Lists, add_row, alpha_at, geometry_row, pixels, put
+
+__all__ = ["absolute_gradients", "composite", "composite_masks"]
+
+_MAX_ALPHA, _MIN_ALPHA = tl.constexpr(MAX_ALPHA), tl.constexpr(MIN_ALPHA)
+_MIN_TRANSMITTANCE = tl.constexpr(MIN_TRANSMITTANCE)
+_CHUNK = tl.constexpr(32)
+_MASKS = 8  # pictures that a program draws: 64 x 8 states of four values, 32 registers per lane of four warps
+
+
+@triton.jit
+def _pass(alpha: Any, t: Any) -> Any:
+    """Return the weight of a splat, and the transmittance behind it."""
+    rest = t * (1 - alpha)
+    goes_on = rest >= _MIN_TRANSMITTANCE
+    return tl.where(goes_on, alpha * t, 0.0), tl.where(goes_on, rest, -tl.abs(t))
+
+
+@triton.jit(do_not_specialize=["width", "height", "columns"])
+def composite_forward(
+    table: Any, starts: Any, gaussians: Any, background: Any, image: Any, alpha: Any, width: Any, height: Any,
+    columns: Any, STRIDE: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr,
+) -> None:  # fmt: skip
+    """Draw a tile: image (3 or 4, H, W), whose fourth channel is depth, and accumulated alpha (H, W)."""
+    tile = tl.program_id(0)
+    x, y, place, inside = pixels(tile, width, height, columns, TILE)
+    t = tl.where(inside, 1.0, -1.0)  # pixels beyond the border are finished before they begin
+    r, g, b, d = tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t)
+    begin, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    while (begin < end) & (tl.max(t) > 0):
+        for e in range(begin, tl.minimum(begin + _CHUNK, end)):
+            row = table + tl.load(gaussians + e) * STRIDE
+            log_opacity = tl.load(row + 5)
+            if log_opacity >= FAINT:  # else left out by a mask
+                raw, _geometry = alpha_at(row, log_opacity, x, y)
+                weight, t = _pass(tl.minimum(raw, _MAX_ALPHA), t)
+                r += weight * tl.load(row + 6)
+                g += weight * tl.load(row + 7)
+                b += weight * tl.load(row + 8)
+                if DEPTH:
+                    d += weight * tl.load(row + 9)
+        begin += _CHUNK
+    t, size = tl.abs(t), width * height
+    tl.store(alpha + place, 1 - t, mask=inside)
+    tl.store(image + place, r + t * tl.load(background), mask=inside)
+    tl.store(image + size + place, g + t * tl.load(background + 1), mask=inside)
+    tl.store(image + 2 * size + place, b + t * tl.load(background + 2), mask=inside)
+    if DEPTH:
+        tl.store(image + 3 * size + place, d, mask=inside)
+
+
+@triton.jit(do_not_specialize=["width", "height", "columns"])
+def composite_backward(
+    table: Any, starts: Any, gaussians: Any, image: Any, alpha: Any, to_image: Any, to_alpha: Any, rows: Any,
+    width: Any, height: Any, columns: Any, STRIDE: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr,
+    ABSOLUTE: tl.constexpr, EACH: tl.constexpr,
+) -> None:  # fmt: skip
+    """Carry gradients to the splats, front to back, so that every alpha is evaluated once.
+
+    With u the gradients of the image's channels and u_a that of alpha = 1 - T, splat i adds T_i alpha_i along_i,
+    along_i = sum_c u_c c_i + u_a, and scales all that is behind it, beyond_i, by 1 - alpha_i:
+
+        d / d alpha_i = T_i along_i - beyond_i / (1 - alpha_i)        beyond_i = beyond_{i-1} - T_i alpha_i along_i
+
+    where beyond_0 is the drawn picture times its gradient. The gradient passes the clamp of alpha.
+    """
+    tile = tl.program_id(0)
+    x, y, place, inside = pixels(tile, width, height, columns, TILE)
+    size = width * height
+    u_a = tl.load(to_alpha + place, mask=inside, other=0.0)
+    u_r = tl.load(to_image + place, mask=inside, other=0.0)
+    u_g = tl.load(to_image + size + place, mask=inside, other=0.0)
+    u_b = tl.load(to_image + 2 * size + place, mask=inside, other=0.0)
+    beyond = u_a * tl.load(alpha + place, mask=inside, other=0.0)
+    beyond += u_r * tl.load(image + place, mask=inside, other=0.0)
+    beyond += u_g * tl.load(image + size + place, mask=inside, other=0.0)
+    beyond += u_b * tl.load(image + 2 * size + place, mask=inside, other=0.0)
+    u_d = tl.zeros_like(u_a)
+    if DEPTH:
+        u_d = tl.load(to_image + 3 * size + place, mask=inside, other=0.0)
+        beyond += u_d * tl.load(image + 3 * size + place, mask=inside, other=0.0)
+    t = tl.where(inside, 1.0, -1.0)
+    begin, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    while (begin < end) & (tl.max(t) > 0):
+        for e in range(begin, tl.minimum(begin + _CHUNK, end)):
+            i = tl.load(gaussians + e)
+            row = table + i * STRIDE
+            log_opacity = tl.load(row + 5)
+            if log_opacity >= FAINT:
+                raw, geometry = alpha_at(row, log_opacity, x, y)
+                clamped, front = tl.minimum(raw, _MAX_ALPHA), t
+                weight, t = _pass(clamped, front)
+                along = u_a + u_r * tl.load(row + 6) + u_g * tl.load(row + 7) + u_b * tl.load(row + 8)
+                if DEPTH:
+                    along += u_d * tl.load(row + 9)
+                beyond -= weight * along
+                slope = tl.where(t > 0, raw * (front * along - beyond / (1 - clamped)), 0.0)  # of ln alpha
+                if ABSOLUTE:
+                    _dx, _dy, w1, w2, l11, l21, l22 = geometry
+                    gradients = put(tl.zeros([ROW], tl.float32), tl.abs(slope * (l11 * w1)), 0)
+                    gradients = put(gradients, tl.abs(slope * (l21 * w1 + l22 * w2)), 1)
+                    add_row(rows, gradients, e, i, 2, EACH)
+                else:
+                    gradients = geometry_row(slope, geometry, log_opacity)
+                    gradients = put(put(put(gradients, weight * u_r, 6), weight * u_g, 7), weight * u_b, 8)
+                    if DEPTH:
+                        gradients = put(gradients, weight * u_d, 9)
+                    add_row(rows, gradients, e, i, STRIDE, EACH)
+        begin += _CHUNK
+
+
+@triton.jit(do_not_specialize=["width", "height", "columns", "count"])
+def composite_masked(
+    table: Any, starts: Any, gaussians: Any, background: Any, ratios: Any, images: Any, alphas: Any, count: Any,
+    width: Any, height: Any, columns: Any, STRIDE: tl.constexpr, TILE: tl.constexpr, MASKS: tl.constexpr,
+) -> None:  # fmt: skip
+    """Draw a tile of MASKS of ``count`` pictures, given by ratios (M, count) on the opacities of the table.
+
+    What does not depend on the opacity, the exponential among it, is evaluated once for all of them.
+    """
+    tile = tl.program_id(0)
+    x, y, place, inside = pixels(tile, width, height, columns, TILE)
+    picture = tl.program_id(1) * MASKS + tl.arange(0, MASKS)
+    drawn = inside[:, None] & (picture < count)[None, :]
+    t = tl.where(drawn, 1.0, -1.0)
+    r, g, b = tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t)
+    begin, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    while (begin < end) & (tl.max(t) > 0):
+        for e in range(begin, tl.minimum(begin + _CHUNK, end)):
+            i = tl.load(gaussians + e)
+            row = table + i * STRIDE
+            log_opacity = tl.load(row + 5)
+            if log_opacity >= FAINT:
+                raw, _geometry = alpha_at(row, log_opacity, x, y)
+                ratio = tl.load(ratios + i.to(tl.int64) * count + picture, mask=picture < count, other=0.0)
+                lower = raw[:, None] * ratio[None, :]
+                weight, t = _pass(tl.where(lower >= _MIN_ALPHA, tl.minimum(lower, _MAX_ALPHA), 0.0), t)
+                r += weight * tl.load(row + 6)
+                g += weight * tl.load(row + 7)
+                b += weight * tl.load(row + 8)
+        begin += _CHUNK
+    t, size = tl.abs(t), width * height
+    at = picture.to(tl.int64)[None, :] * size + place[:, None]
+    tl.store(alphas + at, 1 - t, mask=drawn)
+    at += picture.to(tl.int64)[None, :] * (2 * size)  # three channels each
+    tl.store(images + at, r + t * tl.load(background), mask=drawn)
+    tl.store(images + size + at, g + t * tl.load(background + 1), mask=drawn)
+    tl.store(images + 2 * size + at, b + t * tl.load(background + 2), mask=drawn)
+
+
+class _Composite(torch.autograd.Function):
+    """The image over the background, with depth as a fourth channel if asked for, and the accumulated alpha."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, splats: Splats, background: Tensor, depth: bool, *_differentiable: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        lists = ctx.lists = Lists.of(splats.lists)
+        table = tiles.make_table(splats, *([splats.projection.depths[:, None]] if depth else []))
+        image, alpha = table.new_empty(3 + depth, lists.height, lists.width), table.new_empty(lists.height, lists.width)
+        tiles.over_tiles(composite_forward, lists, table, background.contiguous(), image, alpha, DEPTH=depth)
+        ctx.save_for_backward(table, image, alpha)
+        return image, alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_image: Tensor, to_alpha: Tensor) -> tuple[Tensor | None, ...]:
+        table, image, alpha = ctx.saved_tensors
+        g = _gradients(ctx.lists, table, image, alpha, to_image, to_alpha, absolute=False)
+        to_background = (to_image[:3] * (1 - alpha)).sum((1, 2)) if ctx.needs_input_grad[1] else None
+        depth = g[:, 9] if len(image) == 4 else None
+        return None, to_background, None, g[:, :2], g[:, 2:5], g[:, 5], g[:, 6:9], depth
+
+
+def _gradients(lists: Lists, table: Tensor, *images: Tensor, absolute: bool) -> Tensor:
+    """Return rows of gradients, (M, 16), given the image, alpha, and the gradients of both."""
+    rows, each = tiles.gradient_rows(lists, table)
+    arguments = (x.contiguous() for x in images)
+    constants = {"DEPTH": len(images[0]) == 4, "ABSOLUTE": absolute, "EACH": each}
+    tiles.over_tiles(composite_backward, lists, table, *arguments, rows, **constants)
+    return tiles.sum_rows(rows, each, lists, len(table))
+
+
+def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Draw splats front to back, see `Engine.composite`."""
+    p = splats.projection
+    image, alpha = _Composite.apply(  # type: ignore[no-untyped-call]
+        splats, background, depth, p.means, p.factors, splats.opacities, splats.colors, p.depths
+    )
+    return image[:3], alpha, image[3] if depth else None
+
+
+def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw all in one pass, see `Engine.composite_masks`."""
+    lists, count = Lists.of(splats.lists), len(opacities)
+    highest = opacities.amax(0)
+    table = tiles.make_table(splats._replace(opacities=highest))
+    ratios = (opacities / highest.clamp_min(MIN_ALPHA)).T.contiguous()
+    images = table.new_empty(count, 3, lists.height, lists.width)
+    alphas = table.new_empty(count, lists.height, lists.width)
+    masks = min(_MASKS, triton.next_power_of_2(count))
+    tiles.launch(
+        composite_masked, (lists.tiles, -(-count // masks)), table, lists.starts, lists.gaussians,
+        background.contiguous(), ratios, images, alphas, count, lists.width, lists.height, splats.lists.columns,
+        warps=max(1, masks // 2), STRIDE=table.shape[1], TILE=lists.tile, MASKS=masks,
+    )  # fmt: skip
+    return images, alphas
+
+
+def absolute_gradients(splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
+    """Sum the absolute gradients of the centers, see `Engine.absolute_gradients`."""
+    lists, table = Lists.of(splats.lists), tiles.make_table(splats, splats.projection.depths[:, None])
+    rows = _gradients(lists, table, drawn[:4], drawn[4], gradient[:4], gradient[4], absolute=True)
+    return rows[:, :2].contiguous()
