@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 import triton
 import triton.language as tl
@@ -21,7 +19,7 @@ _LANES = 8  # and one that covers 10,000 tiles keeps a program busy for 1,250 st
 
 
 @triton.jit
-def _boundary(dy: Any, side: Any, limit: Any, x: Any, l11: Any, l21: Any, l22: Any) -> Any:
+def _boundary(dy, side, limit, x, l11, l21, l22):
     """Return the x of the left (side -1) or right (1) boundary of an ellipse, dy below its center."""
     half = tl.sqrt(tl.maximum(limit - (l22 * dy) * (l22 * dy), 0.0))
     return x + (side * half - l21 * dy) / l11
@@ -29,10 +27,10 @@ def _boundary(dy: Any, side: Any, limit: Any, x: Any, l11: Any, l21: Any, l22: A
 
 @triton.jit(do_not_specialize=["count", "width", "height", "columns", "listing"])
 def list_tiles(
-    order: Any, means: Any, factors: Any, covariances: Any, opacities: Any, counts: Any, ends: Any, touched: Any,
-    keys: Any, gaussians: Any, count: Any, width: Any, height: Any, columns: Any, listing: Any, TILE: tl.constexpr,
+    order, means, factors, covariances, opacities, counts, ends, touched,
+    keys, gaussians, count, width, height, columns, listing, TILE: tl.constexpr,
     GROUP: tl.constexpr, LANES: tl.constexpr,
-) -> None:  # fmt: skip
+):  # fmt: skip
     """Count the tiles of Gaussians, nearest first, or list them, from ``ends - counts`` on.
 
     Both by the same machine code: two compilations could contract products and sums differently, and a tile on the
@@ -90,7 +88,9 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
     columns, count = -(-width // TILE), len(opacities)
     tiles = columns * -(-height // TILE)
     order = torch.argsort(projection.depths, stable=True).int()
-    shapes = (x.detach().contiguous() for x in (projection.means, projection.factors, projection.covariances, opacities))
+    shapes = (
+        x.detach().contiguous() for x in (projection.means, projection.factors, projection.covariances, opacities)
+    )
     counts = order.new_zeros(count)
     touched = torch.zeros(count, dtype=torch.bool, device=order.device)
     short = torch.int16 if tiles < 2**15 else torch.int32
@@ -98,7 +98,18 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
     grid, size = (-(-count // _GROUP),), (count, width, height, columns)
     constants = {"warps": 4, "TILE": TILE, "GROUP": _GROUP, "LANES": _LANES}
     nothing = order.new_empty(0)
-    launch(list_tiles, grid, *given, counts.long(), touched.view(torch.uint8), nothing.to(short), nothing, *size, 0, **constants)
+    launch(
+        list_tiles,
+        grid,
+        *given,
+        counts.long(),
+        touched.view(torch.uint8),
+        nothing.to(short),
+        nothing,
+        *size,
+        0,
+        **constants,
+    )
     ends = counts.cumsum(0)
     total = int(ends[-1]) if count else 0  # the one number read back
     keys, gaussians = order.new_empty(total, dtype=short), order.new_empty(total)

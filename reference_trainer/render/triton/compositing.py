@@ -24,11 +24,11 @@ __all__ = ["absolute_gradients", "composite", "composite_masks"]
 _MAX_ALPHA, _MIN_ALPHA = tl.constexpr(MAX_ALPHA), tl.constexpr(MIN_ALPHA)
 _MIN_TRANSMITTANCE = tl.constexpr(MIN_TRANSMITTANCE)
 _CHUNK = tl.constexpr(32)
-_MASKS = 8  # pictures that a program draws: 64 x 8 states of four values, 32 registers per lane of four warps
+_MASKS = 4  # pictures that a program draws: 4 x 64 states of four values, 72 registers in all; 8 would take 162
 
 
 @triton.jit
-def _pass(alpha: Any, t: Any) -> Any:
+def _pass(alpha, t):
     """Return the weight of a splat, and the transmittance behind it."""
     rest = t * (1 - alpha)
     goes_on = rest >= _MIN_TRANSMITTANCE
@@ -37,9 +37,9 @@ def _pass(alpha: Any, t: Any) -> Any:
 
 @triton.jit(do_not_specialize=["width", "height", "columns"])
 def composite_forward(
-    table: Any, starts: Any, gaussians: Any, background: Any, image: Any, alpha: Any, width: Any, height: Any,
-    columns: Any, STRIDE: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr,
-) -> None:  # fmt: skip
+    table, starts, gaussians, background, image, alpha, width, height,
+    columns, STRIDE: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr,
+):  # fmt: skip
     """Draw a tile: image (3 or 4, H, W), whose fourth channel is depth, and accumulated alpha (H, W)."""
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
@@ -70,10 +70,10 @@ def composite_forward(
 
 @triton.jit(do_not_specialize=["width", "height", "columns"])
 def composite_backward(
-    table: Any, starts: Any, gaussians: Any, image: Any, alpha: Any, to_image: Any, to_alpha: Any, rows: Any,
-    width: Any, height: Any, columns: Any, STRIDE: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr,
+    table, starts, gaussians, image, alpha, to_image, to_alpha, rows,
+    width, height, columns, STRIDE: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr,
     ABSOLUTE: tl.constexpr, EACH: tl.constexpr,
-) -> None:  # fmt: skip
+):  # fmt: skip
     """Carry gradients to the splats, front to back, so that every alpha is evaluated once.
 
     With u the gradients of the image's channels and u_a that of alpha = 1 - T, splat i adds T_i alpha_i along_i,
@@ -130,17 +130,18 @@ def composite_backward(
 
 @triton.jit(do_not_specialize=["width", "height", "columns", "count"])
 def composite_masked(
-    table: Any, starts: Any, gaussians: Any, background: Any, ratios: Any, images: Any, alphas: Any, count: Any,
-    width: Any, height: Any, columns: Any, STRIDE: tl.constexpr, TILE: tl.constexpr, MASKS: tl.constexpr,
-) -> None:  # fmt: skip
+    table, starts, gaussians, background, ratios, images, alphas, count,
+    width, height, columns, STRIDE: tl.constexpr, TILE: tl.constexpr, MASKS: tl.constexpr,
+):  # fmt: skip
     """Draw a tile of MASKS of ``count`` pictures, given by ratios (M, count) on the opacities of the table.
 
-    What does not depend on the opacity, the exponential among it, is evaluated once for all of them.
+    What does not depend on the opacity, the exponential among it, is evaluated once for all of them: with pixels along
+    the last axis and one warp, a lane holds all pictures of its two pixels.
     """
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
     picture = tl.program_id(1) * MASKS + tl.arange(0, MASKS)
-    drawn = inside[:, None] & (picture < count)[None, :]
+    drawn = inside[None, :] & (picture < count)[:, None]
     t = tl.where(drawn, 1.0, -1.0)
     r, g, b = tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t)
     begin, end = tl.load(starts + tile), tl.load(starts + tile + 1)
@@ -152,16 +153,16 @@ def composite_masked(
             if log_opacity >= FAINT:
                 raw, _geometry = alpha_at(row, log_opacity, x, y)
                 ratio = tl.load(ratios + i.to(tl.int64) * count + picture, mask=picture < count, other=0.0)
-                lower = raw[:, None] * ratio[None, :]
+                lower = ratio[:, None] * raw[None, :]
                 weight, t = _pass(tl.where(lower >= _MIN_ALPHA, tl.minimum(lower, _MAX_ALPHA), 0.0), t)
                 r += weight * tl.load(row + 6)
                 g += weight * tl.load(row + 7)
                 b += weight * tl.load(row + 8)
         begin += _CHUNK
     t, size = tl.abs(t), width * height
-    at = picture.to(tl.int64)[None, :] * size + place[:, None]
+    at = picture.to(tl.int64)[:, None] * size + place[None, :]
     tl.store(alphas + at, 1 - t, mask=drawn)
-    at += picture.to(tl.int64)[None, :] * (2 * size)  # three channels each
+    at += picture.to(tl.int64)[:, None] * (2 * size)  # three channels each
     tl.store(images + at, r + t * tl.load(background), mask=drawn)
     tl.store(images + size + at, g + t * tl.load(background + 1), mask=drawn)
     tl.store(images + 2 * size + at, b + t * tl.load(background + 2), mask=drawn)
@@ -221,7 +222,7 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
     tiles.launch(
         composite_masked, (lists.tiles, -(-count // masks)), table, lists.starts, lists.gaussians,
         background.contiguous(), ratios, images, alphas, count, lists.width, lists.height, splats.lists.columns,
-        warps=max(1, masks // 2), STRIDE=table.shape[1], TILE=lists.tile, MASKS=masks,
+        STRIDE=table.shape[1], TILE=lists.tile, MASKS=masks,
     )  # fmt: skip
     return images, alphas
 

@@ -30,7 +30,7 @@ _PROGRAMS = 4096  # of the backward pass at once: about what fills the largest c
 
 
 @triton.jit
-def _random(row: Any, raw: Any, MAX: tl.constexpr) -> Any:
+def _random(row, raw, MAX: tl.constexpr):
     """Return alpha, expected, spread, passed and shrink."""
     alpha = tl.minimum(raw, MAX)
     expected, spread = tl.load(row + 9) * alpha, tl.load(row + 10) * alpha * alpha
@@ -39,7 +39,7 @@ def _random(row: Any, raw: Any, MAX: tl.constexpr) -> Any:
 
 
 @triton.jit
-def _load3(image: Any, place: Any, size: Any, inside: Any) -> Any:
+def _load3(image, place, size, inside):
     """Return the three channels of an image at the pixels."""
     r = tl.load(image + place, mask=inside, other=0.0)
     g = tl.load(image + size + place, mask=inside, other=0.0)
@@ -47,7 +47,7 @@ def _load3(image: Any, place: Any, size: Any, inside: Any) -> Any:
 
 
 @triton.jit
-def _store3(image: Any, place: Any, size: Any, inside: Any, r: Any, g: Any, b: Any) -> None:
+def _store3(image, place, size, inside, r, g, b):
     """Store the three channels of an image at the pixels."""
     tl.store(image + place, r, mask=inside)
     tl.store(image + size + place, g, mask=inside)
@@ -56,9 +56,9 @@ def _store3(image: Any, place: Any, size: Any, inside: Any, r: Any, g: Any, b: A
 
 @triton.jit(do_not_specialize=["width", "height", "columns"])
 def moments_forward(
-    table: Any, starts: Any, gaussians: Any, behind: Any, mean: Any, variance: Any, alpha: Any, width: Any, height: Any,
-    columns: Any, STRIDE: tl.constexpr, TILE: tl.constexpr, MAX: tl.constexpr,
-) -> None:  # fmt: skip
+    table, starts, gaussians, behind, mean, variance, alpha, width, height,
+    columns, STRIDE: tl.constexpr, TILE: tl.constexpr, MAX: tl.constexpr,
+):  # fmt: skip
     """Composite mean and variance (3, H, W) and the expected alpha (H, W) of a tile, back to front."""
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
@@ -84,9 +84,9 @@ def moments_forward(
 
 @triton.jit
 def _behind_chunk(
-    state: Any, table: Any, gaussians: Any, first: Any, last: Any, x: Any, y: Any, of_variance: Any, kept: Any,
+    state, table, gaussians, first, last, x, y, of_variance, kept,
     STRIDE: tl.constexpr, MAX: tl.constexpr, KEEP: tl.constexpr,
-) -> Any:  # fmt: skip
+):  # fmt: skip
     """Carry what is behind the splats over entries last - 1 to first; keep contrasts and the rest, if asked to."""
     m0, m1, m2, hidden, t = state
     u0, u1, u2 = of_variance
@@ -107,14 +107,14 @@ def _behind_chunk(
 
 
 @triton.jit
-def _store_state(at: Any, state: Any) -> None:
+def _store_state(at, state):
     p = tl.arange(0, state[0].shape[0])
     for k in tl.static_range(_STATE):
         tl.store(at + k * state[0].shape[0] + p, state[k])
 
 
 @triton.jit
-def _load_state(at: Any, PIXELS: tl.constexpr) -> Any:
+def _load_state(at, PIXELS: tl.constexpr):
     at += tl.arange(0, PIXELS)
     a, b, c = tl.load(at), tl.load(at + PIXELS), tl.load(at + 2 * PIXELS)
     return a, b, c, tl.load(at + 3 * PIXELS), tl.load(at + 4 * PIXELS)
@@ -122,10 +122,10 @@ def _load_state(at: Any, PIXELS: tl.constexpr) -> Any:
 
 @triton.jit(do_not_specialize=["width", "height", "columns", "count"])
 def moments_backward(
-    table: Any, starts: Any, gaussians: Any, behind: Any, to_mean: Any, to_variance: Any, to_alpha: Any,
-    checkpoints: Any, kept: Any, rows: Any, to_behind: Any, count: Any, width: Any, height: Any, columns: Any,
+    table, starts, gaussians, behind, to_mean, to_variance, to_alpha,
+    checkpoints, kept, rows, to_behind, count, width, height, columns,
     STRIDE: tl.constexpr, TILE: tl.constexpr, MAX: tl.constexpr, EACH: tl.constexpr,
-) -> None:  # fmt: skip
+):  # fmt: skip
     """Carry gradients to the splats, and each splat's share of the weighted variance, of ``count`` tiles.
 
     Splat i meets what is in front of it only as factors on the gradients. With u the gradient of the mean, U that of
@@ -200,16 +200,14 @@ def moments_of(table: Tensor, lists: Lists, behind: Tensor) -> tuple[Tensor, Ten
     """Return mean and variance (3, H, W) and the expected alpha (H, W) of a table of splats and moments, (M, 11)."""
     mean, variance = (table.new_empty(3, lists.height, lists.width) for _ in range(2))
     alpha = table.new_empty(lists.height, lists.width)
-    tiles.over_tiles(
-        moments_forward, lists, table, behind.contiguous(), mean, variance, alpha, MAX=lists.max_alpha
-    )
+    tiles.over_tiles(moments_forward, lists, table, behind.contiguous(), mean, variance, alpha, MAX=lists.max_alpha)
     return mean, variance, alpha
 
 
 def _gradients(
     table: Tensor, lists: Lists, behind: Tensor, to_mean: Tensor, to_variance: Tensor, to_alpha: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return rows of gradients, (M, 16), whose columns 9 to 11 are of mean and variance and the share; and of behind."""
+    """Return rows of gradients (M, 16), columns 9 to 11 those of the moments and the share, and that of behind."""
     rows, each = tiles.gradient_rows(lists, table)
     programs, state = min(_PROGRAMS, lists.tiles), (_STATE.value, lists.tile**2)
     checkpoints = table.new_empty(len(lists.gaussians) // _CHUNK.value + lists.tiles + 1, *state)

@@ -29,46 +29,50 @@ _G, _H = tl.constexpr(math.sqrt(21 / (32 * math.pi))), tl.constexpr(math.sqrt(7 
 
 
 @triton.jit
-def _load3(at: Any, mask: Any) -> Any:
-    return tl.load(at, mask=mask, other=1.0), tl.load(at + 1, mask=mask, other=1.0), tl.load(at + 2, mask=mask, other=1.0)
+def _load3(at, mask):
+    return (
+        tl.load(at, mask=mask, other=1.0),
+        tl.load(at + 1, mask=mask, other=1.0),
+        tl.load(at + 2, mask=mask, other=1.0),
+    )
 
 
 @triton.jit
-def _store3(at: Any, a: Any, mask: Any) -> None:
+def _store3(at, a, mask):
     tl.store(at, a[0], mask=mask)
     tl.store(at + 1, a[1], mask=mask)
     tl.store(at + 2, a[2], mask=mask)
 
 
 @triton.jit
-def _dot(a: Any, b: Any) -> Any:
+def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @triton.jit
-def _cross(a: Any, b: Any) -> Any:
+def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @triton.jit
-def _plus(a: Any, scale: Any, b: Any) -> Any:
+def _plus(a, scale, b):
     """Return a + scale b."""
     return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
 
 
 @triton.jit
-def _times(scale: Any, a: Any) -> Any:
+def _times(scale, a):
     return scale * a[0], scale * a[1], scale * a[2]
 
 
 @triton.jit
-def _by_column(row: Any, r0: Any, r1: Any, r2: Any) -> Any:
+def _by_column(row, r0, r1, r2):
     """Return a row vector times the matrix with rows r0, r1, r2."""
     return _plus(_plus(_times(row[0], r0), row[1], r1), row[2], r2)
 
 
 @triton.jit
-def _rotation(at: Any, mask: Any) -> Any:
+def _rotation(at, mask):
     """Return a quaternion's rotation matrix by rows, the unit quaternion, and the factor that normalizes it."""
     w, x = tl.load(at, mask=mask, other=1.0), tl.load(at + 1, mask=mask, other=0.0)
     y, z = tl.load(at + 2, mask=mask, other=0.0), tl.load(at + 3, mask=mask, other=0.0)
@@ -86,7 +90,7 @@ def _rotation(at: Any, mask: Any) -> Any:
 
 
 @triton.jit
-def _view(view: Any) -> Any:
+def _view(view):
     """Return the three rows of the view rotation."""
     right = tl.load(view), tl.load(view + 1), tl.load(view + 2)
     down = tl.load(view + 4), tl.load(view + 5), tl.load(view + 6)
@@ -94,7 +98,7 @@ def _view(view: Any) -> Any:
 
 
 @triton.jit
-def _ellipse(mean: Any, r0: Any, r1: Any, r2: Any, s: Any, view: Any, fx: Any, fy: Any, limit_x: Any, limit_y: Any) -> Any:
+def _ellipse(mean, r0, r1, r2, s, view, fx, fy, limit_x, limit_y):
     """Project a Gaussian; return all that its gradient needs.
 
     The covariance is u u^T + dilation with rows u_x, u_y = (Jacobian x view rotation) x rotation x scales. Its
@@ -119,7 +123,7 @@ def _ellipse(mean: Any, r0: Any, r1: Any, r2: Any, s: Any, view: Any, fx: Any, f
 
 
 @triton.jit
-def _basis(x: Any, y: Any, z: Any) -> Any:
+def _basis(x, y, z):
     """Return the 16 real spherical harmonics up to degree 3; those that nobody reads are never computed.
 
     Constants stand on the right: in the interpreter, a `tl.constexpr` times a tensor would be a `tl.constexpr`.
@@ -134,7 +138,7 @@ def _basis(x: Any, y: Any, z: Any) -> Any:
 
 
 @triton.jit
-def _basis_slopes(x: Any, y: Any, z: Any) -> Any:
+def _basis_slopes(x, y, z):
     """Return the derivatives of the harmonics in x, y and z."""
     xx, yy, zz, no = x * x, y * y, z * z, 0 * x
     in_x = (
@@ -153,7 +157,7 @@ def _basis_slopes(x: Any, y: Any, z: Any) -> Any:
 
 
 @triton.jit
-def _towards(mean: Any, position: Any) -> Any:
+def _towards(mean, position):
     """Return the unit vector from the camera to a mean, and one over their distance."""
     offset = _plus(mean, -1.0, (tl.load(position), tl.load(position + 1), tl.load(position + 2)))
     inverse = 1 / tl.maximum(tl.sqrt(_dot(offset, offset)), 1e-12)
@@ -162,19 +166,17 @@ def _towards(mean: Any, position: Any) -> Any:
 
 @triton.jit(do_not_specialize=["count"])
 def project_forward(
-    indices: Any, means: Any, quaternions: Any, scales: Any, sh: Any, view: Any, position: Any, centers: Any,
-    factors: Any, covariances: Any, depths: Any, colors: Any, count: Any, fx: Any, fy: Any, cx: Any, cy: Any,
-    limit_x: Any, limit_y: Any, BANDS: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
-) -> None:  # fmt: skip
+    indices, means, quaternions, scales, sh, view, position, centers,
+    factors, covariances, depths, colors, count, fx, fy, cx, cy,
+    limit_x, limit_y, BANDS: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Project and color; BANDS harmonics of the ROW given ones, or plain colors if it is 0."""
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     real = k < count
     i = tl.load(indices + k, mask=real, other=0)
     mean, s = _load3(means + 3 * i, real), _load3(scales + 3 * i, real)
     r0, r1, r2, _unit, _scale = _rotation(quaternions + 4 * i, real)
-    slopes, _rows, _axes, _u, _det, covariance, factor = _ellipse(
-        mean, r0, r1, r2, s, view, fx, fy, limit_x, limit_y
-    )
+    slopes, _rows, _axes, _u, _det, covariance, factor = _ellipse(mean, r0, r1, r2, s, view, fx, fy, limit_x, limit_y)
     l11, l22 = factor
     tl.store(centers + 2 * k, fx * slopes[0] + cx, mask=real)
     tl.store(centers + 2 * k + 1, fy * slopes[1] + cy, mask=real)
@@ -197,11 +199,11 @@ def project_forward(
 
 @triton.jit(do_not_specialize=["count"])
 def project_backward(
-    indices: Any, means: Any, quaternions: Any, scales: Any, sh: Any, view: Any, position: Any, colors: Any,
-    to_centers: Any, to_factors: Any, to_depths: Any, to_colors: Any, to_means: Any, to_quaternions: Any,
-    to_scales: Any, to_sh: Any, count: Any, fx: Any, fy: Any, limit_x: Any, limit_y: Any, BANDS: tl.constexpr,
+    indices, means, quaternions, scales, sh, view, position, colors,
+    to_centers, to_factors, to_depths, to_colors, to_means, to_quaternions,
+    to_scales, to_sh, count, fx, fy, limit_x, limit_y, BANDS: tl.constexpr,
     ROW: tl.constexpr, BLOCK: tl.constexpr,
-) -> None:  # fmt: skip
+):  # fmt: skip
     """Carry gradients back to the Gaussians; nothing is kept of the forward pass but the colors that were cut at 0."""
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     real = k < count
@@ -286,7 +288,9 @@ class _Project(torch.autograd.Function):
         ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, indices: Tensor, camera: Camera,
         bands: int,
     ) -> tuple[Tensor, ...]:  # fmt: skip
-        limits = (FRUSTUM_MARGIN * 0.5 * size / f for size, f in ((camera.width, camera.fx), (camera.height, camera.fy)))
+        limits = (
+            FRUSTUM_MARGIN * 0.5 * size / f for size, f in ((camera.width, camera.fx), (camera.height, camera.fy))
+        )
         ctx.size = len(indices), camera.fx, camera.fy
         ctx.limits = tuple(limits)
         ctx.constants = {"warps": 4, "BANDS": bands, "ROW": sh.shape[1], "BLOCK": _BLOCK}

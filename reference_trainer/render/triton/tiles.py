@@ -70,8 +70,8 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 1, 
     """Start the programs of a grid on the device of the first argument; an empty grid is no launch."""
     if min(grid) > 0:
         LAUNCHED[kernel.fn.__name__] += 1
-        with torch.cuda.device_of(arguments[0]):
-            kernel[grid](*arguments, num_warps=warps, **constants)
+        with torch.cuda.device_of(arguments[0]):  # type: ignore[no-untyped-call]
+            kernel[grid](*arguments, num_warps=warps, enable_fp_fusion=True, **constants)
 
 
 def over_tiles(kernel: Any, lists: Lists, table: Tensor, *arguments: Any, programs: int = 0, **constants: Any) -> None:
@@ -109,7 +109,7 @@ def sum_rows(rows: Tensor, each: bool, lists: Lists, count: int) -> Tensor:
 
 
 @triton.jit
-def pixels(tile: Any, width: Any, height: Any, columns: Any, TILE: tl.constexpr) -> Any:
+def pixels(tile, width, height, columns, TILE: tl.constexpr):
     """Return x and y of a tile's pixel centers, their places in an image, and which are inside of it."""
     p = tl.arange(0, TILE * TILE)
     x = tile % columns * TILE + p % TILE
@@ -118,7 +118,7 @@ def pixels(tile: Any, width: Any, height: Any, columns: Any, TILE: tl.constexpr)
 
 
 @triton.jit
-def alpha_at(row: Any, log_opacity: Any, x: Any, y: Any) -> Any:
+def alpha_at(row, log_opacity, x, y):
     """Return a splat's alpha at the pixels before the clamp, 0 below `MIN_ALPHA`, and its geometry there.
 
     ln alpha = ln o - (w1^2 + w2^2) / 2 with w1 = l11 dx + l21 dy, w2 = l22 dy: squares of what is small wherever alpha
@@ -132,13 +132,13 @@ def alpha_at(row: Any, log_opacity: Any, x: Any, y: Any) -> Any:
 
 
 @triton.jit
-def put(row: Any, values: Any, COLUMN: tl.constexpr) -> Any:
+def put(row, values, COLUMN: tl.constexpr):
     """Write the sum of the pixels' values into a column of a row."""
     return tl.where(tl.arange(0, ROW) == COLUMN, tl.sum(values), row)
 
 
 @triton.jit
-def geometry_row(slope: Any, geometry: Any, log_opacity: Any) -> Any:
+def geometry_row(slope, geometry, log_opacity):
     """Carry the gradients of ln alpha at the pixels, ``slope``, to x, y, l11, l21, l22 and the opacity: columns 0 to 5.
 
     As the pixel's offset is dx = pixel - x, the derivatives of ln alpha are l11 w1 in x, l21 w1 + l22 w2 in y, -w1 dx,
@@ -154,13 +154,13 @@ def geometry_row(slope: Any, geometry: Any, log_opacity: Any) -> Any:
 
 
 @triton.jit
-def add_row(rows: Any, row: Any, e: Any, i: Any, COLUMNS: tl.constexpr, EACH: tl.constexpr) -> Any:
+def add_row(rows, row, e, i, COLUMNS: tl.constexpr, EACH: tl.constexpr):
     """Add the gradients of entry e to those of splat i, or store them as the entry's own.
 
     Relaxed: additions need no order among other memory accesses, and the fences of the default would wait for each.
     """
-    column = tl.arange(0, ROW)
+    column = tl.arange(0, ROW).to(tl.int64)
     if EACH:
-        tl.store(rows + e.to(tl.int64) * ROW + column, row, mask=column < COLUMNS)
+        tl.store(rows + (0 * column + e) * ROW + column, row, mask=column < COLUMNS)
     else:
-        tl.atomic_add(rows + i.to(tl.int64) * ROW + column, row, mask=column < COLUMNS, sem="relaxed")
+        tl.atomic_add(rows + (0 * column + i) * ROW + column, row, mask=column < COLUMNS, sem="relaxed")
