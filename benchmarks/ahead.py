@@ -11,9 +11,12 @@ import subprocess
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import triton
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
@@ -99,11 +102,21 @@ def compile_ahead(kernel: Kernel, target: str, **options: Any) -> Compiled:
     source = ASTSource(fn=kernel.function, signature=signature, constexprs=kernel.constants)
     code = triton.compile(source, target=TARGETS[target], options=options).asm
     registers, shared, spills, rows = measure_nvidia(code["cubin"]) if "cubin" in code else _measure_amd(code["amdgcn"])
-    return Compiled(kernel.label, target, registers, shared, spills, len(rows), _innermost(rows) if kernel.walks else None)
+    return Compiled(
+        kernel.label, target, registers, shared, spills, len(rows), _per_entry(rows) if kernel.walks else None
+    )
 
 
-def measure_nvidia(cubin: bytes) -> tuple[int, int, int, list[int | None]]:
-    """Return registers, shared memory, spills, and for every instruction the one that it jumps back to, if any.
+class Step(NamedTuple):
+    """An instruction: where it jumps to, if it does, whether the next one may follow, whether it is an exponential."""
+
+    jump: int | None
+    falls: bool
+    exponential: bool
+
+
+def measure_nvidia(cubin: bytes) -> tuple[int, int, int, list[Step]]:
+    """Return registers, shared memory, spills, and the instructions.
 
     Spills are the instructions that touch local memory, where the assembler puts what does not fit into registers.
     """
@@ -116,15 +129,19 @@ def measure_nvidia(cubin: bytes) -> tuple[int, int, int, list[int | None]]:
             for option in ("-res-usage", "-sass")
         )
     found = {name: int(value) for name, value in re.findall(r"(REG|SHARED|STACK|LOCAL):(\d+)", usage)}
-    lines = re.findall(r"/\*([0-9a-f]{4,})\*/\s+(.+?);", sass)
+    lines = re.findall(r"/\*([0-9a-f]{4,})\*/\s+(.+?)\s*;", sass)
+    lines = [(address, text) for address, text in lines if text != "NOP"]
     places = {int(address, 16): i for i, (address, _) in enumerate(lines)}
-    jumps = (re.search(r"\bBRA\b.*?0x([0-9a-f]+)", text) for _, text in lines)
-    rows = [places.get(int(jump[1], 16)) if jump else None for jump in jumps]
+    steps = []
+    for _, text in lines:
+        jump = re.search(r"\bBRA(?!\.DIV).*?0x([0-9a-f]+)", text)  # lanes do not diverge
+        ends = re.match(r"(BRA(\.U)? 0x|EXIT|RET)", text)
+        steps.append(Step(places.get(int(jump[1], 16)) if jump else None, not ends, "MUFU.EX2" in text))
     spills = sum(bool(re.search(r"\b(LDL|STL)\b", text)) for _, text in lines)
-    return found["REG"], found["SHARED"], spills + found["STACK"] + found["LOCAL"], rows
+    return found["REG"], found["SHARED"], spills + found["STACK"] + found["LOCAL"], steps
 
 
-def _measure_amd(assembly: str) -> tuple[int, int, int, list[int | None]]:
+def _measure_amd(assembly: str) -> tuple[int, int, int, list[Step]]:
     """The same from the text of the assembler, which says at its end what is needed."""
     found = {name: int(value) for name, value in re.findall(r"\.(\w+):\s+(\d+)\s*$", assembly, re.M)}
     labels: dict[str, int] = {}
@@ -132,19 +149,40 @@ def _measure_amd(assembly: str) -> tuple[int, int, int, list[int | None]]:
     for line in assembly.splitlines():
         if label := re.match(r"(\.L\w+):", line):
             labels[label[1]] = len(lines)
-        elif re.match(r"\t[sv]_|\t(global|flat|buffer|ds|scratch)_", line):
-            lines.append(line)
-    jumps = (re.match(r"\ts_c?branch\w*\s+(\.L\w+)", line) for line in lines)
-    rows = [labels.get(jump[1]) if jump else None for jump in jumps]
+        elif re.match(r"\t([sv]|global|flat|buffer|ds|scratch)_", line):
+            lines.append(line.strip())
+    steps = []
+    for line in lines:
+        jump = re.match(r"s_c?branch\w*\s+(\.L\w+)", line)
+        ends = re.match(r"s_(branch|endpgm)\b", line)
+        steps.append(Step(labels.get(jump[1]) if jump else None, not ends, "v_exp_f32" in line))
     spills = found["vgpr_spill_count"] + found["sgpr_spill_count"] + found["private_segment_fixed_size"]
-    return found["vgpr_count"], found["group_segment_fixed_size"], spills, rows
+    return found["vgpr_count"], found["group_segment_fixed_size"], spills, steps
 
 
-def _innermost(rows: list[int | None]) -> int:
-    """Return the instructions in loops that contain no other loop."""
-    loops = [(back, i) for i, back in enumerate(rows) if back is not None and back < i]
-    inner = [a for a in loops if not any(b != a and a[0] <= b[0] and b[1] <= a[1] for b in loops)]
-    return len({i for first, last in inner for i in range(first, last + 1)})
+def _per_entry(steps: list[Step]) -> int:
+    """Return the instructions of the innermost loops that evaluate alphas, i.e. those of one entry of a list.
+
+    A loop is a strongly connected part of the program; without its first instruction, what is still connected is a
+    loop within it.
+    """
+    edges = [(i, i + 1) for i, step in enumerate(steps[:-1]) if step.falls]
+    edges += [(i, step.jump) for i, step in enumerate(steps) if step.jump is not None]
+
+    def loops(within: set[int]) -> int:
+        inside = [(a, b) for a, b in edges if a in within and b in within]
+        rows, columns = zip(*inside, strict=True) if inside else ((), ())
+        graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(len(steps), len(steps)))
+        _, label = connected_components(graph, connection="strong")
+        total = 0
+        for part in np.flatnonzero(np.bincount(label) > 1):
+            members = set(np.flatnonzero(label == part).tolist())
+            if any(steps[i].exponential for i in members):
+                head = min(b for a, b in edges if b in members and a not in members)
+                total += loops(members - {head}) or len(members)
+        return total
+
+    return loops(set(range(len(steps))))
 
 
 def markdown(rows: list[Compiled]) -> str:

@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from reference_trainer.render.splats import Splats
 from reference_trainer.render.triton import tiles
-from reference_trainer.render.triton.tiles import FAINT, ROW, Lists, add_row, alpha_at, geometry_row, pixels, put
+from reference_trainer.render.triton.tiles import FAINT, Lists, add_row, alpha_at, geometry_sums, make_row, pixels
 
 __all__ = ["absolute_gradients", "composite", "composite_masks"]
 
@@ -116,14 +116,17 @@ def composite_backward(
                 slope = tl.where(t > 0, raw * (front * along - beyond / (1 - clamped)), 0.0)  # of ln alpha
                 if ABSOLUTE:
                     _dx, _dy, w1, w2, l11, l21, l22 = geometry
-                    gradients = put(tl.zeros([ROW], tl.float32), tl.abs(slope * (l11 * w1)), 0)
-                    gradients = put(gradients, tl.abs(slope * (l21 * w1 + l22 * w2)), 1)
+                    to_x, to_y = tl.abs(slope * (l11 * w1)), tl.abs(slope * (l21 * w1 + l22 * w2))
+                    nothing = 0.0, 0.0, 0.0, 0.0
+                    gradients = make_row((tl.sum(to_x), tl.sum(to_y), 0.0, 0.0), nothing, nothing)
                     add_row(rows, gradients, e, i, 2, EACH)
                 else:
-                    gradients = geometry_row(slope, geometry, log_opacity)
-                    gradients = put(put(put(gradients, weight * u_r, 6), weight * u_g, 7), weight * u_b, 8)
+                    g0, g1, g2, g3, g4, g5 = geometry_sums(slope, geometry, log_opacity)
+                    to_r, to_g, to_b = tl.sum(weight * u_r), tl.sum(weight * u_g), tl.sum(weight * u_b)
+                    to_d = 0.0
                     if DEPTH:
-                        gradients = put(gradients, weight * u_d, 9)
+                        to_d = tl.sum(weight * u_d)
+                    gradients = make_row((g0, g1, g2, g3), (g4, g5, to_r, to_g), (to_b, to_d, 0.0, 0.0))
                     add_row(rows, gradients, e, i, STRIDE, EACH)
         begin += _CHUNK
 

@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from reference_trainer.render.splats import MomentImages, Splats
 from reference_trainer.render.triton import tiles
-from reference_trainer.render.triton.tiles import FAINT, Lists, add_row, alpha_at, geometry_row, pixels, put
+from reference_trainer.render.triton.tiles import FAINT, Lists, add_row, alpha_at, geometry_sums, make_row, pixels
 
 __all__ = ["moments", "moments_of", "shares", "shares_of"]
 
@@ -122,11 +122,13 @@ def _load_state(at, PIXELS: tl.constexpr):
 
 @triton.jit(do_not_specialize=["width", "height", "columns", "count"])
 def moments_backward(
-    table, starts, gaussians, behind, to_mean, to_variance, to_alpha,
-    checkpoints, kept, rows, to_behind, count, width, height, columns,
+    table, starts, gaussians, images, checkpoints, rows, count, width, height, columns,
     STRIDE: tl.constexpr, TILE: tl.constexpr, MAX: tl.constexpr, EACH: tl.constexpr,
 ):  # fmt: skip
     """Carry gradients to the splats, and each splat's share of the weighted variance, of ``count`` tiles.
+
+    ``images`` (10, H, W) are the gradients of mean, variance and alpha, and what is behind, whose own gradients take
+    the place of the first three. Few arguments, as addresses take scalar registers, of which AMD's cards have 102.
 
     Splat i meets what is in front of it only as factors on the gradients. With u the gradient of the mean, U that of
     the variance, u_a that of the expected alpha, all as they arrive at splat i from the front,
@@ -143,13 +145,14 @@ def moments_backward(
     """
     program = tl.program_id(0)
     PIXELS: tl.constexpr = TILE * TILE
-    kept += program.to(tl.int64) * (_CHUNK * _STATE * PIXELS)
+    kept = checkpoints + program.to(tl.int64) * (_CHUNK * _STATE * PIXELS)
+    checkpoints += tl.num_programs(0).to(tl.int64) * (_CHUNK * _STATE * PIXELS)
     size = width * height
     for tile in range(program, count, tl.num_programs(0)):
         x, y, place, inside = pixels(tile, width, height, columns, TILE)
-        of_variance = _load3(to_variance, place, size, inside)
+        of_variance = _load3(images + 3 * size, place, size, inside)
         U0, U1, U2 = of_variance
-        m0, m1, m2 = _load3(behind, place, size, inside)
+        m0, m1, m2 = _load3(images + 7 * size, place, size, inside)
         state = m0, m1, m2, tl.zeros_like(m0), tl.zeros_like(m0) + 1
         begin, end = tl.load(starts + tile), tl.load(starts + tile + 1)
         # Floor and one more per tile: no two tiles share a checkpoint, wherever their lists begin.
@@ -162,8 +165,8 @@ def moments_backward(
             last = tl.minimum(first + _CHUNK, end)
             state = _behind_chunk(state, table, gaussians, first, last, x, y, of_variance, kept, STRIDE, MAX, False)
             chunk -= 1
-        u0, u1, u2 = _load3(to_mean, place, size, inside)
-        u_a = tl.load(to_alpha + place, mask=inside, other=0.0)
+        u0, u1, u2 = _load3(images, place, size, inside)
+        u_a = tl.load(images + 6 * size + place, mask=inside, other=0.0)
         front = tl.zeros_like(u_a) + 1
         for chunk in range(0, chunks):
             tl.debug_barrier()  # a lane reads what it wrote itself; this also holds where layouts differ
@@ -189,11 +192,12 @@ def moments_backward(
                     u0, u1, u2, u_a = u0 - c0, u1 - c1, u2 - c2, u_a * passed
                     front *= shrink
                     slope = raw * (2 * tl.load(row + 10) * to_spread * alpha + to_expected * tl.load(row + 9))
-                    gradients = put(geometry_row(slope, geometry, log_opacity), c0, 6)
-                    gradients = put(put(gradients, c1, 7), c2, 8)
-                    gradients = put(put(gradients, to_expected * alpha, 9), to_spread * alpha * alpha, 10)
-                    add_row(rows, put(gradients, of_spread * spread, 11), e, i, 12, EACH)
-        _store3(to_behind, place, size, inside, u0, u1, u2)
+                    g0, g1, g2, g3, g4, g5 = geometry_sums(slope, geometry, log_opacity)
+                    to_r, to_g, to_b, share = tl.sum(c0), tl.sum(c1), tl.sum(c2), tl.sum(of_spread * spread)
+                    to_m, to_v = tl.sum(to_expected * alpha), tl.sum(to_spread * alpha * alpha)
+                    gradients = make_row((g0, g1, g2, g3), (g4, g5, to_r, to_g), (to_b, to_m, to_v, share))
+                    add_row(rows, gradients, e, i, 12, EACH)
+        _store3(images, place, size, inside, u0, u1, u2)
 
 
 def moments_of(table: Tensor, lists: Lists, behind: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -204,20 +208,19 @@ def moments_of(table: Tensor, lists: Lists, behind: Tensor) -> tuple[Tensor, Ten
     return mean, variance, alpha
 
 
-def _gradients(
-    table: Tensor, lists: Lists, behind: Tensor, to_mean: Tensor, to_variance: Tensor, to_alpha: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return rows of gradients (M, 16), columns 9 to 11 those of the moments and the share, and that of behind."""
+def _gradients(table: Tensor, lists: Lists, images: Tensor) -> tuple[Tensor, Tensor]:
+    """Return rows of gradients (M, 16), columns 9 to 11 those of the moments and the share, and that of behind.
+
+    The images (10, H, W) are the gradients of mean, variance and alpha, and what is behind; they are overwritten.
+    """
     rows, each = tiles.gradient_rows(lists, table)
-    programs, state = min(_PROGRAMS, lists.tiles), (_STATE.value, lists.tile**2)
-    checkpoints = table.new_empty(len(lists.gaussians) // _CHUNK.value + lists.tiles + 1, *state)
-    kept, to_behind = table.new_empty(programs * _CHUNK.value, *state), table.new_empty(3, lists.height, lists.width)
-    images = (x.contiguous() for x in (behind, to_mean, to_variance, to_alpha))
+    programs, saved = min(_PROGRAMS, lists.tiles), len(lists.gaussians) // _CHUNK.value + lists.tiles + 1
+    checkpoints = table.new_empty(programs * _CHUNK.value + saved, _STATE.value, lists.tile**2)
     tiles.over_tiles(
-        moments_backward, lists, table, *images, checkpoints, kept, rows, to_behind, lists.tiles, programs=programs,
-        MAX=lists.max_alpha, EACH=each,
+        moments_backward, lists, table, images, checkpoints, rows, lists.tiles, programs=programs, MAX=lists.max_alpha,
+        EACH=each,
     )  # fmt: skip
-    return tiles.sum_rows(rows, each, lists, len(table)), to_behind
+    return tiles.sum_rows(rows, each, lists, len(table)), images[:3]
 
 
 class _Moments(torch.autograd.Function):
@@ -233,7 +236,7 @@ class _Moments(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         table, behind = ctx.saved_tensors
-        g, to_behind = _gradients(table, ctx.lists, behind, *upstream)
+        g, to_behind = _gradients(table, ctx.lists, torch.cat([*upstream[:2], upstream[2][None], behind]))
         return None, g[:, 9:11], to_behind, g[:, :2], g[:, 2:5], g[:, 5], g[:, 6:9]
 
 
@@ -249,8 +252,8 @@ def moments(splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
 def shares_of(table: Tensor, lists: Lists, behind: Tensor, weights: Tensor) -> Tensor:
     """Return every row's share of the variance, mean over RGB, for weights of the pixels (H, W); (M,), float64."""
     nothing = weights.new_zeros(3, *weights.shape)
-    upstream = nothing, (weights / 3).expand_as(nothing), nothing[0]
-    return _gradients(table, lists, behind, *upstream)[0][:, 11].double()
+    images = torch.cat([nothing, (weights / 3).expand_as(nothing), nothing[:1], behind])
+    return _gradients(table, lists, images)[0][:, 11].double()
 
 
 def shares(splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:

@@ -20,8 +20,8 @@ from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
-    "FAINT", "LAUNCHED", "ROW", "Lists", "add_row", "alpha_at", "geometry_row", "gradient_rows", "launch", "make_table",
-    "over_tiles", "pixels", "put", "sum_rows",
+    "FAINT", "LAUNCHED", "ROW", "Lists", "add_row", "alpha_at", "geometry_sums", "gradient_rows", "launch", "make_row",
+    "make_table", "over_tiles", "pixels", "sum_rows",
 ]  # fmt: skip
 
 ROW = tl.constexpr(16)
@@ -132,25 +132,32 @@ def alpha_at(row, log_opacity, x, y):
 
 
 @triton.jit
-def put(row, values, COLUMN: tl.constexpr):
-    """Write the sum of the pixels' values into a column of a row."""
-    return tl.where(tl.arange(0, ROW) == COLUMN, tl.sum(values), row)
-
-
-@triton.jit
-def geometry_row(slope, geometry, log_opacity):
-    """Carry the gradients of ln alpha at the pixels, ``slope``, to x, y, l11, l21, l22 and the opacity: columns 0 to 5.
+def geometry_sums(slope, geometry, log_opacity):
+    """Carry the gradients of ln alpha at the pixels, ``slope``, to x, y, l11, l21, l22 and the opacity.
 
     As the pixel's offset is dx = pixel - x, the derivatives of ln alpha are l11 w1 in x, l21 w1 + l22 w2 in y, -w1 dx,
     -w1 dy, -w2 dy in the factor, and 1 / o in the opacity.
     """
     dx, dy, w1, w2, l11, l21, l22 = geometry
-    column = tl.arange(0, ROW)
     s1, s2 = slope * w1, slope * w2
     along, across = tl.sum(s1), tl.sum(s2)
-    row = tl.where(column == 0, l11 * along, tl.where(column == 1, l21 * along + l22 * across, 0.0))
-    row = put(put(put(row, -s1 * dx, 2), -s1 * dy, 3), -s2 * dy, 4)
-    return put(row, slope * tl.exp2(-log_opacity), 5)
+    to_factor = -tl.sum(s1 * dx), -tl.sum(s1 * dy), -tl.sum(s2 * dy)
+    to_y = l21 * along + l22 * across
+    return l11 * along, to_y, to_factor[0], to_factor[1], to_factor[2], tl.sum(slope) * tl.exp2(-log_opacity)
+
+
+@triton.jit
+def make_row(a, b, c):
+    """Put three times four sums into the first columns of a row, in a tree of choices by the bits of the column.
+
+    A mask for every column would take two of AMD's scalar registers each.
+    """
+    column = tl.arange(0, ROW)
+    odd, second = (column & 1) != 0, (column & 2) != 0
+    first = tl.where(second, tl.where(odd, a[3], a[2]), tl.where(odd, a[1], a[0]))
+    middle = tl.where(second, tl.where(odd, b[3], b[2]), tl.where(odd, b[1], b[0]))
+    last = tl.where(second, tl.where(odd, c[3], c[2]), tl.where(odd, c[1], c[0]))
+    return tl.where(column >= 8, last, tl.where((column & 4) != 0, middle, first))
 
 
 @triton.jit
