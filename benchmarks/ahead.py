@@ -28,8 +28,8 @@ TARGETS = {f"sm_{x}": GPUTarget("cuda", x, 32) for x in (75, 80, 86, 89, 90, 100
 TARGETS |= {f"gfx{x}": GPUTarget("hip", f"gfx{x}", 64 if x[0] == "9" else 32) for x in ("90a", "942", "1100", "1201")}
 
 # Types by the names of the arguments, which are the same in all kernels; the others are float32 numbers in memory.
-_TYPES = {name: "*i32" for name in ("starts", "gaussians", "order", "counts")}
-_TYPES |= {"indices": "*i64", "ends": "*i64", "touched": "*u8", "keys": "*i16"}
+_TYPES = {name: "*i32" for name in ("starts", "gaussians", "counts")}
+_TYPES |= {"indices": "*i64", "order": "*i64", "ends": "*i64", "touched": "*u8", "keys": "*i16"}
 _TYPES |= {name: "i32" for name in ("count", "width", "height", "columns", "listing")}
 _TYPES |= {name: "fp32" for name in ("fx", "fy", "cx", "cy", "limit_x", "limit_y")}
 

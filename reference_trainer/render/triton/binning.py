@@ -42,7 +42,7 @@ def list_tiles(
     """
     k = tl.program_id(0) * GROUP + tl.arange(0, GROUP)
     real = k < count
-    i = tl.load(order + k, mask=real, other=0)
+    i = tl.load(order + k, mask=real, other=0).to(tl.int32)
     x, y = tl.load(means + 2 * i, mask=real), tl.load(means + 2 * i + 1, mask=real)
     l11, l21 = tl.load(factors + 3 * i, mask=real, other=1.0), tl.load(factors + 3 * i + 1, mask=real, other=0.0)
     l22 = tl.load(factors + 3 * i + 2, mask=real, other=1.0)
@@ -55,6 +55,7 @@ def list_tiles(
     first_row = top // TILE
     rows = tl.where(real & (bottom >= top), bottom // TILE - first_row + 1, 0)
     found = tl.zeros([GROUP], tl.int32)
+    # While counting, both are not yet written, and the difference not used.
     place = tl.load(ends + k, mask=real, other=0) - tl.load(counts + k, mask=real, other=0)
     for r in range(0, tl.max(rows)):
         row = first_row + r
@@ -87,35 +88,26 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
     """
     columns, count = -(-width // TILE), len(opacities)
     tiles = columns * -(-height // TILE)
-    order = torch.argsort(projection.depths, stable=True).int()
+    short = torch.int16 if tiles < 2**15 else torch.int32
+    order = torch.argsort(projection.depths, stable=True)
     shapes = (
         x.detach().contiguous() for x in (projection.means, projection.factors, projection.covariances, opacities)
     )
-    counts = order.new_zeros(count)
-    touched = torch.zeros(count, dtype=torch.bool, device=order.device)
-    short = torch.int16 if tiles < 2**15 else torch.int32
-    given = order, *shapes, counts
-    grid, size = (-(-count // _GROUP),), (count, width, height, columns)
-    constants = {"warps": 4, "TILE": TILE, "GROUP": _GROUP, "LANES": _LANES}
-    nothing = order.new_empty(0)
-    launch(
-        list_tiles,
-        grid,
-        *given,
-        counts.long(),
-        touched.view(torch.uint8),
-        nothing.to(short),
-        nothing,
-        *size,
-        0,
-        **constants,
-    )
-    ends = counts.cumsum(0)
-    total = int(ends[-1]) if count else 0  # the one number read back
-    keys, gaussians = order.new_empty(total, dtype=short), order.new_empty(total)
+    counts, ends = order.new_empty(count, dtype=torch.int32), torch.empty_like(order)
+    touched = order.new_empty(count, dtype=torch.bool)
+    given = order, *shapes, counts, ends, touched.view(torch.uint8)
+
+    def fill(keys: Tensor, gaussians: Tensor, listing: int) -> None:
+        size = count, width, height, columns, listing
+        constants = {"warps": 4, "TILE": TILE, "GROUP": _GROUP, "LANES": _LANES}
+        launch(list_tiles, (-(-count // _GROUP),), *given, keys, gaussians, *size, **constants)
+
+    nothing = counts[:0]
+    fill(nothing.view(short), nothing, 0)
+    total = int(torch.cumsum(counts, 0, out=ends)[-1]) if count else 0  # the one number read back
+    keys, gaussians = counts.new_empty(total, dtype=short), counts.new_empty(total)
     if total:
-        launch(list_tiles, grid, *given, ends, touched.view(torch.uint8), keys, gaussians, *size, 1, **constants)
+        fill(keys, gaussians, 1)
     keys, by_tile = torch.sort(keys, stable=True)
     edges = torch.arange(tiles + 1, dtype=short, device=order.device)
-    starts = torch.searchsorted(keys, edges, out_int32=True)
-    return TileLists(width, height, starts, gaussians[by_tile], touched)
+    return TileLists(width, height, torch.searchsorted(keys, edges, out_int32=True), gaussians[by_tile], touched)

@@ -157,16 +157,18 @@ def _basis_slopes(x, y, z):
 
 
 @triton.jit
-def _towards(mean, position):
-    """Return the unit vector from the camera to a mean, and one over their distance."""
-    offset = _plus(mean, -1.0, (tl.load(position), tl.load(position + 1), tl.load(position + 2)))
+def _towards(mean, view):
+    """Return the unit vector from the camera, at -R^T t, to a mean, and one over their distance."""
+    right, down, forward = _view(view)
+    at = _plus(_plus(_times(tl.load(view + 3), right), tl.load(view + 7), down), tl.load(view + 11), forward)
+    offset = _plus(mean, 1.0, at)
     inverse = 1 / tl.maximum(tl.sqrt(_dot(offset, offset)), 1e-12)
     return _times(inverse, offset), inverse
 
 
 @triton.jit(do_not_specialize=["count"])
 def project_forward(
-    indices, means, quaternions, scales, sh, view, position, centers,
+    indices, means, quaternions, scales, sh, view, centers,
     factors, covariances, depths, colors, count, fx, fy, cx, cy,
     limit_x, limit_y, BANDS: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -186,7 +188,7 @@ def project_forward(
     given = sh + i * (3 * ROW)
     color = _load3(given, real)
     if BANDS > 0:
-        direction, _inverse = _towards(mean, position)
+        direction, _inverse = _towards(mean, view)
         values = _basis(direction[0], direction[1], direction[2])
         color = 0.5 + values[0] * color[0], 0.5 + values[0] * color[1], 0.5 + values[0] * color[2]
         for j in tl.static_range(1, BANDS):
@@ -199,7 +201,7 @@ def project_forward(
 
 @triton.jit(do_not_specialize=["count"])
 def project_backward(
-    indices, means, quaternions, scales, sh, view, position, colors,
+    indices, means, quaternions, scales, sh, view, colors,
     to_centers, to_factors, to_depths, to_colors, to_means, to_quaternions,
     to_scales, to_sh, count, fx, fy, limit_x, limit_y, BANDS: tl.constexpr,
     ROW: tl.constexpr, BLOCK: tl.constexpr,
@@ -267,7 +269,7 @@ def project_backward(
     else:
         r, g, b = to_color
         r, g, b = tl.where(shown[0] > 0, r, 0.0), tl.where(shown[1] > 0, g, 0.0), tl.where(shown[2] > 0, b, 0.0)
-        direction, inverse = _towards(mean, position)
+        direction, inverse = _towards(mean, view)
         values = _basis(direction[0], direction[1], direction[2])
         in_x, in_y, in_z = _basis_slopes(direction[0], direction[1], direction[2])
         at, to_at = sh + i * (3 * ROW), to_sh + i * (3 * ROW)
@@ -295,7 +297,7 @@ class _Project(torch.autograd.Function):
         ctx.limits = tuple(limits)
         ctx.constants = {"warps": 4, "BANDS": bands, "ROW": sh.shape[1], "BLOCK": _BLOCK}
         given = [x.detach().contiguous() for x in (indices, means, quaternions, scales, sh)]
-        given += [camera.world_to_camera.contiguous(), camera.position.contiguous()]
+        given.append(camera.world_to_camera.contiguous())
         outputs = tuple(means.new_empty(len(indices), *shape) for shape in ((2,), (3,), (3,), (), (3,)))
         grid = (triton.cdiv(len(indices), _BLOCK),)
         launch(project_forward, grid, *given, *outputs, *ctx.size, camera.cx, camera.cy, *ctx.limits, **ctx.constants)
