@@ -27,6 +27,7 @@ class GsplatMoments:
     Args:
         rasterize: ``rasterize(opacities, view)`` returns the colors of all N Gaussians towards the view, RGB, (N, 3),
             and gsplat's ``meta`` of a render with these activated opacities, (N,) or (N, 1); packed or not.
+        background: the model's own, shape (3,); None for black.
         max_alpha: where this gsplat clamps alphas; by default that of the installed version, 0.999 before 1.6, which
             is then 0.99.
 
@@ -39,9 +40,14 @@ class GsplatMoments:
     """
 
     def __init__(
-        self, rasterize: Callable[[Tensor, Any], tuple[Tensor, Mapping[str, Any]]], *, max_alpha: float | None = None
+        self,
+        rasterize: Callable[[Tensor, Any], tuple[Tensor, Mapping[str, Any]]],
+        *,
+        background: Tensor | None = None,
+        max_alpha: float | None = None,
     ) -> None:
         self.rasterize = rasterize
+        self.background = background
         self.max_alpha = max_alpha
 
     def __call__(self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None) -> ExactMoments:
@@ -90,6 +96,7 @@ class GsplatMoments:
         ids, size = meta["flatten_ids"].int(), (3, int(meta["height"]), int(meta["width"]))
         starts = torch.cat([meta["isect_offsets"].flatten().int(), ids.new_full((1,), len(ids))])
         lists = Lists(starts, ids, size[2], size[1], int(meta["tile_size"]), self.max_alpha or _max_alpha())
+        background = self.background if background is None else background
         behind = a.new_zeros(3) if background is None else background.to(a)
         return table, lists, (behind if behind.ndim == 3 else behind[:, None, None]).expand(size), which
 

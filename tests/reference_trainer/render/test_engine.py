@@ -36,7 +36,7 @@ def test_the_line_that_says_which():
     threads = torch.get_num_threads()
     assert describe_engine("cpu").startswith("loops (numba ")
     assert describe_engine("cpu").endswith(f", {threads} thread{'s' * (threads > 1)})")
-    assert describe_engine("cuda") == "torch"  # also where there is no card, as before a sweep on other machines
+    assert describe_engine("cuda").split()[0] in ("triton", "torch")  # also where there is no card, before a sweep
     use_engine("torch")
     assert describe_engine("cpu") == "torch"
 

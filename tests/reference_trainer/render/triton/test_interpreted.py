@@ -1,4 +1,4 @@
-"""Runs `interpreted.py` in a process of its own: in Triton's interpreter, and on a card where there is one."""
+"""Runs this file's neighbors in processes of their own: in Triton's interpreter and, where there is one, on a card."""
 
 import subprocess
 import sys
@@ -9,13 +9,15 @@ import torch
 from subprocesses import subprocess_environment
 
 pytest.importorskip("triton")
-FILE = Path(__file__).with_name("interpreted.py")
+FOLDER = Path(__file__).parent
 
 
-def passes(marked, interpret):
-    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-m", marked, str(FILE)]
+def passes(marked, interpret, name="interpreted.py"):
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-m", marked]
     environment = subprocess_environment(TRITON_INTERPRET=interpret)
-    done = subprocess.run(command, cwd=FILE.parents[4], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [*command, str(FOLDER / name)], cwd=FOLDER.parents[3], env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     assert " passed" in done.stdout
 
@@ -24,6 +26,12 @@ def passes(marked, interpret):
 @pytest.mark.parametrize("marked", ["not slow", "slow"])
 def test_in_the_interpreter(marked):
     passes(marked, "1")
+
+
+@pytest.mark.slow
+def test_over_gsplats_lists():
+    pytest.importorskip("gsplat")
+    passes("slow", "1", "gsplat_lists.py")
 
 
 @pytest.mark.gpu
