@@ -31,7 +31,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
-from reference_trainer.render import describe_engine, draw, draw_masks, render_moments, splat, use_engine
+from reference_trainer.render import describe_engine, rasterize, render_masks, render_moments, splat, use_engine
 
 __all__ = ["Counts", "bytes_per_entry", "count_exact_score", "main"]
 
@@ -69,12 +69,12 @@ class Model(NamedTuple):
 class Counts(NamedTuple):
     """What an exact score costs, beyond its arithmetic.
 
-    ``drawing`` of the operations (kernels of Triton included) are those of the engine, without the checks of its inputs
+    ``rendering`` of the operations (kernels of Triton included) are those of the engine, without the checks of its inputs
     and without what the score does with the moments.
     """
 
     operations: int
-    drawing: int
+    rendering: int
     read_backs: int
     entries: int
 
@@ -172,14 +172,14 @@ def count_exact_score(count: int, width: int, scale: float, device: torch.device
     inputs = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities, "colors": colors}
     multiplier, behind = torch.full((count, 2), 0.25, device=device), torch.zeros(3, width, width, device=device)
 
-    def drawing() -> Any:
+    def rendering() -> Any:
         projection, shown = splats.engine.project(inputs, splats.indices, model.camera, None)
         lists = splats.engine.bin(projection, opacities, width, width)
-        drawn = splats._replace(projection=projection, colors=shown, lists=lists)
-        return splats.engine.moments(drawn, multiplier, behind)
+        shown_splats = splats._replace(projection=projection, colors=shown, lists=lists)
+        return splats.engine.moments(shown_splats, multiplier, behind)
 
     operations, mode, _ = _counted(score)
-    return Counts(operations, _counted(drawing)[0], mode.read_backs, len(splats.lists.gaussians))
+    return Counts(operations, _counted(rendering)[0], mode.read_backs, len(splats.lists.gaussians))
 
 
 @torch.no_grad()
@@ -207,7 +207,7 @@ def _count() -> str:
         return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
     rows = [count_exact_score(*size, device) for size in ((24, 24, 0.05), (24, 24, 0.2), (48, 40, 0.1))]
     out = ["| entries | operations of an exact score | of them the engine's | read-backs |", "|---:|---:|---:|---:|"]
-    out += [f"| {x.entries} | {x.operations} | {x.drawing} | {x.read_backs} |" for x in rows]
+    out += [f"| {x.entries} | {x.operations} | {x.rendering} | {x.read_backs} |" for x in rows]
     return "\n".join(out) + f"\n\n{bytes_per_entry(device):.1f} bytes per list entry at the peak."
 
 
@@ -249,15 +249,15 @@ def _times() -> str:
         score = CAScore(exact=model.moments, drop_rate=0.5)
 
         def forward() -> Any:
-            return draw(splat(*model.tensors[:4], model.camera, colors=model.tensors[4])).image  # noqa: B023
+            return rasterize(splat(*model.tensors[:4], model.camera, colors=model.tensors[4])).image  # noqa: B023
 
         def backward() -> Any:
             leaves = [x.clone().requires_grad_() for x in model.tensors]  # noqa: B023
-            draw(splat(*leaves[:4], model.camera, colors=leaves[4])).image.square().sum().backward()  # noqa: B023
+            rasterize(splat(*leaves[:4], model.camera, colors=leaves[4])).image.square().sum().backward()  # noqa: B023
 
         def masks() -> Any:
             splats = splat(*model.tensors[:4], model.camera, colors=model.tensors[4])  # noqa: B023
-            return draw_masks(splats, model.tensors[3] * keep)  # noqa: B023
+            return render_masks(splats, model.tensors[3] * keep)  # noqa: B023
 
         works = {
             "render": torch.no_grad()(forward),
@@ -347,7 +347,7 @@ def _agreement() -> str:
         use_engine(engine)
         with torch.no_grad():
             splats = splat(*model.tensors[:4], model.camera, colors=model.tensors[4])
-            images[engine] = draw(splats).image
+            images[engine] = rasterize(splats).image
             variances[engine] = render_moments(splats, Multiplier.dropout(0.5)).variance
     try:
         import gsplat

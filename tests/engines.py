@@ -45,7 +45,7 @@ class Case(NamedTuple):
 CASES = {
     "torch-float64": Case("torch", torch.float64, "cpu", 1e-12, 1e-9, 0.0),
     "torch-float32": Case("torch", torch.float32, "cpu", 2e-4, 1e-3, 0.005),
-    "loops-float32": Case("loops", torch.float32, "cpu", 2e-4, 1e-3, 0.005),
+    "numba-float32": Case("numba", torch.float32, "cpu", 2e-4, 1e-3, 0.005),
 }
 ON_CARDS = {
     f"torch-{device}-{name}": CASES[f"torch-{name}"]._replace(device=device)

@@ -5,10 +5,10 @@ import math
 
 import torch
 
-from reference_trainer.density import DENSITY, DensityStrategy
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.density import DENSITY, DensityStrategy
 
 __all__ = ["begun", "short", "some", "stepped"]
 
@@ -38,6 +38,6 @@ def begun(expression: str, scene, count: int, **settings) -> DensityStrategy:
 
 
 def short(config: TrainConfig, expression: str, iterations: int) -> TrainConfig:
-    """Settings with this density control, and as many fields as it compares."""
-    fields = 2 if "fields" in DENSITY.make_one(expression).needs else 1
-    return dataclasses.replace(config, density=expression, iterations=iterations, prune_size=None, fields=fields)
+    """Settings with this density control, and as many models as it compares."""
+    models = 2 if "models" in DENSITY.make_one(expression).needs else 1
+    return dataclasses.replace(config, density=expression, iterations=iterations, prune_size=None, models=models)

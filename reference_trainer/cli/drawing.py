@@ -17,8 +17,8 @@ Device = Annotated[str, tyro.conf.arg(help='"cpu" or "cuda".')]
 class Drawing:
     """The rendering engine, for all commands that render."""
 
-    engine: Literal["auto", "torch", "loops"] | None = None
-    """What draws: "loops" (compiled; float32 on a CPU), "torch" (anything), or "auto", whichever fits. By default
+    engine: Literal["auto", "torch", "numba", "triton"] | None = None
+    """What draws: "numba" (compiled; float32 on a CPU), "torch" (anything), or "auto", whichever fits. By default
     $CA_REG_ENGINE, or "auto"."""
 
     def begin(self, device: str, *, trains: bool = False) -> None:

@@ -23,9 +23,9 @@ class Names:
 
     def __call__(self) -> None:
         from ca_reg.regularizers import REGULARIZERS
-        from reference_trainer.density import DENSITY
-        from reference_trainer.losses import LOSSES
         from reference_trainer.renderers import RENDERERS
+        from reference_trainer.training.density import DENSITY
+        from reference_trainer.training.losses import LOSSES
 
         known: dict[str, Any] = {"regularizer": REGULARIZERS, "loss": LOSSES, "density": DENSITY, "renderer": RENDERERS}
         for option, registry in known.items():

@@ -133,11 +133,11 @@ class Train:
     def __call__(self) -> None:
         from reference_trainer.evaluation.tables import summary
         from reference_trainer.runs.run import run_experiment
-        from reference_trainer.training.determinism import deterministic
+        from reference_trainer.training.randomness import deterministic
 
         if self.deterministic and self.config.renderer == "gsplat":
             raise ValueError(
-                "--deterministic needs --renderer torch: gsplat's kernels add gradients in whatever order they come, "
+                "--deterministic needs --renderer builtin: gsplat's kernels add gradients in whatever order they come, "
                 "which PyTorch cannot change."
             )
         between = min(self.monitor_every, self.config.iterations)
@@ -150,7 +150,7 @@ class Train:
                 viewer = stack.enter_context(Viewer(*self.viewer or (PORT,)))
                 watched = {"watch": viewer.follow}
                 print(viewer)
-            if self.config.renderer == "torch":
+            if self.config.renderer == "builtin":
                 self.drawing.begin(self.device, trains=True)
             if self.deterministic:
                 stack.enter_context(deterministic(self.device))
@@ -190,9 +190,10 @@ class Plan:
 
     def __call__(self) -> None:
         from reference_trainer.evaluation.results import markdown_table, write_json
+        from reference_trainer.scenes import load_scene
         from reference_trainer.training.plan import make_plan
 
-        scene = _chosen(self.scene, self.folder).load(seed=self.config.seed)
+        scene = load_scene(_chosen(self.scene, self.folder), seed=self.config.seed)
         plan = make_plan(scene, self.config, given=self.given)
         print(f"{scene}\n")
         print(markdown_table(plan.rows(), ["item", "decision", "change", "reason"]))
@@ -348,7 +349,7 @@ class Compare:
             lpips=self.lpips,
             say=print,
         )
-        if self.config.renderer == "torch":
+        if self.config.renderer == "builtin":
             self.drawing.begin(self.device, trains=True)
         comparisons = compare(scene_folders(paths, self.scene, self.out), chosen, range(self.seeds), running)
         report(comparisons, say=print)

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION
-from reference_trainer.render.eager.projection import project
 from reference_trainer.render.splats import Splats
+from reference_trainer.render.torch.projection import project
 
 __all__ = ["filtered"]
 

@@ -5,9 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from reference_trainer.render.eager.formulas import blend_weights
-from reference_trainer.render.eager.walk import blocks, geometry_rows, pad_entries, pixel_offsets, tile
 from reference_trainer.render.splats import Splats
+from reference_trainer.render.torch.compositing import (
+    blend_weights,
+    blocks,
+    geometry_rows,
+    pad_entries,
+    pixel_offsets,
+    tile,
+)
 
 __all__ = ["contributions"]
 

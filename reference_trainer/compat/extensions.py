@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.compat.unpacking import names_of_results
-from reference_trainer.losses.photometric import ssim_map
+from reference_trainer.training.losses.photometric import ssim_map
 
 __all__ = ["distCUDA2", "fused_ssim", "make_module"]
 

@@ -15,7 +15,7 @@ from unittest.mock import patch
 from torch import Tensor
 
 from reference_trainer.compat.rasterization import make_rasterization
-from reference_trainer.model.relocation import compute_relocation
+from reference_trainer.model.gaussians import compute_relocation
 from reference_trainer.rotations import rotation_matrices
 
 __all__ = ["gsplat_functions", "quat_scale_to_covar_preci"]

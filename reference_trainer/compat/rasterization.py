@@ -13,10 +13,9 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.compat.antialiasing import filtered
-from reference_trainer.render import Splats, draw, splat
-from reference_trainer.render.absolute import absgrad_sink, with_absolute_gradients
+from reference_trainer.render import Splats, rasterize, splat
 from reference_trainer.render.constants import DILATION, MIN_ALPHA, NEAR_PLANE
-from reference_trainer.render.radii import longer_radii
+from reference_trainer.render.densification import absgrad_sink, longer_radii, with_absolute_gradients
 
 __all__ = ["make_rasterization"]
 
@@ -124,7 +123,9 @@ def _rasterize(given: SimpleNamespace, per_axis: bool) -> tuple[Tensor, Tensor, 
         projection = view.splats.projection
         moved = projection._replace(means=rows(means2d, number, projection.means))
         background = None if given.backgrounds is None or "RGB" not in given.render_mode else given.backgrounds[number]
-        rendering = draw(view.splats._replace(projection=moved), background=background, depth="D" in given.render_mode)
+        rendering = rasterize(
+            view.splats._replace(projection=moved), background=background, depth="D" in given.render_mode
+        )
         if sink is not None:
             nothing = torch.zeros_like(projection.means)
             rendering = with_absolute_gradients(rendering, rows(sink, number, nothing), background)

@@ -16,11 +16,10 @@ from reference_trainer.compat.outputs import Picture, Unknown, kinds_of
 from reference_trainer.compat.settings import GaussianRasterizationSettings, camera_of, warn_of_ignored
 from reference_trainer.compat.surfels import surface_planes
 from reference_trainer.compat.unpacking import names_of_results
-from reference_trainer.model.relocation import compute_relocation
-from reference_trainer.render import draw, splat
-from reference_trainer.render.absolute import splat_weights, with_absolute_gradients
+from reference_trainer.model.gaussians import compute_relocation
+from reference_trainer.render import rasterize, splat
 from reference_trainer.render.constants import DILATION
-from reference_trainer.render.radii import in_front, visible_radii
+from reference_trainer.render.densification import in_front, splat_weights, visible_radii, with_absolute_gradients
 
 __all__ = ["GaussianRasterizer", "rasterizer_module"]
 
@@ -137,7 +136,7 @@ class GaussianRasterizer(nn.Module):
         inverse, surfaces = "inverse_depth" in parts, not SURFACES.isdisjoint(parts)
         true_depth = surfaces or "depth" in parts
         depths = projection.depths.reciprocal() if inverse else projection.depths  # only summed: sorting is done
-        rendering = draw(
+        rendering = rasterize(
             splats._replace(projection=splats.projection._replace(depths=depths)),
             background=settings.bg,
             depth=inverse or true_depth,
@@ -148,7 +147,7 @@ class GaussianRasterizer(nn.Module):
         if rendering.depth is not None:
             found["inverse_depth" if inverse else "depth"] = rendering.depth[None]
         if inverse and true_depth:  # absolute gradients are those of the first picture
-            rendering = draw(splats, depth=True)
+            rendering = rasterize(splats, depth=True)
             assert rendering.depth is not None
             found["depth"] = rendering.depth[None]
         if "weights" in parts:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render import Rendering, draw
+from reference_trainer.render import Rendering, rasterize
 from reference_trainer.rotations import rotation_matrices
 
 __all__ = ["FAR", "NEAR", "surface_planes"]
@@ -39,14 +39,14 @@ def surface_planes(
     away = (normals * (seen @ pose[:3, :3].T + pose[:3, 3])).sum(1, keepdim=True) > 0
     mapped = FAR / (FAR - NEAR) * (1 - NEAR / splats.projection.depths)
     mapped = mapped - mapped.detach().mean()  # differences count: near 1, the distortion of a thin wall would cancel
-    first = draw(
+    first = rasterize(
         splats._replace(
             colors=torch.where(away, -normals, normals).to(splats.colors),
             projection=splats.projection._replace(depths=mapped),
         ),
         depth=True,
     )
-    second = draw(splats._replace(colors=mapped[:, None].square().expand(-1, 3).contiguous()))
+    second = rasterize(splats._replace(colors=mapped[:, None].square().expand(-1, 3).contiguous()))
     assert first.depth is not None
     distortion = alpha * second.image[0] - first.depth.square()
     mean = depth / torch.where(alpha > 0, alpha, 1.0)

@@ -36,7 +36,7 @@ def _digest() -> str:
     inlined.
     """
     package = Path(__file__).parents[1]
-    sources = package / "render/constants.py", Path(__file__), *sorted((package / "render/loops").glob("*.py"))
+    sources = package / "render/constants.py", Path(__file__), *sorted((package / "render/numba").glob("*.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 

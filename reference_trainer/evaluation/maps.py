@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
-from reference_trainer.render.eager import formulas
-from reference_trainer.render.eager.walk import geometry_rows, walk
-from reference_trainer.render.renderer import draw
+from reference_trainer.render.renderer import rasterize
 from reference_trainer.render.splats import Splats
+from reference_trainer.render.torch import compositing
+from reference_trainer.render.torch.compositing import geometry_rows, walk
 
 __all__ = ["color_variance_map", "first_order_map"]
 
@@ -33,7 +33,7 @@ def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
         >>> round(variance[8, 8].item(), 2)  # weights 1/2 and 1/4: (1/3) (2/3)
         0.22
     """
-    drawn, squares = draw(splats), draw(splats._replace(colors=splats.colors.square()))
+    drawn, squares = rasterize(splats), rasterize(splats._replace(colors=splats.colors.square()))
     covered = drawn.alpha > 0
     weight = torch.where(covered, drawn.alpha, 1.0)
     return (squares.image / weight - (drawn.image / weight).square()).mean(0).clamp_min(0.0), covered
@@ -62,4 +62,4 @@ def first_order_map(splats: Splats, multiplier: Multiplier) -> Tensor:
         spread = spread[splats.indices].to(splats.colors)[:, None]
     rows = torch.cat([geometry_rows(splats), (spread * splats.colors.square()).T])
     behind = rows.new_zeros(3, splats.lists.height, splats.lists.width)
-    return walk(formulas.first_order, rows, behind, splats.lists, extra=0)
+    return walk(compositing.first_order, rows, behind, splats.lists, extra=0)

@@ -12,7 +12,7 @@ from ca_reg import CAResult, Reason, attribute, total_effects
 from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
-from reference_trainer.render.absolute import splat_weights
+from reference_trainer.render.densification import splat_weights
 from reference_trainer.scenes.scene import Viewpoint
 
 __all__ = [

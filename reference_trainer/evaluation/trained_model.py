@@ -18,7 +18,7 @@ from reference_trainer.render import (
     MomentImages,
     Rendering,
     Splats,
-    draw_masks,
+    render_masks,
     render_moments,
     splat,
     variance_shares,
@@ -164,7 +164,9 @@ class MaskedRenders:
         """Render a view with K sets of opacities (K, N); images (K, 3, H, W), alphas (K, H, W)."""
         plain = self._model.gaussians.opacities
         if bool((opacities > plain).any()):  # the lists for the plain opacities would be too short
-            return draw_masks(self._model.splats(opacities.amax(0), view), opacities, background=self._model.background)
+            return render_masks(
+                self._model.splats(opacities.amax(0), view), opacities, background=self._model.background
+            )
         if self._splats is None or view is not self._view:
             self._view, self._splats = view, self._model.splats(plain, view)
-        return draw_masks(self._splats, opacities, background=self._model.background)
+        return render_masks(self._splats, opacities, background=self._model.background)

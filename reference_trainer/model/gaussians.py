@@ -1,4 +1,4 @@
-"""The parameters of a set of 3D Gaussians, and their activations."""
+"""The parameters of a set of 3D Gaussians, their activations, and several Gaussians in place of one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from ca_reg import Params
 from reference_trainer.camera import Camera
 
-__all__ = ["PARAMETERS", "SH_C0", "Gaussians"]
+__all__ = ["PARAMETERS", "SH_C0", "Gaussians", "compute_relocation"]
 
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 """The parameters of every Gaussian, by the names of the fields."""
@@ -141,6 +141,7 @@ class Gaussians:
     @classmethod
     def from_named(cls, tensors: Mapping[str, Tensor]) -> Gaussians:
         """Make Gaussians of named parameters, as `named` yields them."""
+        # Whatever is not a parameter of every Gaussian was learned by a regularizer.
         own = {name: tensors[name] for name in PARAMETERS}
         return cls(**own, learned={name: x for name, x in tensors.items() if name not in PARAMETERS})
 
@@ -154,3 +155,28 @@ class Gaussians:
     def to(self, device: torch.device | str) -> Gaussians:
         """Return the Gaussians on another device."""
         return self.map(lambda x: x.to(device))
+
+
+@torch.no_grad()
+def compute_relocation(
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Return opacities and scales with which n Gaussians at one place look like one (3DGS-MCMC, equation 9).
+
+    Opacities (N,) and scales (N, 3) are those of the one; ``ratios`` (N,) holds n, clamped to the size of ``binoms``,
+    whose row n and column k is n choose k. New opacities are at least ``min_opacity``, and the scales account for it
+    (gsplat 1.6).
+
+    Example:
+        >>> table = torch.tensor([[1.0, 0.0], [1.0, 1.0]])
+        >>> opacity, scales = compute_relocation(torch.tensor([0.75]), torch.ones(1, 3), torch.tensor([2]), table)
+        >>> opacity.item(), round(scales[0, 0].item(), 4)  # 0.75 / (2 x 0.5 - 0.5^2 / sqrt(2))
+        (0.5, 0.9111)
+    """
+    n = ratios.long().clamp(1, len(binoms))
+    opacity = (1 - (1 - opacities.double()) ** (1 / n.double())).clamp_min(min_opacity)
+    k = torch.arange(len(binoms), dtype=torch.float64, device=binoms.device)
+    # The signs of the terms alternate: in single precision they would cancel.
+    terms = binoms.double().cumsum(0) * (-1) ** k / (k + 1).sqrt()
+    shrink = opacities.double() / (terms[n - 1] * opacity[:, None] ** (k + 1)).sum(1)
+    return opacity.to(opacities), scales * shrink[:, None].to(scales)

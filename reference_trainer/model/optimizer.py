@@ -33,6 +33,7 @@ class GaussianOptimizer:
     def __init__(self, gaussians: Gaussians, rates: Mapping[str, float]) -> None:
         self.gaussians = gaussians.map(lambda x: x.detach().clone().requires_grad_())
         groups = [{"params": [x], "lr": rates[name], "name": name} for name, x in self.gaussians.named()]
+        # The INRIA code's epsilon: gradients of single Gaussians can be far below Adam's usual 1e-8.
         self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def step(self) -> None:
@@ -95,6 +96,7 @@ class GaussianOptimizer:
 
     def _replace(self, tensors: dict[str, Tensor]) -> None:
         """Make these leaves the parameters; the caller must set their optimizer state."""
+        # Adam's state is keyed by the tensors themselves, and would keep the old ones alive.
         self._adam.state.clear()
         for name, x in tensors.items():
             self._group(name)["params"] = [x]
@@ -102,6 +104,7 @@ class GaussianOptimizer:
 
     def _rebuild(self, parameter: Any, moment: Any) -> None:
         """Replace every parameter and its two moments by functions of the old ones."""
+        # "step" is one number per tensor, which no resizing changes.
         old = {name: self._adam.state[x] for name, x in self.gaussians.named()}
         with torch.no_grad():
             self._replace({n: parameter(n, x).detach().requires_grad_() for n, x in self.gaussians.named()})

@@ -31,7 +31,7 @@ def render_gaussians(
 
     Opacities (N,), activated, replace the model's own; ``sh_degree`` is the highest band to use, by default all; with
     ``depth``, depth is accumulated as well; with ``absgrad``, if the renderer is capable of it, the backward pass sets
-    ``splats.projection.means.absgrad``. Another renderer, such as gsplat's, takes the arguments of `render`; its result
+    ``splats.means.absgrad``. Another renderer, such as gsplat's, takes the arguments of `render`; its result
     is returned as it is.
 
     Example:
@@ -41,6 +41,7 @@ def render_gaussians(
         >>> render_gaussians(gaussians, camera, torch.zeros(3)).image.shape
         torch.Size([3, 16, 16])
     """
+    # Renderers that know no absolute gradients do not have the argument.
     given = arguments(model, opacities) | ({"absgrad": True} if absgrad else {})
     out: Rendering = renderer(**given, camera=camera, sh_degree=sh_degree, background=background, depth=depth)
     return out

@@ -1,6 +1,7 @@
-"""What the renderer refuses to draw: numbers that are not finite, and coordinates too large for their precision.
+"""What the renderer refuses: numbers that are not finite, coordinates too large for float32.
 
-A nan would go unnoticed otherwise: a Gaussian whose depth is nan does not lie in front of the camera, and is culled.
+A nan would go unnoticed otherwise: a Gaussian whose depth is nan does not lie in front of the
+camera, and is culled.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ class NotFiniteError(ValueError):
 def check_projection(
     total: Tensor, projection: Projection, colors: Tensor, inputs: Mapping[str, Tensor], camera: Camera
 ) -> None:
-    """Raise unless all numbers are finite and the camera is near enough to the world's origin for their precision.
+    """Raise unless all numbers are finite and the world's coordinates not too large.
 
-    ``total`` sums what decides which Gaussians are drawn: all depths and opacities. Only if it and the projected values
-    add up to nan or infinity are the inputs (of all Gaussians, by name) examined one by one.
+    ``total`` sums what decides which Gaussians are rendered: all depths and opacities. Only if it and
+    the projected values add up to nan or infinity are the inputs (of all Gaussians, by name)
+    examined one by one.
 
     Raises:
         NotFiniteError: if an input, which the message names, or a projection is nan or infinite.
@@ -38,7 +40,8 @@ def check_projection(
     results = (projection.means, projection.covariances, colors)
     # The camera's distance from the world's origin, in mean depths.
     distance = camera.position.abs().amax() / projection.depths.mean()
-    total, share = torch.stack([sum((x.sum() for x in results), total), distance]).tolist()  # one wait for a GPU
+    # Both numbers at once: one wait for a GPU.
+    total, share = torch.stack([sum((x.sum() for x in results), total), distance]).tolist()
     if not math.isfinite(total):
         _refuse(results, inputs, camera)
     rounding = 0.5 * torch.finfo(colors.dtype).eps * share * max(camera.fx, camera.fy)

@@ -1,17 +1,18 @@
-"""Render Gaussians: tensors and a camera in, an image out."""
+"""Render Gaussians: tensors and a camera in, an image out, or the exact moments of its colors."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
 from reference_trainer.render.checks import check_projection, checked_background, checked_colors
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.engine import engine_for
-from reference_trainer.render.splats import Rendering, Splats
+from reference_trainer.render.splats import MomentImages, Rendering, Splats
 
-__all__ = ["draw", "draw_masks", "render", "splat"]
+__all__ = ["rasterize", "render", "render_masks", "render_moments", "splat", "variance_shares"]
 
 
 def splat(
@@ -27,23 +28,25 @@ def splat(
 ) -> Splats:
     """Project Gaussians, evaluate their colors and list them per tile.
 
-    Gaussians that cannot be seen (behind the near plane, or with an opacity below `MIN_ALPHA`, such as dropped ones)
-    are left out before the projection and cost nothing. The arguments are those of `render`.
+    Gaussians that cannot be seen (behind the near plane, or with an opacity below `MIN_ALPHA`, such
+    as dropped ones) are left out before the projection and cost nothing. The arguments are those of
+    `render`.
 
     Raises:
         TypeError: if a tensor is not floating point.
-        ValueError: if not exactly one of ``sh`` and ``colors`` is given, a tensor has the wrong shape, or the world
-            coordinates are too large for their precision, see `MAX_ROUNDING`.
-        NotFiniteError: if an input that affects the view is nan or infinite. Of Gaussians behind the camera, or
-            dropped, only position and opacity must be finite.
+        ValueError: if not exactly one of ``sh`` and ``colors`` is given, a tensor has the wrong
+            shape, or the world coordinates are too large for their precision, see `MAX_ROUNDING`.
+        NotFiniteError: if an input that affects the view is nan or infinite. Of Gaussians behind
+            the camera, or dropped, only position and opacity must be finite.
     """
     values, degree = checked_colors(sh, sh_degree, colors)
     n = means.shape[0]
     if opacities.shape not in ((n,), (n, 1)):
         raise ValueError(f"opacities must have shape ({n},) or ({n}, 1), got {tuple(opacities.shape)}.")
+    # Shapes are checked here, once for all engines: compiled loops would read beyond the ends.
     named = {"means": means, "quaternions": quaternions, "scales": scales, "colors" if degree is None else "sh": values}
     for (name, x), shape in zip(named.items(), ((n, 3), (n, 4), (n, 3), (n, *values.shape[1:])), strict=True):
-        if x.shape != shape:  # the loops would read beyond the ends
+        if x.shape != shape:
             raise ValueError(f"{name} must have shape {shape}, got {tuple(x.shape)}.")
     named["opacities"] = opacities.reshape(n)
     inputs = {name: _working(name, x, means.dtype) for name, x in named.items()}
@@ -58,6 +61,7 @@ def splat(
         check_projection(depths.sum() + opacities.detach().sum(), projection, shown, inputs, camera)
         if indices.shape[0] < n:
             opacities = opacities.index_select(0, indices)
+        # Which tile a splat touches is a decision, not a quantity: nothing flows through the lists.
         with torch.no_grad():
             lists = engine.bin(projection, opacities, camera.width, camera.height)
         return Splats(indices, projection, opacities, shown, lists, engine)
@@ -85,8 +89,9 @@ def render(
 ) -> Rendering:
     """Render 3D Gaussians; differentiable in every tensor.
 
-    Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA rasterizer. The work is
-    done in float64 if the means are, else in float32: also for float16 and bfloat16 inputs, and inside torch.autocast.
+    Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA
+    rasterizer. The work is done in float64 if the means are, else in float32: also for float16 and
+    bfloat16 inputs, and inside torch.autocast.
 
     Args:
         means: world coordinates, shape (N, 3).
@@ -114,11 +119,12 @@ def render(
         (torch.Size([3, 32, 32]), 0.8)
     """
     splats = splat(means, quaternions, scales, opacities, camera, sh=sh, sh_degree=sh_degree, colors=colors)
-    return draw(splats, background=background, depth=depth)
+    return rasterize(splats, background=background, depth=depth)
 
 
-def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = False) -> Rendering:
+def rasterize(splats: Splats, *, background: Tensor | None = None, depth: bool = False) -> Rendering:
     """Composite the splats of `splat`; other arguments and errors are those of `render`."""
+    # Projected centers are no leaves; density control reads their gradient all the same.
     if splats.projection.means.requires_grad:
         splats.projection.means.retain_grad()
     with torch.autocast(splats.opacities.device.type, enabled=False):
@@ -129,13 +135,13 @@ def draw(splats: Splats, *, background: Tensor | None = None, depth: bool = Fals
 
 
 @torch.no_grad()
-def draw_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Draw the same Gaussians K times with lower opacities, without projecting and sorting them again.
+def render_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Render the same Gaussians K times with lower opacities, projecting and sorting once.
 
     Args:
         splats: of a view.
-        opacities: activated, of all N Gaussians, (K, N), nowhere higher than those of the splats; 0 leaves a Gaussian
-            out, at no cost.
+        opacities: activated, of all N Gaussians, (K, N), nowhere higher than those of the splats; 0
+            leaves a Gaussian out, at no cost.
         background: as for `render`.
 
     Returns:
@@ -144,3 +150,86 @@ def draw_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None =
     lower = opacities[:, splats.indices].to(splats.opacities.dtype)
     with torch.autocast(lower.device.type, enabled=False):
         return splats.engine.composite_masks(splats, lower, checked_background(background, splats, (3,)))
+
+
+def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor | None = None) -> MomentImages:
+    """Render exact mean and variance of a view under random factors on the alphas.
+
+    Differentiable. The factors are independent per splat. There is no early stop: splats behind an
+    opaque surface shine through its dropped ones.
+
+    Args:
+        splats: of the full model, with its plain opacities.
+        multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,), one
+            value each.
+        background: fixed color behind everything, shape (3,), or one for each pixel, (3, H, W);
+            black by default.
+
+    Raises:
+        ValueError: if the background has another shape, or is not finite.
+
+    Example:
+        >>> from reference_trainer.camera import Camera
+        >>> from reference_trainer.render import splat
+        >>> camera = Camera(torch.eye(4), 50.0, 50.0, 8.0, 8.0, 16, 16)
+        >>> splats = splat(torch.tensor([[0.0, 0, 1]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 1.0),
+        ...                torch.tensor([0.8]), camera, colors=torch.ones(1, 3))
+        >>> moments = render_moments(splats, Multiplier.dropout(0.5))
+        >>> round(moments.mean[0, 8, 8].item(), 2), round(moments.variance[0, 8, 8].item(), 2)  # 0.5 x 0.8, 0.25 x 0.64
+        (0.4, 0.16)
+    """
+    with torch.autocast(splats.colors.device.type, enabled=False):
+        return splats.engine.moments(splats, _factors(multiplier, splats), _background_image(background, splats))
+
+
+@torch.no_grad()
+def variance_shares(
+    splats: Splats, multiplier: Multiplier, weights: Tensor, *, background: Tensor | None = None
+) -> Tensor:
+    """Attribute a weighted sum of the variance over the pixels to the Gaussians.
+
+    The shares add up to it. A Gaussian's share at a pixel is its summand of the variance,
+    `ca_reg.functional.contributions`, mean over RGB.
+
+    The weights have shape (H, W); 1 / count in the region of a score gives shares of that score.
+    Other arguments are those of `render_moments`. Returns one share for every projected Gaussian
+    (``splats.indices``), (M,), float64.
+
+    Raises:
+        ValueError: if the weights or the background have another shape.
+
+    Example:
+        >>> from reference_trainer.camera import Camera
+        >>> from reference_trainer.render import splat
+        >>> camera = Camera(torch.eye(4), 50.0, 50.0, 8.0, 8.0, 16, 16)
+        >>> means, quaternions = torch.tensor([[0.0, 0, 1], [0.1, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]] * 2)
+        >>> splats = splat(means, quaternions, torch.full((2, 3), 0.2), torch.full((2,), 0.5), camera,
+        ...                colors=torch.tensor([[0.0, 0, 0], [1.0, 1, 1]]))
+        >>> shares = variance_shares(splats, Multiplier.dropout(0.5), torch.full((16, 16), 1 / 256))
+        >>> variance = render_moments(splats, Multiplier.dropout(0.5)).variance
+        >>> torch.allclose(shares.sum(), variance.double().mean())
+        True
+    """
+    shape = (splats.lists.height, splats.lists.width)
+    if weights.shape != shape:
+        raise ValueError(f"weights must have one value per pixel, shape {shape}, got {tuple(weights.shape)}.")
+    with torch.autocast(splats.colors.device.type, enabled=False):
+        return splats.engine.shares(
+            splats, _factors(multiplier, splats), _background_image(background, splats), weights.to(splats.colors)
+        )
+
+
+def _background_image(background: Tensor | None, splats: Splats) -> Tensor:
+    """Return the background of every pixel, (3, H, W)."""
+    shape = (3, splats.lists.height, splats.lists.width)
+    found = checked_background(background, splats, (3,), shape)
+    return (found if found.ndim == 3 else found[:, None, None]).expand(shape)
+
+
+def _factors(multiplier: Multiplier, splats: Splats) -> Tensor:
+    """Return mean and variance of every projected Gaussian's factor, (M, 2)."""
+    columns = [
+        x[splats.indices].to(splats.opacities) if isinstance(x, Tensor) else torch.full_like(splats.opacities, x)
+        for x in (multiplier.mean, multiplier.variance)
+    ]
+    return torch.stack(columns, dim=1)

@@ -1,27 +1,25 @@
-"""What the engines produce: projected Gaussians, tile lists, and rendered views."""
+"""What engines are, and what they produce: projected Gaussians, tile lists, and rendered views."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from reference_trainer.camera import Camera
 from reference_trainer.render.constants import TILE
 
-if TYPE_CHECKING:
-    from reference_trainer.render.engine import Engine
-
-__all__ = ["MomentImages", "Projection", "Rendering", "Splats", "TileLists"]
+__all__ = ["Engine", "MomentImages", "Projection", "Rendering", "Splats", "TileLists", "ViewSplats"]
 
 
 class Projection(NamedTuple):
     """Projected Gaussians.
 
-    The inverse 2D covariance is kept as its triangular factor: the squared Mahalanobis distance of an offset (dx, dy)
-    is ``(l11 dx + l21 dy)^2 + (l22 dy)^2``. The inverse covariance of a needle at 45 degrees has large entries that
-    cancel; its factor does not cancel, so float32 is enough.
+    The inverse 2D covariance is kept as its triangular factor: the squared Mahalanobis distance of
+    an offset (dx, dy) is ``(l11 dx + l21 dy)^2 + (l22 dy)^2``. The inverse covariance of a needle
+    at 45 degrees has large entries that cancel; its factor does not cancel, so float32 is enough.
 
     Args:
         means: pixel coordinates, shape (M, 2).
@@ -43,10 +41,12 @@ class TileLists:
     Args:
         width: image width, pixels.
         height: image height, pixels.
-        starts: where each tile's list starts, row by row over the image, and where the last ends, shape (tiles + 1,).
-        gaussians: the numbers of the listed Gaussians, tile after tile, shape (P,).
+        starts: where each tile's list starts, row by row over the image, and where the last ends,
+            shape (tiles + 1,).
+        gaussians: the indices of the listed Gaussians, tile after tile, shape (P,).
         touched: whether a Gaussian is in any list, shape (M,) bool.
-        slots: a unique number for every entry, consecutive for each Gaussian, shape (P,); the loops need them.
+        slots: a unique number for every entry, consecutive for each Gaussian, shape (P,); the loops
+            need them.
         offsets: each Gaussian's first slot, and the number of all, shape (M + 1,); likewise.
     """
 
@@ -82,11 +82,11 @@ class TileLists:
         """Return the part (..., H, W) of an image of whole tiles."""
         return image[..., : self.height, : self.width]
 
-    def only(self, kept: Tensor) -> TileLists:
-        """Return the lists without Gaussians that are not kept, (M,) bool, and without slots and offsets."""
-        stays = kept[self.gaussians]
+    def only(self, keep: Tensor) -> TileLists:
+        """Return the lists of some Gaussians, ``keep`` (M,) bool; slots and offsets are lost."""
+        stays = keep[self.gaussians]
         starts = torch.nn.functional.pad(stays.cumsum(0), (1, 0))[self.starts]
-        gaussians, touched = self.gaussians[stays], self.touched & kept
+        gaussians, touched = self.gaussians[stays], self.touched & keep
         return replace(self, starts=starts, gaussians=gaussians, touched=touched, slots=None, offsets=None)
 
 
@@ -98,7 +98,33 @@ class Splats(NamedTuple):
     opacities: Tensor  # activated, (M,)
     colors: Tensor  # towards this camera, (M, 3)
     lists: TileLists
-    engine: Engine  # what made them, and draws them
+    engine: Engine  # what made them, and renders them
+
+    @property
+    def means(self) -> Tensor:
+        """Projected centers, see `ViewSplats`."""
+        return self.projection.means
+
+    @property
+    def touched(self) -> Tensor:
+        """Which of the M may have reached a pixel, see `ViewSplats`."""
+        return self.lists.touched
+
+
+class ViewSplats(Protocol):
+    """What density control reads of a render, whichever renderer made it."""
+
+    @property
+    def indices(self) -> Tensor:
+        """Which of the N Gaussians lie in view, shape (M,)."""
+
+    @property
+    def means(self) -> Tensor:
+        """Their projected centers, pixels, which keep their gradient, shape (M, 2)."""
+
+    @property
+    def touched(self) -> Tensor:
+        """Which of them were rendered, shape (M,) bool."""
 
 
 class Rendering(NamedTuple):
@@ -107,8 +133,10 @@ class Rendering(NamedTuple):
     Args:
         image: colors over the background, not clamped, shape (3, H, W).
         alpha: accumulated alpha, shape (H, W).
-        depth: sum of weight times camera depth, not divided by alpha, shape (H, W); None unless asked for.
-        splats: what was drawn. ``splats.projection.means`` keeps its gradient (pixels) for densification.
+        depth: sum of weight times camera depth, not divided by alpha, shape (H, W); None unless
+            asked for.
+        splats: what was rendered. ``splats.projection.means`` keeps its gradient (pixels) for
+            densification.
     """
 
     image: Tensor
@@ -123,3 +151,68 @@ class MomentImages(NamedTuple):
     mean: Tensor  # expected colors over the background, (3, H, W)
     variance: Tensor  # of the colors, at least 0, (3, H, W)
     alpha_mean: Tensor  # expected accumulated alpha, (H, W)
+
+
+class Engine(Protocol):
+    """What renders: turns Gaussians into images, and into the exact moments of images.
+
+    All tensors of a call share one dtype and one device, and have been checked
+    (`reference_trainer.render.renderer`); results are differentiable unless said otherwise. A new
+    engine is to be added to `reference_trainer.render.engine`.
+    """
+
+    name: str
+
+    def project(
+        self, inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
+    ) -> tuple[Projection, Tensor]:
+        """Project M of N Gaussians, those at ``indices`` (M,), and evaluate their colors, (M, 3).
+
+        The inputs, by name, are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,),
+        and either sh (N, K, 3), used up to band ``degree``, or colors (N, 3), whose ``degree`` is
+        None.
+        """
+
+    def bin(self, projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
+        """List the Gaussians of every tile, given their activated opacities (M,).
+
+        A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the
+        rectangle spanned by the tile's pixel centers. The test is exact: within a row of tiles, an
+        ellipse covers an interval of columns.
+        """
+
+    def masked(self, splats: Splats, opacities: Tensor) -> Splats:
+        """Return the splats with lower opacities (M,), reusing projection and lists.
+
+        None may be higher than before: the lists would be too short. Splats below `MIN_ALPHA` cost
+        nothing.
+        """
+
+    def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Composite splats front to back over a background (3,).
+
+        Returns image (3, H, W), alpha (H, W), and depth (H, W) if asked for.
+        """
+
+    def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Composite K images at once, without a graph; what their masks share is computed once.
+
+        The opacities (K, M) are as in `masked`. Returns images (K, 3, H, W) and alphas (K, H, W).
+        """
+
+    def absolute_gradients(self, splats: Splats, rendered: Tensor, gradient: Tensor) -> Tensor:
+        """Sum the absolute values of each pixel's gradient of the centers (AbsGS), (M, 2).
+
+        Without a graph. ``rendered`` (5, H, W) holds colors and depth over black and the accumulated
+        alpha, and ``gradient`` that of a loss with respect to it.
+        """
+
+    def moments(self, splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
+        """Return mean and variance of every pixel under random factors on the alphas.
+
+        ``multiplier`` (M, 2) holds mean and variance of every splat's factor, the background is (3,
+        H, W).
+        """
+
+    def shares(self, splats: Splats, multiplier: Tensor, background: Tensor, weights: Tensor) -> Tensor:
+        """Return every splat's share of the variance, weighted by pixel (H, W); (M,), float64."""

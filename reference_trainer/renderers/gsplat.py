@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
@@ -25,11 +24,11 @@ __all__ = ["GsplatRenderer", "GsplatRendering", "GsplatSplats", "load_gsplat_ren
 
 
 class GsplatSplats(NamedTuple):
-    """What density control reads of `Splats`, under the same names."""
+    """What density control reads of a render, see `ViewSplats`."""
 
-    indices: Tensor  # which of the N Gaussians lie in view, (M,)
-    projection: SimpleNamespace  # has means, pixel coordinates, (M, 2), which keep their gradient
-    lists: SimpleNamespace  # has touched, whether a Gaussian was drawn, (M,) bool
+    indices: Tensor
+    means: Tensor
+    touched: Tensor
 
 
 class GsplatRendering(NamedTuple):
@@ -56,7 +55,7 @@ class GsplatRenderer(Renderer):
 
 
 def load_gsplat_render(device: torch.device | str) -> Callable[..., GsplatRendering]:
-    """Return a function with the arguments of `render` that draws with gsplat, for Gaussians on a device.
+    """Return a function with the arguments of `render` that renders with gsplat, for Gaussians on a device.
 
     Raises:
         RuntimeError: if the device is not a CUDA device, or there is none.
@@ -64,16 +63,16 @@ def load_gsplat_render(device: torch.device | str) -> Callable[..., GsplatRender
     """
     if torch.device(device).type != "cuda":
         raise RuntimeError(
-            f"the gsplat renderer draws on CUDA devices only, and the device is {str(device)!r}: train with --device "
-            "cuda, or with --renderer torch, which runs anywhere."
+            f"the gsplat renderer renders on CUDA devices only, and the device is {str(device)!r}: train with --device "
+            "cuda, or with --renderer builtin, which runs anywhere."
         )
     if not torch.cuda.is_available():
-        raise RuntimeError("the gsplat renderer needs a CUDA device, and torch finds none: use --renderer torch.")
+        raise RuntimeError("the gsplat renderer needs a CUDA device, and torch finds none: use --renderer builtin.")
     try:
         import gsplat
     except ModuleNotFoundError as error:
         raise ImportError(
-            "the gsplat renderer needs gsplat: pip install 'ca_reg[gsplat]', or use --renderer torch."
+            "the gsplat renderer needs gsplat: pip install 'ca_reg[gsplat]', or use --renderer builtin."
         ) from error
     return functools.partial(render_by, gsplat.rasterization)
 
@@ -96,15 +95,16 @@ def render_by(
     """Render 3D Gaussians with ``gsplat.rasterization``, 1.5 or newer; differentiable in all but the background.
 
     Arguments and conventions are those of `render`; with ``absgrad`` the backward pass leaves absolute gradients (M, 2)
-    in ``projection.means.absgrad``.
+    in ``splats.means.absgrad``.
 
     Raises:
         TypeError: if the Gaussians are not float32, the only dtype that gsplat takes.
         ValueError: if not exactly one of ``sh`` and ``colors`` is given.
     """
+    # gsplat tells colors from coefficients by their shape and the degree alone.
     values, degree = checked_colors(sh, sh_degree, colors)
     if means.dtype != torch.float32:
-        raise TypeError(f"the gsplat renderer knows float32 only, got {means.dtype}: use the torch renderer.")
+        raise TypeError(f"the gsplat renderer knows float32 only, got {means.dtype}: use the builtin one.")
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
     images, alphas, info = rasterization(
         means=means,
@@ -124,12 +124,11 @@ def render_by(
         render_mode="RGB+D" if depth else "RGB",
         absgrad=absgrad,
     )
+    # As in `rasterize`: projected centers are no leaves, and density control reads their gradient.
     if info["means2d"].requires_grad:
         info["means2d"].retain_grad()
     image = images[0].permute(2, 0, 1)
     splats = GsplatSplats(
-        indices=info["gaussian_ids"].long(),
-        projection=SimpleNamespace(means=info["means2d"]),
-        lists=SimpleNamespace(touched=info["tiles_per_gauss"] > 0),
+        indices=info["gaussian_ids"].long(), means=info["means2d"], touched=info["tiles_per_gauss"] > 0
     )
     return GsplatRendering(image[:3], alphas[0, ..., 0], image[3] if depth else None, splats)

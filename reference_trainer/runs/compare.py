@@ -6,13 +6,15 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from reference_trainer.losses import LossTerm
 from reference_trainer.runs.compare_report import Comparison, save
 from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.runs.folder import RESULTS, folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.training.assembly import check, make_losses
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.losses import LossTerm
 
 __all__ = ["NAMED", "compare", "scene_folders", "strategies"]
 
@@ -63,7 +65,7 @@ def strategies(
         else:
             made[folder_name(name)] = dataclasses.replace(plain, regularizer=name)
     for settings in made.values():
-        settings.check()
+        check(settings)
     return made
 
 
@@ -128,10 +130,10 @@ def compare(
         )
         for folder, name, seed in grid
     ]
-    terms = [term for config in configs.values() for term in config.make_losses()]
+    terms = [term for config in configs.values() for term in make_losses(config)]
     if looking := [term for term in terms if type(term).begin is not LossTerm.begin]:
         for options in {run.options for run in runs if not (run.out / RESULTS).exists()}:
-            scene = options.load()
+            scene = load_scene(options)
             for term in looking:
                 term.begin(scene)
     comparisons = {folder: Comparison({}, {}) for folder in scenes}

@@ -10,7 +10,7 @@ from typing import Any
 
 from reference_trainer.json_files import read_json, settings_from
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.config import TrainConfig, saved_config
 from reference_trainer.training.plan import Plan
 
 __all__ = [
@@ -63,7 +63,7 @@ def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
     if not isinstance(content, dict) or not {"scene", "config"} <= content.keys():
         raise ValueError(f"{path} is not the config.json of a run: it must hold the objects 'scene' and 'config'.")
     scene = settings_from(SceneOptions, content["scene"], f"{path}, scene")
-    return scene, settings_from(TrainConfig, content["config"], f"{path}, config")
+    return scene, saved_config(content["config"], f"{path}, config")
 
 
 def begun_with(

@@ -37,13 +37,14 @@ from reference_trainer.runs.folder import (
     run_settings,
 )  # fmt: skip
 from reference_trainer.runs.lock import run_lock
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.threads import threads_for
+from reference_trainer.training.assembly import check
 from reference_trainer.training.checkpoint import load_checkpoint
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
-from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.interruption import TrainingInterrupted, TrainingStoppedError
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
 
@@ -142,13 +143,14 @@ def run_experiment(
             SIGTERM a checkpoint is saved as well, and the signal is raised again, which ends the process.
         OSError: if a file cannot be written, such as on a full disk; its previous content is kept.
     """
-    config.check()
+    check(config)
     check_intervals(monitor_every, checkpoint_every)
     perceptual = load_lpips(lpips, device=device)
     begun_with(out, options, config, auto=auto, given=given)
     if (out / RESULTS).exists():
         return _complete(out, say)
-    scene = options.load(seed=config.seed)  # before the folder is made, so that a mistyped scene does not claim it
+    # Before the folder is made, so that a mistyped scene does not claim it.
+    scene = load_scene(options, seed=config.seed)
     for note in scene.notes:
         say(note)
     with run_lock(out), threads_for(scene.pixels):
@@ -186,7 +188,7 @@ def load_run(folder: Path, device: torch.device | str = "cpu") -> Trainer:
     if not (folder / CONFIG).exists():
         raise FileNotFoundError(f"{folder} holds no run (no {CONFIG}): give the --out folder of ca-reg train.")
     options, config = read_run_settings(folder / CONFIG)
-    return Trainer.load(folder / CHECKPOINT, options.load(seed=config.seed), device)
+    return Trainer.load(folder / CHECKPOINT, load_scene(options, seed=config.seed), device)
 
 
 def _complete(out: Path, say: Callable[[str], None]) -> dict[str, Any]:

@@ -21,8 +21,9 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.frame_check import check_frame
 from reference_trainer.runs.measure import measure
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import BACKGROUNDS, OrbitOptions, SceneOptions
-from reference_trainer.scenes.orbit import bounding_sphere
+from reference_trainer.scenes.orbit import bounding_sphere, orbit_cameras
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 
 __all__ = ["Placed", "PlyFacts", "of_plain_ply", "of_ply", "place", "scaled", "score_ply"]
@@ -151,7 +152,7 @@ def place(
     say: Say = print,
 ) -> Placed:
     """Load the model of a PLY and the views of a scene, or cameras on an orbit; arguments and errors of `score_ply`."""
-    scene = where.load() if isinstance(where, SceneOptions) else None
+    scene = load_scene(where) if isinstance(where, SceneOptions) else None
     if scene is None and background not in ("auto", *BACKGROUNDS):
         raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {background!r}.")
     color = torch.tensor(BACKGROUNDS.get(background, BACKGROUNDS["black"])) if scene is None else scene.background
@@ -194,7 +195,7 @@ def score_ply(
         say: receives the progress, the table, and doubts whether the frames agree.
 
     Raises:
-        ValueError: from `of_ply`, `check_frame` or `OrbitOptions.views`, or if the background is unknown.
+        ValueError: from `of_ply`, `check_frame` or `orbit_cameras`, or if the background is unknown.
         FileNotFoundError: if the PLY or the scene is missing.
     """
     placed = place(ply, where, background=background, regularizer=regularizer, device=device, say=say)
@@ -224,7 +225,7 @@ def _on_orbit(model: TrainedModel, orbit: OrbitOptions, about: dict[str, object]
         )
     enlarged = max(1.0, SMALLEST_RADIUS / sphere.radius)
     model = replace(model, gaussians=scaled(model.gaussians, enlarged))
-    cameras = orbit.views(model.gaussians.means, model.gaussians.opacities)
+    cameras = orbit_cameras(orbit, model.gaussians.means, model.gaussians.opacities)
     views = [Viewpoint(f"{index:03d}", camera) for index, camera in enumerate(cameras)]
     found = {"center": sphere.center.tolist(), "radius": sphere.radius, "enlarged": enlarged}
     return Placed(model, enlarged, {"orbit": views}, None, about | {"orbit": asdict(orbit) | found})

@@ -27,7 +27,7 @@ from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.scenes.transforms import BLENDER, TRANSFORMS
 from reference_trainer.scenes.undistort import corner_displacement
 
-__all__ = ["load_options", "load_scene"]
+__all__ = ["load_scene"]
 
 # The order matters: of several formats that fit a folder, the first counts.
 for _format in (BLENDER, IDR, COLMAP, TRANSFORMS, LLFF, ARRAYS):
@@ -38,13 +38,13 @@ FEW = 8
 """Below this many photographs all are trained on, unless a split is asked for: there are none to spare."""
 
 
-def load_scene(path: str | Path, *, seed: int = 0, **options: Any) -> Scene:
+def load_scene(scene: str | Path | SceneOptions, *, seed: int = 0, **options: Any) -> Scene:
     """Load a scene: photographs with cameras, split into training and test views, and initial points.
 
     Args:
-        path: the scene folder, or ``"synthetic"`` for the built-in scene.
+        scene: the scene folder, ``"synthetic"`` for the built-in scene, or all options in one.
         seed: seed of random points, and of the points of the built-in scene.
-        options: the fields of `SceneOptions`.
+        options: the other fields of `SceneOptions`.
 
     Returns:
         The scene, float32 on the CPU; views are sorted by name, those of Blender scenes in the order of the JSON file.
@@ -58,11 +58,12 @@ def load_scene(path: str | Path, *, seed: int = 0, **options: Any) -> Scene:
         >>> len(scene.train), len(scene.test), tuple(scene.train[0].image.shape)
         (3, 3, (3, 30, 40))
     """
-    return load_options(SceneOptions(str(path), **options), seed)
+    return _load(
+        replace(scene, **options) if isinstance(scene, SceneOptions) else SceneOptions(str(scene), **options), seed
+    )
 
 
-def load_options(options: SceneOptions, seed: int = 0) -> Scene:
-    """Load the scene that options describe, as `load_scene` does."""
+def _load(options: SceneOptions, seed: int) -> Scene:
     if options.path == "synthetic":
         return _built_in(options, seed)
     root = Path(options.path)

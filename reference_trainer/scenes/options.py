@@ -5,13 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
-
-if TYPE_CHECKING:  # importing torch takes seconds, and --help needs none of it
-    from torch import Tensor
-
-    from reference_trainer.camera import Camera
-    from reference_trainer.scenes.scene import Scene
+from typing import Literal
 
 __all__ = ["BACKGROUNDS", "OrbitOptions", "SceneOptions", "World"]
 
@@ -29,8 +23,8 @@ class SceneOptions:
         ValueError: if an option is out of range, whatever the scene holds.
 
     Example:
-        >>> SceneOptions("synthetic").load(seed=0).name
-        'synthetic'
+        >>> SceneOptions("synthetic", views=4).views
+        4
     """
 
     path: str = "synthetic"
@@ -87,12 +81,6 @@ class SceneOptions:
         path = self.path if self.path == "synthetic" else str(Path(self.path).resolve())
         return replace(self, path=path, init=None if self.init is None else str(Path(self.init).resolve()))
 
-    def load(self, *, seed: int = 0) -> Scene:
-        """Load the scene; ``seed`` decides random initial points. Errors are those of `load_scene`."""
-        from reference_trainer.scenes.load import load_options
-
-        return load_options(self, seed)
-
 
 @dataclass(frozen=True)
 class OrbitOptions:
@@ -102,9 +90,8 @@ class OrbitOptions:
         ValueError: if there is no camera or no pixel, or the arc is not in (0, 360] degrees.
 
     Example:
-        >>> import torch
-        >>> [camera.width for camera in OrbitOptions(cameras=2, size=64).views(torch.eye(3), torch.ones(3))]
-        [64, 64]
+        >>> OrbitOptions(cameras=2, size=64).arc
+        360.0
     """
 
     cameras: int = 8
@@ -122,18 +109,3 @@ class OrbitOptions:
                 f"an orbit needs at least 1 camera and a size of at least 1 pixel, and an arc in (0, 360] degrees, got "
                 f"cameras={self.cameras}, size={self.size} and arc={self.arc:g}."
             )
-
-    def views(self, means: Tensor, opacities: Tensor) -> list[Camera]:
-        """Place the cameras around Gaussians; arguments and errors are those of `orbit_views`."""
-        from reference_trainer.scenes.orbit import orbit_views
-
-        return orbit_views(
-            means,
-            opacities,
-            count=self.cameras,
-            width=self.size,
-            height=self.size,
-            fill=0.8,  # so that what lies outside the bounding sphere, such as a plant's highest leaf, shows too
-            world=self.world,
-            arc=math.radians(self.arc),
-        )

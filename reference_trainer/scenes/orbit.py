@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reference_trainer.camera import Camera
-from reference_trainer.scenes.options import World
+from reference_trainer.scenes.options import OrbitOptions, World
 
-__all__ = ["BoundingSphere", "bounding_sphere", "look_at", "orbit_views"]
+__all__ = ["BoundingSphere", "bounding_sphere", "look_at", "orbit_cameras", "orbit_views"]
 
 ELEVATION = math.radians(20)
 """Elevation of the cameras above the center: objects are mostly looked at from a little above."""
@@ -39,6 +39,25 @@ class BoundingSphere:
     center: Tensor
     radius: float
     surroundings: bool
+
+
+def orbit_cameras(options: OrbitOptions, means: Tensor, opacities: Tensor) -> list[Camera]:
+    """Place the cameras that options describe around Gaussians; other arguments and errors are those of `orbit_views`.
+
+    Example:
+        >>> [camera.width for camera in orbit_cameras(OrbitOptions(2, size=64), torch.eye(3), torch.ones(3))]
+        [64, 64]
+    """
+    return orbit_views(
+        means,
+        opacities,
+        count=options.cameras,
+        width=options.size,
+        height=options.size,
+        fill=0.8,  # so that what lies outside the bounding sphere, such as a plant's highest leaf, shows too
+        world=options.world,
+        arc=math.radians(options.arc),
+    )
 
 
 def orbit_views(

@@ -20,7 +20,7 @@ from reference_trainer.evaluation.maps import first_order_map
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import is_ply
-from reference_trainer.render.engine import drawn_by, engines_on
+from reference_trainer.render.engine import engines_on, using_engine
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.score_ply import of_plain_ply
 from reference_trainer.scenes.orbit import orbit_views
@@ -31,7 +31,7 @@ from reference_trainer.studies.study import Record, Records, Study, checkpoints
 __all__ = ["entries_of", "error_runtime", "error_runtime_study", "rms", "samples_to_match", "single", "slope"]
 
 MONTE_CARLO, FIRST_ORDER, DOUBLE = "Monte Carlo", "first order", "exact float64"
-LOOPS, TORCH = "exact, loops", "exact, torch"
+LOOPS, TORCH = "exact, numba", "exact, torch"
 ERRORS = ("score", "map")
 
 DROP_RATE = 0.5
@@ -139,7 +139,7 @@ def error_runtime(model: TrainedModel, view: Viewpoint, *, max_samples: int = 10
         return found, abs(found - score) / score, (estimate - reference).square().mean().sqrt().item() / score
 
     def moments(engine: str) -> Tensor:
-        with drawn_by(engine):
+        with using_engine(engine):
             return model.moments(opacities, view, multiplier).variance
 
     exact_calls = {f"exact, {engine}": functools.partial(moments, engine) for engine in engines_on(device)}

@@ -1,17 +1,25 @@
-"""Checkpoints: written atomically, read without executing anything."""
+"""Checkpoints: writing and reading them, and checking their content before anything is made of it."""
 
 from __future__ import annotations
 
 import io
+import json
+import math
+from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from reference_trainer.files import replacing
+from reference_trainer.model.gaussians import PARAMETERS, Gaussians
+from reference_trainer.scenes.scene import Scene
 from reference_trainer.tensor_files import load_tensors, moved
+from reference_trainer.training.assembly import make_density, make_regularizer
+from reference_trainer.training.config import TrainConfig, saved_config
 
-__all__ = ["load_checkpoint", "save_checkpoint"]
+__all__ = ["TrainingState", "load_checkpoint", "read_state", "save_checkpoint"]
 
 _FORMAT = "ca_reg-checkpoint-1"
 
@@ -47,3 +55,148 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
         raise ValueError(f"{path} is not a checkpoint of this program (expected format {_FORMAT!r}).")
     return state
+
+
+_TIMES = ("seconds", "processor_seconds")
+_ENTRIES = ("format", "config", "scene", "train_views", "step", *_TIMES)
+_OF_A_MODEL = ("statistics", "regularizer", "gaussians", "moments")
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+
+
+class TrainingState(NamedTuple):
+    """A trainer between two steps.
+
+    Args:
+        config: all settings.
+        step: number of steps taken.
+        seconds: wall-clock time that they took.
+        processor_seconds: CPU time that all threads spent on them.
+        models: the `ModelState.state_dict` of each model.
+    """
+
+    config: TrainConfig
+    step: int
+    seconds: float
+    processor_seconds: float
+    models: list[dict[str, Any]]
+
+
+def read_state(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
+    """Check that what `Trainer.save` wrote is complete and consistent, and belongs to the scene.
+
+    Args:
+        state: content of the checkpoint.
+        scene: the scene to continue on.
+        where: the file, for errors.
+
+    Raises:
+        ValueError: if something is missing, unknown, or of another type or shape, a number is not finite or out of
+            its range, or the checkpoint belongs to another scene or other training views.
+    """
+    try:
+        return _read(state, scene, where)
+    except (TypeError, AttributeError, LookupError) as error:
+        raise ValueError(f"{where} is a damaged checkpoint: {error}") from error
+
+
+def _read(state: dict[str, Any], scene: Scene, where: Path) -> TrainingState:
+    """Read a state; wrong types that are not checked for raise TypeError, AttributeError or LookupError."""
+    others = ["others"] if "others" in state else []
+    _refuse_other_entries(state, (*_ENTRIES, *_OF_A_MODEL, *others), f"{where}")
+    names = [view.name for view in scene.train]
+    if state["scene"] != scene.name:
+        raise ValueError(f"{where} was trained on the scene {state['scene']!r:.80}, this one is {scene.name!r}.")
+    if state["train_views"] != names:
+        raise ValueError(f"{where} was trained on the views {state['train_views']!r:.400}, the scene has {names}.")
+    config = _config(state["config"], where)
+    step, times = state["step"], (state["seconds"], state["processor_seconds"])
+    if type(step) is not int or not 0 <= step <= config.iterations:
+        raise ValueError(f"{where}: step must be a whole number from 0 to {config.iterations}, got {step!r:.80}.")
+    if not all(type(x) is float and 0 <= x < math.inf for x in times):
+        raise ValueError(f"{where}: {' and '.join(_TIMES)} must be positive numbers, got {times!r:.80}.")
+    models = [{name: state[name] for name in _OF_A_MODEL}, *(state["others"] if others else ())]
+    if len(models) != config.models:
+        raise ValueError(f"{where}: expected {config.models} models, got {len(models)}; the checkpoint is damaged.")
+    read = [
+        _read_model(model, config, scene, step, number, f"{where}{f', model {number}' if number else ''}")
+        for number, model in enumerate(models)
+    ]
+    return TrainingState(config, step, *times, read)
+
+
+def _read_model(
+    state: dict[str, Any], config: TrainConfig, scene: Scene, step: int, number: int, where: str
+) -> dict[str, Any]:
+    """Read the state of one of the models."""
+    _refuse_other_entries(state, _OF_A_MODEL, where)
+    tensors, moments = state["gaussians"], state["moments"]
+    parameters = [*PARAMETERS, *make_regularizer(config).learns]
+    _refuse_other_entries(tensors, parameters, f"{where}, gaussians")
+    _refuse_other_entries(moments, parameters, f"{where}, moments")
+    try:
+        gaussians = Gaussians.from_named(tensors)
+    except ValueError as error:
+        raise ValueError(f"{where}, gaussians: {error}") from error
+    if len(gaussians) == 0:
+        raise ValueError(f"{where}, gaussians: there is none to train.")
+    if gaussians.sh_degree != config.sh_degree:
+        raise ValueError(f"{where}, gaussians: expected sh_degree {config.sh_degree}, got {gaussians.sh_degree}.")
+    for name, x in tensors.items():
+        _check(x, tuple(x.shape), f"{where}, {name}")
+        if moments[name] != {}:  # as before the first step
+            _check_moments(moments[name], tuple(x.shape), step, f"{where}, moments of {name}")
+    counts = make_density(config, number)
+    counts.begin(config, scene, gaussians.means.device, len(gaussians))
+    expected = counts.state_dict()
+    _refuse_other_entries(state["statistics"], expected, f"{where}, statistics")
+    for name, x in state["statistics"].items():
+        _check(x, tuple(expected[name].shape), f"{where}, {name}")
+    # They are updated in place, which a file can prevent: by requiring a gradient, or by sharing memory.
+    statistics = {name: x.detach().clone() for name, x in state["statistics"].items()}
+    found = state["regularizer"]
+    if type(found) is not dict or not all(isinstance(x, Tensor) and bool(x.isfinite().all()) for x in found.values()):
+        raise ValueError(f"{where}, regularizer: expected finite tensors by name; the checkpoint is damaged.")
+    plain = {name: {key: x.detach() for key, x in of.items()} for name, of in moments.items()}
+    return {"statistics": statistics, "regularizer": found, "gaussians": tensors, "moments": plain}
+
+
+def _config(text: Any, where: Path) -> TrainConfig:
+    """Read the settings."""
+    if type(text) is not str:
+        raise ValueError(f"{where} is a damaged checkpoint: config must be JSON, got {type(text).__name__}.")
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{where} is a damaged checkpoint: config is not JSON: {error}") from error
+    return saved_config(values, f"{where}, config")
+
+
+def _refuse_other_entries(values: Any, names: Collection[str], what: str) -> None:
+    """Refuse anything but a dict with exactly these names."""
+    if type(values) is not dict:
+        raise ValueError(f"{what}: expected entries by name, got {type(values).__name__}; the checkpoint is damaged.")
+    if missing := [name for name in names if name not in values]:
+        raise ValueError(f"{what}: it lacks {missing[0]!r}; the checkpoint is damaged, train anew, or take a copy.")
+    if unknown := [f"{name!r:.40}" for name in values if name not in names]:
+        raise ValueError(f"{what}: unknown entry {unknown[0]}; it is damaged, or another version wrote it.")
+
+
+def _check_moments(moments: Any, shape: tuple[int, ...], step: int, what: str) -> None:
+    """Refuse what Adam cannot continue from: a negative second moment would give nan at the next step."""
+    _refuse_other_entries(moments, _MOMENTS, what)
+    for key, x in moments.items():
+        _check(x, () if key == "step" else shape, f"{what}, {key}", least=None if key == "exp_avg" else 0)
+    taken = moments["step"].item()
+    if taken > step or taken != int(taken):
+        raise ValueError(f"{what}, step: expected a whole number up to {step}, got {taken:g}.")
+
+
+def _check(x: Any, shape: tuple[int, ...], what: str, *, least: float | None = None) -> None:
+    """Refuse anything but a finite float32 tensor of a shape, without values below ``least``."""
+    if not isinstance(x, Tensor) or x.dtype != torch.float32 or tuple(x.shape) != shape:
+        got = f"{x.dtype}, {tuple(x.shape)}" if isinstance(x, Tensor) else type(x).__name__
+        raise ValueError(f"{what}: expected float32 of shape {shape}, got {got}.")
+    if not bool(x.isfinite().all()):
+        raise ValueError(f"{what}: holds nan or infinity.")
+    if least is not None and not bool((x >= least).all()):
+        raise ValueError(f"{what}: must not be below {least:g}, got {x.min().item():g}.")

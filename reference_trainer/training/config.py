@@ -6,15 +6,11 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-if TYPE_CHECKING:
-    from ca_reg import Chain
-    from reference_trainer.density import DensityStrategy
-    from reference_trainer.losses import LossTerm
-    from reference_trainer.renderers import Renderer
+from reference_trainer.json_files import settings_from
 
-__all__ = ["TrainConfig"]
+__all__ = ["TrainConfig", "saved_config"]
 
 
 @dataclass(frozen=True)
@@ -22,7 +18,7 @@ class TrainConfig:
     """Settings of one training run. The defaults are those of the recipe ``3dgs``, but 3,000 iterations.
 
     Raises:
-        TypeError: if a number of steps, fields, Gaussians or bands, or the seed, is no integer.
+        TypeError: if a number of steps, models, Gaussians or bands, or the seed, is no integer.
         ValueError: if a setting is out of range, or two contradict each other.
     """
 
@@ -47,12 +43,12 @@ class TrainConfig:
     density: str = "adaptive"
     """Density control, such as "absgrad" or "share_pruning(every=500)", or "my_module:MyStrategy"; `ca-reg names` lists
     them."""
-    fields: int = 1
+    models: int = 1
     """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
     random_background: bool = False
     """Train over a background color drawn anew at each step, which penalizes transparency (CoR-GS, SE-GS)."""
-    renderer: str = "torch"
-    """Renderer of the training: "torch", this package's own, "gsplat", which needs gsplat and a CUDA device, or
+    renderer: str = "builtin"
+    """Renderer of the training: "builtin", this package's own, "gsplat", which needs gsplat and a CUDA device, or
     "my_module:MyRenderer"."""
 
     sh_degree: int = 3
@@ -120,6 +116,8 @@ class TrainConfig:
             for name in names:
                 if not right(getattr(self, name)):
                     raise ValueError(f"{name} must be {rule}, got {getattr(self, name)!r}{hint}.")
+        if self.renderer in _RENAMED_RENDERERS:
+            raise ValueError(f"the renderer {self.renderer!r} is called {_RENAMED_RENDERERS[self.renderer]!r} now.")
         if self.analytic and not self.regularizers:
             raise ValueError("analytic training needs something to average over: set dropout, noise or regularizer.")
         if self.regularize_from >= self.iterations and self.regularizers:
@@ -146,6 +144,7 @@ class TrainConfig:
             >>> round(TrainConfig().means_rate_at(1500), 7)  # half way
             1.6e-05
         """
+        # Linear in the logarithm.
         along = step / self.iterations
         return math.exp((1 - along) * math.log(self.means_rate) + along * math.log(self.means_rate_final))
 
@@ -153,62 +152,29 @@ class TrainConfig:
         """Highest band of spherical harmonics of the step with this number, the first being 1."""
         return min(self.sh_degree, number // self.sh_every) if self.sh_every else self.sh_degree
 
-    # The following methods import torch, which the command line defers until it has to.
 
-    def make_regularizer(self) -> Chain:
-        """Make the regularizers; empty if there are none."""
-        from ca_reg.regularizers import parse
+def saved_config(values: Any, where: str) -> TrainConfig:
+    """Read settings from JSON, as `settings_from` does, also those that a version before 0.2 has written.
 
-        return parse(self.regularizers)
+    Example:
+        >>> saved_config({"fields": 2, "renderer": "torch"}, "config.json") == TrainConfig(models=2)
+        True
+    """
+    if isinstance(values, dict):
+        values = {_RENAMED_SETTINGS.get(name, name): value for name, value in values.items()}
+        if isinstance(name := values.get("renderer"), str):
+            values["renderer"] = _RENAMED_RENDERERS.get(name, name)
+    return settings_from(TrainConfig, values, where)
 
-    def make_losses(self) -> list[LossTerm]:
-        """Make the terms of the loss."""
-        from reference_trainer.losses import LOSSES
 
-        return LOSSES.make(self.loss)
-
-    def make_density(self, field: int = 0) -> DensityStrategy:
-        """Make the density control of a field."""
-        from reference_trainer.density import DENSITY
-
-        density = DENSITY.make_one(self.density)
-        density.field = field
-        return density
-
-    def make_renderer(self) -> Renderer:
-        """Make the renderer."""
-        from reference_trainer.renderers import RENDERERS
-
-        return RENDERERS.make_one(self.renderer)
-
-    def check(self) -> None:
-        """Raise a ValueError unless all expressions are valid and what they name is compatible."""
-        self.make_regularizer()
-        density = self.make_density()
-        renderer, terms = self.make_renderer(), self.make_losses()
-        if not terms:
-            raise ValueError("loss needs at least one term, such as photometric.")
-        of_terms = frozenset[str]().union(*(term.needs for term in terms))
-        if self.fields < 2 and "fields" in density.needs | of_terms:
-            raise ValueError(f"{self.loss} with {self.density} compares fields, of which there is one: set fields=2.")
-        if self.analytic and "moments" not in renderer.capabilities:
-            raise ValueError("analytic training needs the moments of the torch renderer: leave out renderer.")
-        if self.analytic and "absgrad" in density.needs:
-            raise ValueError(f"analytic training has no absolute gradients, which {self.density} needs: leave it out.")
-        for what, needs in ((self.density, density.needs), ("the loss", of_terms)):
-            if lacking := ", ".join(sorted(needs - renderer.capabilities - {"fields"})):
-                raise ValueError(f"{what} needs {lacking}, which the renderer {self.renderer} lacks.")
-        if self.analytic and (drawn := [type(term).__name__ for term in terms if not term.analytic]):
-            raise ValueError(
-                f"analytic training has no draw, which {', '.join(drawn)} needs: leave out analytic, or the term."
-            )
-
+_RENAMED_RENDERERS = {"torch": "builtin"}
+_RENAMED_SETTINGS = {"fields": "models"}
 
 _INTEGERS: dict[str, tuple[type, ...]] = {"int": (int,), "int | None": (int, type(None))}
 """Types of values by annotation; a bool is no number here."""
 
 _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
-    (("iterations", "fields"), lambda x: x >= 1, "at least 1", ""),
+    (("iterations", "models"), lambda x: x >= 1, "at least 1", ""),
     (("dropout",), lambda x: 0 <= x < 1, "in [0, 1)", ": 0 turns it off"),
     (("noise",), lambda x: x >= 0, "at least 0", ": 0 turns it off"),
     (("seed", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_from",

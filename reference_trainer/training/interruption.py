@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM between steps, never in the middle of one."""
+"""What ends a training early: an error, or Ctrl-C and SIGTERM, which wait for the end of a step."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["TrainingInterrupted", "hold_interrupts"]
+__all__ = ["TrainingInterrupted", "TrainingStoppedError", "hold_interrupts"]
+
+
+class TrainingStoppedError(RuntimeError):
+    """Training cannot go on; the message says why and what to try."""
 
 
 class TrainingInterrupted(KeyboardInterrupt):

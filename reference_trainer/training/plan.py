@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.assembly import check
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan_rules import RULES, PlanItem
 
@@ -86,7 +87,7 @@ def make_plan(scene: Scene, config: TrainConfig, *, given: Collection[str] = ())
     unknown = set(given) - {f.name for f in dataclasses.fields(TrainConfig)}
     if unknown:
         raise ValueError(f"given must name fields of TrainConfig, got {sorted(unknown)}.")
-    config.check()
+    check(config)
     kept = _kept(config, given)
     return Plan(tuple(_item(rule(scene, config), config, kept) for rule in RULES))
 

@@ -9,10 +9,11 @@ from typing import Any, Literal
 
 import torch
 
-from reference_trainer.losses import Photometric
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.assembly import make_density, make_losses, make_regularizer
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.initial import drawn_by_any, initial_gaussians
+from reference_trainer.training.losses import Photometric
+from reference_trainer.training.model_state import initial_gaussians, seen_by_any
 
 __all__ = ["DROPOUT_GAINS", "FAR_APART_GAINS", "RULES", "PlanItem"]
 
@@ -74,7 +75,7 @@ def background(scene: Scene, config: TrainConfig) -> PlanItem:
 
 def depth_output(scene: Scene, config: TrainConfig) -> PlanItem:
     """Depth is drawn only if a term of the loss needs it."""
-    asking = dict.fromkeys(type(term).__name__ for term in config.make_losses() if "depth" in term.needs)
+    asking = dict.fromkeys(type(term).__name__ for term in make_losses(config) if "depth" in term.needs)
     if asking:
         return PlanItem("depth output", "used", f"asked for: {', '.join(asking)} looks at it")
     return PlanItem("depth output", "left out", "by construction: no term of the loss looks at depth")
@@ -105,7 +106,7 @@ def opacity_reset(scene: Scene, config: TrainConfig) -> PlanItem:
     if config.opacity_reset_over_white and scene.is_white:
         first = min(first, config.densify_from)
     until = config.densify_end
-    if not config.make_density().resets:
+    if not make_density(config).resets:
         return PlanItem(name, "left out", f"by construction: density control by {config.density} has none")
     if config.opacity_reset_every == 0:
         return PlanItem(name, "left out", "asked for (opacity_reset_every=0)")
@@ -127,21 +128,21 @@ def dropout(scene: Scene, config: TrainConfig) -> PlanItem:
     views = f"{count} views, {apart:.0f} degrees apart" if count > 1 else "1 view"
     told = ", ".join(f"{gain:+.1f} dB on {where} ({rate})" for (where, rate), gain in gains.items())
     reason = f"{views}: {said}; {known} it changed PSNR by {told}"
-    if config.make_regularizer().drops:
+    if make_regularizer(config).drops:
         return PlanItem("dropout", "used", f"asked for; {reason}")
     return PlanItem("dropout", "left out", f"not asked for; {reason}")
 
 
 def dropped(scene: Scene, config: TrainConfig) -> PlanItem:
     """Dropped Gaussians."""
-    masks = config.make_regularizer().drops and not config.analytic
+    masks = make_regularizer(config).drops and not config.analytic
     reason = "what a mask drops is neither projected nor sorted in the step" if masks else "training draws no masks"
     return PlanItem("dropped Gaussians", "left out", f"by construction: {reason}")
 
 
 def regularizer_inputs(scene: Scene, config: TrainConfig) -> PlanItem:
     """What the regularizers need besides the opacities."""
-    needed = ", ".join(config.make_regularizer().needs)
+    needed = ", ".join(make_regularizer(config).needs)
     if needed:
         return PlanItem("inputs of the regularizers", "used", f"asked for: they need {needed}")
     reason = "by construction: they look at opacities alone, so neither neighbors nor depths are computed"
@@ -152,7 +153,7 @@ def unseen(scene: Scene, config: TrainConfig) -> PlanItem:
     """Initial Gaussians that have no pixel in a training view: they would stay as they are and fog the test views."""
     name = "Gaussians outside every view"
     start = initial_gaussians(scene, replace(config, initial_points="all"))
-    outside = len(start) - int(drawn_by_any(start, scene.train).sum())
+    outside = len(start) - int(seen_by_any(start, scene.train).sum())
     counts = f"{outside} of {len(start)} initial Gaussians have no pixel in a training view"
     if outside == 0:
         return PlanItem(name, "left out", f"by construction: {counts}")
@@ -171,7 +172,7 @@ def ssim_windows(scene: Scene, config: TrainConfig) -> PlanItem:
     color = scene.background[:, None, None]
     busy = [(view.image != color).any(0) for view in scene.train]
     share = sum(float(part.any(1).float().mean() * part.any(0).float().mean()) for part in busy) / len(busy)
-    if not any(isinstance(term, Photometric) and term.lambda_dssim > 0 for term in config.make_losses()):
+    if not any(isinstance(term, Photometric) and term.lambda_dssim > 0 for term in make_losses(config)):
         return PlanItem("SSIM windows without change", "left out", "by construction: the loss has no SSIM")
     reason = f"the box around what differs from the background is {share:.0%} of a picture"
     return PlanItem("SSIM windows without change", "used", f"{reason}; cutting it out gains nothing")

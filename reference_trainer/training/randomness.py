@@ -1,11 +1,15 @@
-"""Random streams that depend on the seed and the step alone, so that a resumed run draws what it would have drawn."""
+"""Random streams that depend on the seed and the step alone, and computing without any other chance."""
 
 from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch
 
-__all__ = ["stream", "view_order"]
+__all__ = ["deterministic", "stream", "view_order"]
 
 
 def stream(seed: int, step: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
@@ -22,6 +26,7 @@ def stream(seed: int, step: int, purpose: str, device: torch.device | str = "cpu
         >>> torch.equal(a, b)
         True
     """
+    # Hashed, so that streams of neighboring seeds and steps have nothing in common.
     words = np.random.SeedSequence([seed, step, *purpose.encode()]).generate_state(2, np.uint32)
     return torch.Generator(device=device).manual_seed(int(words[0]) << 32 | int(words[1]))
 
@@ -33,6 +38,43 @@ def view_order(seed: int, step: int, count: int) -> int:
         >>> sorted(view_order(0, step, 3) for step in range(3))
         [0, 1, 2]
     """
+    # Drawn anew from the epoch alone: a resumed run needs no state to continue in the middle of one.
     epoch, position = divmod(step, count)
     order = torch.randperm(count, generator=stream(seed, epoch, "views"))
     return int(order[position])
+
+
+@contextmanager
+def deterministic(device: torch.device | str = "cpu") -> Iterator[None]:
+    """Compute in one thread, and on CUDA with deterministic algorithms, within a block.
+
+    Without this a run on a CPU repeats bit for bit with the same number of threads. With another number, some
+    exponentials differ in their last bit, because the ends of a thread's share are computed by other instructions, and
+    training amplifies that. On CUDA, sums by atomic additions differ from run to run.
+
+    Args:
+        device: where to compute. On CUDA, enter the block before the first computation of the process, which is when
+            cuBLAS reads its settings.
+
+    Raises:
+        RuntimeError: from within, on CUDA, if an operation has no deterministic algorithm.
+
+    Example:
+        >>> with deterministic():
+        ...     torch.get_num_threads()
+        1
+    """
+    threads, algorithms = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    fill = torch.utils.deterministic.fill_uninitialized_memory  # type: ignore[attr-defined]
+    torch.set_num_threads(1)
+    if torch.device(device).type != "cpu":
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+        torch.use_deterministic_algorithms(True)
+        # Not needed: all buffers are written before they are read.
+        torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        torch.use_deterministic_algorithms(algorithms)
+        torch.utils.deterministic.fill_uninitialized_memory = fill  # type: ignore[attr-defined]

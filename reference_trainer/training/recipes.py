@@ -41,7 +41,7 @@ _INRIA = TrainConfig(
 )
 _CORGS = TrainConfig(
     iterations=10_000,
-    fields=2,
+    models=2,
     random_background=True,
     opacity_reset_from=501,
     loss="photometric + co_regularization(between(1.0, 500))",
@@ -107,7 +107,7 @@ RECIPES: dict[str, Recipe] = {
     "corgs": Recipe(
         _CORGS,
         "CoR-GS (ECCV 2024) on LLFF, jiaw-z/CoR-GS 1db13a4",
-        "pseudo views between near and far of the initial points, drawn at each step; the fields' splits are seeded "
+        "pseudo views between near and far of the initial points, drawn at each step; the models' splits are seeded "
         "apart",
         "initial points, cameras that look to one side, a world in LLFF's units",
     ),
@@ -169,6 +169,7 @@ def with_recipe(name: str, **changes: object) -> TrainConfig:
     if name not in RECIPES:
         raise ValueError(f"there is no recipe {name!r}; choose one of {', '.join(RECIPES)}.")
     config = RECIPES[name].config
+    # Through TrainConfig, which refuses a number of iterations that is none.
     times = TrainConfig(iterations=changes.get("iterations", config.iterations)).iterations / config.iterations  # type: ignore[arg-type]
     scaled: dict[str, object] = {
         mark: max(int(mark == "sh_every"), round(times * at))

@@ -1,4 +1,4 @@
-"""One training step in progress: what a loss term may read and render."""
+"""One training step: its view, its render, and the means for loss terms to render more."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
-from reference_trainer.render import MomentImages, Rendering, Splats
-from reference_trainer.renderers.gsplat import GsplatSplats
+from reference_trainer.render import MomentImages, Rendering, ViewSplats
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.randomness import stream
 
@@ -25,7 +24,10 @@ __all__ = ["Step"]
 
 @dataclass(eq=False, repr=False)
 class Step:
-    """A view, what was drawn of it, and the means to draw more.
+    """One training step: its view, its render, and the means for loss terms to render more.
+
+    The trainer calls `sample` or `expect`, which set ``image``; then every term of the loss reads from
+    the step, and renders with `render` and `moments` whatever else it compares.
 
     Args:
         number: of the step, the first being 0.
@@ -39,11 +41,11 @@ class Step:
         renderer: what draws.
         absgrad: whether density control is to see absolute gradients.
         label: prefix of the labels of the random streams.
-        fields: the steps of all fields at this view, the first one's first.
+        siblings: the steps of all models at this view, this one among them, the first model's first.
 
     Attributes:
         params: the activated parameters, with the view's camera, before any regularizer.
-        drawn: the same after the regularizer; in an analytic step, what the expectation was rendered with.
+        rendered: the same after the regularizer; in an analytic step, what the expectation was rendered with.
         image: the render, or in an analytic step its expectation, not clamped, shape (3, H, W).
         variance: of the colors in an analytic step, shape (3, H, W); None in others.
         rendering: the render with alpha, depth if a term needs it, and splats; None in an analytic step.
@@ -62,14 +64,15 @@ class Step:
     renderer: Callable[..., Any]
     absgrad: bool = False
     label: str = ""
-    fields: Sequence[Step] = ()
+    siblings: Sequence[Step] = ()
     image: Tensor = field(init=False)
-    drawn: Params = field(init=False)
+    rendered: Params = field(init=False)
     variance: Tensor | None = field(default=None, init=False)
     rendering: Rendering | None = field(default=None, init=False)
-    observed: list[tuple[Splats | GsplatSplats, Camera]] = field(default_factory=list, init=False)
+    observed: list[tuple[ViewSplats, Camera]] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
+        # Activated once for all terms: they share its graph.
         self.params = self.gaussians.params(self.view.camera, step=self.number)
 
     @property
@@ -81,16 +84,16 @@ class Step:
 
     def sample(self, *, depth: bool) -> None:
         """Render the view with one draw of the regularizer."""
-        self.drawn = self.regularizer.regularize(self.params, self.generator("regularizer"))
-        self.rendering = self.render(self.view.camera, self.drawn, depth=depth, observed=True)
+        self.rendered = self.regularizer.regularize(self.params, self.generator("regularizer"))
+        self.rendering = self.render(self.view.camera, self.rendered, depth=depth, observed=True)
         self.image = self.rendering.image
 
     def expect(self) -> None:
         """Render the view in expectation over the draws of the regularizer."""
         multiplied = self.regularizer.multiplied(self.params)
         assert multiplied is not None, "the trainer has refused this"
-        self.drawn, multiplier = multiplied
-        moments = self.moments(self.view.camera, multiplier, self.drawn, observed=True)
+        self.rendered, multiplier = multiplied
+        moments = self.moments(self.view.camera, multiplier, self.rendered, observed=True)
         self.image, self.variance = moments.mean, moments.variance
 
     def at(self, view: View) -> Step:
@@ -98,6 +101,7 @@ class Step:
 
         Density control counts it as it counts the view of the step.
         """
+        # A shallow copy: `observed` is one list, so density control sees the renders of both.
         other = copy(self)
         other.view, other.params = view, self.gaussians.params(view.camera, step=self.number)
         other.label += f"{view.name}/"
@@ -127,6 +131,7 @@ class Step:
             absgrad=observed and self.absgrad,
             renderer=self.renderer,
         )
+        # The projected centers have no gradient yet: the trainer hands them on after the backward pass.
         if observed:
             self.observed.append((out.splats, camera))
         return out

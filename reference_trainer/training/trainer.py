@@ -15,13 +15,12 @@ from ca_reg import Chain
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import NotFiniteError
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
+from reference_trainer.training.assembly import check, make_density, make_losses, make_regularizer, make_renderer
+from reference_trainer.training.checkpoint import load_checkpoint, read_state, save_checkpoint
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
-from reference_trainer.training.field import Field
-from reference_trainer.training.interruption import hold_interrupts
+from reference_trainer.training.interruption import TrainingStoppedError, hold_interrupts
+from reference_trainer.training.model_state import ModelState
 from reference_trainer.training.randomness import stream, view_order
-from reference_trainer.training.state import read_state
 from reference_trainer.training.step import Step
 
 __all__ = ["Trainer"]
@@ -40,8 +39,8 @@ class Trainer:
         seconds: wall-clock time that they took.
         processor_seconds: CPU time that all threads spent on them: the fairer figure on a busy machine.
         renderer: what draws all but moments.
-        fields: the models; the first is the one that is measured and written.
-        optimizer: of the first field.
+        models: what is trained; the first is the one that is measured and written.
+        optimizer: of the first model.
         density: likewise.
         regularizer: likewise.
 
@@ -60,22 +59,25 @@ class Trainer:
     """
 
     def __init__(self, scene: Scene, config: TrainConfig, device: torch.device | str = "cpu") -> None:
-        config.check()
+        check(config)
         if scene.start is not None:  # whose colors have all bands already
             config = dataclasses.replace(config, sh_every=0)
         self.scene = scene
         self.config = config
         self.device = torch.device(device)
-        self.renderer = config.make_renderer()
+        self.renderer = make_renderer(config)
         self.renderer.prepare(self.device)
         self.step = 0
         self.seconds = self.processor_seconds = 0.0
         self.views = [view.to(self.device) for view in scene.train]
         self.background = scene.background.to(self.device)
-        self.fields = [Field(scene, config, self.device, number) for number in range(config.fields)]
-        first = self.fields[0]
+        self.models = [
+            ModelState(scene, config, make_density(config, i), make_regularizer(config), device=self.device, index=i)
+            for i in range(config.models)
+        ]
+        first = self.models[0]
         self.optimizer, self.density, self.regularizer = first.optimizer, first.density, first.regularizer
-        self.losses = config.make_losses()
+        self.losses = make_losses(config)
         for term in self.losses:
             term.begin(scene)
         if config.random_background and any(view.alpha is not None for view in scene.train):
@@ -85,7 +87,7 @@ class Trainer:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The model as it stands, of the first field."""
+        """The Gaussians as they stand, of the first model."""
         return self.optimizer.gaussians
 
     @property
@@ -142,13 +144,13 @@ class Trainer:
         """Take one step on one view.
 
         Returns:
-            The loss, of all fields together, and the mean squared error of the first one's (regularized) render.
+            The loss, of all models together, and the mean squared error of the first one's (regularized) render.
         """
         terms = [term for term in self.losses if term.acts(self.step)]
         try:  # also where density control renders
-            for field in self.fields:
-                field.density.before_step(field.optimizer, self.step)
-            self.density.together(self.fields, self.step)
+            for model in self.models:
+                model.density.before_step(model.optimizer, self.step)
+            self.density.together(self.models, self.step)
             steps = self._begin_steps()
             for step in steps:
                 if self.config.analytic and len(step.regularizer):
@@ -164,12 +166,12 @@ class Trainer:
             raise TrainingStoppedError(f"the loss became {value} at step {self.step + 1}: lower the learning rates.")
         if loss.requires_grad:
             loss.backward()  # type: ignore[no-untyped-call]
-            for field, step in zip(self.fields, steps, strict=True):
-                for splats, camera in step.observed if field.density.observes(self.step) else ():
-                    if splats.projection.means.grad is not None:  # none if nothing was drawn, or no term saw it
-                        field.density.observe(splats, camera)
-                field.optimizer.set_means_rate(self.config.means_rate_at(self.step) * self.scene.extent)
-                field.optimizer.step()
+            for model, step in zip(self.models, steps, strict=True):
+                for splats, camera in step.observed if model.density.observes(self.step) else ():
+                    if splats.means.grad is not None:  # none if nothing was drawn, or no term saw it
+                        model.density.observe(splats, camera)
+                model.optimizer.set_means_rate(self.config.means_rate_at(self.step) * self.scene.extent)
+                model.optimizer.step()
         self.step += 1
         steps.clear()  # each step refers to all: a cycle would keep their graphs until garbage collection
         return value, squared_error
@@ -182,8 +184,8 @@ class Trainer:
                 replace a good one.
             OSError: if it cannot be written; what was there before is kept.
         """
-        first, *others = [field.state_dict() for field in self.fields]
-        moved = [x for field in (first, *others) for x in (field["gaussians"], *field["moments"].values())]
+        first, *others = [model.state_dict() for model in self.models]
+        moved = [x for model in (first, *others) for x in (model["gaussians"], *model["moments"].values())]
         if not all(bool(x.isfinite().all()) for tensors in moved for x in tensors.values()):
             raise TrainingStoppedError(
                 f"Gaussians became nan or infinite by step {self.step}, which is not saved: lower the learning rates."
@@ -222,8 +224,8 @@ class Trainer:
         trainer.step = state.step
         trainer.seconds, trainer.processor_seconds = state.seconds, state.processor_seconds
         try:
-            for field, of_field in zip(trainer.fields, state.fields, strict=True):
-                field.load_state_dict(of_field)
+            for model, of_model in zip(trainer.models, state.models, strict=True):
+                model.load_state_dict(of_model)
         except ValueError as error:
             raise ValueError(f"{path}, regularizer: {error}") from error
         return trainer
@@ -240,26 +242,26 @@ class Trainer:
             )
 
     def _begin_steps(self) -> list[Step]:
-        """Choose the view of the step and what regularizes it; return a `Step` for every field."""
+        """Choose the view of the step and what regularizes it; return a `Step` for every model."""
         begun, steps, background = self.step >= self.config.regularize_from, list[Step](), self.background
         if self.config.random_background:
             generator = stream(self.config.seed, self.step, "background", self.device)
             background = torch.rand(3, generator=generator, device=self.device)
         view = self.views[view_order(self.config.seed, self.step, len(self.views))]
-        for field in self.fields:
+        for model in self.models:
             step = Step(
                 self.step,
                 view,
                 self.views,
-                field.gaussians,
-                field.regularizer if begun else Chain(),
+                model.gaussians,
+                model.regularizer if begun else Chain(),
                 background,
                 sh_degree=self.config.sh_degree_at(self.step + 1),
                 seed=self.config.seed,
                 renderer=self.renderer,
                 absgrad="absgrad" in self.density.needs and self.density.observes(self.step),
-                label=field.label,
-                fields=steps,
+                label=model.label,
+                siblings=steps,
             )
             steps.append(step)
         return steps

@@ -10,7 +10,7 @@ from torch import Tensor
 from benchmarks.workloads import Workload
 from reference_trainer.camera import Camera
 from reference_trainer.render import render
-from reference_trainer.render.engine import drawn_by, engines_on
+from reference_trainer.render.engine import engines_on, using_engine
 from reference_trainer.renderers.gsplat import load_gsplat_render
 from reference_trainer.studies.stability.baseline import render_simply
 
@@ -26,7 +26,7 @@ def draw_of(engine: str) -> Draw:
     """Return one of the engines of the renderer as something to time."""
 
     def draw(parameters: Mapping[str, Tensor], camera: Camera) -> Tensor:
-        with drawn_by(engine):  # projection and drawing; the gradient goes through what they have chosen
+        with using_engine(engine):  # projection and drawing; the gradient goes through what they have chosen
             return render(**parameters, camera=camera).image
 
     return draw
@@ -45,7 +45,7 @@ def others_on(device: torch.device) -> dict[str, Draw]:
 
     Example:
         >>> list(others_on(torch.device("cpu")))
-        ['loops', 'torch']
+        ['numba', 'torch']
     """
     found = {engine: draw_of(engine) for engine in engines_on(device)}
     try:

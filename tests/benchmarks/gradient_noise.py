@@ -26,7 +26,6 @@ from benchmarks.gradient_noise_moments import (
 )
 from benchmarks.gradient_noise_report import gradient_noise_figure, gradient_noise_report
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask, expected_squared_error
-from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
 from reference_trainer.runs.run import load_run
@@ -34,6 +33,7 @@ from reference_trainer.scenes.scene import View
 from reference_trainer.studies.clocks import now
 from reference_trainer.studies.study import Record, Records, Study, checkpoints, run_study
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream
 
 __all__ = ["gradient_noise", "gradient_noise_study"]

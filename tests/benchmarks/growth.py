@@ -40,7 +40,7 @@ def growth(
     repeats: int = 3,
     time_limit: float = 300.0,
     device: str = "cpu",
-    engine: Literal["all", "loops", "torch"] = "all",
+    engine: Literal["all", "numba", "torch"] = "all",
 ) -> None:
     """Measure time and memory of the engines against Gaussians, pixels, and Gaussians per pixel, with exponents.
 

@@ -94,7 +94,7 @@ def fits(points: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
         points: of an axis in the report.
 
     Returns:
-        Fits as plain data by "loops, forward, time", "loops, forward, memory" and so on.
+        Fits as plain data by "numba, forward, time", "numba, forward, memory" and so on.
     """
     found = {curve.name: fit_exponent(curve.values) for curve in _curves(points)}
     return {name: asdict(fit) for name, fit in found.items() if fit is not None}

@@ -21,6 +21,7 @@ from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.results import format_mean_std, markdown_table
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.run import model_of
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.study import Study, run_study
 from reference_trainer.training.config import TrainConfig
@@ -136,7 +137,7 @@ def plan_study(
         alternatives: keys of `ALTERNATIVES` to try besides.
         device: where to train.
     """
-    plan = make_plan(options.load(seed=config.seed), config)
+    plan = make_plan(load_scene(options, seed=config.seed), config)
     chosen = {name: shortened(of, iterations) for name, of in variants(plan, config, alternatives).items()}
     shared = {"options": options, "device": device, "threads": torch.get_num_threads()}
     cases = {
@@ -186,7 +187,7 @@ def plan_table(records: Sequence[Mapping[str, Any]]) -> str:
 def _train(options: SceneOptions, variant: str, config: TrainConfig, device: str, threads: int) -> dict[str, Any]:
     """Do one training in a process of its own."""
     torch.set_num_threads(threads)
-    scene = options.load(seed=config.seed)
+    scene = load_scene(options, seed=config.seed)
     trainer = Trainer(scene, config, device)
     start = time.process_time()
     trainer.train()

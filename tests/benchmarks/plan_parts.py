@@ -7,11 +7,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render import render
 from reference_trainer.runs.run import model_of
 from reference_trainer.studies.clocks import in_turns, processor_clock
+from reference_trainer.training.losses.photometric import photometric_loss
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 

@@ -16,7 +16,6 @@ import torch
 import tyro
 from torch import Tensor
 
-from reference_trainer.density import DensityStrategy
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import format_mean_std, markdown_table, mean_std
 from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
@@ -26,6 +25,7 @@ from reference_trainer.runs.folder import CONFIG, read_run_settings
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.study import Record, Records, Study, checkpoints, run_study
+from reference_trainer.training.density import DensityStrategy
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 
@@ -122,7 +122,7 @@ def train_on(trainer: Trainer, steps: int) -> None:
     """
     config = trainer.config
     trainer.config = dataclasses.replace(config, iterations=trainer.step + steps, means_rate=config.means_rate_final)
-    trainer.fields[0].density = _LeftAlone()
+    trainer.models[0].density = _LeftAlone()
     trainer.train()
 
 

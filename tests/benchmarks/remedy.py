@@ -26,10 +26,11 @@ import tyro
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import format_mean_std, markdown_table, mean_std
 from reference_trainer.runs.run import model_of
-from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes import load_scene, synthetic_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.study import Record, Records, Study, run_study
+from reference_trainer.training.assembly import check
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
@@ -107,11 +108,11 @@ def held_out(options: SceneOptions, seed: int) -> Scene:
     of the way from each training view to the next. Where there are none, such as in lego, two of the training views are
     held out, others for every seed.
     """
-    scene = options.load(seed=seed)
+    scene = load_scene(options, seed=seed)
     if options.path == "synthetic":
         return replace(scene, test=synthetic_scene(test_views=5, points=1).test[:-1])
     used = {view.name for view in (*scene.train, *scene.test)}
-    everything = replace(options, split="auto", test="none").load(seed=seed).train
+    everything = load_scene(options, seed=seed, split="auto", test="none").train
     if others := tuple(view for view in everything if view.name not in used):
         return replace(scene, test=others)
     half = len(scene.train) // 2
@@ -136,7 +137,7 @@ def remedy_study(
     if unknown := set(scenes) - set(SCENES if views == "final" else CHOOSING):
         raise ValueError(f"{views} knows the scenes {', '.join(SCENES if views == 'final' else CHOOSING)}: {unknown}.")
     for text in arms:
-        TrainConfig(**COMMON | arm(text)).check()
+        check(TrainConfig(**COMMON | arm(text)))
     found = {
         name: options if options.path == "synthetic" else replace(options, path=f"{data}/{options.path}")
         for name, options in SCENES.items()
@@ -153,7 +154,7 @@ def remedy_study(
 def _measure(views: _Views, scene: str, options: dict[str, Any], seed: int, settings: str) -> Record:
     """Train, and measure every view."""
     chosen = SceneOptions(**options)
-    loaded = held_out(chosen, seed) if views == "choose" else chosen.load(seed=seed)
+    loaded = held_out(chosen, seed) if views == "choose" else load_scene(chosen, seed=seed)
     trainer = Trainer(loaded, TrainConfig(**COMMON | arm(settings), seed=seed))
     trainer.train()
     model = model_of(trainer)

@@ -21,6 +21,7 @@ from pathlib import Path
 from benchmarks.fork_scene import write_scene
 from benchmarks.trainers import EVALUATE, EXPORT, OPTIONS, TRAINERS, named, settings, steps
 from reference_trainer.evaluation.results import machine
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.paper.rows import Row, Rows
 
@@ -82,7 +83,7 @@ def main() -> None:
     args = parser.parse_args()
     args.fork_scene = args.out / "llff"  # CoR-GS tells its readers by the path
     if not (args.fork_scene / "poses_bounds.npy").is_file():
-        write_scene(SceneOptions(str(args.scene), images=args.images).load(), args.fork_scene)
+        write_scene(load_scene(SceneOptions(str(args.scene), images=args.images)), args.fork_scene)
     rows = Rows(args.file, {"scene": args.scene.name, "iterations": args.iterations, "machine": machine(), "usual": {}})
     for seed in args.seeds:
         for trainer in args.trainers:

@@ -27,6 +27,7 @@ from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json
 from reference_trainer.render.engine import engines_on
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.studies.clocks import in_turns, now, processor_clock
@@ -58,7 +59,7 @@ def speed(
         device: where to render, "cpu" or "cuda".
     """
     specs: dict[str, WorkloadSpec] = {name: WORKLOADS[name] for name in workloads}
-    measure_speed(specs, out, scene=scene.load(), repeats=repeats, against=against, device=device)
+    measure_speed(specs, out, scene=load_scene(scene), repeats=repeats, against=against, device=device)
 
 
 def measure_speed(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from benchmarks.workloads import Workload
 from reference_trainer.render import splat
-from reference_trainer.render.engine import drawn_by, engine_for
+from reference_trainer.render.engine import engine_for, using_engine
 from reference_trainer.studies.clocks import Clock
 
 __all__ = ["STAGES", "Staged", "staged"]
@@ -63,7 +63,10 @@ def staged(workload: Workload, engine: str, clock: Clock) -> Staged:
 
         return call
 
-    with drawn_by(engine), mock.patch.object(room := engine_for(colors.device, colors.dtype), "bin", timed(room.bin)):
+    with (
+        using_engine(engine),
+        mock.patch.object(room := engine_for(colors.device, colors.dtype), "bin", timed(room.bin)),
+    ):
         times = [clock()]
         splats = splat(**leaves, camera=workload.camera)
         end = clock()

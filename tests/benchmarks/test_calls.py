@@ -11,7 +11,7 @@ from reference_trainer.render import render
 TINY = WorkloadSpec(80, 40, 24, 0.06)
 
 
-@pytest.mark.parametrize("name", ["loops", "torch", "gsplat"])
+@pytest.mark.parametrize("name", ["numba", "torch", "gsplat"])
 def test_everything_draws_the_same(name, monkeypatch):
     monkeypatch.setattr(calls, "load_gsplat_render", lambda device: render)  # gsplat's has the same arguments
     workload = TINY.make()
@@ -25,7 +25,7 @@ def test_everything_draws_the_same(name, monkeypatch):
 
 
 def test_without_a_gpu_there_is_no_gsplat():
-    assert list(others_on(torch.device("cpu"))) == ["loops", "torch"]
+    assert list(others_on(torch.device("cpu"))) == ["numba", "torch"]
 
 
 @pytest.mark.gpu

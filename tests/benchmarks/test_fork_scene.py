@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from benchmarks.fork_scene import write_scene
-from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes import load_scene, synthetic_scene
 from reference_trainer.scenes.depth import point_prior
 from reference_trainer.scenes.options import SceneOptions
 
@@ -13,7 +13,7 @@ from reference_trainer.scenes.options import SceneOptions
 def test_a_fork_reads_the_scene_of_the_recipe(tmp_path):
     scene = synthetic_scene(width=64, height=48, points=300)
     write_scene(scene, tmp_path)
-    read = SceneOptions(str(tmp_path), test="none", points="sparse/0/points3D.ply", depth="depth:inverse").load()
+    read = load_scene(SceneOptions(str(tmp_path), test="none", points="sparse/0/points3D.ply", depth="depth:inverse"))
     assert len(read.train) == len(scene.train)
     torch.testing.assert_close(read.points.positions, scene.points.positions, rtol=0, atol=0)
     torch.testing.assert_close(read.points.colors, scene.points.colors, rtol=0, atol=0.5001 / 255)

@@ -21,15 +21,16 @@ from benchmarks.gradient_noise_moments import (
 )
 from ca_reg.functional import Multiplier, draw_keep_mask
 from reference_trainer.evaluation.results import write_json
-from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.rendering import render_moments_of
 from reference_trainer.runs.folder import CHECKPOINT
 from reference_trainer.runs.folder import CONFIG as RUN_CONFIG
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.training.randomness import stream
 from reference_trainer.training.trainer import Trainer
 
@@ -322,7 +323,7 @@ OPTIONS = SceneOptions("synthetic", views=2, downscale=8)
 def trainer() -> Trainer:
     """Two views, and noise and inverted dropout, which the study leaves out."""
     config = TrainConfig(regularizer="dropout(0.4, compensate=True)", noise=0.3, seed=5)
-    return Trainer(OPTIONS.load(seed=5), config)
+    return Trainer(load_scene(OPTIONS, seed=5), config)
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ def test_a_tiny_measurement_of_both_engines(tmp_path, monkeypatch):
         assert all(len(x) == 2 and min(x) > 0 for x in point["seconds"].values())
     assert set(report["axes"]["layers"]["fits"]) == {
         f"{engine}, {x}, {what}"
-        for engine in ("loops", "torch")
+        for engine in ("numba", "torch")
         for x in ("forward", "forward+backward")
         for what in ("time", "memory")
     }

@@ -51,10 +51,10 @@ def test_two_points_have_no_error_and_no_fit():
 
 def test_what_was_left_out_or_has_no_memory_is_not_fitted():
     points = [
-        {"x": x, "medians": {"loops": {"forward": x, "forward+backward": x**2}}, "memory": {"loops": None}}
+        {"x": x, "medians": {"numba": {"forward": x, "forward+backward": x**2}}, "memory": {"numba": None}}
         for x in (1.0, 2.0, 4.0)
     ]
     found = fits([*points, {"x": 8.0, "skipped": "too large"}])
-    assert list(found) == ["loops, forward, time", "loops, forward+backward, time"]
-    assert found["loops, forward+backward, time"]["exponent"] == pytest.approx(2)
-    assert found["loops, forward, time"]["end"] == 4
+    assert list(found) == ["numba, forward, time", "numba, forward+backward, time"]
+    assert found["numba, forward+backward, time"]["exponent"] == pytest.approx(2)
+    assert found["numba, forward, time"]["end"] == 4

@@ -14,6 +14,7 @@ from benchmarks.plan_parts import parts_of_a_step
 from reference_trainer.runs.engines.engine import Task
 from reference_trainer.runs.engines.processes import Processes
 from reference_trainer.runs.engines.run_all import run_all
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
@@ -150,7 +151,7 @@ def test_differences_are_taken_within_a_seed():
 
 
 def test_more_work_takes_longer_and_the_model_stays(options):
-    trainer = Trainer(options.load(), TrainConfig(iterations=1, sh_every=1))
+    trainer = Trainer(load_scene(options), TrainConfig(iterations=1, sh_every=1))
     before = trainer.gaussians.map(lambda x: x.detach().clone())
     parts = parts_of_a_step(trainer, repeats=3)
     assert parts["step"] > 0

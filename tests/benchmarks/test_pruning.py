@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from benchmarks import pruning as pruning_module
 from benchmarks.pruning import CRITERIA, prune_lowest, pruning_order, pruning_study, train_on
 from ca_reg import attribute
-from reference_trainer.density import adaptive
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.shares import blend_weights
@@ -17,6 +16,7 @@ from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import model_of
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.density import adaptive
 from reference_trainer.training.trainer import Trainer
 
 

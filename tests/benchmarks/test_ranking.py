@@ -17,6 +17,7 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.run import run_experiment
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
@@ -156,7 +157,7 @@ def trained(tmp_path_factory, options, short):
     folder = tmp_path_factory.mktemp("runs")
     results = run_experiment(options, short, folder / "both" / "seed_0", monitor_every=0)
     config = TrainConfig(iterations=6, densify_gradient=1e9, seed=4)
-    plain = Trainer(options.load(seed=4), config)
+    plain = Trainer(load_scene(options, seed=4), config)
     plain.train()
     plain.save(folder / "plain" / "seed_4" / CHECKPOINT)
     claim = {"scene": dataclasses.asdict(options), "config": dataclasses.asdict(config)}

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from benchmarks import remedy
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.studies.study import run_study
@@ -15,7 +16,7 @@ from reference_trainer.studies.study import run_study
 def test_held_out_views_of_the_built_in_scene_are_none_of_its_test_views(monkeypatch):
     monkeypatch.setattr(remedy, "synthetic_scene", lambda **given: synthetic_scene(20, 15, **given))
     options = SceneOptions(downscale=8)
-    scene, plain = remedy.held_out(options, 1), options.load(seed=1)
+    scene, plain = remedy.held_out(options, 1), load_scene(options, seed=1)
     assert [view.name for view in scene.train] == [view.name for view in plain.train]
     places = [torch.stack([view.camera.position for view in each.test]) for each in (scene, plain)]
     assert torch.cdist(*places).min() > 0.1

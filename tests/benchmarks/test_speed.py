@@ -33,8 +33,8 @@ def test_a_tiny_measurement_and_its_gate(tmp_path, measure):
     assert json.loads((tmp_path / "speed.json").read_text()) == report
     assert torch.get_num_threads() == threads
     tiny = report["workloads"]["tiny"]
-    assert all(len(x) == 2 for x in (*tiny["seconds"].values(), *tiny["stages"]["loops"].values()))
-    engines = ("loops", "torch")
+    assert all(len(x) == 2 for x in (*tiny["seconds"].values(), *tiny["stages"]["numba"].values()))
+    engines = ("numba", "torch")
     ratios = ("forward / baseline", "forward+backward / baseline", "exact score / render", "score, K = 5 / render")
     assert {f"tiny, {e}: {x}" for e in engines for x in (*ratios, "two threads / one")} <= set(report["ratios"])
     parts = ("analytic / sampled", "renderer / step", "loss / step", "optimizer / step")
@@ -42,15 +42,15 @@ def test_a_tiny_measurement_and_its_gate(tmp_path, measure):
     assert len(report["errors"]) == 2 * (2 + 5)
     assert all(0 < x < 1e-4 for x in report["errors"].values())
     text = (tmp_path / "speed.md").read_text()
-    row = next(x for x in text.splitlines() if x.startswith("| tiny (60, 40x24) | loops |"))
-    forward, pairs = sorted(tiny["seconds"]["loops: forward"]), tiny["pairs"]
+    row = next(x for x in text.splitlines() if x.startswith("| tiny (60, 40x24) | numba |"))
+    forward, pairs = sorted(tiny["seconds"]["numba: forward"]), tiny["pairs"]
     cells = [float(x) for x in row.strip("| ").split("|")[2:]]
     assert cells[0] == pytest.approx(5e2 * sum(forward), rel=1e-3)
     assert cells[2:4] == pytest.approx([pairs / (5e5 * sum(forward)), 3], rel=1e-3)
 
     old = tmp_path / "old.json"
     write_json(old, report | {"errors": {x: y / 3 for x, y in report["errors"].items()}, "ratios": {}})
-    with pytest.raises(RuntimeError, match=r"numbers are worse than in .*old.json:\n  tiny, loops: gradient of"):
+    with pytest.raises(RuntimeError, match=r"numbers are worse than in .*old.json:\n  tiny, numba: gradient of"):
         measure(tmp_path / "worse", against=old)
     assert (tmp_path / "worse" / "speed.md").exists()
 

@@ -10,7 +10,7 @@ from benchmarks.stages import STAGES, staged
 from benchmarks.workloads import WorkloadSpec, covered_pairs
 
 
-@pytest.mark.parametrize("engine", ["loops", "torch"])
+@pytest.mark.parametrize("engine", ["numba", "torch"])
 def test_the_stages_do_what_a_rendering_and_its_gradient_do(engine):
     workload = WorkloadSpec(80, 40, 24, 0.06).make()
     ticks = itertools.count()

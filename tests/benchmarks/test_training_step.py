@@ -50,12 +50,12 @@ def test_a_step_and_its_parts_are_timed_with_all_bands(scene, steps):
 
 
 def test_analytic_and_sampled_steps_take_turns(scene, steps):
-    found = analytic_step(scene, "loops", repeats=2, device=CPU, clock=itertools.count().__next__)
+    found = analytic_step(scene, "numba", repeats=2, device=CPU, clock=itertools.count().__next__)
     assert steps[6:] == [(3, False), (3, True)] * 3
     assert found == {"sampled": [1, 1], "analytic": [1, 1]}
 
 
-@pytest.mark.parametrize("engine", ["loops", "torch"])
+@pytest.mark.parametrize("engine", ["numba", "torch"])
 def test_scores_are_those_of_the_workload_drawn_by_the_engine(engine, monkeypatch):
     drawn = []
     splats = training_step.TrainedModel.splats

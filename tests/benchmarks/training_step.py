@@ -10,13 +10,13 @@ import torch
 
 from benchmarks.workloads import Workload
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render.engine import drawn_by
+from reference_trainer.render.engine import using_engine
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.clocks import Clock, in_turns
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.losses.photometric import photometric_loss
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["MASKS", "PARTS", "analytic_step", "scores", "step_parts"]
@@ -49,7 +49,7 @@ def step_parts(
     """
     trainer = _trainer(scene, _CONFIG, device)
     found: dict[str, list[float]] = {name: [] for name in ("step", *PARTS)}
-    with drawn_by(engine):
+    with using_engine(engine):
         for i in range(repeats + 1):  # the first round is not kept
             seconds = _one_step(trainer, clock)
             for name, x in seconds.items() if i else ():
@@ -87,7 +87,7 @@ def analytic_step(
     """Time steps of the same training "sampled" and "analytic" in turns; see `step_parts`."""
     configs = {"sampled": _CONFIG, "analytic": dataclasses.replace(_CONFIG, analytic=True)}
     trainers = {name: _trainer(scene, config, device) for name, config in configs.items()}
-    with drawn_by(engine):
+    with using_engine(engine):
         return in_turns({name: trainer.train_step for name, trainer in trainers.items()}, repeats, clock)
 
 
@@ -123,7 +123,7 @@ def scores(workload: Workload, engine: str) -> dict[str, Callable[[], object]]:
     def by_engine(call: Callable[[], object]) -> Callable[[], object]:
         @torch.no_grad()
         def drawn() -> object:
-            with drawn_by(engine):
+            with using_engine(engine):
                 return call()
 
         return drawn

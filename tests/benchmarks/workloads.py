@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.eager.projection import project
+from reference_trainer.render.torch.projection import project
 
 __all__ = ["PARAMETERS", "WORKLOADS", "Workload", "WorkloadSpec", "covered_pairs"]
 

@@ -10,7 +10,7 @@ from oracles import random_scene
 from ca_reg import CAScore, ListMoments, OpacityNoise, Params, PixelLists, Reason, attribute, total_effects
 from ca_reg.types import ExactMoments
 from reference_trainer.render import splat
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render.renderer import render_moments
 
 HEIGHT, WIDTH = 3, 4
 THRESHOLD = 0.2

@@ -17,7 +17,7 @@ from ca_reg import (
 )
 from ca_reg.functional import Multiplier
 from ca_reg.lists import PixelLists
-from reference_trainer.training.determinism import deterministic
+from reference_trainer.training.randomness import deterministic
 
 N, SIDE = 24, 4
 

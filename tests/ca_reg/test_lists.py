@@ -11,7 +11,7 @@ from ca_reg import CAScore, ListMoments, PixelLists
 from ca_reg.functional import Multiplier, alpha_moments, contributions, pixel_moments
 from ca_reg.lists import _blocks
 from reference_trainer.render import splat
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render.renderer import render_moments
 
 HEIGHT, WIDTH, N = 3, 5, 12
 SIZE = HEIGHT * WIDTH

@@ -11,7 +11,7 @@ from torch.nn.functional import mse_loss
 from ca_reg import CAPenalty, Constant, LinearRamp
 from ca_reg.functional import Multiplier, alpha_moments, expected_squared_error, pixel_moments, scale_opacity
 from reference_trainer.render import render, splat
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render.renderer import render_moments
 
 HEIGHT, WIDTH = 3, 4
 BACKGROUND = torch.tensor([0.9, 0.1, 0.4], dtype=torch.float64)

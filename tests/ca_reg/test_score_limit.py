@@ -13,7 +13,7 @@ from oracles import random_scene
 from ca_reg import CAMonitor, CAScore, Reason, summarize
 from ca_reg.types import read_moments
 from reference_trainer.render import render, splat
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render.renderer import render_moments
 
 BACKGROUND = torch.tensor([0.9, 0.1, 0.4], dtype=torch.float64)
 THRESHOLD = 0.35  # of alpha: a part of the picture

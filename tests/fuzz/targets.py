@@ -26,7 +26,7 @@ from reference_trainer.scenes.points import ply_points
 from reference_trainer.scenes.splits import file_split
 from reference_trainer.scenes.transforms import read_transforms
 from reference_trainer.training.checkpoint import load_checkpoint
-from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.interruption import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["TARGETS"]

@@ -7,7 +7,7 @@ from torch import nn
 
 from ca_reg import GaussianDropout, OpacityNoise, StartStop
 from ca_reg.integrations.inria import RasterizerHook
-from reference_trainer.density.statistics import DensityStatistics
+from reference_trainer.training.density.operations import DensityStatistics
 
 BLACK = torch.zeros(3)
 FORMS = ["plain", "inverse-depth", "weights", "depth-alpha"]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.eager.projection import project
+from reference_trainer.render.torch.projection import project
 
 EYE = torch.eye(4)
 

@@ -9,6 +9,7 @@ from reference_trainer.cli import main
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import RESULTS
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.trainer import Trainer
 
@@ -19,7 +20,7 @@ TRAIN = "train --downscale 8 --iterations 4 --densify-from 1 --densify-every 2 -
 @pytest.mark.parametrize("options", ["--noise 0.4 --monitor-every 2", "--analytic --monitor-every 0"])
 def test_commands(card, tmp_path, options):
     """From a tenth of the points: the card counts every operation, and the longest list decides how many there are."""
-    points = SceneOptions(downscale=8.0).load().points
+    points = load_scene(SceneOptions(downscale=8.0)).points
     places, colors = points.positions[::10], points.colors[::10]
     start = Gaussians.from_points(places, colors, rms_neighbor_distance(places), sh_degree=0, opacity=0.5)
     save_ply(start, tmp_path / "start.ply")
@@ -31,7 +32,7 @@ def test_commands(card, tmp_path, options):
 
 def test_the_deterministic_switch_reaches_the_device(card, tmp_path, monkeypatch, capsys):
     """With sums as CUDA refuses them there, training is refused: the test above would not have seen them."""
-    monkeypatch.setattr("reference_trainer.render.eager.formulas._running", lambda x, product: x.cumsum(-1))
+    monkeypatch.setattr("reference_trainer.render.torch.compositing._running", lambda x, product: x.cumsum(-1))
     with pytest.raises(SystemExit):
         main([*TRAIN.split(), "--deterministic", "--monitor-every", "0", "--out", str(tmp_path)])
     assert "cumsum does not have a deterministic implementation" in capsys.readouterr().err

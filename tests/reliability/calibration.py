@@ -18,8 +18,8 @@ from torch import Tensor
 
 from ca_reg import CAScore, MomentsFn, RenderFn
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.render import draw_masks, splat
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render import render_masks, splat
+from reference_trainer.render.renderer import render_moments
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
@@ -92,7 +92,7 @@ def gaussians_at_random(drop_rate: float, n: int = 12, size: float = 0.4) -> Cas
         """Many masks at a time."""
 
         def many(self, opacities: Tensor, view: None) -> tuple[Tensor, Tensor]:
-            return draw_masks(whole, opacities, background=background)
+            return render_masks(whole, opacities, background=background)
 
         def __call__(self, opacity: Tensor, view: None) -> tuple[Tensor, Tensor]:
             images, alphas = self.many(opacity[None], view)

@@ -17,11 +17,12 @@ from torch import Tensor
 
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import markdown_table
-from reference_trainer.losses.photometric import photometric_loss
 from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.losses.photometric import photometric_loss
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["gradient_differences", "gradients", "main", "trained"]
@@ -68,7 +69,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3, help="how many seeds to compare with")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    scene = SceneOptions(options.path, images=options.images, downscale=options.downscale).load()
+    scene = load_scene(SceneOptions(options.path, images=options.images, downscale=options.downscale))
     config = TrainConfig(
         iterations=options.iterations, dropout=0.2, noise=0.4,
         densify_from=50, densify_every=options.densify_every,

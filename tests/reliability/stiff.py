@@ -17,10 +17,10 @@ import torch
 
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.runs.run import model_of
-from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
+from reference_trainer.training.interruption import TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["CASES", "Ending", "main", "push"]
@@ -142,7 +142,7 @@ def main() -> None:
     parser.add_argument("--downscale", type=float, default=1.0, help="make pictures smaller")
     parser.add_argument("--iterations", type=int, default=200)
     options = parser.parse_args()
-    scene = SceneOptions(options.path, images=options.images, downscale=options.downscale).load(seed=0)
+    scene = load_scene(options.path, seed=0, images=options.images, downscale=options.downscale)
     n = options.iterations
     config = TrainConfig(
         iterations=n, sh_every=n // 4, densify_from=n // 10, densify_every=n // 10, opacity_reset_from=n // 4,

@@ -4,7 +4,7 @@ from reliability.order import gradient_differences, gradients
 
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.determinism import deterministic
+from reference_trainer.training.randomness import deterministic
 from reference_trainer.training.trainer import Trainer
 
 BOUND = 1e-6

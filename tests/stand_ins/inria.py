@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from reference_trainer.camera import Camera
 from reference_trainer.render import render as reference_render
 from reference_trainer.render.constants import NEAR_PLANE
-from reference_trainer.render.eager.projection import project
-from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
+from reference_trainer.render.densification import SMALLEST_SPREAD, longer_radii
+from reference_trainer.render.torch.projection import project
 
 PIPE = SimpleNamespace(debug=False)
 

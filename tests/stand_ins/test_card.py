@@ -4,7 +4,7 @@ import pytest
 import torch
 from stand_ins.card import pretended_card
 
-from reference_trainer.training.determinism import deterministic
+from reference_trainer.training.randomness import deterministic
 
 
 def on(device, *shape):

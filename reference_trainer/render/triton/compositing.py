@@ -1,4 +1,4 @@
-"""Front-to-back compositing, its gradient, absolute gradients, and pictures of many masks.
+"""Front-to-back compositing, its gradient, absolute gradients, and renders of many masks.
 
 A pixel's transmittance is negative from the splat on that terminates it (`MIN_TRANSMITTANCE`): one register instead of
 two, and the largest of a tile says whether it is finished, which is asked every 32 entries.
@@ -24,7 +24,7 @@ __all__ = ["absolute_gradients", "composite", "composite_masks"]
 _MAX_ALPHA, _MIN_ALPHA = tl.constexpr(MAX_ALPHA), tl.constexpr(MIN_ALPHA)
 _MIN_TRANSMITTANCE = tl.constexpr(MIN_TRANSMITTANCE)
 _CHUNK = tl.constexpr(32)
-_MASKS = 4  # pictures that a program draws: 4 x 64 states of four values, 72 registers in all; 8 would take 162
+_MASKS = 4  # images that a program renders: 4 x 64 states of four values, 72 registers in all; 8 would take 162
 
 
 @triton.jit
@@ -40,7 +40,7 @@ def composite_forward(
     table, starts, gaussians, background, image, alpha, width, height,
     columns, STRIDE: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr,
 ):  # fmt: skip
-    """Draw a tile: image (3 or 4, H, W), whose fourth channel is depth, and accumulated alpha (H, W)."""
+    """Render a tile: image (3 or 4, H, W), whose fourth channel is depth, and accumulated alpha (H, W)."""
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
     t = tl.where(inside, 1.0, -1.0)  # pixels beyond the border are finished before they begin
@@ -81,7 +81,7 @@ def composite_backward(
 
         d / d alpha_i = T_i along_i - beyond_i / (1 - alpha_i)        beyond_i = beyond_{i-1} - T_i alpha_i along_i
 
-    where beyond_0 is the drawn picture times its gradient. The gradient passes the clamp of alpha.
+    where beyond_0 is the rendered image times its gradient. The gradient passes the clamp of alpha.
     """
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
@@ -136,16 +136,16 @@ def composite_masked(
     table, starts, gaussians, background, ratios, images, alphas, count,
     width, height, columns, STRIDE: tl.constexpr, TILE: tl.constexpr, MASKS: tl.constexpr,
 ):  # fmt: skip
-    """Draw a tile of MASKS of ``count`` pictures, given by ratios (M, count) on the opacities of the table.
+    """Render a tile of MASKS of ``count`` images, given by ratios (M, count) on the opacities of the table.
 
     What does not depend on the opacity, the exponential among it, is evaluated once for all of them: with pixels along
-    the last axis and one warp, a lane holds all pictures of its two pixels.
+    the last axis and one warp, a lane holds all images of its two pixels.
     """
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
-    picture = tl.program_id(1) * MASKS + tl.arange(0, MASKS)
-    drawn = inside[None, :] & (picture < count)[:, None]
-    t = tl.where(drawn, 1.0, -1.0)
+    which = tl.program_id(1) * MASKS + tl.arange(0, MASKS)
+    shown = inside[None, :] & (which < count)[:, None]
+    t = tl.where(shown, 1.0, -1.0)
     r, g, b = tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t)
     begin, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     while (begin < end) & (tl.max(t) > 0):
@@ -155,7 +155,7 @@ def composite_masked(
             log_opacity = tl.load(row + 5)
             if log_opacity >= FAINT:
                 raw, _geometry = alpha_at(row, log_opacity, x, y)
-                ratio = tl.load(ratios + i.to(tl.int64) * count + picture, mask=picture < count, other=0.0)
+                ratio = tl.load(ratios + i.to(tl.int64) * count + which, mask=which < count, other=0.0)
                 lower = ratio[:, None] * raw[None, :]
                 weight, t = _pass(tl.where(lower >= _MIN_ALPHA, tl.minimum(lower, _MAX_ALPHA), 0.0), t)
                 r += weight * tl.load(row + 6)
@@ -163,12 +163,12 @@ def composite_masked(
                 b += weight * tl.load(row + 8)
         begin += _CHUNK
     t, size = tl.abs(t), width * height
-    at = picture.to(tl.int64)[:, None] * size + place[None, :]
-    tl.store(alphas + at, 1 - t, mask=drawn)
-    at += picture.to(tl.int64)[:, None] * (2 * size)  # three channels each
-    tl.store(images + at, r + t * tl.load(background), mask=drawn)
-    tl.store(images + size + at, g + t * tl.load(background + 1), mask=drawn)
-    tl.store(images + 2 * size + at, b + t * tl.load(background + 2), mask=drawn)
+    at = which.to(tl.int64)[:, None] * size + place[None, :]
+    tl.store(alphas + at, 1 - t, mask=shown)
+    at += which.to(tl.int64)[:, None] * (2 * size)  # three channels each
+    tl.store(images + at, r + t * tl.load(background), mask=shown)
+    tl.store(images + size + at, g + t * tl.load(background + 1), mask=shown)
+    tl.store(images + 2 * size + at, b + t * tl.load(background + 2), mask=shown)
 
 
 class _Composite(torch.autograd.Function):
@@ -205,7 +205,7 @@ def _gradients(lists: Lists, table: Tensor, *images: Tensor, absolute: bool) -> 
 
 
 def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Draw splats front to back, see `Engine.composite`."""
+    """Composite splats front to back, see `Engine.composite`."""
     p = splats.projection
     image, alpha = _Composite.apply(  # type: ignore[no-untyped-call]
         splats, background, depth, p.means, p.factors, splats.opacities, splats.colors, p.depths
@@ -214,7 +214,7 @@ def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tenso
 
 
 def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Draw all in one pass, see `Engine.composite_masks`."""
+    """Render all in one pass, see `Engine.composite_masks`."""
     lists, count = Lists.of(splats.lists), len(opacities)
     highest = opacities.amax(0)
     table = tiles.make_table(splats._replace(opacities=highest))
@@ -230,8 +230,8 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
     return images, alphas
 
 
-def absolute_gradients(splats: Splats, drawn: Tensor, gradient: Tensor) -> Tensor:
+def absolute_gradients(splats: Splats, rendered: Tensor, gradient: Tensor) -> Tensor:
     """Sum the absolute gradients of the centers, see `Engine.absolute_gradients`."""
     lists, table = Lists.of(splats.lists), tiles.make_table(splats, splats.projection.depths[:, None])
-    rows = _gradients(lists, table, drawn[:4], drawn[4], gradient[:4], gradient[4], absolute=True)
+    rows = _gradients(lists, table, rendered[:4], rendered[4], gradient[:4], gradient[4], absolute=True)
     return rows[:, :2].contiguous()

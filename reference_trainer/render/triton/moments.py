@@ -56,14 +56,14 @@ def _store3(image, place, size, inside, r, g, b):
 
 @triton.jit(do_not_specialize=["width", "height", "columns"])
 def moments_forward(
-    table, starts, gaussians, behind, mean, variance, alpha, width, height,
+    table, starts, gaussians, background, mean, variance, alpha, width, height,
     columns, STRIDE: tl.constexpr, TILE: tl.constexpr, MAX: tl.constexpr,
 ):  # fmt: skip
     """Composite mean and variance (3, H, W) and the expected alpha (H, W) of a tile, back to front."""
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
     size = width * height
-    m0, m1, m2 = _load3(behind, place, size, inside)
+    m0, m1, m2 = _load3(background, place, size, inside)
     v0, v1, v2, t = tl.zeros_like(m0), tl.zeros_like(m0), tl.zeros_like(m0), tl.zeros_like(m0) + 1
     begin, e = tl.load(starts + tile), tl.load(starts + tile + 1) - 1
     while e >= begin:
@@ -200,11 +200,11 @@ def moments_backward(
         _store3(images, place, size, inside, u0, u1, u2)
 
 
-def moments_of(table: Tensor, lists: Lists, behind: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def moments_of(table: Tensor, lists: Lists, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return mean and variance (3, H, W) and the expected alpha (H, W) of a table of splats and moments, (M, 11)."""
     mean, variance = (table.new_empty(3, lists.height, lists.width) for _ in range(2))
     alpha = table.new_empty(lists.height, lists.width)
-    tiles.over_tiles(moments_forward, lists, table, behind.contiguous(), mean, variance, alpha, MAX=lists.max_alpha)
+    tiles.over_tiles(moments_forward, lists, table, background.contiguous(), mean, variance, alpha, MAX=lists.max_alpha)
     return mean, variance, alpha
 
 
@@ -227,35 +227,35 @@ class _Moments(torch.autograd.Function):
     """Mean and variance of the colors, and the expected accumulated alpha."""
 
     @staticmethod
-    def forward(ctx: Any, splats: Splats, multiplier: Tensor, behind: Tensor, *_differentiable: Tensor) -> Any:
+    def forward(ctx: Any, splats: Splats, multiplier: Tensor, background: Tensor, *_differentiable: Tensor) -> Any:
         table, ctx.lists = tiles.make_table(splats, multiplier), Lists.of(splats.lists)
-        ctx.save_for_backward(table, behind)
-        return moments_of(table, ctx.lists, behind)
+        ctx.save_for_backward(table, background)
+        return moments_of(table, ctx.lists, background)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        table, behind = ctx.saved_tensors
-        g, to_behind = _gradients(table, ctx.lists, torch.cat([*upstream[:2], upstream[2][None], behind]))
-        return None, g[:, 9:11], to_behind, g[:, :2], g[:, 2:5], g[:, 5], g[:, 6:9]
+        table, background = ctx.saved_tensors
+        g, to_background = _gradients(table, ctx.lists, torch.cat([*upstream[:2], upstream[2][None], background]))
+        return None, g[:, 9:11], to_background, g[:, :2], g[:, 2:5], g[:, 5], g[:, 6:9]
 
 
-def moments(splats: Splats, multiplier: Tensor, behind: Tensor) -> MomentImages:
+def moments(splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
     """Composite mean and variance back to front, see `Engine.moments`."""
     p = splats.projection
     images = _Moments.apply(  # type: ignore[no-untyped-call]
-        splats, multiplier, behind, p.means, p.factors, splats.opacities, splats.colors
+        splats, multiplier, background, p.means, p.factors, splats.opacities, splats.colors
     )
     return MomentImages(*images)
 
 
-def shares_of(table: Tensor, lists: Lists, behind: Tensor, weights: Tensor) -> Tensor:
+def shares_of(table: Tensor, lists: Lists, background: Tensor, weights: Tensor) -> Tensor:
     """Return every row's share of the variance, mean over RGB, for weights of the pixels (H, W); (M,), float64."""
     nothing = weights.new_zeros(3, *weights.shape)
-    images = torch.cat([nothing, (weights / 3).expand_as(nothing), nothing[:1], behind])
+    images = torch.cat([nothing, (weights / 3).expand_as(nothing), nothing[:1], background])
     return _gradients(table, lists, images)[0][:, 11].double()
 
 
-def shares(splats: Splats, multiplier: Tensor, behind: Tensor, weights: Tensor) -> Tensor:
+def shares(splats: Splats, multiplier: Tensor, background: Tensor, weights: Tensor) -> Tensor:
     """Return every splat's share of the weighted variance of the pixels, see `Engine.shares`."""
-    return shares_of(tiles.make_table(splats, multiplier), Lists.of(splats.lists), behind, weights)
+    return shares_of(tiles.make_table(splats, multiplier), Lists.of(splats.lists), background, weights)

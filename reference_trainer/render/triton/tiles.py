@@ -1,6 +1,6 @@
 """What the kernels of a tile share: its pixels, the alphas of its splats at them, and where gradients go.
 
-A program draws one tile, two of its 64 pixels per lane of one warp (one on AMD's wide wavefronts). A warp needs no
+A program renders one tile, two of its 64 pixels per lane of one warp (one on AMD's wide wavefronts). A warp needs no
 shared memory and no barriers, its values fit into registers, and 32 of them share a multiprocessor, which hides the
 latency of the loads: all lanes read the same row of the table, one transaction for the whole tile.
 """

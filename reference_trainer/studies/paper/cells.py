@@ -22,6 +22,7 @@ from reference_trainer.runs.engines.engine import Failure, Task, attempt
 from reference_trainer.runs.folder import folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.runs.measure import of_run
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.paper.claims import Claim, Setting
@@ -129,7 +130,7 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
             raise FileNotFoundError(
                 f"there is no folder {folder}: say with --data, or $CA_REG_DATA, where the scenes are."
             )
-        if not grid.scenes[name].options.load().test:
+        if not load_scene(grid.scenes[name].options).test:
             raise ValueError(f"{name} has no test views, which the claims are about: hold some out with --split llff.")
     cells = {_folder(grid, cell): cell for cell in left}
     failed: dict[str, Failure] = {}

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from reference_trainer.losses import LOSSES
-from reference_trainer.losses.term import PriorTerm
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.training.losses import LOSSES
+from reference_trainer.training.losses.term import PriorTerm
 
 __all__ = ["SCENES", "PaperScene", "chosen_scenes"]
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier, apply_dropout, apply_opacity_noise, draw_keep_mask, draw_opacity_noise
 from reference_trainer.camera import Camera
-from reference_trainer.render import Splats, draw, splat
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render import Splats, rasterize, splat
+from reference_trainer.render.renderer import render_moments
 from reference_trainer.studies.stability.baseline import render_simply
 from reference_trainer.studies.stability.scenes import PARAMETERS, StressScene
 
@@ -50,7 +50,7 @@ def scene_quantities(
     scene = scene.to(dtype, camera=torch.float64)
     n = scene.means.shape[0]
     leaves = _leaves(scene)
-    out = draw(splats_of(leaves), background=scene.background)
+    out = rasterize(splats_of(leaves), background=scene.background)
     result = {"image": out.image.detach(), "alpha": out.alpha.detach()}
     result |= _gradients(_loss(out.image, out.alpha, scene.camera), leaves.parameters, _GRADIENTS)
 
@@ -73,7 +73,7 @@ def scene_quantities(
     noise = draw_opacity_noise(n, sigma, generator=torch.Generator().manual_seed(_SEED))
     drawn = {"dropout": apply_dropout(scene.opacities, keep), "noise": apply_opacity_noise(scene.opacities, noise)}
     for name, opacities in drawn.items():
-        result[name] = draw(splats_of(replace(scene, opacities=opacities)), background=scene.background).image
+        result[name] = rasterize(splats_of(replace(scene, opacities=opacities)), background=scene.background).image
     return result
 
 

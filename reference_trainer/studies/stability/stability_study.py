@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from reference_trainer.evaluation.results import machine, markdown_table
-from reference_trainer.render.engine import drawn_by, engines_on
+from reference_trainer.render.engine import engines_on, using_engine
 from reference_trainer.studies.stability.blends import blend_cases
 from reference_trainer.studies.stability.case import Case, Probe
 from reference_trainer.studies.stability.geometry import geometry_cases
@@ -68,7 +68,7 @@ def judge_with(number: int, engine: str | None) -> Record:
     if engine is None:
         record = judge(case)
     else:
-        with drawn_by(engine):
+        with using_engine(engine):
             record = judge(case)
     return {"engine": engine, "seconds": perf_counter() - start, **record}
 

@@ -47,7 +47,9 @@ def test_plan_says_first_which_pictures_and_views(capsys):
 
 def test_the_scene_may_be_given_either_way(monkeypatch):
     loaded: list[SceneOptions] = []
-    monkeypatch.setattr(SceneOptions, "load", lambda self, **k: loaded.append(self) or (_ for _ in ()).throw(OSError))
+    monkeypatch.setattr(
+        "reference_trainer.scenes.load._load", lambda x, *_: loaded.append(x) or (_ for _ in ()).throw(OSError)
+    )
     for arguments in (["garden"], ["--path", "garden"], []):
         with pytest.raises(SystemExit):
             main(["plan", *arguments, "--views", "5"])
@@ -84,6 +86,6 @@ def test_a_value_is_not_an_option():
 
 def test_plan_says_what_the_loader_did(tiny_scene, monkeypatch, capsys):
     noted = dataclasses.replace(tiny_scene, notes=("lens distortion is undone",))
-    monkeypatch.setattr(SceneOptions, "load", lambda self, **keywords: noted)
+    monkeypatch.setattr("reference_trainer.scenes.load._load", lambda *_: noted)
     main(["plan", "garden"])
     assert capsys.readouterr().out.splitlines()[3] == "lens distortion is undone"

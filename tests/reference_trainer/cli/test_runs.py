@@ -69,9 +69,9 @@ def test_a_ply_is_known_by_its_name(monkeypatch):
     assert asked == ["somewhere/a.PLY"]
 
 
-@pytest.mark.parametrize("engine", ["torch", "loops"])
+@pytest.mark.parametrize("engine", ["torch", "numba"])
 def test_the_engine_is_chosen_said_and_noted(engine, trained, capsys, tmp_path, monkeypatch):
-    if engine == "loops":
+    if engine == "numba":
         pytest.importorskip("numba")
     monkeypatch.setenv("CA_REG_ENGINE", "auto")  # which the option changes, for workers
     main(["evaluate", str(trained), "--samples", "2", "--engine", engine, "--out", str(tmp_path)])

@@ -4,7 +4,7 @@ import torch
 from oracles import brute_force, random_scene
 
 from reference_trainer.compat.rasterizer import rasterizer_module
-from reference_trainer.render.eager.projection import project
+from reference_trainer.render.torch.projection import project
 
 
 def test_scores_are_sums_over_the_pixels_at_which_a_gaussian_is_drawn(settings_of):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from reference_trainer.camera import Camera
 from reference_trainer.compat.rasterizer import rasterizer_module
 from reference_trainer.compat.settings import camera_of
-from reference_trainer.render.eager.spherical_harmonics import evaluate_sh
+from reference_trainer.render.torch.projection import evaluate_sh
 
 NAME = "diff_gaussian_rasterization"
 DEPTH_ALPHA = ("depth", "alpha")

@@ -77,7 +77,7 @@ def test_the_digest_is_of_what_is_inlined(monkeypatch):
     monkeypatch.setattr(compiling.Path, "read_bytes", edited)
     changed = ""
     assert compiling._digest() == compiling._DIGEST
-    for changed in ("constants.py", "tiles.py", "harmonics.py", "drawing.py"):  # noqa: B007
+    for changed in ("constants.py", "tiles.py", "projection.py", "compositing.py"):  # noqa: B007
         assert compiling._digest() != compiling._DIGEST
     changed = "threads.py"
     assert compiling._digest() == compiling._DIGEST

@@ -9,14 +9,14 @@ from engines import CASES, ON_CARDS, Case
 from stand_ins.card import CARD, pretended_card
 
 
-@pytest.fixture(params=["torch", "loops"])
+@pytest.fixture(params=["torch", "numba"])
 def engine(request, monkeypatch) -> str:
     """Each engine in turn draws what it can."""
     return chosen(request.param, monkeypatch)
 
 
 def chosen(name: str, monkeypatch: pytest.MonkeyPatch) -> str:
-    if name == "loops":
+    if name == "numba":
         pytest.importorskip("numba")
     monkeypatch.setenv("CA_REG_ENGINE", name)
     return name

@@ -1,10 +1,14 @@
-"""Which engine draws."""
+"""Which engine renders, and the choice of the user afterwards."""
+
+import os
+from importlib.util import find_spec
 
 import pytest
 import torch
 from oracles import random_scene
 
 from reference_trainer.render import describe_engine, render, use_engine
+from reference_trainer.render.engine import engine_for, engines_on, using_engine
 
 pytest.importorskip("numba")
 
@@ -17,15 +21,15 @@ def restored(monkeypatch):
 @pytest.mark.parametrize(
     ("chosen", "dtype", "name"),
     [
-        ("auto", torch.float32, "loops"),
-        ("loops", torch.float32, "loops"),
+        ("auto", torch.float32, "numba"),
+        ("numba", torch.float32, "numba"),
         ("torch", torch.float32, "torch"),
         ("auto", torch.float64, "torch"),
-        ("loops", torch.float64, "torch"),
-        ("auto", torch.bfloat16, "loops"),  # is drawn in float32
+        ("numba", torch.float64, "torch"),
+        ("auto", torch.bfloat16, "numba"),  # is drawn in float32
     ],
 )
-def test_loops_draw_float32_on_a_processor(chosen, dtype, name):
+def test_numba_renders_float32_on_a_processor(chosen, dtype, name):
     use_engine(chosen)
     scene = random_scene(3, 9, 7, seed=1).to(dtype)
     camera = scene.camera.to(dtype=torch.float64)
@@ -34,16 +38,84 @@ def test_loops_draw_float32_on_a_processor(chosen, dtype, name):
 
 def test_the_line_that_says_which():
     threads = torch.get_num_threads()
-    assert describe_engine("cpu").startswith("loops (numba ")
+    assert describe_engine("cpu").startswith("numba (")
     assert describe_engine("cpu").endswith(f", {threads} thread{'s' * (threads > 1)})")
-    assert describe_engine("cuda").split()[0] in ("triton", "torch")  # also where there is no card, before a sweep
+    assert describe_engine("cuda").split()[0] == (
+        "triton" if find_spec("triton") else "torch"
+    )  # also where there is no card, as before a sweep on other machines
     use_engine("torch")
     assert describe_engine("cpu") == "torch"
 
 
 def test_an_engine_that_does_not_exist(monkeypatch):
-    with pytest.raises(ValueError, match="there is no engine 'metal'; choose one of auto, torch, loops"):
+    with pytest.raises(ValueError, match="there is no engine 'metal'; choose one of auto, torch, numba"):
         use_engine("metal")
     monkeypatch.setenv("CA_REG_ENGINE", "metal")
     with pytest.raises(ValueError, match="CA_REG_ENGINE names the engine 'metal'"):
         describe_engine("cpu")
+
+
+def test_the_old_name_of_an_engine_is_refused_with_the_new_one(monkeypatch):
+    with pytest.raises(ValueError, match="no engine 'loops'; it is called numba now"):
+        use_engine("loops")
+    monkeypatch.setenv("CA_REG_ENGINE", "loops")
+    with pytest.raises(ValueError, match="CA_REG_ENGINE names the engine 'loops'; it is called numba now"):
+        describe_engine("cpu")
+
+
+@pytest.mark.parametrize("chosen", [None, "auto", "torch"])
+@pytest.mark.parametrize("drawing", ["numba", "torch"])
+def test_what_was_chosen_is_chosen_again(chosen, drawing, monkeypatch):
+    if chosen is None:
+        monkeypatch.delenv("CA_REG_ENGINE", raising=False)
+    else:
+        monkeypatch.setenv("CA_REG_ENGINE", chosen)
+
+    def interrupted():
+        with using_engine(drawing):
+            assert describe_engine("cpu").startswith(drawing)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert os.environ.get("CA_REG_ENGINE") == chosen
+
+
+def test_an_engine_that_is_not_there_changes_nothing(monkeypatch):
+    monkeypatch.setenv("CA_REG_ENGINE", "torch")
+    with pytest.raises(ValueError, match="no engine 'lasers'"), using_engine("lasers"):
+        pass
+    assert os.environ["CA_REG_ENGINE"] == "torch"
+
+
+def test_loops_draw_on_a_cpu_alone():
+    assert engines_on(torch.device("cpu")) == ("numba", "torch")
+    assert engines_on(torch.device("cuda")) == (("triton", "torch") if find_spec("triton") else ("torch",))
+
+
+def test_triton_renders_float32_on_a_card_and_if_interpreted_on_a_cpu(monkeypatch):
+    """Also where there is no card, as before a sweep on other machines."""
+    pytest.importorskip("triton")
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    for chosen, device, dtype, name in [
+        ("auto", "cuda", torch.float32, "triton"),
+        ("auto", "cuda", torch.float64, "torch"),
+        ("torch", "cuda", torch.float32, "torch"),
+        ("triton", "cuda", torch.float32, "triton"),
+        ("triton", "cpu", torch.float64, "torch"),
+    ]:
+        monkeypatch.setenv("CA_REG_ENGINE", chosen)
+        assert engine_for(torch.device(device), dtype).name == name
+    assert engine_for(torch.device("cpu")).name != "triton"  # compiled kernels cannot run there
+    monkeypatch.setenv("CA_REG_ENGINE", "triton")
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    assert engine_for(torch.device("cpu")).name == "triton"
+    assert describe_engine("cpu").startswith("triton ")
+    assert describe_engine("cpu").endswith("interpreted)")
+
+
+def test_triton_that_is_missing_is_an_error_only_if_asked_for(monkeypatch):
+    monkeypatch.setattr("reference_trainer.render.engine._triton_engine", lambda: None)
+    assert engines_on(torch.device("cuda")) == ("torch",)
+    with pytest.raises(ImportError, match="pip install triton"), using_engine("triton"):
+        pass

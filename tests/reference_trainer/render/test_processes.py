@@ -36,7 +36,7 @@ def picture(*_):
     tensors = [means, torch.randn(3000, 4, generator=g), 0.05 * torch.rand(3000, 3, generator=g),
                torch.rand(3000, generator=g).requires_grad_()]
     out = render(*tensors, Camera(torch.eye(4), 90.0, 90.0, 50.0, 40.0, 100, 80), colors=means)
-    assert out.splats.engine.name == "loops"
+    assert out.splats.engine.name == "numba"
     out.image.square().sum().backward()
     return out.image.detach().numpy().tobytes() + tensors[3].grad.numpy().tobytes()
 """
@@ -180,7 +180,7 @@ main(["train", "--downscale", "16", "--iterations", "2", "--monitor-every", "0",
 main(["warmup"])
 assert "numba" not in sys.modules
 try:
-    main(["render", out, "--engine", "loops"])
+    main(["render", out, "--engine", "numba"])
 except SystemExit as exit_:
     print("code", exit_.code)
 """
@@ -203,7 +203,7 @@ with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     print(describe_engine("cpu"), describe_engine("cpu"), [str(x.message) for x in caught])
 try:
-    use_engine("loops")
+    use_engine("numba")
 except ImportError as error:
     print(error)
 """,
@@ -211,7 +211,7 @@ except ImportError as error:
     )
     assert out.startswith("torch torch ['numba is installed but cannot be imported (Numba needs NumPy 1.0 or less): ")
     assert out.count("numba is installed") == 1
-    assert "the compiled loops need numba" in out
+    assert "the engine numba needs numba" in out
 
 
 def test_warmup_leaves_nothing_to_compile(tmp_path):

@@ -1,16 +1,16 @@
-"""The projection against autograd Jacobians, float128-like arithmetic and numpy."""
+"""The projection against autograd Jacobians, float128-like arithmetic and numpy; spherical harmonics."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
-from oracles import random_scene
+from oracles import random_scene, spherical_harmonics
 
 from reference_trainer.camera import Camera
 from reference_trainer.render import splat
-from reference_trainer.render.eager.projection import project
-from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
+from reference_trainer.render.densification import SMALLEST_SPREAD, longer_radii
+from reference_trainer.render.torch.projection import evaluate_sh, project, sh_basis
 from reference_trainer.rotations import rotation_matrices
 
 
@@ -159,3 +159,18 @@ def test_every_engine_projects_alike(kind, case):
         ).all()
     depths = scene.means @ scene.camera.world_to_camera[2, :3] + scene.camera.world_to_camera[2, 3]
     assert torch.equal(splats.indices, torch.nonzero(depths > 0.2).squeeze(1))
+
+
+def test_the_basis_is_scipys():
+    directions = torch.nn.functional.normalize(
+        torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64), dim=1
+    )
+    torch.testing.assert_close(sh_basis(directions, 3), spherical_harmonics(directions, 3), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_lower_degrees_are_a_prefix(degree):
+    directions = torch.nn.functional.normalize(torch.randn(5, 3, dtype=torch.float64), dim=1)
+    coefficients = torch.randn(5, (degree + 1) ** 2, 3, dtype=torch.float64)
+    expected = torch.einsum("nk,nkc->nc", sh_basis(directions, 3)[:, : (degree + 1) ** 2], coefficients)
+    torch.testing.assert_close(evaluate_sh(coefficients, directions, degree), (expected + 0.5).clamp(min=0))

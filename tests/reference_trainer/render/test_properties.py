@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from oracles import GaussianScene, random_scene
 
 from ca_reg.functional import Multiplier
-from reference_trainer.render import draw, render_moments, splat, use_engine, variance_shares
+from reference_trainer.render import rasterize, render_moments, splat, use_engine, variance_shares
 from reference_trainer.render.constants import MIN_ALPHA, MIN_TRANSMITTANCE
 
 pytest.importorskip("numba")
@@ -64,7 +64,7 @@ def results(scene, engine, dtype, weights, mask, random):
         out = render_moments(splats, Multiplier(leaves[5], leaves[6]), background=leaves[7])
         images = torch.cat([out.mean, out.variance, out.alpha_mean[None]])
     else:
-        out = draw(splats, background=torch.tensor([0.2, 0.9, 0.5]), depth=True)
+        out = rasterize(splats, background=torch.tensor([0.2, 0.9, 0.5]), depth=True)
         images = torch.cat([out.image, out.alpha[None], out.depth[None]])
     if mask is None:
         mask, _ = decided(splats)
@@ -79,8 +79,8 @@ def agree(random, scene):
     shape = (8, scene.camera.height, scene.camera.width)
     weights = torch.randn(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     splats, exact, gradients, shares, mask = results(scene, "torch", torch.float64, weights, None, random)
-    ours, image, mine, parts, _ = results(scene, "loops", torch.float32, weights, mask, random)
-    assert (splats.engine.name, ours.engine.name) == ("torch", "loops")
+    ours, image, mine, parts, _ = results(scene, "numba", torch.float32, weights, mask, random)
+    assert (splats.engine.name, ours.engine.name) == ("torch", "numba")
     assert torch.equal(splats.indices, ours.indices)
     assert torch.isfinite(image).all()
     error = (image - exact).abs() / exact.abs().clamp(min=1.0)

@@ -7,7 +7,7 @@ import torch
 from oracles import GaussianScene, brute_force, random_scene
 
 from reference_trainer.camera import Camera
-from reference_trainer.render import draw, draw_masks, render, splat
+from reference_trainer.render import rasterize, render, render_masks, splat
 
 
 @functools.cache
@@ -151,7 +151,7 @@ def test_a_mask_draws_what_a_fresh_render_draws(case):
     for lower in (scene.opacities * (torch.rand(150, generator=g) > 0.5), scene.opacities * 0.3, 0 * scene.opacities):
         opacities = lower.clone().requires_grad_()
         fresh = lower.clone().requires_grad_()
-        one = draw(whole.engine.masked(whole, opacities[whole.indices]))
+        one = rasterize(whole.engine.masked(whole, opacities[whole.indices]))
         other = render(*scene[:3], fresh, scene.camera, colors=scene.colors)
         torch.testing.assert_close(one.image, other.image, rtol=0, atol=10 * torch.finfo(case.dtype).eps)
         torch.testing.assert_close(one.alpha, other.alpha, rtol=0, atol=10 * torch.finfo(case.dtype).eps)
@@ -172,7 +172,7 @@ def test_many_masks_at_once_draw_what_fresh_renders_draw(case):
     opacities = scene.opacities * torch.stack([x.to(case.dtype) for x in factors])
     whole = splat(*scene[:4], scene.camera, colors=scene.colors)
     for some in (opacities, opacities[:2], opacities[1:2]):
-        images, alphas = draw_masks(whole, some, background=background)
+        images, alphas = render_masks(whole, some, background=background)
         assert images.shape == (len(some), 3, 21, 37)
         for image, alpha, opacity in zip(images, alphas, some, strict=True):
             fresh = render(*scene[:3], opacity, scene.camera, colors=scene.colors, background=background)
@@ -288,7 +288,7 @@ def test_an_input_that_was_changed_before_the_backward_pass_does_not_falsify_it(
         image = render(means, *scene[1:4], scene.camera, colors=scene.colors).image
         with torch.no_grad():
             means.add_(change)
-        if case.engine == "loops":  # which keeps what it was given, the other engine copies of it
+        if case.engine == "numba":  # which keeps what it was given, the other engine copies of it
             with pytest.raises(RuntimeError, match="modified by an inplace operation"):
                 image.sum().backward()
             return

@@ -10,7 +10,7 @@ import torch
 from oracles import random_scene
 
 from ca_reg.functional import Multiplier
-from reference_trainer.render import draw, draw_masks, render_moments, splat, variance_shares
+from reference_trainer.render import rasterize, render_masks, render_moments, splat, variance_shares
 from reference_trainer.render.constants import TILE
 
 pytest.importorskip("numba")
@@ -20,7 +20,7 @@ from reference_trainer.compiled.threads import in_threads
 @pytest.fixture(autouse=True)
 def loops(monkeypatch):
     """The loops, and as many threads as before at the end."""
-    monkeypatch.setenv("CA_REG_ENGINE", "loops")
+    monkeypatch.setenv("CA_REG_ENGINE", "numba")
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
@@ -31,9 +31,9 @@ def everything(scene):
     sh = (scene.colors[:, None] - 0.5).repeat(1, 9, 1) / 3
     leaves = [x.clone().requires_grad_() for x in (*scene[:4], sh)]
     splats = splat(*leaves[:4], scene.camera, sh=leaves[4])
-    out = draw(splats, depth=True)
-    kept = draw(splats.engine.masked(splats, splats.opacities * (splats.indices % 2)))
-    masks = draw_masks(
+    out = rasterize(splats, depth=True)
+    kept = rasterize(splats.engine.masked(splats, splats.opacities * (splats.indices % 2)))
+    masks = render_masks(
         splats, scene.opacities * torch.stack([torch.arange(len(sh)) % n for n in (2, 3, 4)]).clamp(max=1)
     )
     moments = render_moments(splats, Multiplier.dropout(0.4))
@@ -163,10 +163,10 @@ def test_no_loop_is_compiled_again_for_views_of_tensors():
         leaves = [change(x) for x in scene.tensors()]
         for opacities in (leaves[3], leaves[3][:, None]):
             splats = splat(*leaves[:3], opacities, scene.camera, colors=leaves[4])
-            out = draw(splats, background=strided(torch.rand(3)), depth=True)
+            out = rasterize(splats, background=strided(torch.rand(3)), depth=True)
             out.image[:, ::2].sum().backward(retain_graph=True) if out.image.requires_grad else None
-            draw(splats.engine.masked(splats, change(0.5 * splats.opacities.detach())))
-            draw_masks(splats, change(0.5 * opacities.detach().reshape(-1)).expand(2, -1))
+            rasterize(splats.engine.masked(splats, change(0.5 * splats.opacities.detach())))
+            render_masks(splats, change(0.5 * opacities.detach().reshape(-1)).expand(2, -1))
             backdrop = torch.rand(2 * TILE, 3 * TILE, 3).permute(2, 0, 1)
             moments = render_moments(splats, Multiplier(strided(torch.rand(40)), 0.2), background=backdrop)
             moments.variance.permute(2, 1, 0).sum().backward()

@@ -8,6 +8,7 @@ from oracles import random_scene
 
 from reference_trainer.render import splat
 from reference_trainer.render.constants import MIN_ALPHA, TILE
+from reference_trainer.render.torch import compositing
 
 ROUNDING = {torch.float64: 1e-9, torch.float32: 1e-3}  # of an alpha, relative
 
@@ -52,7 +53,7 @@ def test_lists_hold_every_gaussian_that_counts_and_few_others(n, width, height, 
 def test_both_engines_list_the_same_but_for_what_touches_a_tile_by_rounding(monkeypatch):
     pytest.importorskip("numba")
     scene, tables = random_scene(400, 61, 43, seed=3, size=0.15).to(torch.float32), []
-    for name in ("torch", "loops"):
+    for name in ("torch", "numba"):
         monkeypatch.setenv("CA_REG_ENGINE", name)
         splats = splat(*scene[:4], scene.camera, colors=scene.colors)
         assert splats.engine.name == name
@@ -65,7 +66,7 @@ def test_both_engines_list_the_same_but_for_what_touches_a_tile_by_rounding(monk
 def test_the_rows_of_a_gaussian_are_its_own_and_follow_each_other(monkeypatch):
     """A row for every entry, those of a Gaussian in sequence: so no sum depends on the threads."""
     pytest.importorskip("numba")
-    monkeypatch.setenv("CA_REG_ENGINE", "loops")
+    monkeypatch.setenv("CA_REG_ENGINE", "numba")
     scene = random_scene(150, 50, 30, seed=5, size=0.2).to(torch.float32)
     lists = splat(*scene[:4], scene.camera, colors=scene.colors).lists
     assert lists.slots.sort().values.tolist() == list(range(len(lists.gaussians)))
@@ -84,14 +85,13 @@ def test_equal_depths_keep_the_order_of_the_gaussians(case):
 
 @pytest.mark.parametrize("budget", [1, 4000, 1 << 30])
 def test_blocks_hold_every_list_once_whatever_their_size(budget, monkeypatch):
-    from reference_trainer.render.eager import walk
 
-    monkeypatch.setattr(walk, "BLOCK_PAIRS_CPU", budget)
+    monkeypatch.setattr(compositing, "BLOCK_PAIRS_CPU", budget)
     scene = random_scene(300, 70, 50, seed=1)
     lists = splat(*scene[:4], scene.camera, colors=scene.colors).lists
     starts, found = lists.starts.tolist(), {}
-    for block in walk.blocks(lists, torch.device("cpu")):
-        assert block.gaussians.numel() * walk.PIXELS <= budget or len(block.tiles) == 1
+    for block in compositing.blocks(lists, torch.device("cpu")):
+        assert block.gaussians.numel() * compositing.PIXELS <= budget or len(block.tiles) == 1
         for tile, row in zip(block.tiles.tolist(), block.gaussians.tolist(), strict=True):
             assert tile not in found
             length = starts[tile + 1] - starts[tile]

@@ -11,10 +11,10 @@ import torch
 from oracles import random_scene
 from stand_ins.gsplat import centered, rasterization
 
-from reference_trainer.density.statistics import DensityStatistics
 from reference_trainer.render import render
-from reference_trainer.renderers import OwnRenderer
+from reference_trainer.renderers import BuiltinRenderer
 from reference_trainer.renderers.gsplat import load_gsplat_render, render_by
+from reference_trainer.training.density.operations import DensityStatistics
 
 N, WIDTH, HEIGHT = 80, 40, 24
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
@@ -24,7 +24,7 @@ by_stand_in = functools.partial(render_by, rasterization)
 
 def own(means, quaternions, scales, opacities, camera, **options):
     given = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities, "camera": camera}
-    return OwnRenderer()(**given, **options)
+    return BuiltinRenderer()(**given, **options)
 
 
 def scene_of(device="cpu"):
@@ -49,7 +49,7 @@ def rendered(renderer, scene, **options):
 def counted(out, camera):
     """What the trainer enters into the densification statistics."""
     statistics = DensityStatistics.zeros(N, out.image.device)
-    indices, drawn, gradient = out.splats.indices, out.splats.lists.touched, out.splats.projection.means.grad
+    indices, drawn, gradient = out.splats.indices, out.splats.touched, out.splats.means.grad
     statistics.update(indices, drawn, gradient, camera.width, camera.height)
     return statistics
 
@@ -94,7 +94,7 @@ def test_without_gradients_nothing_is_retained():
     scene = scene_of()
     with torch.no_grad():
         out = by_stand_in(*scene[:4], scene.camera, colors=scene.colors)
-    assert not out.splats.projection.means.requires_grad
+    assert not out.splats.means.requires_grad
     assert out.depth is None
 
 
@@ -115,8 +115,8 @@ def test_absolute_gradients_are_left_where_density_control_looks():
     scene, sums = scene_of(), []
     for renderer in (own, by_stand_in):
         splats = rendered(renderer, scene, absgrad=True)[0].splats
-        assert (splats.projection.means.absgrad >= splats.projection.means.grad.abs() * (1 - 1e-4) - 1e-6).all()
-        sums.append(torch.zeros(N, 2).index_copy(0, splats.indices, splats.projection.means.absgrad))
+        assert (splats.means.absgrad >= splats.means.grad.abs() * (1 - 1e-4) - 1e-6).all()
+        sums.append(torch.zeros(N, 2).index_copy(0, splats.indices, splats.means.absgrad))
     torch.testing.assert_close(*sums)
     assert sums[0].any()
 
@@ -127,13 +127,15 @@ def test_absolute_gradients_without_a_background_are_those_over_black():
         means = scene.means.clone().requires_grad_()
         out = own(means, *scene[1:4], scene.camera, colors=scene.colors, absgrad=True, **options)
         out.image.square().sum().backward()
-        sums.append(out.splats.projection.means.absgrad)
+        sums.append(out.splats.means.absgrad)
     assert torch.equal(*sums)
     assert sums[0].any()
 
 
 def test_what_is_missing_is_told(monkeypatch):
-    with pytest.raises(RuntimeError, match=r"the device is 'cpu': train with --device cuda, or with --renderer torch"):
+    with pytest.raises(
+        RuntimeError, match=r"the device is 'cpu': train with --device cuda, or with --renderer builtin"
+    ):
         load_gsplat_render("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(RuntimeError, match="torch finds none"):

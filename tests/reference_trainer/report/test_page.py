@@ -22,6 +22,7 @@ from reference_trainer.report.findings import find
 from reference_trainer.report.page import write_report
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG, run_settings
 from reference_trainer.runs.measure import of_run
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.config import TrainConfig
@@ -157,7 +158,7 @@ def test_the_models_are_those_of_the_runs(pair):
 
 def unfinished(folder: Path, options: SceneOptions, config: TrainConfig) -> Trainer:
     """Train a run for some steps and leave it."""
-    trainer = Trainer(options.load(), config)
+    trainer = Trainer(load_scene(options), config)
     trainer.train(until=4)
     trainer.save(folder / CHECKPOINT)
     write_json(folder / CONFIG, run_settings(options, config))

@@ -27,6 +27,7 @@ from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.grid import Running
 from reference_trainer.runs.measure import render_run
 from reference_trainer.runs.run import run_experiment
+from reference_trainer.scenes import load as scenes_load
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud
@@ -134,12 +135,12 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("changes", "lacking"),
-    [({"loss": "pearson"}, "--depth"), ({"fields": 2, "loss": "co_regularization"}, "no initial point")],
+    [({"loss": "pearson"}, "--depth"), ({"models": 2, "loss": "co_regularization"}, "no initial point")],
 )
 def test_what_a_scene_lacks_is_said_once_before_any_run(changes, lacking, tmp_path, monkeypatch):
     nothing = PointCloud(torch.empty(0, 3), torch.empty(0, 3), "nowhere")
     scene = dataclasses.replace(synthetic_scene(width=32, height=24, points=9), points=nothing)
-    monkeypatch.setattr(SceneOptions, "load", lambda self: scene)
+    monkeypatch.setattr("reference_trainer.scenes.load._load", lambda *_: scene)
     engine = Here()
     with pytest.raises(ValueError, match=lacking):
         compare({tmp_path: SceneOptions()}, {"a": TrainConfig(**changes)}, [0, 1], Running(engine))
@@ -157,8 +158,8 @@ def test_failed_runs_are_listed_at_the_end(tmp_path):
 
 def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch):
     """Nothing is held out: exact CA is reported at the training views, between them and around them."""
-    load = SceneOptions.load
-    monkeypatch.setattr(SceneOptions, "load", lambda *a, **named: dataclasses.replace(load(*a, **named), test=()))
+    load = scenes_load._load
+    monkeypatch.setattr(scenes_load, "_load", lambda *a: dataclasses.replace(load(*a), test=()))
     said: list[str] = []
     results = run_experiment(options, short, tmp_path / "a" / "seed_0", say=said.append)
     assert sum(line.startswith("No test views") for line in said) == 1
@@ -321,7 +322,7 @@ def test_a_worker_draws_with_the_engine_of_the_sweep(chosen, tmp_path, options, 
     train = grid.train_run
 
     def elsewhere(*arguments):
-        monkeypatch.setenv("CA_REG_ENGINE", "loops")
+        monkeypatch.setenv("CA_REG_ENGINE", "numba")
         return train(*arguments)
 
     monkeypatch.setattr(grid, "train_run", elsewhere)

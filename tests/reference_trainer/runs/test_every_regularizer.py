@@ -10,6 +10,7 @@ from ca_reg.regularizers import REGULARIZERS
 from reference_trainer.runs.folder import PLY
 from reference_trainer.runs.run import load_run, model_of, run_experiment
 from reference_trainer.runs.score_ply import of_ply
+from reference_trainer.scenes import load_scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
@@ -38,7 +39,7 @@ def test_it_trains_is_saved_and_resumed_evaluated_and_named_in_the_ply(name, opt
     assert math.isfinite(results["mean"]["test"]["psnr"])
     trainer = load_run(out)
 
-    scene = options.load(seed=config.seed)
+    scene = load_scene(options, seed=config.seed)
     first, plain = Trainer(scene, config), Trainer(scene, dataclasses.replace(config, regularizer=""))
     first.train(until=13)  # clones, splits, pruning and a reset before and after
     first.save(tmp_path / "half.pt")
@@ -74,7 +75,7 @@ def test_it_trains_is_saved_and_resumed_evaluated_and_named_in_the_ply(name, opt
 def test_it_trains_on_its_expectation_or_says_that_it_has_none(name, options):
     """What it learns included: the expectation has a gradient in it."""
     expression = EXPRESSIONS.get(name, name)
-    scene, config = options.load(seed=0), TrainConfig(iterations=3, regularizer=expression, analytic=True)
+    scene, config = load_scene(options, seed=0), TrainConfig(iterations=3, regularizer=expression, analytic=True)
     sampled = Trainer(scene, dataclasses.replace(config, analytic=False))
     if sampled.regularizer.multiplied(sampled.gaussians.params(sampled.views[0].camera)) is None:
         with pytest.raises(ValueError, match="analytic training needs draws"):

@@ -19,6 +19,7 @@ from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.runs.lock import LOCK, FolderInUseError, run_lock
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import run_experiment
+from reference_trainer.scenes import load_scene
 from reference_trainer.training.trainer import Trainer
 
 HOLD = """
@@ -141,15 +142,15 @@ def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, opti
 def test_what_another_process_finished_while_the_scene_was_read_is_not_trained_again(
     tmp_path, options, short, monkeypatch
 ):
-    scene, results = options.load(seed=0), []
+    scene, results = load_scene(options, seed=0), []
 
     def load(self, seed):
         with monkeypatch.context() as patch:
-            patch.setattr(type(options), "load", lambda self, seed: scene)
+            patch.setattr("reference_trainer.scenes.load._load", lambda *_: scene)
             results.append(run_experiment(options, short, tmp_path, monitor_every=0))
         return scene
 
-    monkeypatch.setattr(type(options), "load", load)
+    monkeypatch.setattr("reference_trainer.scenes.load._load", load)
     monkeypatch.setattr("reference_trainer.runs.run._train", train_once(monkeypatch))
     assert run_experiment(options, short, tmp_path, monitor_every=0) == results[0]
 

@@ -14,10 +14,10 @@ from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import run as run_module
 from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, CONFIG, PLAN, PLY, RESULTS, read_results
 from reference_trainer.runs.run import load_run, model_of, run_experiment
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
-from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.interruption import TrainingInterrupted, TrainingStoppedError
 from reference_trainer.training.plan import Plan
 from reference_trainer.training.trainer import Trainer
 
@@ -87,7 +87,7 @@ def test_everything_is_there(finished, options, short):
 def test_a_second_call_does_nothing(finished, options, short, monkeypatch):
     out, results = finished
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
-    monkeypatch.setattr(SceneOptions, "load", lambda *a, **k: pytest.fail("the scene was loaded again"))
+    monkeypatch.setattr("reference_trainer.scenes.load._load", lambda *_: pytest.fail("the scene was loaded again"))
     said: list[str] = []
     assert run_experiment(options, short, out, **EVERY, say=said.append) == results
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
@@ -231,7 +231,7 @@ def test_an_interrupted_run_ends_like_an_uninterrupted_one(finished, interrupted
 
 def test_a_killed_run_continues_from_its_last_checkpoint(finished, options, short, tmp_path):
     """No farewell: the checkpoint of step 4, and a log that is already further, with half a line at its end."""
-    partial = Trainer(options.load(seed=0), short)
+    partial = Trainer(load_scene(options, seed=0), short)
     partial.train(until=4)
     partial.save(tmp_path / CHECKPOINT)
     shutil.copy(finished[0] / CONFIG, tmp_path)
@@ -293,12 +293,12 @@ def test_a_mistyped_scene_does_not_claim_the_folder(options, short, tmp_path):
 
 def broken_scene(options: SceneOptions, monkeypatch) -> None:
     """Give one training view a pixel that is not a number."""
-    scene = options.load()
+    scene = load_scene(options)
     image = scene.train[1].image.clone()
     image[0, 0, 0] = torch.nan
     bad = dataclasses.replace(scene.train[1], image=image)
     scene = dataclasses.replace(scene, train=(scene.train[0], bad, scene.train[2]))
-    monkeypatch.setattr(SceneOptions, "load", lambda self, seed: scene)
+    monkeypatch.setattr("reference_trainer.scenes.load._load", lambda *_: scene)
 
 
 def test_divergence_keeps_the_last_checkpoint(options, short, monkeypatch, tmp_path):

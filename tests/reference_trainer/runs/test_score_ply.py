@@ -15,6 +15,7 @@ from reference_trainer.runs.folder import BAKED_PLY, PLY
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.runs.score_ply import of_ply, score_ply
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import OrbitOptions
 
 FEW = OrbitOptions(cameras=2, size=40)
@@ -39,7 +40,7 @@ def orbit(gaussians, tmp_path, name, **keywords):
 def test_a_baked_ply_is_not_scaled_twice(run, options):
     """Three ways to the image of the test: baked and marked, plain with the rate, and the checkpoint."""
     out, _ = run
-    scene = options.load()
+    scene = load_scene(options)
     baked, facts = of_ply(out / BAKED_PLY, background=scene.background)  # it says its rate itself
     plain, _ = of_ply(out / PLY, background=scene.background, regularizer="dropout(0.2)")
     trained, _ = of_run(out)
@@ -65,7 +66,7 @@ def test_a_ply_without_dropout_is_used_as_it_is(tmp_path, run):
 
 def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options, tmp_path):
     out, results = scaled
-    scene = options.load()
+    scene = load_scene(options)
     model, facts = of_ply(out / BAKED_PLY, background=scene.background)
     assert "those of the test, used as they are, for CA too" in str(facts)
     trained = of_run(out)[0]
@@ -240,7 +241,7 @@ def test_a_ply_on_its_scene(run, options, tmp_path):
 def test_a_model_that_fits_no_photograph(tmp_path, photographs, request):
     """It is in the pictures, so only the photographs can tell."""
     options = request.getfixturevalue(photographs)
-    points = options.load().points
+    points = load_scene(options).points
     right = Gaussians.from_points(points.positions, points.colors, torch.full((len(points.positions),), 0.05),
                                   sh_degree=0, opacity=0.9)  # fmt: skip
     wrong = dataclasses.replace(right, sh_dc=-right.sh_dc)  # a negative

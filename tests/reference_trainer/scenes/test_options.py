@@ -9,14 +9,14 @@ def test_loading_takes_the_options_by_name():
     assert (
         load_scene("synthetic", downscale=8, views=2)
         .train[0]
-        .image.equal(SceneOptions("synthetic", downscale=8, views=2).load().train[0].image)
+        .image.equal(load_scene(SceneOptions("synthetic", downscale=8, views=2)).train[0].image)
     )
     with pytest.raises(TypeError, match="no_such_option"):
         load_scene("synthetic", no_such_option=1)
 
 
 def test_the_seed_moves_the_points_and_not_the_photographs():
-    one, other = (SceneOptions("synthetic", downscale=8).load(seed=seed) for seed in (0, 1))
+    one, other = (load_scene(SceneOptions("synthetic", downscale=8), seed=seed) for seed in (0, 1))
     assert not torch.equal(one.points.positions, other.points.positions)
     assert torch.equal(one.train[0].image, other.train[0].image)
 

@@ -215,7 +215,7 @@ def test_every_engine_draws_its_own_moments(scene, monkeypatch):
 
 
 def test_where_there_are_no_loops_torch_alone_is_measured(scene, monkeypatch):
-    monkeypatch.setattr("reference_trainer.render.engine._loop_engine", lambda: None)
+    monkeypatch.setattr("reference_trainer.render.engine._numba_engine", lambda: None)
     measured = error_runtime(*scene, max_samples=16, seeds=1)
     assert [m["name"] for m in measured["estimators"][-3:]] == [FIRST_ORDER, TORCH, DOUBLE]
     assert single(measured) is entry(measured, TORCH)
@@ -292,9 +292,9 @@ def test_the_table_holds_medians_and_root_mean_squares():
     assert cells[8] == ["exact float64", "", "0.5", "5", "2", "0", "0"]
     assert "8x6, 12 Gaussians; the region covers 75%" in text
     # 12.5 / K = 25e-8 at K = 5e7, which takes 5e6 seconds.
-    end = "continued as K^-0.5 it equals that of exact, loops at K = 5.0e+07, after 1.4e+03 hours"
+    end = "continued as K^-0.5 it equals that of exact, numba at K = 5.0e+07, after 1.4e+03 hours"
     assert f"falls as K^-0.50; {end}" in text
-    assert "exact, loops has none" in text.partition("## y")[2]
+    assert "exact, numba has none" in text.partition("## y")[2]
 
 
 def test_the_figure_can_be_drawn_without_an_error_of_the_exact_estimate(tmp_path):

@@ -17,6 +17,7 @@ from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG
 from reference_trainer.runs.measure import of_run
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies import gaussian_shares as shares_module
 from reference_trainer.studies.gaussian_shares import study_attribution
@@ -27,7 +28,7 @@ from reference_trainer.training.trainer import Trainer
 def run(tmp_path_factory, options, short):
     """Opaque enough to have a score after a few steps."""
     out = tmp_path_factory.mktemp("run")
-    trainer = Trainer(options.load(), dataclasses.replace(short, initial_opacity=0.9, noise=0.0))
+    trainer = Trainer(load_scene(options), dataclasses.replace(short, initial_opacity=0.9, noise=0.0))
     trainer.train(until=4)
     trainer.save(out / CHECKPOINT)
     config = {"scene": dataclasses.asdict(options), "config": dataclasses.asdict(trainer.config)}
@@ -206,7 +207,7 @@ def test_other_views_and_mistakes(run, tmp_path):
 def test_a_run_whose_opacities_depend_on_the_camera(run, tmp_path, options, short):
     """Its PLYs hold the plain ones."""
     trainer = Trainer(
-        options.load(),
+        load_scene(options),
         dataclasses.replace(short, regularizer="depth(0.4, scale=True)", dropout=0.0, noise=0.0, initial_opacity=0.9),
     )
     trainer.train(until=4)

@@ -3,8 +3,9 @@ import math
 
 import pytest
 
-from reference_trainer.density import DENSITY, AdaptiveDensity
-from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.assembly import check, make_regularizer
+from reference_trainer.training.config import TrainConfig, saved_config
+from reference_trainer.training.density import DENSITY, AdaptiveDensity
 from reference_trainer.training.recipes import RECIPES, with_recipe
 
 
@@ -37,7 +38,7 @@ def test_an_unknown_recipe_names_the_known_ones():
 def test_all_regularizers_are_one_expression(settings, text):
     config = TrainConfig(**settings)
     assert config.regularizers == text
-    assert len(config.make_regularizer()) == (text.count("+") + 1 if text else 0)
+    assert len(make_regularizer(config)) == (text.count("+") + 1 if text else 0)
 
 
 @pytest.mark.parametrize(
@@ -104,16 +105,16 @@ def test_counts_are_integers(field, value):
 )
 def test_expressions_are_read_before_anything_is_trained(settings, message):
     with pytest.raises(ValueError, match=message):
-        TrainConfig(**settings).check()
+        check(TrainConfig(**settings))
 
 
 def test_only_what_the_renderer_lacks_is_named(monkeypatch):
     class Greedy(AdaptiveDensity):
-        needs = frozenset({"absgrad", "fields", "moments"})
+        needs = frozenset({"absgrad", "models", "moments"})
 
     monkeypatch.setitem(DENSITY._factories, "greedy", Greedy)
     with pytest.raises(ValueError, match="greedy needs moments, which the renderer gsplat lacks"):
-        TrainConfig(density="greedy", fields=2, renderer="gsplat").check()
+        check(TrainConfig(density="greedy", models=2, renderer="gsplat"))
 
 
 @pytest.mark.parametrize("regularizer", [{"dropout": 0.2}, {"noise": 0.8}])
@@ -129,3 +130,11 @@ def test_an_expectation_needs_something_random():
     with pytest.raises(ValueError, match="set dropout, noise or regularizer"):
         TrainConfig(analytic=True)
     assert TrainConfig(analytic=True, noise=0.1, loss="photometric + co_adaptation(2.0)").analytic
+
+
+def test_settings_of_an_older_version_are_read_and_their_names_refused():
+    old = dataclasses.asdict(TrainConfig(dropout=0.2))
+    old |= {"renderer": "torch", "fields": old.pop("models") + 1}
+    assert saved_config(old, "config.json") == TrainConfig(dropout=0.2, models=2)
+    with pytest.raises(ValueError, match="the renderer 'torch' is called 'builtin' now"):
+        TrainConfig(renderer="torch")

@@ -8,6 +8,7 @@ import torch
 from stand_ins.gsplat import rasterization
 
 from reference_trainer.renderers import gsplat
+from reference_trainer.training.assembly import check
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
@@ -28,9 +29,9 @@ def test_a_run_with_gsplat_is_the_run_with_the_own_renderer(tiny_scene, busy, mo
 
 
 def test_the_choice_is_checked(tiny_scene):
-    with pytest.raises(RuntimeError, match="--renderer torch"):
+    with pytest.raises(RuntimeError, match="--renderer builtin"):
         Trainer(tiny_scene, TrainConfig(renderer="gsplat"))
-    with pytest.raises(ValueError, match="there is no renderer 'cuda'; choose one of gsplat, torch"):
-        TrainConfig(renderer="cuda").check()
-    with pytest.raises(ValueError, match="analytic training needs the moments of the torch renderer"):
-        TrainConfig(renderer="gsplat", analytic=True, dropout=0.2).check()
+    with pytest.raises(ValueError, match="there is no renderer 'cuda'; choose one of builtin, gsplat"):
+        check(TrainConfig(renderer="cuda"))
+    with pytest.raises(ValueError, match="analytic training needs the moments of the builtin renderer"):
+        check(TrainConfig(renderer="gsplat", analytic=True, dropout=0.2))

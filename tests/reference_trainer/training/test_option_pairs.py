@@ -19,16 +19,16 @@ from torch import Tensor
 
 from ca_reg import Chain, GaussianDropout, OpacityNoise
 from reference_trainer.camera import Camera
-from reference_trainer.losses.photometric import expected_photometric_loss, photometric_loss
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
 from reference_trainer.render import render
 from reference_trainer.renderers import gsplat as kernels
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import PointCloud, Scene, View
+from reference_trainer.training.assembly import check
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.determinism import deterministic
-from reference_trainer.training.randomness import stream
+from reference_trainer.training.losses.photometric import expected_photometric_loss, photometric_loss
+from reference_trainer.training.randomness import deterministic, stream
 from reference_trainer.training.recipes import RECIPES
 from reference_trainer.training.trainer import Trainer
 
@@ -52,7 +52,7 @@ OPTIONS: dict[str, dict[str, object]] = {
 NEEDS = {"compensate": "dropout", "clip": "noise", "scale": "noise"}
 REFUSED = {
     ("analytic", "recipe binocular"): "analytic training has no draw, which Warp needs",
-    ("analytic", "renderer"): "analytic training needs the moments of the torch renderer",
+    ("analytic", "renderer"): "analytic training needs the moments of the builtin renderer",
     ("loss", "renderer"): "the loss needs moments, which the renderer gsplat lacks",
 }
 SCHEDULE = {  # what decides when and how fast, and enters no single step
@@ -66,7 +66,7 @@ SCHEDULE = {  # what decides when and how fast, and enters no single step
 
 def test_every_setting_is_an_option_here_or_a_matter_of_the_schedule():
     named = {field for settings in OPTIONS.values() for field in settings} - {"recipe"}
-    elsewhere = {"regularizer", "fields", "random_background"}  # test_every_regularizer.py, test_fields.py
+    elsewhere = {"regularizer", "models", "random_background"}  # test_every_regularizer.py, test_models.py
     assert named | SCHEDULE | elsewhere == {field.name for field in dataclasses.fields(TrainConfig)}
     assert not named & SCHEDULE
 
@@ -182,7 +182,7 @@ def gsplat(monkeypatch):
 def test_a_pair_is_what_its_options_say_or_refused(pair, gsplat):
     if pair in REFUSED:
         with pytest.raises(ValueError, match=REFUSED[pair]):
-            together(pair)[0].check()
+            check(together(pair)[0])
         return
     (config, draws, scaled), white = together(pair), "white" in pair
     world = scene(white)

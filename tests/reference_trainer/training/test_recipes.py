@@ -13,13 +13,14 @@ import pytest
 import torch
 
 from ca_reg.schedules import as_schedule
-from reference_trainer.density import absgrad, adaptive
 from reference_trainer.model.rendering import render_gaussians
-from reference_trainer.render.radii import SMALLEST_SPREAD, longer_radii
+from reference_trainer.render.densification import SMALLEST_SPREAD, longer_radii
 from reference_trainer.scenes.depth import true_priors
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training import step as step_module
+from reference_trainer.training.assembly import check, make_density, make_losses
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.density import adaptive
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.recipes import RECIPES, with_recipe
 from reference_trainer.training.trainer import Trainer
@@ -115,7 +116,6 @@ def control(monkeypatch: pytest.MonkeyPatch, scene: Scene, config: TrainConfig) 
     note("prune", lambda *a, max_scale, **k: None if max_scale is None else pytest.approx(max_scale / scene.extent))
     note("reset_opacity", lambda optimizer, ceiling: ceiling)
     note("decay_opacity", lambda optimizer, factor: factor)
-    monkeypatch.setattr(absgrad, "reset_opacity", adaptive.reset_opacity)
     for trainer.step in range(config.iterations):
         trainer.density.before_step(trainer.optimizer, trainer.step)
     return events
@@ -165,7 +165,7 @@ def test_rates_and_thresholds(scene, name):
     # DNGaussian's L1 + 0.2 (1 - SSIM) is this but for a factor.
     dssim = pytest.approx(0.2 / 1.2, abs=1e-6) if far > 1 else 0.2
     last = 1.6e-4 if name == "segs" else far * 1.6e-6
-    assert (config.means_rate_final, config.make_losses()[0].lambda_dssim) == (pytest.approx(last), dssim)
+    assert (config.means_rate_final, make_losses(config)[0].lambda_dssim) == (pytest.approx(last), dssim)
     assert (config.prune_opacity, config.initial_opacity) == (0.01 if far > 1 else 0.005, 0.1)
     assert (config.dense_fraction, config.initial_scale) == (0.01, 1.0)
 
@@ -190,7 +190,7 @@ WEIGHTS = {
 @pytest.mark.parametrize("share", [1.0, 0.1])
 def test_terms_act_when_those_of_the_code_base_do(name, share):
     config = with_recipe(name, iterations=round(share * RECIPES[name].config.iterations))
-    terms = config.make_losses()
+    terms = make_losses(config)
     assert {type(term).__name__ for term in terms} == {"Photometric", *WEIGHTS.get(name, {})}
     for kind, weight in WEIGHTS.get(name, {}).items():
         for iteration in (1, 1_000, 1_010, 9_500, 9_510, 20_000, 20_010, 30_000):  # of the code base
@@ -206,11 +206,11 @@ def test_steps_scale_with_the_iterations_and_all_else_stays():
     changed = {name: value for name, value in vars(short).items() if value != vars(whole)[name]}
     assert changed == {"iterations": 3_000, "sh_every": 100, "densify_from": 50, "densify_until": 700,
                        "prune_size_from": 300, "opacity_reset_from": 300}  # fmt: skip
-    assert with_recipe("fsgs", iterations=2_000).make_density().unpool_until == 400
+    assert make_density(with_recipe("fsgs", iterations=2_000)).unpool_until == 400
     for name, recipe in RECIPES.items():
         for iterations in (1, 30, 60_000):
             config = with_recipe(name, iterations=iterations, dropout=0.2)
-            config.check()
+            check(config)
             assert config.density.count("(") == recipe.config.density.count("(")
 
 

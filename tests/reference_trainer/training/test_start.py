@@ -13,6 +13,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes import load_scene
+from reference_trainer.training.assembly import make_regularizer
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
@@ -67,7 +68,7 @@ def test_the_first_step_sees_the_model_as_it_is(ply, monkeypatch):
 
 def test_it_goes_on_with_what_a_regularizer_has_learned(tmp_path):
     learned = torch.linspace(-1, 1, 60)
-    name = next(iter(TrainConfig(regularizer="concrete").make_regularizer().learns))
+    name = next(iter(make_regularizer(TrainConfig(regularizer="concrete")).learns))
     save_ply(model(**{name: learned}), tmp_path / "b.ply")
     config = TrainConfig(regularizer="concrete")
     assert torch.equal(Trainer(scene_with(tmp_path / "b.ply"), config).gaussians.learned[name], learned)

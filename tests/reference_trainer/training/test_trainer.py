@@ -7,13 +7,12 @@ import pytest
 import torch
 
 from reference_trainer.camera import Camera
-from reference_trainer.density import adaptive
-from reference_trainer.density.operations import reset_opacity
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.errors import TrainingStoppedError
-from reference_trainer.training.interruption import TrainingInterrupted
+from reference_trainer.training.density import adaptive
+from reference_trainer.training.density.operations import reset_opacity
+from reference_trainer.training.interruption import TrainingInterrupted, TrainingStoppedError
 from reference_trainer.training.trainer import Trainer
 
 

@@ -11,6 +11,7 @@ from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.measure import of_run
 from reference_trainer.runs.run import run_experiment
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.orbit import orbit_views
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.viewer import window
@@ -83,7 +84,7 @@ def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer
 
 
 def test_a_training_that_is_watched_ends_with_the_same_model(run, options, short, tmp_path, viewer):
-    client = Client(options.load().train[0].camera)
+    client = Client(load_scene(options).train[0].camera)
     viewer._connected(client)
     modes = cycle(["render", "co-adaptation", "depth", "heat"])
 

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
-from reference_trainer.render import draw, draw_masks, render_moments, splat, use_engine, variance_shares
-from reference_trainer.render.absolute import absgrad_sink, splat_weights, with_absolute_gradients
+from reference_trainer.render import rasterize, render_masks, render_moments, splat, use_engine, variance_shares
 from reference_trainer.render.constants import MIN_ALPHA, MIN_TRANSMITTANCE, TILE
+from reference_trainer.render.densification import absgrad_sink, splat_weights, with_absolute_gradients
 
 DEVICE = torch.device("cpu" if os.environ.get("TRITON_INTERPRET") == "1" else "cuda")
 # What differs between a processor and a card is the rounding of division, square roots and exponentials.
@@ -179,7 +179,7 @@ def same(made, w, *, gradient=GRADIENT):
 
 
 def plain(splats, background):
-    out = draw(splats, background=background, depth=True)
+    out = rasterize(splats, background=background, depth=True)
     return (out.image, out.alpha, out.depth), ()
 
 
@@ -214,7 +214,7 @@ def test_images_are_those_of_brute_force(n):
     safe = safe_pixels(s)
     image, alpha = brute_force(*s.tensors(), s.camera)
     leaves = leaves_of("triton", *s.tensors())
-    out = draw(splat(*leaves[:4], s.camera, colors=leaves[4]))
+    out = rasterize(splat(*leaves[:4], s.camera, colors=leaves[4]))
     for mine, exact in ((out.image, image), (out.alpha, alpha)):
         assert ((mine.detach().cpu() - exact) * safe).abs().max() <= 2e-5  # float32 coordinates against float64
 
@@ -230,7 +230,7 @@ def test_harmonics(degree):
     def made(engine):
         leaves = leaves_of(engine, *s[:4], sh)
         splats = splat(*leaves[:4], s.camera, sh=leaves[4], sh_degree=degree)
-        image = draw(splats).image
+        image = rasterize(splats).image
         (image * w.to(image)).sum().backward()
         assert (leaves[4].grad[:, (degree + 1) ** 2 :] == 0).all()
         return Outcome([image.detach().cpu()], [x.grad.cpu() for x in leaves])
@@ -250,8 +250,8 @@ def test_pictures_of_many_masks(count):
     def made(engine):
         leaves = [x.detach() for x in leaves_of(engine, *s.tensors(), lower, BACKGROUND)]
         splats = splat(*leaves[:4], s.camera, colors=leaves[4])
-        one = draw(splats.engine.masked(splats, leaves[5][-1][splats.indices]), background=leaves[6])
-        return [x.cpu() for x in (*draw_masks(splats, leaves[5], background=leaves[6]), one.image, one.alpha)]
+        one = rasterize(splats.engine.masked(splats, leaves[5][-1][splats.indices]), background=leaves[6])
+        return [x.cpu() for x in (*render_masks(splats, leaves[5], background=leaves[6]), one.image, one.alpha)]
 
     mine = made("triton")
     for a, b in zip(mine, made("torch"), strict=True):
@@ -268,7 +268,7 @@ def test_absolute_gradients_and_weights():
         leaves = leaves_of(engine, *s.tensors())
         splats = splat(*leaves[:4], s.camera, colors=leaves[4])
         sink = absgrad_sink(splats.projection.means)
-        out = with_absolute_gradients(draw(splats, depth=True), sink)
+        out = with_absolute_gradients(rasterize(splats, depth=True), sink)
         images = torch.cat([out.image, out.alpha[None], out.depth[None]])
         (images * w.to(images)).sum().backward()
         return Outcome([], [splats.projection.means.absgrad.cpu(), splat_weights(splats).cpu()])

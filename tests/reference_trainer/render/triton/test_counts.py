@@ -26,7 +26,7 @@ def test_an_exact_score_costs_the_same_at_any_size():
     found = json.loads(done.stdout.splitlines()[-1])
     small, large = found["rows"]
     assert large["entries"] > 4 * small["entries"]
-    assert large["drawing"] == small["drawing"] <= 16
+    assert large["rendering"] == small["rendering"] <= 16
     assert abs(large["operations"] - small["operations"]) <= 3  # whether some Gaussians are left out
     assert large["read_backs"] - small["read_backs"] <= 1
     assert found["bytes"] <= 32

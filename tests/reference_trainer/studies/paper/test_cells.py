@@ -19,6 +19,7 @@ from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.runs import grid as grid_module
 from reference_trainer.runs.engines.engine import Failure
 from reference_trainer.runs.grid import Running
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.studies.paper import cells as cells_module
@@ -27,6 +28,7 @@ from reference_trainer.studies.paper.claims import CLAIMS, chosen
 from reference_trainer.studies.paper.comparison import Kept, judged
 from reference_trainer.studies.paper.rows import Rows, config_of, resolved, value
 from reference_trainer.studies.paper.scenes import SCENES, chosen_scenes
+from reference_trainer.training.assembly import check
 
 ALL = Grid(CLAIMS, SCENES)
 """Everything."""
@@ -54,7 +56,7 @@ def test_every_training_is_declared_once_and_covers_its_claims():
 def test_every_training_is_one_that_the_trainer_takes():
     for cell in declared(Grid(CLAIMS, SCENES, seeds=1)):
         config = config_of(cell.setting, cell.seed)
-        config.check()
+        check(config)
         assert config.iterations == 3_000
         options = SCENES[cell.scene].options_for(cell.setting, config.loss)
         needs_depth = cell.setting["recipe"] in ("fsgs", "dngaussian")
@@ -72,7 +74,7 @@ def test_the_schemes_are_those_of_the_registry():
 def test_the_declared_scenes_start_without_their_test_views(data_root):
     widths, views = {}, {}
     for name, scene in chosen_scenes((), data_root, SceneOptions("")).items():
-        loaded = scene.options.load()
+        loaded = load_scene(scene.options)
         widths[name] = loaded.train[0].camera.width
         views[name] = len(loaded.train), len(loaded.test)
         seen = loaded.points.seen_by or frozenset()

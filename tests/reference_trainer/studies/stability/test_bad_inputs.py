@@ -10,8 +10,8 @@ from ca_reg import CAScore, GaussianDropout, OpacityNoise
 from ca_reg import functional as F
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import render
-from reference_trainer.render.engine import drawn_by
-from reference_trainer.render.moments import render_moments
+from reference_trainer.render.engine import using_engine
+from reference_trainer.render.renderer import render_moments
 from reference_trainer.studies.stability.quantities import scene_quantities, splats_of
 from reference_trainer.studies.stability.scenes import PARAMETERS, base_scene
 
@@ -57,12 +57,12 @@ RENDERER = {
 }
 
 
-@pytest.mark.parametrize("engine", ["loops", "torch"])
+@pytest.mark.parametrize("engine", ["numba", "torch"])
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 @pytest.mark.parametrize("name", RENDERER)
 def test_the_renderer_names_the_input(name, bad, engine):
     word = name.replace("camera.", "").partition(" ")[0]
-    with drawn_by(engine), pytest.raises(ValueError, match=word):
+    with using_engine(engine), pytest.raises(ValueError, match=word):
         RENDERER[name](bad)
 
 

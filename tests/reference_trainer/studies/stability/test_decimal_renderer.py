@@ -7,7 +7,7 @@ import torch
 from decimal_renderer import exact_images
 from oracles import brute_force
 
-from reference_trainer.render.engine import drawn_by, engines_on
+from reference_trainer.render.engine import engines_on, using_engine
 from reference_trainer.studies.stability.judge import GRADIENT_TOLERANCE, VALUE_TOLERANCE, relative_error
 from reference_trainer.studies.stability.quantities import (
     IMAGES,
@@ -69,7 +69,7 @@ def test_long_needles_are_drawn_right_where_float64_itself_is_in_doubt(ratio):
     if ratio <= 1e6:  # then its covariances of 1e16 and 0.3 leave float64 nothing to invert
         drawn["reference"] = independent_images(scene)
     for engine in engines_on(torch.device("cpu")):
-        with drawn_by(engine):
+        with using_engine(engine):
             drawn[engine] = scene_quantities(scene, torch.float32)
     for by, quantities in drawn.items():
         for name in IMAGES:

@@ -52,7 +52,7 @@ def test_what_draws_is_judged_with_every_engine_against_one_reference(made_up):
 
     made_up(Case("f", "n", lambda magnitude: Probe(measured, reference)), Case("f", "m", grows, draws=False))
     records = [judge_with(**settings) for settings in stability_study().cases.values()]
-    assert [record["engine"] for record in records] == [*drawn, None] == ["loops", "torch", None]
+    assert [record["engine"] for record in records] == [*drawn, None] == ["numba", "torch", None]
     assert len(references) == 1
 
 
@@ -95,13 +95,13 @@ def test_numbers_tables_and_picture(made_up, tmp_path, capsys):
     made_up(*MADE_UP)
     records = study_stability(tmp_path)
     assert [(case["engine"], case["ending"]) for case in records.values()] == [
-        ("loops", "limit"), ("torch", "limit"), (None, "refused"), (None, "ok")
+        ("numba", "limit"), ("torch", "limit"), (None, "refused"), (None, "ok")
     ]  # fmt: skip
     text = (tmp_path / "stability.md").read_text()
     assert text in capsys.readouterr().out
     assert "22 magnitudes" in text  # 2 (5 + 5) + 2
     rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in text.splitlines()]
-    for engine in ("loops", "torch"):
+    for engine in ("numba", "torch"):
         assert [engine, "3", "1", "1", "1", "0"] in rows
         assert ["grows", engine, "1e+03", "1e-03", "0"] in rows
     assert ["is right", "", "one", "1e-06", "0"] in rows

@@ -1,0 +1,125 @@
+"""From 3D Gaussians to colored 2D ellipses: EWA projection and spherical harmonics."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
+from reference_trainer.render.splats import Projection
+from reference_trainer.rotations import rotations
+
+__all__ = ["evaluate_sh", "project", "sh_basis"]
+
+
+def project(
+    means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera, *, dilation: float = DILATION
+) -> Projection:
+    """Project 3D Gaussians with a local affine approximation of the perspective (EWA splatting).
+
+    Convention: OpenCV camera, half-pixel centers, wxyz quaternions. Every Gaussian must lie in
+    front of the camera.
+
+    The arguments are those of `reference_trainer.render.render`; differentiable in each.
+
+    Example:
+        >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
+        >>> quaternion = torch.tensor([[1.0, 0, 0, 0]])
+        >>> project(torch.tensor([[0.0, 0.0, 1.0]]), quaternion, torch.full((1, 3), 0.1), camera).means.tolist()
+        [[16.0, 16.0]]
+    """
+    view = camera.world_to_camera.to(means)
+    rotation = view[:3, :3]
+    x, y, z = torch.addmm(view[:3, 3:], rotation, means.T).unbind(0)
+    slope_x, slope_y = x / z, y / z
+    limit_x, limit_y = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx, FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
+    right, down, forward = (axis[:, None] for axis in rotation)
+    # The two rows of (Jacobian x view rotation), then of (Jacobian x view rotation x Gaussian
+    # axes), each (3, M).
+    row_x = (camera.fx / z) * (right - slope_x.clamp(-limit_x, limit_x) * forward)
+    row_y = (camera.fy / z) * (down - slope_y.clamp(-limit_y, limit_y) * forward)
+    axes = rotations(quaternions) * scales.T
+    row_x, row_y = (row_x[:, None] * axes).sum(0), (row_y[:, None] * axes).sum(0)
+    xx, xy, yy = (row_x * row_x).sum(0) + dilation, (row_x * row_y).sum(0), (row_y * row_y).sum(0) + dilation
+    # The determinant as a sum of squares (Cauchy-Binet), |ux|^2 |uy|^2 - (ux uy)^2 = |ux x uy|^2:
+    # xx yy - xy^2 would cancel for needles. Divided by yy before it is squared: fourth powers of
+    # the scales would overflow from a million scene sizes on.
+    l22 = torch.rsqrt(yy)
+    cross = torch.linalg.cross(row_x, row_y * l22, dim=0)
+    l11 = torch.rsqrt((cross * cross).sum(0) + dilation * (xx + yy - dilation) * (l22 * l22))
+    return Projection(
+        means=torch.stack([camera.fx * slope_x + camera.cx, camera.fy * slope_y + camera.cy], dim=-1),
+        factors=torch.stack([l11, -xy * (l22 * l22) * l11, l22], dim=-1),
+        covariances=torch.stack([xx, xy, yy], dim=-1),
+        depths=z,
+    )
+
+
+_C0 = math.sqrt(1 / (4 * math.pi))
+_C1 = math.sqrt(3 / (4 * math.pi))
+_C2 = (math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi)), math.sqrt(15 / (16 * math.pi)))
+_C3 = (
+    math.sqrt(35 / (32 * math.pi)),
+    math.sqrt(105 / (4 * math.pi)),
+    math.sqrt(21 / (32 * math.pi)),
+    math.sqrt(7 / (16 * math.pi)),
+    math.sqrt(105 / (16 * math.pi)),
+)
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Evaluate the (degree + 1)^2 real spherical harmonics, up to 3, of unit vectors (N, 3).
+
+    Convention: the Condon-Shortley phase is kept and the order within a band is m = -l .. l, as in
+    the INRIA code.
+
+    Example:
+        >>> sh_basis(torch.tensor([[0.0, 0.0, 1.0]]), 1).shape
+        torch.Size([1, 4])
+    """
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, _C0)]
+    if degree >= 1:
+        basis += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        basis += [_C2[0] * x * y, -_C2[0] * y * z, _C2[1] * (2 * zz - xx - yy), -_C2[0] * x * z, _C2[2] * (xx - yy)]
+    if degree >= 3:
+        basis += [
+            -_C3[0] * y * (3 * xx - yy),
+            _C3[1] * x * y * z,
+            -_C3[2] * y * (4 * zz - xx - yy),
+            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            -_C3[2] * x * (4 * zz - xx - yy),
+            _C3[4] * z * (xx - yy),
+            -_C3[0] * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+def evaluate_sh(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """Evaluate colors from spherical-harmonic coefficients.
+
+    Convention: 0.5 is added and the result is clamped below at 0, as in the INRIA code; it is not
+    clamped above.
+
+    The coefficients are (N, (degree + 1)^2, 3), of degree at most 3, the directions unit vectors
+    from the camera center to the Gaussians, (N, 3), the colors (N, 3).
+
+    Example:
+        >>> evaluate_sh(torch.zeros(2, 1, 3), torch.eye(3)[:2], 0).tolist()
+        [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]
+    """
+    if degree == 0:
+        return torch.relu(_C0 * coefficients[:, 0] + 0.5)
+    count = coefficients.shape[1]
+    # Repeating the basis per channel and summing over it as matrix products keeps all axes long: on
+    # a CPU this is several times faster than a batched product or a broadcast over the three
+    # channels.
+    channels = torch.eye(3, dtype=coefficients.dtype, device=coefficients.device)
+    spread = torch.eye(count, dtype=coefficients.dtype, device=coefficients.device).repeat_interleave(3, dim=1)
+    terms = (sh_basis(directions, degree) @ spread) * coefficients.flatten(1)
+    return torch.relu(terms @ channels.repeat(count, 1) + 0.5)

@@ -1,0 +1,32 @@
+"""The terms of the training loss, and their registry: what ``--loss`` knows by name."""
+
+from ca_reg.registry import Registry
+from ca_reg.schedules import SCHEDULES
+from reference_trainer.training.losses.comparisons import CoAdaptation, Consistency, CoRegularization, StraightThrough
+from reference_trainer.training.losses.depth import PatchDepth, Pearson, SmoothDepth, Warp
+from reference_trainer.training.losses.penalties import Alpha, Flat, Opacity, Scale
+from reference_trainer.training.losses.photometric import Photometric, Views
+from reference_trainer.training.losses.term import LossTerm
+
+__all__ = ["LOSSES", "CoAdaptation", "Consistency", "LossTerm", "Photometric"]
+
+LOSSES: Registry[LossTerm] = Registry(
+    "loss term",
+    LossTerm,  # type: ignore[type-abstract]
+    SCHEDULES,
+    photometric=Photometric,
+    views=Views,
+    pearson=Pearson,
+    patch_depth=PatchDepth,
+    warp=Warp,
+    smooth_depth=SmoothDepth,
+    alpha=Alpha,
+    flat=Flat,
+    scale=Scale,
+    opacity=Opacity,
+    co_adaptation=CoAdaptation,
+    consistency=Consistency,
+    straight_through=StraightThrough,
+    co_regularization=CoRegularization,
+)
+"""The terms by name; ``LOSSES.register("name")`` adds a class."""

@@ -1,0 +1,159 @@
+"""One model in training: the Gaussians that it starts from, and everything that changes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from ca_reg import Chain
+from ca_reg.neighbors import rms_neighbor_distance
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.optimizer import GaussianOptimizer
+from reference_trainer.model.rendering import arguments
+from reference_trainer.render import splat
+from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.density import DensityStrategy
+
+__all__ = ["ModelState", "initial_gaussians", "seen_by_any"]
+
+
+def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
+    """Make one isotropic Gaussian per point, as wide as the distance to its neighbors times ``config.initial_scale``.
+
+    If the scene has a model to start from, its Gaussians are taken as they are, their spherical harmonics cut or padded
+    with zeros to ``config.sh_degree``.
+
+    Args:
+        scene: with its initial points or model.
+        config: says which points to take and how large and how opaque the Gaussians are.
+
+    Raises:
+        ValueError: if only seen points are to be taken and there are none.
+
+    Example:
+        >>> from reference_trainer.scenes import synthetic_scene
+        >>> scene = synthetic_scene(width=16, height=12, points=50)
+        >>> len(initial_gaussians(scene, TrainConfig()))
+        50
+    """
+    if scene.start is not None:
+        bands = (config.sh_degree + 1) ** 2 - 1
+        rest = scene.start.sh_rest[:, :bands]
+        start = replace(scene.start, sh_rest=pad(rest, (0, 0, 0, bands - rest.shape[1])))
+    else:
+        start = Gaussians.from_points(
+            scene.points.positions,
+            scene.points.colors,
+            rms_neighbor_distance(scene.points.positions) * config.initial_scale,
+            sh_degree=config.sh_degree,
+            opacity=config.initial_opacity,
+        )
+    if config.initial_points == "all":
+        return start
+    seen = seen_by_any(start, scene.train)
+    if not bool(seen.any()):
+        raise ValueError(
+            f"no initial Gaussian of scene {scene.name!r} has a pixel in a training view: give other points."
+        )
+    return start[seen]
+
+
+@torch.no_grad()
+def seen_by_any(gaussians: Gaussians, views: tuple[View, ...]) -> Tensor:
+    """Return which Gaussians have a pixel in some view, shape (N,), bool. The others never receive a gradient."""
+    seen = torch.zeros(len(gaussians), dtype=torch.bool)
+    for view in views:
+        splats = splat(**arguments(gaussians), camera=view.camera, sh_degree=0)
+        seen[splats.indices[splats.touched]] = True
+    return seen
+
+
+class ModelState:
+    """Gaussians with an optimizer, density control and regularizers of their own; a training has one, or several.
+
+    All models of a training start from the same points and diverge by their random numbers: every model has its own for
+    the splits of density control and for the draws of regularizers and loss terms.
+
+    Args:
+        scene: with the points to start from.
+        config: all settings.
+        density: its density control; prepared here.
+        regularizer: its regularizers.
+        device: where to train.
+        index: which of the models it is; the first, 0, is the one that is measured and written.
+
+    Attributes:
+        label: prefix of the labels of the model's random streams.
+
+    Raises:
+        ValueError: as `initial_gaussians`.
+
+    Example:
+        >>> from reference_trainer.scenes import synthetic_scene
+        >>>         >>> scene, config = synthetic_scene(width=16, height=12, points=50), TrainConfig()
+        >>> state = ModelState(scene, config, make_density(config), make_regularizer(config))
+        >>> len(state.gaussians)
+        50
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        density: DensityStrategy,
+        regularizer: Chain,
+        *,
+        device: torch.device | str = "cpu",
+        index: int = 0,
+    ) -> None:
+        # The label names random streams: with another word than "field", trainings would come out differently.
+        self.label = f"field {index}/" if index else ""
+        self.regularizer = regularizer
+        learns, start = regularizer.learns, initial_gaussians(scene, config)
+        known = start.learned  # of a model with the same regularizers
+        learned = {name: known.get(name, torch.full((len(start),), x.start)) for name, x in learns.items()}
+        start = replace(start, learned=learned)
+        # The means move in the world's units, everything else in units of its own.
+        rates = {
+            "means": config.means_rate_at(0) * scene.extent,
+            "log_scales": config.scales_rate,
+            "quaternions": config.quaternions_rate,
+            "opacity_logits": config.opacity_rate,
+            "sh_dc": config.color_rate,
+            "sh_rest": config.color_rate / 20,
+            **{name: learned.rate for name, learned in learns.items()},
+        }
+        self.optimizer = GaussianOptimizer(start.to(device), rates)
+        self.density = density
+        density.begin(config, scene, torch.device(device), len(start))
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The model as it stands."""
+        return self.optimizer.gaussians
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the next step depends on, as nested dicts of tensors."""
+        found = {"statistics": self.density.state_dict(), "regularizer": dict(self.regularizer.state_dict())}
+        return found | self.optimizer.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            ValueError: if the regularizers refuse their part.
+        """
+        self.optimizer.load_state_dict(dict(state))
+        # For the size of the loaded model; its counts follow.
+        self.density.reset(len(self.gaussians))
+        self.density.load_state_dict(state["statistics"])
+        try:
+            self.regularizer.load_state_dict(state["regularizer"])
+        except RuntimeError as error:
+            raise ValueError(str(error)) from error

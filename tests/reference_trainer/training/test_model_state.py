@@ -1,0 +1,200 @@
+"""The Gaussians that a training starts from; a training of two models, and what is saved of them."""
+
+import dataclasses
+import gc
+
+import pytest
+import torch
+
+from reference_trainer.camera import Camera
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.runs.run import model_of
+from reference_trainer.scenes.scene import PointCloud, Scene, View
+from reference_trainer.training.assembly import check
+from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.model_state import initial_gaussians, seen_by_any
+from reference_trainer.training.step import Step
+from reference_trainer.training.trainer import Trainer
+
+BEHIND = torch.tensor([[0.0, 0.0, -40.0]])
+
+
+def camera(width: int = 32, height: int = 24) -> Camera:
+    return Camera(torch.eye(4), 20.0, 20.0, width / 2, height / 2, width, height)
+
+
+def with_points(scene: Scene, extra: torch.Tensor) -> Scene:
+    """The scene with more initial points at the end of the list."""
+    points = scene.points
+    positions = torch.cat([points.positions, extra])
+    cloud = PointCloud(positions, torch.cat([points.colors, torch.ones_like(extra)]), points.source)
+    return dataclasses.replace(scene, points=cloud)
+
+
+def test_sizes_are_the_distance_to_the_neighbors_times_the_scale(tiny_scene):
+    whole = initial_gaussians(tiny_scene, TrainConfig())
+    half = initial_gaussians(tiny_scene, TrainConfig(initial_scale=0.5))
+    torch.testing.assert_close(half.scales, whole.scales / 2)
+    torch.testing.assert_close(half.means, whole.means)
+
+
+def test_a_gaussian_is_drawn_where_its_footprint_reaches_the_picture():
+    """At depth 10 the right edge of the picture is at x = 8; a standard deviation of 1 reaches 2.5 further at 0.1."""
+    means = torch.tensor([[0.0, 0.0, 10.0], [9.0, 0.0, 10.0], [40.0, 0.0, 10.0], [0.0, 0.0, -10.0]])
+    gaussians = Gaussians.from_points(means, torch.rand(4, 3), torch.ones(4), sh_degree=0)
+    view = View("a", camera(), torch.zeros(3, 24, 32))
+    assert seen_by_any(gaussians, (view,)).tolist() == [True, True, False, False]
+
+
+def test_unseen_points_change_nothing_at_the_training_views(tiny_scene):
+    """Without draws, which depend on the number of Gaussians, training is the same but for rounding."""
+    scene = with_points(tiny_scene, BEHIND.repeat(3, 1) + torch.arange(3.0)[:, None])
+    drawn = seen_by_any(initial_gaussians(scene, TrainConfig()), scene.train)
+    assert torch.nonzero(~drawn).flatten().tolist() == [150, 151, 152]
+    config = TrainConfig(iterations=6, sh_every=2, densify_every=0, opacity_reset_from=3)
+    everything, seen = (Trainer(scene, dataclasses.replace(config, initial_points=which)) for which in ("all", "seen"))
+    everything.train()
+    seen.train()
+    assert len(seen.gaussians) == len(everything.gaussians) - 3
+    for (name, x), (_, y) in zip(everything.gaussians.named(), seen.gaussians.named(), strict=True):
+        torch.testing.assert_close(x[:150], y, rtol=1e-4, atol=1e-6, msg=lambda m, n=name: f"{n}: {m}")
+
+
+def test_unseen_points_stay_as_they_began(tiny_scene):
+    """That is why they are worth leaving out: no step ever moves them."""
+    scene = with_points(tiny_scene, BEHIND.repeat(3, 1) + torch.arange(3.0)[:, None])
+    trainer = Trainer(scene, TrainConfig(iterations=4, densify_every=0))
+    before = trainer.gaussians.map(lambda x: x.detach()[150:].clone())
+    trainer.train()
+    for (name, x), (_, y) in zip(before.named(), trainer.gaussians.named(), strict=True):
+        assert torch.equal(x, y.detach()[150:]), name
+
+
+def test_no_point_in_view_says_what_to_do(tiny_scene):
+    points = PointCloud(BEHIND.repeat(5, 1) + torch.arange(5.0)[:, None], torch.rand(5, 3), "behind")
+    scene = dataclasses.replace(tiny_scene, points=points, train=(View("a", camera(), torch.zeros(3, 24, 32)),))
+    with pytest.raises(ValueError, match=r"no initial Gaussian .* training view.*other points"):
+        initial_gaussians(scene, TrainConfig(initial_points="seen"))
+
+
+SEGS = "self_ensembling(1.0, every=3, start=6, stop=20, views=2)"
+
+
+def trained(scene, config: TrainConfig, until: int | None = None) -> Trainer:
+    trainer = Trainer(scene, config)
+    trainer.train(until=until)
+    return trainer
+
+
+@pytest.mark.parametrize("changes", [{}, {"analytic": True}, {"density": "mcmc(growth=1.2)", "regularizer": "d2gs"}])
+def test_the_first_of_two_that_are_not_compared_is_the_only_one(tiny_scene, busy, tmp_path, changes):
+    config = dataclasses.replace(busy, iterations=14, loss="photometric + views(2) + consistency", **changes)
+    if config.analytic:
+        config = dataclasses.replace(config, loss="photometric + views(2)")
+    alone, both = (trained(tiny_scene, dataclasses.replace(config, models=n)) for n in (1, 2))
+    torch.testing.assert_close(both.models[0].state_dict(), alone.models[0].state_dict(), rtol=0, atol=0)
+    assert model_of(both).gaussians.means.data_ptr() == both.models[0].gaussians.means.data_ptr()
+    for trainer in (alone, both):
+        trainer.save(tmp_path / "checkpoint.pt")
+        assert len(load_checkpoint(tmp_path / "checkpoint.pt").get("others", [])) == len(trainer.models) - 1
+
+
+def test_models_start_alike_and_draw_on_their_own(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, dropout=0.3, models=3))
+    starts = [model.gaussians for model in trainer.models]
+    assert all(torch.equal(starts[0].means, each.means) for each in starts)
+    assert len({each.means.data_ptr() for each in starts}) == 3
+    steps = trainer._begin_steps()
+    for step in steps:
+        step.sample(depth=False)
+    assert len({step.view.name for step in steps}) == 1
+    keeps = [model.regularizer.keep for model in trainer.models]
+    assert not torch.equal(keeps[0], keeps[1])
+    assert not torch.equal(keeps[1], keeps[2])
+    random = [model.density.split_generator(7).initial_seed() for model in trainer.models]
+    assert len(set(random)) == 3
+
+
+def test_a_training_of_two_fields_is_resumed_to_the_identical_result(tiny_scene, busy, tmp_path):
+    loss = "photometric + co_regularization(between(1.0, 4))"
+    config = dataclasses.replace(busy, iterations=16, loss=loss, density=SEGS, models=2, regularizer="concrete")
+    whole = trained(tiny_scene, config)
+    assert len({len(model.gaussians) for model in whole.models}) == 2
+    for at in (5, 8, 12):
+        part = trained(tiny_scene, config, until=at)
+        part.save(tmp_path / "checkpoint.pt")
+        again = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
+        again.train()
+        for one, other in zip(whole.models, again.models, strict=True):
+            torch.testing.assert_close(other.state_dict(), one.state_dict(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda s: s.pop("others"), "expected 2 models, got 1"),
+        (lambda s: s["others"].clear(), "expected 2 models, got 1"),
+        (lambda s: s["others"].append({}), "expected 2 models, got 3"),
+        (lambda s: s.update(others=3), "damaged checkpoint"),
+        (lambda s: s["others"][0].pop("moments"), "model 1: it lacks 'moments'"),
+        (lambda s: s["others"][0].update(step=3), "model 1: unknown entry 'step'"),
+        (lambda s: s["others"][0]["gaussians"]["means"].fill_(torch.nan), "model 1, means: holds nan"),
+        (lambda s: s["others"][0]["statistics"].update(pictures=torch.zeros(1)), "model 1, statistics: unknown entry"),
+        (
+            lambda s: s["statistics"].update(pictures=torch.zeros(2, 3)),
+            "pictures: expected float32 of shape",
+        ),
+        (lambda s: s["statistics"].pop("pictures"), "statistics: it lacks 'pictures'"),
+    ],
+)
+def test_a_damaged_second_field_is_refused(tiny_scene, tmp_path, change, said):
+    path = tmp_path / "checkpoint.pt"
+    Trainer(tiny_scene, TrainConfig(iterations=30, density=SEGS, models=2)).save(path)
+    state = load_checkpoint(path)
+    change(state)
+    save_checkpoint(path, state)
+    with pytest.raises(ValueError, match=said):
+        Trainer.load(path, tiny_scene)
+
+
+@pytest.mark.parametrize("settings", [{"loss": "photometric + co_regularization"}, {"density": "co_pruning"}])
+def test_what_compares_fields_needs_two(settings):
+    with pytest.raises(ValueError, match="compares models, of which there is one: set models=2"):
+        check(TrainConfig(**settings))
+    check(TrainConfig(**settings, models=2))
+    with pytest.raises(ValueError, match="models must be at least 1, got 0"):
+        TrainConfig(models=0)
+
+
+def test_all_fields_train_over_one_random_background(tiny_scene):
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=9, models=2, random_background=True))
+    colors = []
+    for _ in range(3):
+        steps = trainer._begin_steps()
+        assert torch.equal(steps[0].background, steps[1].background)
+        colors.append(steps[0].background)
+        steps[0].sample(depth=False)
+        behind = (1 - steps[0].rendering.alpha) * colors[-1][:, None, None]
+        over_black = steps[0].render(steps[0].view.camera).image - behind
+        dark = dataclasses.replace(steps[0], background=torch.zeros(3))
+        torch.testing.assert_close(dark.render(dark.view.camera).image, over_black, rtol=0, atol=1e-5)
+        trainer.train_step()
+    assert len({tuple(color.tolist()) for color in colors}) == 3
+    assert torch.equal(model_of(trainer).background, tiny_scene.background)
+    views = tuple(dataclasses.replace(view, alpha=torch.ones(24, 32)) for view in tiny_scene.train)
+    with pytest.raises(ValueError, match="lie on a background already"):
+        Trainer(dataclasses.replace(tiny_scene, train=views), trainer.config)
+
+
+@pytest.mark.parametrize("models", [1, 2])
+def test_nothing_of_a_step_outlives_it(tiny_scene, models):
+    loss = "photometric + views(2)" + " + co_regularization" * (models == 2)
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=4, models=models, loss=loss))
+    gc.collect()
+    gc.disable()
+    try:
+        trainer.train_step()
+        assert not [x for x in gc.get_objects() if type(x) is Step]
+    finally:
+        gc.enable()
