@@ -69,8 +69,8 @@ class Model(NamedTuple):
 class Counts(NamedTuple):
     """What an exact score costs, beyond its arithmetic.
 
-    ``rendering`` of the operations (kernels of Triton included) are those of the engine, without the checks of its inputs
-    and without what the score does with the moments.
+    ``rendering`` of the operations (kernels of Triton included) are those of the engine, without the checks of its
+    inputs and without what the score does with the moments.
     """
 
     operations: int
