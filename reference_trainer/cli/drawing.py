@@ -18,8 +18,8 @@ class Drawing:
     """The rendering engine, for all commands that render."""
 
     engine: Literal["auto", "torch", "numba", "triton"] | None = None
-    """What draws: "numba" (compiled; float32 on a CPU), "torch" (anything), or "auto", whichever fits. By default
-    $CA_REG_ENGINE, or "auto"."""
+    """What draws: "numba" (compiled; float32 on a CPU), "triton" (float32 on a card), "torch" (anything), or "auto",
+    whichever fits. By default $CA_REG_ENGINE, or "auto"."""
 
     def begin(self, device: str, *, trains: bool = False) -> None:
         """Choose the engine of this process and its workers, and print which it is.
