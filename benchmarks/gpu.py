@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 import traceback
+import warnings
 import weakref
 from collections import Counter
 from collections.abc import Callable
@@ -274,7 +275,14 @@ def _times() -> str:
 
 
 def _measure(work: Callable[[], Any]) -> list[str]:
-    """Return the median time, the peak of memory, launches and waits of a call, as text."""
+    """Return the median time, the peak of memory, launches and waits of a call, as text; or what it failed with."""
+    try:
+        return _measured(work)
+    except Exception as error:  # name it, and measure the next
+        return [f"FAILED: {str(error).splitlines()[0][:100] if str(error) else type(error).__name__}", "", "", ""]
+
+
+def _measured(work: Callable[[], Any]) -> list[str]:
     for _ in range(3):
         work()
     times = []
@@ -292,11 +300,10 @@ def _measure(work: Callable[[], Any]) -> list[str]:
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         work()
         torch.cuda.synchronize()
-    kernels = sum(not x.name.startswith(("Memcpy", "Memset")) for x in profile.events())
+    on_card = (x for x in profile.events() if x.device_type == torch.autograd.DeviceType.CUDA)
+    kernels = sum(not x.name.startswith(("Memcpy", "Memset")) for x in on_card)
     torch.cuda.set_sync_debug_mode("warn")
     try:
-        import warnings
-
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             work()
