@@ -52,3 +52,4 @@ ON_CARDS = {
     for device in (CARD, "cuda")
     for name in ("float64", "float32")
 }
+ON_CARDS["triton-cuda-float32"] = Case("triton", torch.float32, "cuda", 2e-4, 1e-3, 0.005)

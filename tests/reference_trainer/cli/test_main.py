@@ -21,7 +21,7 @@ from reference_trainer.training.recipes import RECIPES
     [
         ([], ["demo", "train", "evaluate", "bake", "render", "compare", "warmup"]),
         (["demo"], ["--iterations", "--seeds", "--jobs", "--out"]),
-        (["warmup"], ["--engine", "{None,auto,torch,numba}"]),
+        (["warmup"], ["--engine", "{None,auto,torch,numba,triton}"]),
         (
             ["train"],
             [
