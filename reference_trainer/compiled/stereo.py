@@ -1,4 +1,4 @@
-"""Loops of multi-view stereo: matching costs on planes, their aggregation, slanted refinement, and consistency.
+"""Loops of multi-view stereo: matching costs on planes, their aggregation, and slanted refinement.
 
 Everything is in one picture's pixels and inverse depths (one over the depth along its camera's z axis), float32. A
 map (3, 4) takes a pixel ``(x, y, 1)`` with inverse depth ``w`` to homogeneous pixels of another picture, whose third
@@ -14,15 +14,15 @@ import numpy as np
 
 from reference_trainer.compiled.compiling import inlined, kernel
 
-__all__ = ["NARROW", "STRIP", "WIDE", "agree", "aggregate", "choose", "refine", "sweep"]
+__all__ = ["NARROW", "STRIP", "WIDE", "aggregate", "refine", "sweep"]
 
 Array = Any
 f4 = np.float32
 STRIP = 32
 """Rows that `sweep` works on at a time, so that their costs stay in the processor's cache."""
-NARROW, WIDE = 2, 5
+NARROW, WIDE = 1, 4
 """Half the widths of the two windows of the sweep: the narrow one keeps edges, the wide one finds faint texture."""
-STEPS = 3  # samples on each side of a slanted window's middle, STRIDE pixels apart
+STEPS = 2  # samples on each side of a slanted window's middle, STRIDE pixels apart
 STRIDE = 2
 SAMPLES = (2 * STEPS + 1) ** 2
 _ZERO, _HALF, _ONE, _TWO = f4(0), f4(0.5), f4(1), f4(2)
@@ -36,10 +36,12 @@ def _bilinear(picture: Array, x: Any, y: Any, width: Any, height: Any) -> Any:
     """Return a picture's value at a pixel position (centers at halves), that of the border outside."""
     x = min(max(x - _HALF, _ZERO), f4(width) - f4(1.001))
     y = min(max(y - _HALF, _ZERO), f4(height) - f4(1.001))
-    j, i = int(x), int(y)
+    j, i = np.int32(x), np.int32(y)
     u, v = x - f4(j), y - f4(i)
-    top = picture[i, j] + u * (picture[i, j + 1] - picture[i, j])
-    bottom = picture[i + 1, j] + u * (picture[i + 1, j + 1] - picture[i + 1, j])
+    left, up = np.uint64(j), np.uint64(i)  # unsigned: an index below 0 would count from the end, which takes a test
+    right, down = left + np.uint64(1), up + np.uint64(1)
+    top = picture[up, left] + u * (picture[up, right] - picture[up, left])
+    bottom = picture[down, left] + u * (picture[down, right] - picture[down, left])
     return top + v * (bottom - top)
 
 
@@ -175,24 +177,6 @@ def aggregate(
 
 
 @kernel
-def choose(first: int, last: int, total: Array, inverses: Array, planes: Array) -> None:
-    """Choose every pixel's inverse depth, between planes where the parabola has its least cost; items are rows.
-
-    ``planes`` (3, H, W) receives it and a slope of 0 in x and y. It is 0, for none, at either end of the range: what
-    lies beyond would match best there.
-    """
-    for y in range(first, last):
-        for x in range(total.shape[1]):
-            costs = total[y, x]
-            d = np.argmin(costs)
-            planes[0, y, x] = planes[1, y, x] = planes[2, y, x] = _ZERO
-            if 0 < d < len(costs) - 1:
-                a, b, c = costs[d - 1], costs[d], costs[d + 1]
-                offset = _HALF * (a - c) / max(a - _TWO * b + c, f4(1e-6))
-                planes[0, y, x] = inverses[d] + max(min(offset, _HALF), -_HALF) * (inverses[1] - inverses[0])
-
-
-@kernel
 def refine(
     first: int, last: int, reference: Array, sources: Array, sizes: Array, maps: Array, step: Any, reach: int,
     ends: Array, old: Array, new: Array, scores: Array,
@@ -285,42 +269,3 @@ def _slanted(
                 n += 1
         result = together / math.sqrt((max(square - mean * mean, _ZERO) + _NOISE) * (spread + _NOISE))
     return result
-
-
-@kernel
-def agree(
-    first: int, last: int, maps: Array, back: Array, sizes: Array, pixels: Any, share: Any, planes: Array,
-    others: Array, count: Array, fused: Array,
-) -> None:  # fmt: skip
-    """Count the sources whose own depth maps agree with this one's, and average with them; items are rows.
-
-    The point goes to the source, takes the depth that the source has there, and comes back: within ``pixels`` of where
-    it began, and its inverse depth within ``share`` of what it was. ``others`` (S, 3, H', W') are the sources' planes.
-    """
-    for y in range(first, last):
-        for x in range(planes.shape[2]):
-            w = planes[0, y, x]
-            count[y, x], fused[y, x] = 0, w
-            if w == _ZERO:
-                continue
-            px, py = f4(x) + _HALF, f4(y) + _HALF
-            for s in range(len(others)):
-                m, b = maps[s], back[s]
-                z = m[2, 0] * px + m[2, 1] * py + m[2, 2] + m[2, 3] * w
-                qx = (m[0, 0] * px + m[0, 1] * py + m[0, 2] + m[0, 3] * w) / z
-                qy = (m[1, 0] * px + m[1, 1] * py + m[1, 2] + m[1, 3] * w) / z
-                if not (z > f4(1e-6) and _ZERO <= qx < f4(sizes[s, 1]) and _ZERO <= qy < f4(sizes[s, 0])):
-                    continue
-                i, j = int(qy), int(qx)
-                there = others[s, 0, i, j]
-                if there == _ZERO:
-                    continue
-                there += others[s, 1, i, j] * (qx - f4(j) - _HALF) + others[s, 2, i, j] * (qy - f4(i) - _HALF)
-                z = b[2, 0] * qx + b[2, 1] * qy + b[2, 2] + b[2, 3] * there
-                dx = (b[0, 0] * qx + b[0, 1] * qy + b[0, 2] + b[0, 3] * there) / z - px
-                dy = (b[1, 0] * qx + b[1, 1] * qy + b[1, 2] + b[1, 3] * there) / z - py
-                again = there / z
-                if dx * dx + dy * dy <= pixels * pixels and abs(again - w) <= share * w:
-                    count[y, x] += 1
-                    fused[y, x] += again
-            fused[y, x] /= f4(count[y, x] + 1)

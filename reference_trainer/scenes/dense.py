@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import logging
 import math
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,20 +16,28 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from reference_trainer.camera import Camera
+from reference_trainer.files import replacing
 from reference_trainer.scenes.images import resize_image
 from reference_trainer.scenes.scene import PointCloud, View
 
-__all__ = ["dense_points", "source_views"]
+__all__ = ["SOURCE", "dense_points", "dense_start", "source_views"]
+
+SOURCE = "dense stereo"
+"""What such a cloud names as its `source`."""
 
 COUNT = 15_000
 LEAST = 1_000
 PIXELS = 200_000  # larger photographs are made smaller: more pixels take longer and add no points
+ENLARGED = 1.4  # and smaller ones larger: the windows, of a fixed number of pixels, then cover finer detail
 SPACING, PLANES = 0.7, 192  # pixels of motion from plane to plane, and their largest number
 COARSE = 4  # how much smaller the photographs are that find the range of depth where no points tell it
 SOURCES = 2
 ANGLES, USUAL = (0.5, 60.0), 12.0  # degrees between the rays that meet in a point: those that can be matched, the best
 OVERLAP = 0.25
+GUIDES = 50  # points that a view must see to tell its range of depth
 ROUNDS = 3
+SIDE = 4  # pixels over which the sweep's depths give a slope
+NEAR, ALIKE = 1.5, 0.02  # pixels and share of the inverse depth within which two photographs agree
 SMALL, LARGE = 0.03, 0.35  # costs of a step between planes, where a correlation of -1 costs 1
 
 
@@ -67,13 +79,17 @@ def dense_points(views: Sequence[View], guide: PointCloud | None = None, *, coun
     try:
         import reference_trainer.compiled.stereo as _  # noqa: F401
     except ImportError as error:
-        raise ImportError("a dense start needs numba: pip install 'ca_reg[trainer]', or choose other points.") from error
+        raise ImportError(
+            "a dense start needs numba: pip install 'ca_reg[trainer]', or choose other points."
+        ) from error
     if len(views) < 2:
         raise ValueError(f"a dense start needs at least 2 training photographs, got {len(views)}: choose other points.")
     for i, view in enumerate(views):
         for other in views[:i]:
             if view.image.shape == other.image.shape and float((view.image - other.image).abs().mean()) < 1 / 255:
-                raise ValueError(f"a dense start needs different photographs: {other.name} and {view.name} are the same.")
+                raise ValueError(
+                    f"a dense start needs different photographs: {other.name} and {view.name} are the same."
+                )
     pictures = [_picture(view, PIXELS) for view in views]
     cameras = [picture.camera for picture in pictures]
     ranges = [_guided(camera, guide) for camera in cameras]
@@ -81,7 +97,9 @@ def dense_points(views: Sequence[View], guide: PointCloud | None = None, *, coun
         small = [_picture(view, picture.gray.size // COARSE**2) for view, picture in zip(views, pictures, strict=True)]
         found = _agreed(small, _depth_maps(small, [_visible(cameras, i) for i in range(len(cameras))]))
         cloud = None if found is None else PointCloud(found[0], found[1], "")
-        ranges = [_guided(camera, cloud) if known is None else known for camera, known in zip(cameras, ranges, strict=True)]
+        ranges = [
+            _guided(camera, cloud) if known is None else known for camera, known in zip(cameras, ranges, strict=True)
+        ]
     points = _agreed(pictures, _depth_maps(pictures, ranges))
     number = 0 if points is None else len(points[0])
     if points is None or number < min(LEAST, count):
@@ -90,7 +108,45 @@ def dense_points(views: Sequence[View], guide: PointCloud | None = None, *, coun
             f"{LEAST:,} are needed: they lack texture or overlap, or the cameras are wrong. Choose other points."
         )
     positions, colors, confidence = _thinned(*points, cameras, count)
-    return PointCloud(positions, colors, "dense stereo", frozenset(view.name for view in views), confidence)
+    return PointCloud(positions, colors, SOURCE, frozenset(view.name for view in views), confidence)
+
+
+def dense_start(views: Sequence[View], guide: PointCloud) -> tuple[PointCloud, str]:
+    """Return `dense_points` with a note on them; kept in the user's cache folder, for every command loads its scene.
+
+    That is ``ca_reg`` in ``$XDG_CACHE_HOME``, else in ``~/.cache``; the file is named by a hash of all that the points
+    depend on. Errors are those of `dense_points`.
+    """
+    names = frozenset(view.name for view in views)
+    note = f"measured on the {len(views)} training photographs by dense stereo"
+    digest = hashlib.sha256(guide.positions.numpy().tobytes())
+    for code in (Path(__file__), Path(__file__).parents[1] / "compiled/stereo.py"):
+        digest.update(code.read_bytes())
+    for view in views:
+        camera = view.camera
+        inner = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
+        for layer in (inner, camera.world_to_camera, view.image, view.alpha):
+            digest.update(b"none" if layer is None else layer.contiguous().numpy().tobytes())
+    path: Path | None = None
+    cloud: PointCloud | None = None
+    try:
+        path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "ca_reg", f"{digest.hexdigest()}.npz")
+        with np.load(path) as kept:
+            parts = [torch.from_numpy(kept[name]) for name in ("positions", "colors", "confidence")]
+        cloud = PointCloud(parts[0], parts[1], SOURCE, names, parts[2])
+    except Exception:  # nothing is kept, or a damaged file, which may raise anything
+        pass
+    if cloud is None:
+        cloud = dense_points(views, guide)
+        assert cloud.confidence is not None
+        made = [part.numpy() for part in (cloud.positions, cloud.colors, cloud.confidence)]
+        try:
+            if path is not None:
+                with replacing(path) as place, place.open("wb") as file:
+                    np.savez(file, positions=made[0], colors=made[1], confidence=made[2])
+        except OSError as error:  # costs the next command half a minute
+            logging.getLogger(__name__).info("the points of the dense start are not kept: %s", error)
+    return cloud, f"initial points: {len(cloud.positions):,} {note}"
 
 
 def source_views(cameras: Sequence[Camera], number: int, depth: float) -> list[int]:
@@ -139,11 +195,11 @@ def _visible(cameras: Sequence[Camera], number: int) -> tuple[float, float] | No
 
 def _guided(camera: Camera, guide: PointCloud | None) -> tuple[float, float] | None:
     """Return the range of depths around the points that a camera sees, if they are enough to tell it."""
-    if guide is None:
+    if guide is None or len(guide.positions) < GUIDES:
         return None
     pixels, depths = camera.project(guide.positions)
     depths = depths[camera.inside(pixels, depths)]
-    if len(depths) < 50:
+    if len(depths) < GUIDES:
         return None
     near, far = depths.quantile(torch.tensor([0.01, 0.99])).tolist()
     return 0.8 * near, 1.6 * far
@@ -152,12 +208,13 @@ def _guided(camera: Camera, guide: PointCloud | None) -> tuple[float, float] | N
 def _picture(view: View, most: int) -> _Picture:
     """Prepare a photograph, made smaller to at most so many pixels."""
     height, width = view.image.shape[1:]
-    factor = min(1.0, math.sqrt(most / (width * height)))
+    factor = min(ENLARGED, math.sqrt(most / (width * height)))
     size = max(2, round(width * factor)), max(2, round(height * factor))
-    colors = view.image if factor == 1 else resize_image(view.image, *size)
-    gray = colors.mean(0)
-    solid = torch.ones_like(gray) if view.alpha is None else resize_image(view.alpha[None], *size, "bilinear")[0]
-    return _Picture((gray - gray.mean()).contiguous().numpy(), colors, view.camera.resized(*size), solid > 0.5)
+    colors = view.image if size == (width, height) else resize_image(view.image, *size)
+    gray = colors.mean(0).numpy()
+    gray = gray - gray.mean()  # numpy's: the last bits of torch's mean depend on the number of threads
+    solid = torch.ones(size[::-1]) if view.alpha is None else resize_image(view.alpha[None], *size, "bilinear")[0]
+    return _Picture(gray, colors, view.camera.resized(*size), solid > 0.5)
 
 
 def _map(one: Camera, other: Camera) -> NDArray[np.float32]:
@@ -170,16 +227,14 @@ def _map(one: Camera, other: Camera) -> NDArray[np.float32]:
 
 
 def _stacked(layers: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Stack pictures (..., H, W), of sizes that may differ, and return their sizes (N, 2)."""
-    sizes = np.array([layer.shape[-2:] for layer in layers])
+    """Stack pictures (H, W), of sizes that may differ, and return their sizes (N, 2)."""
+    sizes = np.array([layer.shape for layer in layers])
     high, wide = sizes.max(0)
-    pads = [[(0, 0)] * (layer.ndim - 2) + [(0, high - layer.shape[-2]), (0, wide - layer.shape[-1])] for layer in layers]
-    return np.stack([np.pad(layer, pad) for layer, pad in zip(layers, pads, strict=True)]), sizes
+    padded = [np.pad(layer, [(0, high - len(layer)), (0, wide - layer.shape[1])]) for layer in layers]
+    return np.stack(padded), sizes
 
 
-def _depth_maps(
-    pictures: Sequence[_Picture], ranges: Sequence[tuple[float, float] | None]
-) -> list[_Depths | None]:
+def _depth_maps(pictures: Sequence[_Picture], ranges: Sequence[tuple[float, float] | None]) -> list[_Depths | None]:
     """Measure the depth of every pixel of every picture that has a range and source views."""
     from reference_trainer.compiled import stereo
     from reference_trainer.compiled.threads import in_threads
@@ -211,17 +266,39 @@ def _depth_maps(
             paths = height if dy == 0 else width if dx == 0 else height + width - 1
             steps = np.float32(SMALL), np.float32(LARGE)
             in_threads(stereo.aggregate, paths, dy, dx, gray, cost, total, *steps, least=16)
-        planes, new = np.empty((2, 3, height, width), np.float32)
+        planes, new = _chosen(total, inverses), np.empty((3, height, width), np.float32)
         scores = np.empty((height, width), np.float32)
-        in_threads(stereo.choose, height, total, inverses, planes, least=16)
         for turn in range(ROUNDS):
             step = np.float32((inverses[1] - inverses[0]) / 2 ** (turn + 1))
             ends = np.array([inverses[0], inverses[-1]])
-            given = gray, images, sizes, maps, step, 1 + 2 * (turn == 0), ends, planes, new, scores
-            in_threads(stereo.refine, height, *given, least=8)
+            reach, kept = (5, 3, 1)[turn], (ends, planes, new, scores)
+            in_threads(stereo.refine, height, gray, images, sizes, maps, step, reach, *kept, least=8)
             planes, new = new, planes
         found.append(_Depths(planes, scores, sources))
     return found
+
+
+def _chosen(total: NDArray[np.float32], inverses: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the inverse depths with the least costs (H, W, D), and slopes of 0: planes (3, H, W).
+
+    Between the planes of the sweep a parabola has its least cost. At either end of the range the inverse depth is 0,
+    for none: what lies beyond would match best there.
+    """
+    best = total.argmin(2)
+    around = np.clip(best, 1, len(inverses) - 2)[:, :, None] + [-1, 0, 1]
+    a, b, c = np.moveaxis(np.take_along_axis(total, around, 2), 2, 0)
+    offset = np.clip(0.5 * (a - c) / np.maximum(a - 2 * b + c, 1e-6), -0.5, 0.5)
+    planes = np.zeros((3, *best.shape), np.float32)
+    inside = (best > 0) & (best < len(inverses) - 1)
+    planes[0] = np.where(inside, inverses[best] + offset * (inverses[1] - inverses[0]), 0)
+    for axis in (0, 1):
+        # Of the slopes to both sides the smaller one: the other may cross an edge.
+        padded = np.pad(planes[0], [(SIDE, SIDE) if axis == k else (0, 0) for k in (0, 1)], mode="edge")
+        step = padded.take(range(SIDE, padded.shape[axis]), axis) - padded.take(range(padded.shape[axis] - SIDE), axis)
+        size = best.shape[axis]
+        left, right = step.take(range(size), axis), step.take(range(SIDE, size + SIDE), axis)
+        planes[2 - axis] = np.where(np.abs(left) < np.abs(right), left, right) / SIDE
+    return planes
 
 
 def _planes(camera: Camera, maps: NDArray[np.float32], near: float, far: float) -> NDArray[np.float32]:
@@ -241,29 +318,39 @@ def _agreed(pictures: Sequence[_Picture], maps: Sequence[_Depths | None]) -> tup
 
     The confidence is the correlation times the share of the source views that agree.
     """
-    from reference_trainer.compiled import stereo
-    from reference_trainer.compiled.threads import in_threads
-
     parts = []
     for picture, depths in zip(pictures, maps, strict=True):
         if depths is None:
             continue
-        others = [(pictures[s].camera, there) for s in depths.sources if (there := maps[s]) is not None]
-        if not others:
-            continue
-        there, sizes = _stacked([each.planes for _, each in others])
-        to = np.stack([_map(picture.camera, camera) for camera, _ in others])
-        back = np.stack([_map(camera, picture.camera) for camera, _ in others])
-        count, fused = np.empty(depths.scores.shape, np.int64), np.empty_like(depths.scores)
-        limits = np.float32(1.0), np.float32(0.01)
-        in_threads(stereo.agree, len(count), to, back, sizes, *limits, depths.planes, there, count, fused, least=16)
-        scores, inverse, agreeing = torch.from_numpy(depths.scores), torch.from_numpy(fused), torch.from_numpy(count)
-        kept = picture.solid & ((agreeing > 1) & (scores > 0.6) | (agreeing > 0) & (scores > 0.8))
-        kept &= _supported(inverse.where(kept, 0))
-        rows, columns = kept.nonzero().unbind(1)
-        positions = picture.camera.lift(torch.stack([columns, rows], 1) + 0.5, 1 / inverse[kept])
-        share = agreeing[kept] / len(depths.sources)
-        parts.append((positions, picture.colors[:, kept].T, scores[kept].clamp(0, 1) * share))
+        known = torch.from_numpy(depths.planes[0]) > 0
+        rows, columns = known.nonzero().unbind(1)
+        pixels, inverse = torch.stack([columns, rows], 1) + 0.5, torch.from_numpy(depths.planes[0])[known]
+        points, scores = picture.camera.lift(pixels, 1 / inverse), torch.from_numpy(depths.scores)[known]
+        agreeing, total = torch.zeros_like(inverse), inverse.clone()
+        for source in depths.sources:
+            other, camera = maps[source], pictures[source].camera
+            if other is None:
+                continue
+            # To the source, from there at the source's own depth, and back: to the same pixel and the same depth?
+            reached, depth = camera.project(points)
+            same = camera.inside(reached, depth)
+            cell = reached.where(same[:, None], 0).long()
+            there, slope_x, slope_y = torch.from_numpy(other.planes)[:, cell[:, 1], cell[:, 0]]
+            offset = reached - cell - 0.5
+            same &= there > 0
+            again, depth = picture.camera.project(
+                camera.lift(reached, 1 / (there + slope_x * offset[:, 0] + slope_y * offset[:, 1]))
+            )
+            same &= ((again - pixels).norm(dim=1) <= NEAR) & ((1 / depth - inverse).abs() <= ALIKE * inverse)
+            agreeing += same
+            total += (1 / depth).where(same, 0)
+        kept = (agreeing > 1) & (scores > 0.5) | (agreeing > 0) & (scores > 0.8)
+        fused = torch.zeros(known.shape)
+        fused[known] = (total / (agreeing + 1)).where(kept, 0)
+        kept = _supported(fused) & picture.solid
+        positions = picture.camera.lift(kept.nonzero().flip(1) + 0.5, 1 / fused[kept])
+        confidence = (scores.clamp(0, 1) * agreeing / len(depths.sources))[kept[known]]
+        parts.append((positions, picture.colors[:, kept].T, confidence))
     if not parts:
         return None
     positions, colors, confidence = (torch.cat(part) for part in zip(*parts, strict=True))
@@ -291,7 +378,12 @@ def _thinned(
     cells = torch.cat([positions / torch.exp2(level)[:, None], level[:, None]], 1)[best].double().numpy()
 
     def chosen(size: float) -> NDArray[Any]:
-        keys = np.floor(cells / [size, size, size, 1]).astype(np.int64) @ [1, 2**20, 2**40, 2**58]  # wraps, rarely meets
+        keys = np.floor(cells / [size, size, size, 1]).astype(np.int64) @ [
+            1,
+            2**20,
+            2**40,
+            2**58,
+        ]  # wraps, rarely meets
         return np.unique(keys, return_index=True)[1]
 
     low, high = 1e-4, 1.0  # too many and few enough, unless there are few anyway
