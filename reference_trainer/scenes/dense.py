@@ -30,7 +30,7 @@ LEAST = 1_000
 PIXELS = 200_000  # larger photographs are made smaller: more pixels take longer and add no points
 ENLARGED = 1.4  # and smaller ones larger: the windows, of a fixed number of pixels, then cover finer detail
 SPACING, PLANES = 0.7, 192  # pixels of motion from plane to plane, and their largest number
-COARSE = 4  # how much smaller the photographs are that find the range of depth where no points tell it
+COARSE = 12_000  # pixels of the photographs that find the range of depth where no points tell it
 SOURCES = 2
 ANGLES, USUAL = (0.5, 60.0), 12.0  # degrees between the rays that meet in a point: those that can be matched, the best
 OVERLAP = 0.25
@@ -94,7 +94,7 @@ def dense_points(views: Sequence[View], guide: PointCloud | None = None, *, coun
     cameras = [picture.camera for picture in pictures]
     ranges = [_guided(camera, guide) for camera in cameras]
     if None in ranges:
-        small = [_picture(view, picture.gray.size // COARSE**2) for view, picture in zip(views, pictures, strict=True)]
+        small = [_picture(view, COARSE) for view in views]
         found = _agreed(small, _depth_maps(small, [_visible(cameras, i) for i in range(len(cameras))]))
         cloud = None if found is None else PointCloud(found[0], found[1], "")
         ranges = [
