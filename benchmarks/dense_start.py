@@ -123,5 +123,6 @@ if __name__ == "__main__":
     machine = {"python": platform.python_version(), "torch": torch.__version__, "numba": numba.__version__}
     out = Path(__file__).parent / "data/dense_start.json"
     out.parent.mkdir(exist_ok=True)
-    out.write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
+    short = [{key: round(x, 4) if isinstance(x, float) else x for key, x in row.items()} for row in rows]
+    out.write_text(json.dumps({"machine": machine, "rows": short}, indent=1) + "\n")
     print(table(rows))
