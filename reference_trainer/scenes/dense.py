@@ -267,6 +267,7 @@ def _depth_maps(pictures: Sequence[_Picture], ranges: Sequence[tuple[float, floa
             steps = np.float32(SMALL), np.float32(LARGE)
             in_threads(stereo.aggregate, paths, dy, dx, gray, cost, total, *steps, least=16)
         planes, new = _chosen(total, inverses), np.empty((3, height, width), np.float32)
+        del cost, total, given  # hundreds of megabytes, before the next photograph needs as much
         scores = np.empty((height, width), np.float32)
         for turn in range(ROUNDS):
             step = np.float32((inverses[1] - inverses[0]) / 2 ** (turn + 1))
