@@ -1,8 +1,8 @@
 """Exact moments for any renderer that can list the Gaussians it composites at each pixel.
 
-Many code bases can: gsplat's ``rasterize_to_indices_in_range`` returns flat lists of Gaussian and pixel indices,
-several forks keep per-pixel buffers. Given the alphas of the entries, :class:`ListMoments` serves
-:class:`~ca_reg.CAScore` as its moments callable, and :meth:`ListMoments.shares` attributes the score to the Gaussians.
+Many code bases can: gsplat's ``rasterize_to_indices_in_range`` returns such lists, several forks keep per-pixel
+buffers. With the alphas of the entries, :class:`ListMoments` is the moments callable of a :class:`~ca_reg.CAScore`, and
+its :meth:`~ListMoments.shares` attribute the score to the Gaussians.
 """
 
 from __future__ import annotations
@@ -94,11 +94,8 @@ class ListMoments:
     def __call__(self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None) -> ExactMoments:
         """Return the exact moments of a view: mean and variance (3, H, W) and the expected alpha (H, W).
 
-        Args:
-            opacity: activated opacities, shape (N,) or (N, 1).
-            view: passed on to ``lists_fn``.
-            multiplier: moments of the factors, numbers, or tensors of shape (N,) or (N, 1), one value per Gaussian.
-            background: shape (3,) or (3, H, W); None for that of the lists.
+        The multiplier is numbers or tensors of one value per Gaussian, the background (3,) or (3, H, W), or None for
+        that of the lists.
 
         Raises:
             TypeError: if ``lists_fn`` returns no :class:`PixelLists`, or a dtype does not fit.
@@ -121,9 +118,7 @@ class ListMoments:
     ) -> Tensor:
         """Return what each Gaussian contributes to a weighted sum of the variance map, shape (N,), float64.
 
-        A Gaussian's share is the sum over pixels of ``weights``, (H, W), times its
-        :func:`~ca_reg.functional.contributions`, averaged over RGB; 0 if it is in no list. The shares add up to the
-        weighted sum of the variances. The other arguments and errors are those of a call.
+        It is as described at :class:`~ca_reg.attribution.SharesFn`; the shares add up to the weighted sum.
 
         Example:
             >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:

@@ -22,7 +22,7 @@ CHUNK_ROWS = 256  # sorted points per chunk; larger chunks span a wider strip, s
 def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Find the nearest other points of every point, exactly.
 
-    For many points, SciPy's k-d tree finds them on the CPU in O(N log N), if SciPy is installed
+    For many points SciPy's k-d tree finds them in O(N log N), if SciPy is installed
     (``pip install ca_reg[neighbors]``); otherwise a search along one axis takes nearly O(N^2). The two may break ties
     differently.
 

@@ -29,8 +29,7 @@ _FORMS = (
 class RenderFn(Protocol):
     """A user's renderer of a model: ``render_fn(opacity, view)``.
 
-    It renders ``view``, an object of any type, with ``opacity`` in place of the model's own activated opacities, and
-    returns one of
+    It renders ``view``, of any type, with ``opacity`` in place of the model's activated opacities, and returns one of
 
     - a tuple ``(image, alpha)`` in either order, or ``(image,)``;
     - the image alone;
@@ -38,12 +37,11 @@ class RenderFn(Protocol):
       one, an alpha named ``alpha``, ``rendered_alpha`` or ``accumulation``.
 
     The image is RGB, (3, H, W) or (H, W, 3) as the layout says, the alpha (H, W), (1, H, W) or (H, W, 1); both are
-    floating-point torch tensors or numpy arrays, and a leading batch axis of 1 is dropped. Longer tuples are refused:
+    floating-point torch tensors or numpy arrays; a batch axis of 1 is dropped. Longer tuples are refused:
     in ``(color, radii, depth, alpha)`` nothing but the position tells depth from alpha.
 
-    A renderer that is faster on several sets of opacities at once may offer a method ``render_batch(opacities, view)``.
-    It takes up to 8 sets, stacked along a new first axis, and returns two sequences, images and alphas. A score then
-    calls it instead.
+    A faster way to render several sets of opacities is a method ``render_batch(opacities, view)``, which a score then
+    calls instead: up to 8 sets, stacked along a new first axis; it returns two sequences, images and alphas.
 
     Example:
         >>> def render_fn(opacity: Tensor, view: str) -> tuple[Tensor, Tensor]:

@@ -17,16 +17,9 @@ from reference_trainer.render.densification import splat_weights
 from reference_trainer.scenes.scene import Viewpoint
 
 __all__ = [
-    "PER_WEIGHT_SCALE",
-    "Heat",
-    "all_but_highest",
-    "blend_weights",
-    "colored_by",
-    "concentration",
-    "mean_effects",
-    "mean_shares",
-    "share_per_weight",
-]
+    "PER_WEIGHT_SCALE", "Heat", "all_but_highest", "blend_weights", "colored_by", "concentration", "mean_effects",
+    "mean_shares", "share_per_weight",
+]  # fmt: skip
 
 PER_WEIGHT_SCALE = (0.1, 10.0)
 """Ends of the color scale for shares per blend weight, in units of the mean."""

@@ -29,15 +29,9 @@ from reference_trainer.scenes.scene import Scene, View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import bounding_sphere, orbit_views
 
 __all__ = [
-    "ModelWithViews",
-    "PlyFacts",
-    "check_frame",
-    "load_for_views",
-    "load_plain_ply_model",
-    "load_ply_model",
-    "scaled",
-    "score_ply",
-]
+    "ModelWithViews", "PlyFacts", "check_frame", "load_for_views", "load_plain_ply_model", "load_ply_model",
+    "scaled", "score_ply",
+]  # fmt: skip
 
 _log = logging.getLogger(__name__)
 
