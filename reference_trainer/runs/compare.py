@@ -14,7 +14,7 @@ from reference_trainer.evaluation.pictures import comparison_figure, dynamics_fi
 from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.evaluation.tables import comparison_table
 from reference_trainer.files import write_text
-from reference_trainer.runs.executors.executor import Failure
+from reference_trainer.runs.executors import Failure
 from reference_trainer.runs.folder import COMPARISON, RESULTS, check_output, folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.scenes import load_scene

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from reference_trainer.render import chosen_engine, use_engine
-from reference_trainer.runs.executors.executor import Executor, Failure, Task, Value, attempt, run_all
+from reference_trainer.runs.executors import Executor, Failure, Task, Value, attempt, run_all
 from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes.options import SceneOptions

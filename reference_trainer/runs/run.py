@@ -21,7 +21,6 @@ from reference_trainer.evaluation.lpips import LPIPS, load_lpips
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import PARTIAL, machine, write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.files import remove_leftovers
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import (
@@ -44,6 +43,7 @@ from reference_trainer.runs.folder import (
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.scenes.virtual_cameras import measured_views
 from reference_trainer.threads import threads_for
 from reference_trainer.training.assembly import check
 from reference_trainer.training.checkpoint import load_checkpoint
