@@ -52,7 +52,7 @@ class SharesFn(Protocol):
 class CAAttribution(NamedTuple):
     """The score of a view, split over the Gaussians.
 
-    The shares, (N,) float64, at least 0, sum to ``result.value`` up to rounding; all are 0 if the score has no value.
+    The shares, (N,) float64, at least 0, sum to ``result.value``; all are 0 if the score has no value.
     """
 
     shares: Tensor

@@ -25,11 +25,8 @@ class Chain(Regularizer):
     twice. Members in ``eval()`` apply their test-time value even in training.
 
     Args:
-        members: regularizers; an ``nn.Sequential`` or another chain is flattened, and any other module is taken for a
-            function of the opacities alone, see :class:`WrappedModule`.
-
-    Raises:
-        TypeError: if a member is not a module.
+        members: regularizers; an ``nn.Sequential`` or another chain is flattened, any other module becomes a
+            :class:`WrappedModule`, and what is no module raises a TypeError.
 
     Example:
         >>> from ca_reg import GaussianDropout, OpacityNoise

@@ -23,8 +23,8 @@ __all__ = ["ListMoments", "PixelLists"]
 class PixelLists(NamedTuple):
     """What a renderer composites at every pixel of one view, as flat lists of P entries.
 
-    Convention: the entries of one pixel are ordered by depth, the nearest first; entries of different pixels may be
-    interleaved in any order. No Gaussian appears twice at a pixel.
+    Convention: the entries of one pixel are ordered by depth, the nearest first, no Gaussian twice; pixels may be
+    interleaved in any order.
 
     Attributes:
         gaussians: index of each entry's Gaussian, int32 or int64, shape (P,).
@@ -32,8 +32,7 @@ class PixelLists(NamedTuple):
         alphas: alpha of the Gaussian at the pixel, ``min(0.99, opacity * falloff)`` with the opacities that were passed
             in, in [0, 1], shape (P,).
         colors: view-dependent colors of all N Gaussians, shape (N, 3), dtype of ``alphas``.
-        height: of the image, in pixels.
-        width: of the image, in pixels.
+        height, width: of the image, in pixels.
         background: the model's own, shape (3,); None for black.
     """
 
@@ -52,18 +51,13 @@ class ListMoments:
     The lists must be complete. Renderers stop at an opaque surface, but what lies behind it shows when splats of the
     surface are dropped, so a list that ends there misses part of the variance.
 
-    Pixels are processed in blocks of similar list length. Beyond the lists themselves, the peak memory is that of one
-    block, about 40 floats per padded entry; a backward pass retains all blocks. Differentiable in everything that
-    ``lists_fn`` is differentiable in, and in the multiplier.
+    Pixels are processed in blocks, of about 40 floats per padded entry; a backward pass retains all. Differentiable in
+    everything that ``lists_fn`` is differentiable in, and in the multiplier.
 
     Args:
         lists_fn: ``lists_fn(opacity, view)`` returns the :class:`PixelLists` of the view for these activated
             opacities, (N,) or (N, 1) as the caller gave them.
         elements: largest number of padded entries in a block; a longer list is a block of its own.
-
-    Raises:
-        TypeError: if ``lists_fn`` is not callable or ``elements`` not an integer.
-        ValueError: if ``elements`` is below 1.
 
     Example:
         Two Gaussians and two pixels; the second pixel sees the first Gaussian only.

@@ -320,12 +320,8 @@ def _measurement(line: bytes) -> dict[str, Any]:
 def read_dynamics(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[np.float64]]:
     """Read the log of a :class:`ca_reg.CAMonitor`.
 
-    Args:
-        path: the log, or the directory that holds it.
-
-    Returns:
-        Every numeric column by name (``step``, ``gaussians``, ``ca/test``, ``psnr/test``, ...), shape (lines,) each,
-        sorted by step; nan where a line has no value. Text columns are left out.
+    Takes the log, or the directory that holds it. Returns every numeric column by name (``step``, ``gaussians``,
+    ``ca/test``, ``psnr/test``, ...), shape (lines,) each, sorted by step; nan where a line has no value.
 
     Raises:
         FileNotFoundError: if there is no log.
@@ -359,8 +355,7 @@ def plot_dynamics(
     """Plot co-adaptation and PSNR against the step, each on its own axes.
 
     ``runs`` is one log or log directory, or several by label. Each run has one color; its last group of views (test) is
-    solid, the others are dotted or dashed; nan leaves a gap. Draws on two ``axes``, by default side by side in a new
-    figure, and returns them: co-adaptation, PSNR.
+    solid. Draws on two ``axes``, by default in a new figure, and returns them: co-adaptation, PSNR.
 
     Raises:
         ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.

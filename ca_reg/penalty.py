@@ -40,9 +40,9 @@ class CAPenalty(Scheduled):
         image, variance, penalty = ca_penalty(gaussians.get_opacity, view)
         loss = mse(image, target) + penalty
 
-    For the absolute error, the main term of the 3DGS loss, the variance enters in another way:
-    ``loss = expected_absolute_error(image, variance, target).mean()`` (:mod:`ca_reg.functional`), without ``penalty``.
-    With any other loss, ``penalty`` is a separate regularizer, whose weight is a free choice.
+    For the absolute error take ``loss = expected_absolute_error(image, variance, target).mean()``
+    (:mod:`ca_reg.functional`), without ``penalty``. With any other loss, ``penalty`` is a separate regularizer, whose
+    weight is a free choice.
 
     ``image`` is also the test-time render, with all opacities multiplied by the mean of the multiplier, up to the
     renderer's treatment of large and small alphas: its clamp at 0.99, before the factor here and after it there, moves
@@ -66,10 +66,6 @@ class CAPenalty(Scheduled):
             the opacities, (N,), at every call, such as ``lambda o: Multiplier.clamped_noise(o, 0.8)``, with gradients.
         weight: factor of the penalty, at least 0, or a schedule of it.
         layout: order of the axes of the images that ``moments_fn`` returns, ``"CHW"`` or ``"HWC"``.
-
-    Attributes:
-        weight: the factor at the current step.
-        step: the training step, set with :meth:`set_step`; a penalty with a schedule saves it in ``state_dict``.
 
     Raises:
         TypeError: if an argument is of the wrong type.

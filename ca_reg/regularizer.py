@@ -265,11 +265,9 @@ class Regularizer(Scheduled):
     def mask_radii(self, radii: Tensor) -> Tensor:
         """Zero the radii of the Gaussians that the last call dropped, so that density control does not count them.
 
-        Counted as seen, they would scale the mean gradients by ``1 - p``, which raises the effective densification
-        threshold by ``1 / (1 - p)``.
+        Counted as seen, they would raise the effective densification threshold by ``1 / (1 - p)``.
 
-        Takes the radii of all Gaussians as the rasterizer returned them, shape (N,) or (N, ...). Returns the same shape
-        and dtype, the very same tensor if nothing was dropped.
+        Takes the radii of all Gaussians, shape (N,) or (N, ...); returns the very same tensor if nothing was dropped.
 
         Raises:
             ValueError: if the number of Gaussians is not that of the last call.

@@ -13,14 +13,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ca_reg._accumulate import Deviations, RenderMoments, effect_of, finite_colors, visible_mean
-from ca_reg._check import (
-    check_callable,
-    check_count,
-    check_finite,
-    check_opacity,
-    check_opacity_range,
-    check_rate,
-)  # fmt: skip
+from ca_reg._check import check_callable, check_count, check_finite, check_opacity, check_opacity_range, check_rate
 from ca_reg._random import seeded
 from ca_reg.functional import Multiplier
 from ca_reg.regularizer import Params, Regularizer

@@ -57,7 +57,7 @@ class MomentsFn(Protocol):
     """A renderer that offers exact moments: ``moments_fn(opacity, view, multiplier, background)``.
 
     It renders what :class:`RenderFn` does, but over all draws of an independent random factor on the alpha of every
-    splat (:func:`ca_reg.functional.pixel_moments` in every pixel), and returns a mapping or an object with
+    splat (:func:`ca_reg.functional.pixel_moments`), and returns a mapping or an object with
 
     - ``mean``: expected colors over the background, (3, H, W), or (H, W, 3) as the layout says;
     - ``variance``: variances of the colors, same shape;
@@ -127,9 +127,7 @@ def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Te
 
     The result may also be the alpha itself, (H, W), (1, H, W) or (H, W, 1).
 
-    Raises:
-        TypeError: if the result is of an unsupported type, or not floating point.
-        ValueError: if its size is not that of ``image``, (3, H, W).
+    Raises TypeError or ValueError if it is neither, or its size is not that of ``image``, (3, H, W).
 
     Example:
         >>> white = torch.full((3, 4, 5), 0.9)
