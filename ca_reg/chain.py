@@ -137,9 +137,6 @@ class WrappedModule(Regularizer):
     Args:
         module: called as ``module(opacity)``, or ``module(opacity, generator=...)`` if there is a generator.
 
-    Raises:
-        TypeError: if it is not a module; in a draw with a generator, if its ``forward`` takes none.
-
     Example:
         >>> WrappedModule(nn.Dropout(0.5)).eval()(torch.full((3,), 0.5))
         tensor([0.5000, 0.5000, 0.5000])

@@ -32,7 +32,8 @@ class PixelLists(NamedTuple):
         alphas: alpha of the Gaussian at the pixel, ``min(0.99, opacity * falloff)`` with the opacities that were passed
             in, in [0, 1], shape (P,).
         colors: view-dependent colors of all N Gaussians, shape (N, 3), dtype of ``alphas``.
-        height, width: of the image, in pixels.
+        height: of the image, in pixels.
+        width: of the image, in pixels.
         background: the model's own, shape (3,); None for black.
     """
 

@@ -54,13 +54,13 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         log_dir: directory of the log and the TensorBoard events; made if it does not exist.
         views: non-empty groups of views by name, usually ``{"train": [...], "test": [...]}``, passed on as they are.
         every: number of steps between measurements, at least 1.
-        last_step: the last step of the training, measured whether or not it is a multiple of ``every``.
+        last_step: the last step of the training, measured in any case.
         psnr: ``psnr(opacity, view)`` returns the PSNR in dB of the view rendered with these opacities, already scaled
             by ``1 - p`` for test time. Called without gradients. None leaves PSNR out.
         details: ``details(opacity, view)`` returns, by name, what TensorBoard shows of the first view of each group
             besides the curves: images (3, H, W) in [0, 1], and numbers (N,) as histograms. Called without gradients.
-        resume_step: None for a new run, which replaces an existing log. For a resumed run, the step of its checkpoint:
-            lines up to this step are kept, later ones dropped.
+        resume_step: None for a new run, which replaces an existing log; else the step of the checkpoint, after which
+            the lines of the log are dropped.
 
     Attributes:
         backends: ``("jsonl",)`` or ``("jsonl", "tensorboard")``.

@@ -228,10 +228,8 @@ class CAScore:
     def __call__(self, opacity: Tensor | Params, view: Any, *, index: int = 0) -> CAResult:
         """Measure one view without counting it in :meth:`compute`; return the score with its maps and its reason.
 
-        Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1); or :class:`~ca_reg.Params`.
-            view: passed on to the callables as it is.
-            index: position of the view among all views, at least 0; determines the masks together with the seed.
+        ``opacity`` is activated, in [0, 1], shape (N,) or (N, 1); or :class:`~ca_reg.Params`. ``view`` is passed on as
+        it is. ``index``, at least 0, is the position of the view among all; with the seed it determines the masks.
 
         Raises:
             TypeError: if ``opacity`` or a render is not of the right type.

@@ -63,8 +63,8 @@ class MomentsFn(Protocol):
     - ``variance``: variances of the colors, same shape;
     - ``alpha_mean``: expected accumulated alpha, (H, W), (1, H, W) or (H, W, 1); a score needs it, a penalty does not.
 
-    ``background`` is None for the model's own, one color of shape (3,), or an image, one color for each pixel. The
-    renderer must not stop early at an opaque surface: splats behind it show where those of the surface are dropped.
+    ``background`` is None for the model's own, one color (3,), or an image. The renderer must not stop early at an
+    opaque surface: splats behind it show where those of the surface are dropped.
 
     Example:
         >>> from ca_reg.functional import alpha_moments, pixel_moments

@@ -99,12 +99,10 @@ class Multiplier:
         those. The result is then the factor on ``min(o, 1)``, which the renderer must be given; its product with
         ``Multiplier.dropout(p)``, without ``compensate``, covers both.
 
-        The renderer's treatment of the noisy alpha is not modeled. With R the range of the colors and the background:
-
-        - its clamp at 0.99 moves each sampled color, hence the mean and the standard deviation of the pixel, by at
-          most ``R / 99``, whatever the length of the list;
-        - its cut-off of alphas below 1/255 moves a sampled color by at most ``R / 255`` for each splat that the noise
-          takes across the cut-off.
+        The renderer's treatment of the noisy alpha is not modeled. With R the range of the colors and the background,
+        its clamp at 0.99 moves the mean and the standard deviation of a pixel by at most ``R / 99``, whatever the
+        length of the list; its cut-off at 1/255 moves a sampled color by at most ``R / 255`` for each splat that
+        crosses it.
 
         Args:
             opacity: activated opacities ``o``, at least 0, any shape.

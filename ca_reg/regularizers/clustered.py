@@ -94,8 +94,7 @@ class AnchorDropout(ClusteredDropout):
     % at a rate of 0.02.
 
     Args:
-        rate: of the anchors, or a schedule of it. The paper's rises from 0 to 0.02 until the end of training; the
-            default takes 10,000 steps for that.
+        rate: of the anchors, or a schedule of it. The paper's rises from 0 to 0.02 until the end of training.
         k: neighbors dropped with an anchor, as in the paper.
         every: steps between neighbor searches; the paper does not say.
 

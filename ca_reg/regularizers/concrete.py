@@ -121,7 +121,7 @@ class ConcreteDropout(BinaryConcrete):
 
     Args:
         p: initial rate of each Gaussian, in (0, 1). The paper does not give it; Gal et al. 2017 start at 0.1.
-        rate: learning rate of the logits. The paper does not give it; the default is that of the opacity logits.
+        rate: learning rate of the logits, by default that of the opacity logits; the paper does not give it.
         temperature: 0.1 in the paper.
 
     Example:

@@ -181,7 +181,8 @@ class DensityDropout(RankedDropout):
         high: rate of the densest, in [0, 1). The paper uses 0.5.
         k: number of neighbors; 3DGS initializes its scales from 3.
         every: steps between neighbor searches; by default 3DGS's densification interval.
-        compensate, scale: as in :class:`~ca_reg.IndependentDropout`.
+        compensate: as in :class:`~ca_reg.IndependentDropout`.
+        scale: likewise.
 
     Example:
         >>> import torch
@@ -213,7 +214,9 @@ class GeometryDropout(RankedDropout):
         low: rate where the surroundings vary least, in [0, 1).
         high: rate where they vary most, in [0, 1).
         k: number of neighbors.
-        every, compensate, scale: as in :class:`DensityDropout`.
+        every: as in :class:`DensityDropout`.
+        compensate: likewise.
+        scale: likewise.
 
     Example:
         >>> from ca_reg import Params

@@ -178,23 +178,14 @@ class Comparison:
 
 
 def save(comparison: Comparison, out: Path) -> None:
-    """Write the results as JSON, and the table if any run finished.
-
-    Args:
-        comparison: the results.
-        out: folder of the comparison.
-    """
+    """Write the results as JSON, and the table if any run finished."""
     write_json(out / COMPARISON, {**dataclasses.asdict(comparison), "machine": machine()})
     if comparison.runs:
         write_text(out / TABLE, comparison_table(comparison.runs) + "\n")
 
 
 def report(comparisons: Mapping[Path, Comparison]) -> None:
-    """Log the table of every scene, draw the figures of its first seed, and name the runs that failed.
-
-    Args:
-        comparisons: the results by folder.
-    """
+    """Log the table of every scene, draw the figures of its first seed, and name the runs that failed."""
     for out, comparison in comparisons.items():
         _log.info(f"\n{out.name}:\n" if len(comparisons) > 1 else "")
         if comparison.runs:

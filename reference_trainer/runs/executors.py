@@ -63,11 +63,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Death:
-    """The worker died without an answer; the call itself may be fine.
-
-    Args:
-        reason: what is known, such as the signal.
-    """
+    """The worker died without an answer; the call itself may be fine. The reason is what is known of it."""
 
     reason: str
 
@@ -97,11 +93,7 @@ class Executor(Protocol):
 
 
 def attempt(task: Task, threads: int) -> Value | Failure:
-    """Execute a task in the worker, and return an exception as a `Failure`.
-
-    Args:
-        task: what to call.
-        threads: how many threads torch may use.
+    """Execute a task in the worker, on so many threads, and return an exception as a `Failure`.
 
     Example:
         >>> import torch
@@ -125,13 +117,8 @@ def run_all(executor: Executor, tasks: Sequence[Task], *, retries: int = 3) -> I
     A task that raises is not retried: it would raise again. One whose worker died goes to the end of the queue, so that
     a task that kills its workers does not delay the others.
 
-    Args:
-        executor: where to run; closed at the end, also if the caller stops iterating or is interrupted.
-        tasks: what to run.
-        retries: how many dead workers of one task are replaced.
-
-    Yields:
-        The index of a task, and its outcome.
+    The executor is closed at the end, also if the caller stops iterating or is interrupted. ``retries`` dead workers of
+    one task are replaced. Yields the index of a task, and its outcome.
     """
     queue = deque(range(len(tasks)))
     running = 0
