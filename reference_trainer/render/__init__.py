@@ -11,18 +11,6 @@ from reference_trainer.render.renderer import rasterize, render, render_masks, r
 from reference_trainer.render.splats import MomentImages, Rendering, Splats, ViewSplats
 
 __all__ = [
-    "MomentImages",
-    "NotFiniteError",
-    "Rendering",
-    "Splats",
-    "ViewSplats",
-    "chosen_engine",
-    "describe_engine",
-    "rasterize",
-    "render",
-    "render_masks",
-    "render_moments",
-    "splat",
-    "use_engine",
-    "variance_shares",
-]
+    "MomentImages", "NotFiniteError", "Rendering", "Splats", "ViewSplats", "chosen_engine", "describe_engine",
+    "rasterize", "render", "render_masks", "render_moments", "splat", "use_engine", "variance_shares",
+]  # fmt: skip

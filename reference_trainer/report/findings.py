@@ -17,12 +17,12 @@ from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.shares import Heat, concentration
 from reference_trainer.evaluation.tables import EXACT
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.report.packing import jpeg, numbers
 from reference_trainer.rotations import rotation_matrices
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.load import evenly_spaced
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
+from reference_trainer.scenes.virtual_cameras import measured_views
 
 __all__ = ["Findings", "find"]
 
