@@ -24,22 +24,23 @@ const TERMS = {
   "seconds": "Time of the training on the machine it ran on.",
   "held by": "Share of the exact CA that these Gaussians hold, those first that hold most.",
 };
-function show(hint, text) {
-  const { left, bottom } = hint.getBoundingClientRect();
+let hint = null; // whose definition is shown
+function show() {
+  const { left, bottom } = hint.getBoundingClientRect(), text = hint.ariaDescription;
   Object.assign($("tip"), { textContent: text, hidden: false });
   $("tip").style.top = `${bottom + 4}px`;
   $("tip").style.left = `${Math.max(4, Math.min(left, innerWidth - $("tip").offsetWidth - 8))}px`;
 }
-const unshow = () => { $("tip").hidden = true; };
+const unshow = () => { $("tip").hidden = true; hint = null; };
 addEventListener("keydown", event => { if (event.key === "Escape") unshow(); });
-addEventListener("scroll", unshow, true);
+addEventListener("scroll", () => { if (hint) show(); }, true);
 function hinted(title, ...shown) {
   const text = TERMS[Object.keys(TERMS).find(term => title.includes(term))];
   if (!text) return [...shown];
-  const hint = make("button", { className: "hint", type: "button", ariaDescription: text }, ...shown);
-  hint.onmouseenter = hint.onfocus = hint.onclick = () => show(hint, text);
-  hint.onmouseleave = hint.onblur = unshow;
-  return [hint];
+  const made = make("button", { className: "hint", type: "button", ariaDescription: text }, ...shown);
+  made.onmouseenter = made.onfocus = made.onclick = () => { hint = made; show(); };
+  made.onmouseleave = made.onblur = unshow;
+  return [made];
 }
 for (const [term, text] of Object.entries(TERMS))
   $("terms").append(make("dt", {}, term.replace(" (", "")), make("dd", {}, text));

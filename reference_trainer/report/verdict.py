@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections import Counter
@@ -57,17 +56,10 @@ def natural_order(config: TrainConfig) -> tuple[int, bool]:
 
 
 def unique_names(configs: Sequence[TrainConfig], paths: Sequence[str]) -> list[str]:
-    """Return a name for each run: the natural one, with its seed or else its path where several share it."""
+    """Return a name for each run: the natural one, with its path where several share it."""
     names = [natural_name(config) for config in configs]
-    seeded = Counter((name, config.seed) for name, config in zip(names, configs, strict=True))
     shared = Counter(names)
-    return [
-        name if shared[name] == 1
-        else f"{name}, seed {config.seed}" if all(n == 1 for (of, _), n in seeded.items() if of == name)
-        and len({dataclasses.replace(c, seed=0) for c, of in zip(configs, names, strict=True) if of == name}) == 1
-        else f"{name} ({path})"
-        for name, config, path in zip(names, configs, paths, strict=True)
-    ]  # fmt: skip
+    return [name if shared[name] == 1 else f"{name} ({path})" for name, path in zip(names, paths, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -138,9 +130,8 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
     if not strategies:
         return "No verdict: no run has been trained to its end.", []
     reference, *rest = strategies
-    tested = [
-        len([view for view in of["views"] if view["split"] == "test"]) for rows in strategies for of in rows.results
-    ]
+    runs = [run for rows in strategies for run in rows.results]
+    tested = [sum(view["split"] == "test" for view in run["views"]) for run in runs]
     split = "test" if all(tested) else "around"
     where = f"on the {tested[0]} test view{'s' * (tested[0] != 1)}" if all(tested) else "around the training views"
     limits = [] if all(tested) else ["Without test views, nothing is known about the quality at unseen views."]
@@ -150,9 +141,8 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
         text = f"{reference.name}: {' and '.join(found) or 'nothing was measured'} {where}."
         return text, [*limits, "Nothing stands beside it: add a run without regularizer to see what it changes."]
     said = {rows.name: _said(rows, reference, split) for rows in rest}
-    best = max(rest, key=lambda rows: mean_std(rows.values("test", "psnr"))[0] if split == "test" else 0.0)
-    if split != "test":
-        best = min(rest, key=lambda rows: mean_std(rows.values(split, "ca_exact_half"))[0])
+    sign, key = (1, "psnr") if split == "test" else (-1, "ca_exact_half")
+    best = max(rest, key=lambda rows: sign * mean_std(rows.values(split, key))[0])
     merit = "highest PSNR" if split == "test" else "least co-adaptation"
     text = f"{best.name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: {said[best.name]} than "
     text += f"{reference.name if not reference.baseline else 'the baseline'} {where}."

@@ -333,7 +333,9 @@ def test_a_browser_shows_the_heat_and_hides_what_co_adapts_most(turned, opened):
 @needs_browser
 def test_a_drag_turns_all_models_about_one_point(turned, opened):
     before = shown(opened, "$('from').value = 0; $('from').onchange()")
-    at = opened.run("scrollTo(0, 0); (({ x, y }) => ({ x, y }))(models[1].canvas.getBoundingClientRect())")
+    at = opened.run(
+        "models[1].canvas.scrollIntoView(); (({ x, y }) => ({ x, y }))(models[1].canvas.getBoundingClientRect())"
+    )
     start = {"x": at["x"] + 20, "y": at["y"] + 20}
     opened("Input.dispatchMouseEvent", type="mousePressed", button="left", **start)
     moved = {"x": start["x"] + 40, "y": start["y"] - 15}
@@ -366,7 +368,7 @@ def test_any_two_pictures_are_wiped_flickered_and_enlarged(turned, opened):
     expected = [[view["pictures"][run]["co-adaptation"], view["pictures"][1]["render"]] for run in (0, 1)]
     assert opened.run(sources) == expected
     turns = f"$('flicker').click(), new Promise(done => setTimeout(() => done({clip}[0][1]), 900))"
-    assert opened.run(turns) == "inset(0px)"  # after one turn the right picture covers the left
+    assert opened.run(turns) == "inset(0px 0px 0px 0%)"  # after one turn the right picture covers the left
     assert opened.run(f"$('flicker').click(); {clip}")[0][1] == "inset(0px 0px 0px 30%)"
     opened.run("stacks[1].box.focus()")
     for key in ("Enter", "PageDown"):
@@ -406,7 +408,7 @@ def test_the_page_fits_its_window_in_light_and_dark(turned, width, scheme):
         assert corner < 0.2 if scheme == "dark" else corner > 0.9
         first, second = page.run("models.map(({ canvas }) => canvas.getBoundingClientRect().toJSON())")
         assert (second["top"] > first["top"]) == (width < 700)  # stacked
-        hint = page.run("const hint = document.querySelector('.hint'); hint.focus(); hint.ariaDescription")
+        hint = page.run("document.querySelector('.hint').focus(); hint.ariaDescription")
         tip = page.run("[$('tip').hidden, $('tip').textContent, $('tip').getBoundingClientRect().right]")
         assert tip[:2] == [False, hint]
         assert tip[2] <= width

@@ -32,8 +32,7 @@ def test_runs_are_called_and_ordered_as_people_do():
 @pytest.mark.parametrize(
     ("changes", "names"),
     [
-        ([{"seed": 1}, {"seed": 2}], ["Baseline, seed 1", "Baseline, seed 2"]),
-        ([{"iterations": 5}, {"seed": 2}], ["Baseline (0)", "Baseline (1)"]),
+        ([{"seed": 1}, {"seed": 2}], ["Baseline (0)", "Baseline (1)"]),
         ([{}, {}], ["Baseline (0)", "Baseline (1)"]),
         ([{}, {"dropout": 0.5}], ["Baseline", "Dropout 0.5"]),
     ],
