@@ -139,7 +139,7 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
         psnr, ca = (mean_std(reference.values(split, key))[0] for key in ("psnr", "ca_exact_half"))
         found = [f"PSNR {psnr:.2f} dB"] * math.isfinite(psnr) + [f"exact CA {ca * 1e3:.2f}e-3"] * math.isfinite(ca)
         text = f"{reference.name}: {' and '.join(found) or 'nothing was measured'} {where}."
-        return text, [*limits, "Nothing stands beside it: add a run without regularizer to see what it changes."]
+        return text, [*limits, "Nothing stands beside it: add a second run to compare it with."]
     said = {rows.name: _said(rows, reference, split) for rows in rest}
     sign, key = (1, "psnr") if split == "test" else (-1, "ca_exact_half")
     best = max(rest, key=lambda rows: sign * mean_std(rows.values(split, key))[0])
