@@ -96,7 +96,8 @@ class ModelState:
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
-        >>>         >>> scene, config = synthetic_scene(width=16, height=12, points=50), TrainConfig()
+        >>> from reference_trainer.training.assembly import make_density, make_regularizer
+        >>> scene, config = synthetic_scene(width=16, height=12, points=50), TrainConfig()
         >>> state = ModelState(scene, config, make_density(config), make_regularizer(config))
         >>> len(state.gaussians)
         50
