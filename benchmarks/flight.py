@@ -16,7 +16,7 @@ import torch
 import tyro
 
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ca_picture
+from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
 from reference_trainer.evaluation.pictures import as_pillow, heat_map
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing
@@ -48,7 +48,7 @@ def there_and_back(cameras: Sequence[Camera], frames: int, past: float) -> list[
 
 @torch.no_grad()
 def sheets(models: Sequence[TrainedModel], labels: Sequence[str], path: Sequence[Camera]) -> list[Image]:
-    """Return a picture for each camera: a column for each model, its render above its map of exact co-adaptation."""
+    """Return a picture for each camera: a column for each model, its render above the exact variance of the pixels."""
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
@@ -60,7 +60,11 @@ def sheets(models: Sequence[TrainedModel], labels: Sequence[str], path: Sequence
         views = [Viewpoint("", camera) for camera in path]
         results = [score(model.gaussians.opacities, view) for view in views]
         renders = [as_pillow(model.test_rendering(view).image) for view in views]
-        drawn.append(list(zip(renders, (as_pillow(ca_picture(result)) for result in results), strict=True)))
+        drawn.append(
+            list(
+                zip(renders, (as_pillow(heat_map(r.variance.float(), CA_PICTURE_RANGE)) for r in results), strict=True)
+            )
+        )
         scores.append(f"exact co-adaptation: {1e3 * sum(r.value for r in results) / len(results):.1f} {_UNIT}")
     sheet = Image.new("RGB", (len(models) * (width + _GAP) + _BAR, 2 * (height + _HEAD)), "white")
     pen, bottom = ImageDraw.Draw(sheet), 2 * _HEAD + height
@@ -92,8 +96,8 @@ def flight(
         "with dropout and opacity decay",
     ),
     width: int = 378,
-    frames: int = 24,
-    past: float = 0.35,
+    frames: int = 22,
+    past: float = 0.6,
     milliseconds: int = 90,
     quality: int = 70,
 ) -> None:

@@ -57,9 +57,8 @@ def gains_figure(kept: Kept, path: Path) -> None:
                 ax.set_xticks(ticks, labels=[f"{x:g}" for x in ticks])
                 ax.minorticks_off()
             ax.set_xlabel(axis)
-            column[-1].legend(
-                loc="upper right", bbox_to_anchor=(1.0, 0.93), fontsize=9
-            )  # the scores leave more room than the gains
+            lowest = [ax for ax, lines in zip(column, of, strict=True) if lines][-1]
+            lowest.legend(loc="upper right", bbox_to_anchor=(1.0, 0.93), fontsize=9)
 
 
 def ranking_figure(kept: Kept, names: Sequence[str], path: Path) -> None:
