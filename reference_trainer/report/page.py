@@ -23,7 +23,6 @@ from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ERROR_PICTUR
 from reference_trainer.evaluation.pictures import dynamics_figure, heat_map
 from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE
 from reference_trainer.evaluation.tables import evaluation_table, markdown_table
-from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import write_text
 from reference_trainer.report.findings import Findings, find
 from reference_trainer.report.packing import data_uri, jpeg
@@ -46,6 +45,7 @@ from reference_trainer.runs.folder import (
 )
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.virtual_cameras import interpolate_cameras
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["labels", "view_name", "write_report"]
