@@ -89,14 +89,13 @@ def write_report(
     if views < 1:
         raise ValueError(f"expected at least 1 view of each split, got {views}.")
     folders, runs = runs, [run for folder in runs for run in runs_of(folder) or [folder]]
-    paths = labels(runs)
+    path_of = dict(zip(runs, labels(runs), strict=True))
     out = report_file(folders, out)
     for run in runs:
         check_run(run)
-    settings = {run: read_run_settings(run / CONFIG) for run in runs}
-    path_of = dict(zip(runs, paths, strict=True))
-    runs = sorted(runs, key=lambda run: natural_order(settings[run][1]))
-    names, found = unique_names([settings[run][1] for run in runs], [path_of[run] for run in runs]), list[Findings]()
+    configs = {run: read_run_settings(run / CONFIG)[1] for run in runs}
+    runs = sorted(runs, key=lambda run: natural_order(configs[run]))
+    names, found = unique_names([configs[run] for run in runs], [path_of[run] for run in runs]), list[Findings]()
     for run, label in zip(runs, names, strict=True):
         _log.info("[%d/%d] %s", len(found) + 1, len(runs), run)
         found.append(find(run, label, views=views, device=device, trust=trust))
@@ -176,9 +175,7 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
 
 def _renamed(results: dict[str, Any]) -> dict[str, Any]:
     """Return results whose views are named for people: no "test test_0"."""
-    views = [
-        view | {"name": view_name(view["split"], view["name"])[len(view["split"]) + 1 :]} for view in results["views"]
-    ]
+    views = [view | {"name": view["name"].removeprefix(f"{view['split']}_")} for view in results["views"]]
     return results | {"views": views}
 
 
