@@ -99,7 +99,7 @@ def flight(
     frames: int = 22,
     past: float = 0.6,
     milliseconds: int = 90,
-    quality: int = 70,
+    quality: int = 55,
 ) -> None:
     """Fly through the training cameras of two runs on one scene, and write a looping WebP.
 

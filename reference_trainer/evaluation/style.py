@@ -101,4 +101,4 @@ def new_figure(path: Path) -> Iterator[Figure]:
         figure = Figure(layout="constrained")
         yield figure
         with replacing(path) as place:
-            figure.savefig(place, dpi=150, format=path.suffix[1:])
+            figure.savefig(place, dpi=125, format=path.suffix[1:])

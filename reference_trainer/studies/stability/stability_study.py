@@ -273,7 +273,7 @@ def _draw(records: Records, figure: Any) -> None:
         if families[i] != families[i - 1]:
             axes.axhline(i - 0.5, color="white", linewidth=4)
     bar = figure.colorbar(heat, ax=axes, location="top", aspect=50, pad=0.01)
-    bar.set_label("largest relative error of any engine where all is right (gray: not part of the case)")
+    bar.set_label("largest relative error where all is right (gray: not part)")
 
 
 def _quantity(name: str) -> str:
@@ -290,5 +290,5 @@ def _label(of: Sequence[Record]) -> str:
     mantissa, exponent = f"{min(onsets) if onsets else magnitudes[1]:.1e}".split("e")
     number = ("" if mantissa == "1.0" else rf"{mantissa} \times ") + f"10^{{{int(exponent)}}}"
     if 0 <= int(exponent) < 3:  # shorter in full
-        number = f"{min(onsets) if onsets else magnitudes[1]:.2g}"
+        number = f"{min(onsets) if onsets else magnitudes[1]:.3g}"
     return f"{name}{'; ends at' if onsets else ', to'} ${number}$"
