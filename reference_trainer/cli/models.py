@@ -16,6 +16,7 @@ from reference_trainer.cli.options import (
     RenderOptions,
     Trust,
     check_model,
+    check_out,
     place_of,
 )
 from reference_trainer.cli.training import PORT, Lpips
@@ -59,6 +60,7 @@ class Evaluate:
         if isinstance(place, OrbitOptions) and self.lpips is not None:
             raise ValueError("without photographs there is no --lpips: give --path.")
         check_model(self.run, place)
+        check_out(self.out, self.run, place)
 
     def __call__(self) -> None:
         from reference_trainer.evaluation.lpips import load_lpips
@@ -101,6 +103,7 @@ class Render:
     def check(self) -> None:
         """Refuse what cannot work, before anything heavy is imported."""
         check_run(self.run)
+        check_out(self.out, self.run)
 
     def __call__(self) -> None:
         from reference_trainer.runs.measure import render_run

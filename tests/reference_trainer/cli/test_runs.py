@@ -218,6 +218,28 @@ def test_what_would_be_lost_is_refused(trained, capsys, tmp_path):
         main(["render", str(trained), "--what", "test"])
 
 
+def test_nothing_is_written_to_the_photographs_or_over_other_files(trained, capsys, tmp_path):
+    """By the commands that measure and draw, wherever they may write."""
+    garden, other, run = tmp_path / "garden", tmp_path / "other", tmp_path / "run"
+    for folder in (garden / "images", other, run):
+        folder.mkdir(parents=True)
+    settings = json.loads((trained / "config.json").read_text())
+    settings["scene"]["path"] = str(garden)
+    (run / "config.json").write_text(json.dumps(settings))
+    ply = str(trained / "point_cloud.ply")
+    for command in (
+        ["evaluate", str(run)], ["render", str(run)], ["evaluate", ply, "--scene", str(garden)],
+        ["compare", str(garden), "--iterations", "1", "--seeds", "1"],
+    ):  # fmt: skip
+        assert "is the folder of the scene" in refused([*command, "--out", str(garden)], capsys)
+    (other / "evaluation.md").write_text("precious")
+    assert "holds evaluation.md" in refused(["evaluate", str(trained), "--out", str(other)], capsys)
+    (other / "dynamics.png").write_text("precious")
+    assert "holds dynamics.png" in refused(["compare", "--out", str(other), *SMALL], capsys)
+    assert [path.name for path in garden.iterdir()] == ["images"]
+    assert {path.read_text() for path in other.iterdir()} == {"precious"}
+
+
 def test_without_test_views_the_training_views_are_rendered(capsys, tmp_path):
     out = tmp_path / "all"
     main(["train", "--out", str(out), "--downscale", "8", "--test", "none", "--iterations", "1"])
