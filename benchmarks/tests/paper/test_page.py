@@ -1,6 +1,7 @@
 """What is kept of trainings, and the tables and figures that are made of it."""
 
 import dataclasses
+import json
 import math
 import re
 from contextlib import contextmanager
