@@ -221,9 +221,10 @@ class Bake:
 class Clean:
     """Remove the Gaussians of a PLY that co-adapt most; refine.
 
-    Most relative to what they contribute; prints a table of before and after. A few training steps on the photographs
-    of the scene close the holes; without a scene, on an orbit, they stay. For models that were trained without a
-    regularizer: after dropout there is little to remove, and such a model is refused unless you say --anyway.
+    Removes those with the most co-adaptation per contribution, and prints a table of before and after. A few training
+    steps on the photographs of the scene close the holes; without a scene, on an orbit, they stay. For models that were
+    trained without a regularizer: after dropout there is little to remove, and such a model is refused unless you say
+    --anyway.
     """
 
     ply: Annotated[Path, tyro.conf.Positional]
