@@ -16,6 +16,7 @@ from reference_trainer.cli.options import (
     RenderOptions,
     Trust,
     check_model,
+    check_out,
     place_of,
 )
 from reference_trainer.cli.training import PORT, Lpips
@@ -59,6 +60,7 @@ class Evaluate:
         if isinstance(place, OrbitOptions) and self.lpips is not None:
             raise ValueError("without photographs there is no --lpips: give --path.")
         check_model(self.run, place)
+        check_out(self.out, self.run, place)
 
     def __call__(self) -> None:
         from reference_trainer.evaluation.lpips import load_lpips
@@ -101,6 +103,7 @@ class Render:
     def check(self) -> None:
         """Refuse what cannot work, before anything heavy is imported."""
         check_run(self.run)
+        check_out(self.out, self.run)
 
     def __call__(self) -> None:
         from reference_trainer.runs.measure import render_run
@@ -218,9 +221,10 @@ class Bake:
 class Clean:
     """Remove the Gaussians of a PLY that co-adapt most; refine.
 
-    Most relative to what they contribute; prints a table of before and after. A few training steps on the photographs
-    of the scene close the holes; without a scene, on an orbit, they stay. For models that were trained without a
-    regularizer: after dropout there is little to remove, and such a model is refused unless you say --anyway.
+    Removes those with the most co-adaptation per contribution, and prints a table of before and after. A few training
+    steps on the photographs of the scene close the holes; without a scene, on an orbit, they stay. For models that were
+    trained without a regularizer: after dropout there is little to remove, and such a model is refused unless you say
+    --anyway.
     """
 
     ply: Annotated[Path, tyro.conf.Positional]

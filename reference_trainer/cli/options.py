@@ -13,11 +13,11 @@ from typing import Annotated, Literal
 import tyro
 
 from reference_trainer.files import is_ply
-from reference_trainer.runs.folder import check_run
+from reference_trainer.runs.folder import CONFIG, check_output, check_run, read_run_settings
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 
 __all__ = [
-    "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_scenes",
+    "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_out", "check_scenes",
     "place_of", "refuse_old_options",
 ]  # fmt: skip
 
@@ -111,6 +111,22 @@ def check_model(source: Path, place: SceneOptions | OrbitOptions | None) -> None
         raise FileNotFoundError(f"there is no file {source}: expected a standard 3DGS .ply, or the folder of a run.")
     elif isinstance(place, SceneOptions):
         check_scenes([place.path])
+
+
+def check_out(out: Path | None, source: Path, place: SceneOptions | OrbitOptions | None = None) -> None:
+    """Refuse to write into the folder of the photographs.
+
+    Args:
+        out: where to write, if it was given.
+        source: the run or PLY.
+        place: of the PLY, as of `place_of`.
+
+    Raises:
+        ValueError: if ``out`` is the scene of the run or of the PLY.
+    """
+    if out is not None:
+        scene = read_run_settings(source / CONFIG)[0] if place is None else place
+        check_output(out, scene.path if isinstance(scene, SceneOptions) else None, ())
 
 
 def check_scenes(paths: Sequence[str]) -> None:

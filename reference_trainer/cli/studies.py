@@ -8,7 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from reference_trainer.cli.options import Device
+from reference_trainer.cli.options import Device, check_model
+from reference_trainer.files import is_ply
+from reference_trainer.scenes.options import OrbitOptions
 
 __all__ = ["MOVED", "ErrorRuntime", "Stability", "Study"]
 
@@ -32,6 +34,11 @@ class ErrorRuntime:
     seeds: int = 3
     """Number of independent sequences of masks."""
     device: Device = "cpu"
+
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        for source in self.sources:
+            check_model(source, OrbitOptions() if is_ply(source) else None)
 
     def __call__(self) -> None:
         from reference_trainer.studies.error_runtime import error_runtime_study

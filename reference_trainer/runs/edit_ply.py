@@ -124,7 +124,7 @@ def clean_ply(
     if model.chain.drops and not anyway:
         raise ValueError(
             f"{ply} was trained with {model.regularizer}, which leaves little to remove: cleaning such a model made it "
-            "worse (20.74 to 20.22 dB at the training views). Keep it as it is, or say --anyway."
+            "worse (fern, 24.21 to 23.80 dB at the test views). Keep it as it is, or say --anyway."
         )
     views = [view.to(device) for view in loaded.views["orbit" if scene is None else "train"]]
     stays = all_but_highest(Heat.of(model, views).values, fraction)

@@ -103,6 +103,8 @@ def settings_of_run(
         check_output(out, options.path, (PLY, BAKED_PLY, RESULTS, VIEWS))
         return None
     if auto and (out / PLAN).exists():
+        from reference_trainer.training.plan import Plan
+
         try:
             config = Plan.from_dict(read_json(out / PLAN)).applied(config, given=given)
         except (ValueError, TypeError, AttributeError) as error:  # whatever a damaged file, or another version's, holds

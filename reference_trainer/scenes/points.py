@@ -107,7 +107,7 @@ def filled(cloud: PointCloud, train: Sequence[Frame], generator: torch.Generator
         return cloud, ""
     more = random_points_in_frusta(cameras, RANDOM_POINTS, near=near, far=far, generator=generator)
     positions, colors = torch.cat([cloud.positions, more.positions]), torch.cat([cloud.colors, more.colors])
-    note = f"{RANDOM_POINTS:,} random ones at their depths are added, for so few grow no model"
+    note = f"{RANDOM_POINTS:,} random ones at their depths are added, because so few points are not enough"
     return replace(cloud, positions=positions, colors=colors), note
 
 

@@ -8,14 +8,16 @@ from pathlib import Path
 import pytest
 
 ERRORS = """
-import torch, ca_reg
-from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise, Params, expected_opacity, scale_opacity
+import tempfile, torch, ca_reg
+from ca_reg import CAMonitor, CAPenalty, CAScore
+from ca_reg import Chain, GaussianDropout, OpacityNoise, Params, expected_opacity, scale_opacity
 from ca_reg import functional as F
 from ca_reg.functional import Multiplier
 
 half = torch.full((5,), 0.5)
 wide = torch.full((3, 4), 0.5)
 dropout, noise = GaussianDropout(0.2), OpacityNoise(0.3)
+FOLDER = tempfile.mkdtemp()
 score = CAScore(lambda opacity, view: (opacity.flatten()[:3, None, None].expand(3, 4, 4), torch.ones(4, 4)))
 CASES = {
     "dropout of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: dropout(wide)),
@@ -31,6 +33,28 @@ CASES = {
     "scaling of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: scale_opacity(wide, 0.2)),
     "the mean of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: expected_opacity(wide, 0.2)),
     "a chain of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: Chain(noise, dropout)(wide)),
+    "a score of one render": (ValueError, "samples", lambda: CAScore(print, samples=1)),
+    "a score at rate 1": (ValueError, "drop_rate", lambda: CAScore(print, drop_rate=1.0)),
+    "a score of nothing": (TypeError, "callable", lambda: CAScore(None)),
+    "a score without alpha": (ValueError, "alpha", lambda: CAScore(lambda o, v: torch.ones(3, 4, 4))(half, None)),
+    "a depth map as alpha": (
+        ValueError, "depth map",
+        lambda: CAScore(lambda o, v: (torch.ones(3, 4, 4), torch.full((4, 4), 5.0)))(half, None)
+    ),
+    "shares of a sampled score": (ValueError, "exact", lambda: ca_reg.attribute(score, print, half, None)),
+    "a penalty of -1": (ValueError, "weight", lambda: CAPenalty(print, Multiplier.dropout(0.2), weight=-1.0)),
+    "a monitor of no views": (ValueError, "views", lambda: CAMonitor(score, FOLDER, views={}, every=1)),
+    "a monitor of a list": (TypeError, "views", lambda: CAMonitor(score, FOLDER, views=[1.0], every=1)),
+    "a chain of numbers": (TypeError, "module", lambda: Chain(0.2)),
+    "radii of another model": (ValueError, "Gaussians", lambda: (dropout(half), dropout.mask_radii(torch.ones(3)))),
+    "step -1": (ValueError, "step", lambda: dropout.set_step(-1)),
+    "a negative sigma": (ValueError, "sigma", lambda: OpacityNoise(-1.0)),
+    "a sigma of 1e39": (ValueError, "1e+30", lambda: OpacityNoise(1e39)),
+    "a negative number of masks": (ValueError, "n must", lambda: F.draw_keep_mask(-1, 0.2)),
+    "a mask of rate 1": (ValueError, "[0, 1)", lambda: F.draw_keep_mask(3, 1.0)),
+    "a multiplier of rate 1": (ValueError, "[0, 1)", lambda: Multiplier.dropout(1.0)),
+    "an unknown name": (ValueError, "no regularizer", lambda: ca_reg.regularizers.parse("dropuot(0.2)")),
+    "a negative weight": (ValueError, "negative", lambda: F.color_variance(-half, torch.ones(5, 3))),
     "a missing field": (ValueError, "needs means", lambda: ca_reg.regularizers.parse("density")(half)),
     "a score of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: score(wide, None)),
     "a score of numpy": (TypeError, "opacity must be a torch tensor", lambda: score(half.numpy(), None)),

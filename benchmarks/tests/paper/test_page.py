@@ -1,6 +1,7 @@
 """What is kept of trainings, and the tables and figures that are made of it."""
 
 import dataclasses
+import json
 import math
 import re
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ from benchmarks.paper.rows import Rows, resolved, value
 from benchmarks.paper.scenes import chosen_scenes
 from reference_trainer.evaluation.style import new_figure
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.training.plan_rules import DROPOUT_GAINS, FAR_APART_GAINS
+from reference_trainer.training.plan_rules import DECAY_GAINS, DROPOUT_GAINS, FAR_APART_GAINS
 
 # What is kept
 
@@ -233,13 +234,38 @@ def test_the_pages_show_what_is_kept(path):
     assert page(path.read_text("utf-8"), Kept(ROOT / "benchmarks" / "data" / "paper")) == path.read_text("utf-8")
 
 
+FOLDERS = {"the built-in scene": "synthetic", "DTU scan24": "dtu-scan24", "DTU scan65": "dtu-scan65"}
+
+
 def test_what_dropout_gained_is_what_was_measured():
     """The figures of the rule against the kept rows of the study."""
     kept = Kept(ROOT / "benchmarks" / "data" / "paper")
-    folders = {"the built-in scene": "synthetic", "DTU scan24": "dtu-scan24", "DTU scan65": "dtu-scan65"}
     for number, measured in (*DROPOUT_GAINS.items(), (3, FAR_APART_GAINS)):
         views = {} if number == 3 else {"views": number}
         for (name, rate), gain in measured.items():
             check = Check("test psnr", {"regularizer": f"dropout({rate})"} | views, views)
-            found = differences(check, folders.get(name, name), kept)
+            found = differences(check, FOLDERS.get(name, name), kept)
             assert gain == pytest.approx(np.mean(found), abs=0.051)
+
+
+def test_no_scene_is_left_out_of_what_is_said_of_dropout():
+    """Above all none where it loses: every scene with three pairs of plain and dropout 0.2."""
+    kept = Kept(ROOT / "benchmarks" / "data" / "paper")
+    check = Check("test psnr", {"regularizer": "dropout(0.2)"}, {})
+    scenes = {path.stem for path in (ROOT / "benchmarks" / "data" / "paper").glob("*.json")}
+    measured = {scene for scene in scenes if len(differences(check, scene, kept)) >= 3}
+    said = {FOLDERS.get(name, name) for name, rate in (*DROPOUT_GAINS[3], *FAR_APART_GAINS) if rate == 0.2}
+    assert said == measured, "plan_rules.py, DROPOUT_GAINS[3] or FAR_APART_GAINS"
+
+
+def test_what_opacity_decay_gained_is_what_was_measured():
+    """The figures of the rule, and those in docs/settings.md, against the kept records of the search."""
+    records = json.loads((ROOT / "benchmarks" / "data" / "remedy_default.json").read_text("utf-8"))["records"]
+    found = {(each["scene"], each["seed"], "opacity_decay=0.995" in each["arm"]): each["psnr"] for each in records}
+    text = (ROOT / "docs" / "settings.md").read_text("utf-8")
+    for scene, gain in DECAY_GAINS.items():
+        gains = [found[scene, seed, True] - found[scene, seed, False] for seed in range(3)]
+        error = np.std(gains, ddof=1) / 3**0.5
+        assert gain == pytest.approx(np.mean(gains), abs=0.0051)
+        shown = re.search(rf"{scene} \+(\d\.\d+) ± (\d\.\d+)", text)
+        assert [float(x) for x in shown.groups()] == pytest.approx([np.mean(gains), error], abs=0.0051)

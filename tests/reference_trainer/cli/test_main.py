@@ -243,7 +243,8 @@ def test_a_reader_that_has_seen_enough_is_no_error():
 @pytest.mark.parametrize(
     "command",
     ["evaluate runs/typo", "evaluate typo.ply", "render runs/typo", "report runs/typo", "view runs/typo",
-     "bake typo.ply", "clean typo.ply", "train typo", "plan typo", "compare typo", "poses typo"],
+     "bake typo.ply", "clean typo.ply", "train typo", "plan typo", "compare typo", "poses typo", "evaluate typo.pt",
+     "study error-runtime typo.ply", "study error-runtime typo"],
 )  # fmt: skip
 def test_a_mistyped_path_is_answered_before_anything_slow_is_imported(command):
     code = f"""if True:

@@ -218,6 +218,28 @@ def test_what_would_be_lost_is_refused(trained, capsys, tmp_path):
         main(["render", str(trained), "--what", "test"])
 
 
+def test_nothing_is_written_to_the_photographs_or_over_other_files(trained, capsys, tmp_path):
+    """By the commands that measure and draw, wherever they may write."""
+    garden, other, run = tmp_path / "garden", tmp_path / "other", tmp_path / "run"
+    for folder in (garden / "images", other, run):
+        folder.mkdir(parents=True)
+    settings = json.loads((trained / "config.json").read_text())
+    settings["scene"]["path"] = str(garden)
+    (run / "config.json").write_text(json.dumps(settings))
+    ply = str(trained / "point_cloud.ply")
+    for command in (
+        ["evaluate", str(run)], ["render", str(run)], ["evaluate", ply, "--scene", str(garden)],
+        ["compare", str(garden), "--iterations", "1", "--seeds", "1"],
+    ):  # fmt: skip
+        assert "is the folder of the scene" in refused([*command, "--out", str(garden)], capsys)
+    (other / "evaluation.md").write_text("precious")
+    assert "holds evaluation.md" in refused(["evaluate", str(trained), "--out", str(other)], capsys)
+    (other / "dynamics.png").write_text("precious")
+    assert "holds dynamics.png" in refused(["compare", "--out", str(other), *SMALL], capsys)
+    assert [path.name for path in garden.iterdir()] == ["images"]
+    assert {path.read_text() for path in other.iterdir()} == {"precious"}
+
+
 def test_without_test_views_the_training_views_are_rendered(capsys, tmp_path):
     out = tmp_path / "all"
     main(["train", "--out", str(out), "--downscale", "8", "--test", "none", "--iterations", "1"])
@@ -242,3 +264,26 @@ def test_own_code_is_trusted_where_the_command_line_names_it(capsys, tmp_path, m
     assert "say --trust own_drop" in refused(["evaluate", str(out / "point_cloud.ply")], capsys)
     main([*page[1:], "--views", "1"])
     main(["evaluate", str(out), "--regularizer", "own_drop:Mine(0.2)", "--samples", "2"])
+
+
+@pytest.mark.slow
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["sceaux", "cape"])
+def test_a_capture_needs_no_word_of_explanation(name, data_root, tmp_path, monkeypatch, capsys):
+    """The README's commands on captures that nothing here was tuned on, one of them of a masked object."""
+    monkeypatch.chdir(tmp_path)
+    scene, quick = str(data_root / name), ["--downscale", "4", "--monitor-every", "0"]
+    best = ["--dropout", "0.2", "--opacity-decay", "0.995"]
+    main(["plan", scene, *best])
+    assert "3 training views" in capsys.readouterr().out
+    main(["train", scene, *best, *quick, "--iterations", "30", "--out", "runs/mine"])
+    main(["compare", scene, *quick, "--iterations", "10", "--seeds", "1", "--strategies", "baseline", "dropout"])
+    main(["report", "runs/mine"])
+    main(["report", "runs/compare"])
+    said = plain(capsys.readouterr().out)
+    assert "exact CA (1e-3)" in said
+    results = json.loads((tmp_path / "runs/mine/results.json").read_text())
+    assert 5 < results["mean"]["test"]["psnr"] < 40
+    assert results["mean"]["test"]["ca_exact_half"] > 0
+    assert all("<html" in (tmp_path / "runs" / file).read_text("utf-8") for file in
+               ("mine/report.html", "compare/report.html"))  # fmt: skip

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from reference_trainer import cli
 from reference_trainer.cli import main
 from reference_trainer.scenes import load_scene, poses
 from reference_trainer.scenes.colmap import read_colmap
@@ -150,20 +151,35 @@ def test_a_truncated_photograph_is_named_before_colmap_works(noise, monkeypatch)
         find_poses(noise)
 
 
-def test_a_photograph_of_another_format_is_not_passed_over_in_silence(noise, monkeypatch):
-    (noise / "IMG_3.HEIC").write_bytes(b"ftypheic")
-    (noise / "1.heic").write_bytes(b"ftypheic")  # 1.png is the same photograph, exported
-    found = SimpleNamespace(
+def reconstruction():
+    """Stand for what COLMAP finds of the photographs of `noise`."""
+    return SimpleNamespace(
         images={i: SimpleNamespace(name=f"{i}.png", has_pose=True) for i in range(3)},
         cameras={0: SimpleNamespace(mean_focal_length=lambda: 50.0)},
         num_points3D=lambda: 3,
         compute_mean_reprojection_error=lambda: 0.5,
         write_binary=lambda folder: None,
     )
-    monkeypatch.setattr(poses, "_reconstruct", lambda *_: found)
+
+
+def test_a_photograph_of_another_format_is_not_passed_over_in_silence(noise, monkeypatch):
+    (noise / "IMG_3.HEIC").write_bytes(b"ftypheic")
+    (noise / "1.heic").write_bytes(b"ftypheic")  # 1.png is the same photograph, exported
+    monkeypatch.setattr(poses, "_reconstruct", lambda *_: reconstruction())
     said = str(find_poses(noise))
     assert "3 of 4 photographs registered" in said
     assert "not read: IMG_3.HEIC. Save them as JPEG or PNG" in said
+
+
+def test_poses_ends_with_the_best_setting_known(noise, monkeypatch, capsys):
+    """A command to paste: that of a training with dropout and opacity decay, which `train` understands."""
+    monkeypatch.setattr(poses, "_reconstruct", lambda *_: reconstruction())
+    main(["poses", str(noise)])
+    *_, last = capsys.readouterr().out.splitlines()
+    program, *arguments = shlex.split(last)
+    assert program == "ca-reg"
+    command = cli._parse(arguments)
+    assert (command.folder, command.config.dropout, command.config.opacity_decay) == (str(noise), 0.2, 0.995)
 
 
 def test_too_few_photographs_and_cameras_that_are_there(noise, colmap_text):

@@ -123,15 +123,9 @@ def test_left_out_by_construction(tiny_scene, name, config, said):
 @pytest.mark.parametrize(
     ("views", "apart", "config", "decision", "said"),
     [
-        (1, 0.0, TrainConfig(), "recommended", r"^not asked for; 1 view; .*; with 2 views .* by \+1\.4 to \+1\.7 dB$"),
-        (
-            3,
-            20.0,
-            TrainConfig(),
-            "recommended",
-            r"3 views, 20 degrees apart; .* with 3 views .* by -3\.6 to \+1\.8 dB$",
-        ),
-        (3, 20.0, TrainConfig(), "recommended", r"; --dropout 0\.2 --opacity-decay 0\.995 .* by -0\.1 to \+1\.9 dB"),
+        (1, 0.0, TrainConfig(), "recommended", r"^not asked for; 1 view; with 2 views .* by \+1\.4 to \+1\.7 dB, and"),
+        (3, 20.0, TrainConfig(), "recommended", r"3 views, 20 degrees apart; with 3 views .* \+1\.0 to \+1\.8 dB, and"),
+        (3, 20.0, TrainConfig(), "recommended", r"a single training can lose.*--dropout 0\.2 --opacity-decay 0\.995$"),
         (4, 30.0, TrainConfig(), "left out", r"30 degrees apart; where views were .* by -0\.1 to \+0\.4 dB$"),
         (12, 10.0, TrainConfig(dropout=0.2), "used", r"^asked for; 12 views, 10 degrees apart; with 9 views"),
         (36, 10.0, TrainConfig(noise=0.8), "left out", r"36 views.*; with 48 views .* by -0\.3 to -0\.1 dB"),
