@@ -21,8 +21,8 @@ import tyro
 from benchmarks.calls import PASSES, draw_of, gradients, image, processor_clock
 from benchmarks.memory import peak_memory
 from benchmarks.workloads import WORKLOADS, WorkloadSpec, covered_pairs
-from reference_trainer.evaluation.pictures import new_figure
 from reference_trainer.evaluation.results import machine, write_json
+from reference_trainer.evaluation.style import new_figure
 from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.files import write_text
 from reference_trainer.json_files import read_json

@@ -21,6 +21,7 @@ from ca_reg import CAScore
 from ca_reg.functional import Multiplier
 from ca_reg.types import read_moments
 from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.style import WIDTH, color, readable
 from reference_trainer.evaluation.tables import markdown_table, mean_std
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.runs.folder import CONFIG, read_run_settings
@@ -331,37 +332,39 @@ def _report(records: Records) -> str:
     return "\n\n".join(part.rstrip() for part in parts) + "\n"
 
 
+_DRAWN = {"protocol_half": ("CA of 5 renders", _FIVE_OF_LIMIT), "neutral_half": ("neutral exact CA", 1.0)}
+
+
 def _draw(records: Records, figure: Any) -> None:
     """Draw the protocol and the neutral score against the exact one, all at drop rate 1/2; a row for each scene."""
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     scenes = _scenes(records)
-    figure.set_size_inches(11, 4.2 * len(scenes))
+    figure.set_size_inches(WIDTH, 4.6 * len(scenes))
     grid = figure.subplots(len(scenes), 2, squeeze=False)
     for row, (scene, runs) in zip(grid, scenes.items(), strict=True):
         labels = group_labels(runs)
         order = {label: i for i, label in enumerate(sorted(set(labels)))}
-        for ax, (quantity, share) in zip(row, (("protocol_half", _FIVE_OF_LIMIT), ("neutral_half", 1.0)), strict=True):
+        for ax, (quantity, (name, share)) in zip(row, _DRAWN.items(), strict=True):
             for label, i in order.items():
-                group = [run for run, name in zip(runs, labels, strict=True) if name == label]
-                x, y = ([mean_of(run, name) * 1e3 for run in group] for name in ("exact_half", quantity))
-                ax.scatter(x, y, color=f"C{i % 10}", marker="osD^vP*X<>p"[i % 11], label=label)
-            ax.set(xscale="log", yscale="log", title=scene, xlabel="exact_half x1e-3", ylabel=f"{quantity} x1e-3")
+                group = [run for run, named in zip(runs, labels, strict=True) if named == label]
+                x, y = ([mean_of(run, score) * 1e3 for run in group] for score in ("exact_half", quantity))
+                ax.scatter(x, y, color=color(label, i), marker="osD^vP*X<>p"[i % 11], label=readable(label))
+            ax.set(xscale="log", yscale="log", title=scene, xlabel="exact CA (10⁻³)", ylabel=f"{name} (10⁻³)")
             ax.axline(
                 (1, share),
                 (2, 2 * share),
                 color="0.7",
                 linewidth=1,
                 zorder=0,
-                label=f"{share:g} x limit" if share < 1 else "equal",
+                label=f"{share:g} times the exact score" if share < 1 else "equal",
             )
             for axis in (ax.xaxis, ax.yaxis):
                 axis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 4, 5, 7)))
                 axis.set_major_formatter(StrMethodFormatter("{x:g}"))
                 axis.set_minor_locator(NullLocator())
-            ax.grid(linewidth=0.3)
-        row[0].legend(*([x[-1]] for x in row[0].get_legend_handles_labels()), loc="upper left", fontsize=8)
-        row[1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+        row[0].legend(*([x[-1]] for x in row[0].get_legend_handles_labels()), loc="upper left")
+        row[1].legend(loc="lower right", fontsize=8.5)
 
 
 def _score_cell(run: Record, variant: str) -> str | None:

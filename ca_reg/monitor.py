@@ -367,13 +367,17 @@ def read_dynamics(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[np.floa
 
 
 def plot_dynamics(
-    runs: str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]], *, axes: Sequence[Axes] | None = None
+    runs: str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]],
+    *,
+    axes: Sequence[Axes] | None = None,
+    colors: Mapping[str, str] | None = None,
 ) -> tuple[Axes, Axes]:
     """Plot co-adaptation and PSNR against the step, each on its own axes.
 
-    ``runs`` is one log or log directory, or several by label. Each run has one color; its last group of views (test) is
-    solid, the others are dotted or dashed; nan leaves a gap. Draws on two ``axes``, by default side by side in a new
-    figure, and returns them: co-adaptation, PSNR.
+    ``runs`` is one log or log directory, or several by label. Each run has one color, by default the next of
+    matplotlib's, else that of its label in ``colors``; its last group of views (test) is solid, the others are dotted
+    or dashed; nan leaves a gap. Draws on two ``axes``, by default side by side in a new figure, and returns them:
+    co-adaptation, PSNR.
 
     Raises:
         ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
@@ -386,10 +390,11 @@ def plot_dynamics(
     columns = {label: read_dynamics(path) for label, path in labelled.items()}
     ca_axes, psnr_axes = new_axes(2) if axes is None else axes
     for number, (label, column) in enumerate(columns.items()):
+        color = (colors or {}).get(label, f"C{number}")
         groups = [key.removeprefix("ca/") for key in column if key.startswith("ca/")]
         lines = [*islice(cycle(("-", ":", "--", "-.")), len(groups))][::-1]
         for group, line in zip(groups, lines, strict=True):
-            style: dict[str, Any] = {"color": f"C{number}", "linestyle": line, "marker": ".", "markersize": 4}
+            style: dict[str, Any] = {"color": color, "linestyle": line, "marker": ".", "markersize": 4}
             ca_axes.plot(column["step"], column[f"ca/{group}"], label=f"{label} {group}".strip(), **style)
             if f"psnr/{group}" in column:
                 psnr_axes.plot(column["step"], column[f"psnr/{group}"], **style)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from benchmarks.paper.claims import GAINS, Check
 from benchmarks.paper.comparison import Kept, differences, interval, ranked
-from reference_trainer.evaluation.pictures import new_figure
+from reference_trainer.evaluation.style import COLORS, WIDTH, new_figure, readable
 
 __all__ = ["gains_figure", "ranking_figure"]
 
-_FIGURES = ("test psnr", "PSNR, dB more than without", 1.0), ("test ca_exact_half", "exact CA at 1/2, % more", 0.01)
+_FIGURES = ("test psnr", "gain in PSNR (dB)", 1.0), ("test ca_exact_half", "change of exact CA (%)", 0.01)
 _DASHES = ".-", ".--"
 
 
@@ -38,7 +39,7 @@ def gains_figure(kept: Kept, path: Path) -> None:
         )
     colors = _colors(kept)
     with new_figure(path) as figure:
-        figure.set_size_inches(1.5 + 4.5 * len(panels), 7)
+        figure.set_size_inches(WIDTH, 5.6)
         grid = figure.subplots(len(_FIGURES), len(panels), sharex="col", sharey="row", squeeze=False)
         for row, (_, title, _) in zip(grid, _FIGURES, strict=True):
             row[0].set_ylabel(title)
@@ -48,7 +49,7 @@ def gains_figure(kept: Kept, path: Path) -> None:
                 for (scene, name), places in lines.items():
                     means, errors = zip(*places.values(), strict=True)
                     style = _DASHES[[*GAINS[axis]].index(name)]
-                    label = f"{scene} {name}".strip()
+                    label = ", ".join(map(readable, filter(None, (scene, name))))
                     ax.errorbar([*places], means, errors, fmt=style, color=colors[scene], label=label, capsize=2)
             ticks = sorted({x for lines in of for places in lines.values() for x in places})
             if ticks[0] > 0:  # numbers of views
@@ -56,7 +57,8 @@ def gains_figure(kept: Kept, path: Path) -> None:
                 ax.set_xticks(ticks, labels=[f"{x:g}" for x in ticks])
                 ax.minorticks_off()
             ax.set_xlabel(axis)
-            column[0].legend(fontsize="small")
+            lowest = [ax for ax, lines in zip(column, of, strict=True) if lines][-1]
+            lowest.legend(loc="upper right", bbox_to_anchor=(1.0, 0.93), fontsize=9)
 
 
 def ranking_figure(kept: Kept, names: Sequence[str], path: Path) -> None:
@@ -76,7 +78,7 @@ def ranking_figure(kept: Kept, names: Sequence[str], path: Path) -> None:
         raise ValueError(f"{kept.folder} has no two seeds of the settings of claim {unknown[0]}: nothing to rank.")
     colors, sizes = _colors(kept), [len(rank) for rank in ranks.values()]
     with new_figure(path) as figure:
-        figure.set_size_inches(13, 1.2 * len(sizes) + 0.3 * sum(sizes))
+        figure.set_size_inches(WIDTH, 0.5 * len(sizes) + 0.27 * sum(sizes))
         grid = figure.subplots(len(sizes), 2, sharex="col", sharey="row", squeeze=False, height_ratios=sizes)
         for row, rank in zip(grid, ranks.values(), strict=True):
             scenes = sorted({scene for _, _, gains in rank for scene in gains})
@@ -84,23 +86,27 @@ def ranking_figure(kept: Kept, names: Sequence[str], path: Path) -> None:
                 known = [(place, gains[scene]) for place, (_, _, gains) in enumerate(rank) if scene in gains]
                 # The scenes of a setting stand below each other, so that their bars do not cover each other.
                 heights = [place + 0.5 * (number / max(1, len(scenes) - 1) - 0.5) for place, _ in known]
-                style = {"fmt": ".", "color": colors[scene], "label": scene, "capsize": 2}
+                style = {"fmt": ".", "color": colors[scene], "label": readable(scene), "capsize": 2}
                 row[0].errorbar([x.psnr for _, x in known], heights, xerr=[x.error for _, x in known], **style)
                 row[1].plot([100 * x.score for _, x in known], heights, ".", color=colors[scene])
             for panel in row:
                 panel.axvline(0, color="0.6", linewidth=0.8)
-                panel.grid(axis="y", color="0.9")
-                panel.set_axisbelow(True)
-            row[0].set_yticks(range(len(rank)), labels=[named for named, _, _ in rank], family="monospace")
+            row[0].set_yticks(range(len(rank)), labels=[readable(named) for named, _, _ in rank])
             row[0].set_ylim(len(rank) - 0.5, -0.5)
-            row[0].legend(fontsize="small")
         for panel, (_, title, _) in zip(grid[-1], _FIGURES, strict=True):
             panel.set_xlabel(title)
+        _legend_below(figure, grid[:, 0])
 
 
 def _colors(kept: Kept) -> dict[str, str]:
-    """Return the color of every scene, the same in all figures."""
-    return {scene: f"C{number}" for number, scene in enumerate(kept.scenes)}
+    """Return the color of every scene, the same in all figures and that of no strategy."""
+    return {scene: COLORS[number % len(COLORS)] for number, scene in enumerate(kept.scenes)}
+
+
+def _legend_below(figure: Any, panels: Iterable[Any]) -> None:
+    """Put one legend for several panels below the figure, each of its lines once."""
+    lines = {text: line for ax in panels for line, text in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend([*lines.values()], [*lines], loc="outside lower center", ncols=min(4, len(lines)))
 
 
 def _lines(axis: str, of: str, unit: float, kept: Kept) -> dict[tuple[str, str], dict[float, tuple[float, float]]]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,11 +17,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ca_reg.monitor import LOG_NAME, plot_dynamics
+from reference_trainer.evaluation.style import WIDTH, color, in_thousandths, new_figure, readable
 from reference_trainer.files import replacing
 from reference_trainer.scenes.images import IMAGE_SUFFIXES, read_image
-
-if TYPE_CHECKING:  # an extra
-    from matplotlib.figure import Figure
 
 __all__ = [
     "PANEL",
@@ -32,7 +30,6 @@ __all__ = [
     "heat_colors",
     "heat_map",
     "is_own_png",
-    "new_figure",
     "save_gif",
     "save_png",
     "side_by_side",
@@ -192,17 +189,6 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
     return torch.from_numpy(np.array(sheet)).permute(2, 0, 1) / 255
 
 
-@contextmanager
-def new_figure(path: Path) -> Iterator[Figure]:
-    """Yield an empty figure, and save it on exit in the format of the extension of ``path``, such as PNG or SVG."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(layout="constrained")
-    yield figure
-    with replacing(path) as place:
-        figure.savefig(place, dpi=110, format=path.suffix[1:])
-
-
 def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
     """Draw CA and PSNR of several runs against the iteration (paper, training dynamics).
 
@@ -211,12 +197,18 @@ def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
         path: the PNG or SVG to write.
     """
     with new_figure(path) as figure:
-        figure.set_size_inches(10, 4.2)
-        ca_axes, _ = plot_dynamics(dict(runs), axes=figure.subplots(1, 2))
+        figure.set_size_inches(WIDTH, 4.4)
+        colors = {label: color(label, number) for number, label in enumerate(runs)}
+        ca_axes, psnr_axes = plot_dynamics(dict(runs), axes=figure.subplots(1, 2), colors=colors)
         exact = [_logs_exact(folder) for folder in runs.values()]
-        if any(exact):  # logs of older versions hold the sampled score
-            ca_axes.set_ylabel("exact CA (1e-3)" if all(exact) else "CA (1e-3); exact, or of 5 renders in older runs")
-            ca_axes.yaxis.set_major_formatter(lambda x, position: f"{x * 1e3:g}")
+        old = "CA; exact, or of 5 renders" if any(exact) else "CA"  # logs of older versions hold the sampled score
+        in_thousandths(ca_axes.yaxis, "exact CA" if all(exact) else old)
+        ca_axes.set_title("Co-adaptation")
+        psnr_axes.set_title("Quality")
+        if (beside := psnr_axes.get_legend()) is not None:
+            beside.remove()  # below both is room for long names
+        names = [" ".join(map(readable, str(line.get_label()).rsplit(" ", 1))) for line in ca_axes.lines]
+        figure.legend(ca_axes.lines, names, loc="outside lower center", ncols=max(1, min(4, len(runs))))
 
 
 def _logs_exact(folder: Path) -> bool:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.maps import first_order_map
+from reference_trainer.evaluation.style import COLORS, WIDTH
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import is_ply
@@ -278,19 +279,19 @@ def _conclusion(record: Record, error: str) -> str:
 
 def _draw(records: Records, figure: Any) -> None:
     """Draw error against time, one panel per model; bars span the smallest to the largest error of a seed."""
-    figure.set_size_inches(5.2 * len(records), 5.2)
+    figure.set_size_inches(WIDTH, 5.6)
     panels = figure.subplots(1, len(records), squeeze=False, sharey=True)[0]
     for axes, (name, record) in zip(panels, records.items(), strict=True):
         _panel(axes, record)
-        axes.set_title(name, fontsize="medium")
+        axes.set_title(name)
     panels[0].set_ylabel("relative error")
     lines = dict(zip(*reversed(panels[-1].get_legend_handles_labels()), strict=True))
-    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize="small")
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=3)
 
 
 def _panel(axes: Any, record: Record) -> None:
     """Draw one model: filled markers for the score, hollow ones for the map."""
-    styles = {MONTE_CARLO: ("o", "C0"), FIRST_ORDER: ("s", "C1"), LOOPS: ("D", "C2"), TORCH: ("^", "C3")}
+    styles = dict(zip((MONTE_CARLO, FIRST_ORDER, LOOPS, TORCH), zip("osD^", COLORS, strict=False), strict=True))
     for error in ERRORS:
         for name, (marker, color) in styles.items():
             measured = [m for m in entries_of(record, name) if rms(m, error) > 0]
@@ -311,9 +312,8 @@ def _panel(axes: Any, record: Record) -> None:
                     capsize=2,
                 )
     precise = statistics.median(entries_of(record, DOUBLE)[0]["seconds"])
-    axes.axvline(precise, color="C2", linestyle=":", label=f"{DOUBLE} (reference)")
+    axes.axvline(precise, color="0.3", linestyle=":", label=f"{DOUBLE} (reference)")
     axes.set(xscale="log", yscale="log", xlabel="wall-clock time, s")
-    axes.grid(alpha=0.3)
     axes.tick_params(which="minor", labelbottom=False)
     render = statistics.median(record["render_seconds"])
     top = axes.secondary_xaxis("top", functions=(lambda s: s / render, lambda n: n * render))

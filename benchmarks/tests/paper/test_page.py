@@ -17,7 +17,7 @@ from benchmarks.paper.figure import gains_figure, ranking_figure
 from benchmarks.paper.page import claims_table, details, gains, page, scenes_table
 from benchmarks.paper.rows import Rows, resolved, value
 from benchmarks.paper.scenes import chosen_scenes
-from reference_trainer.evaluation.pictures import new_figure
+from reference_trainer.evaluation.style import new_figure
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.plan_rules import DROPOUT_GAINS, FAR_APART_GAINS
 
@@ -212,7 +212,7 @@ def test_the_ranking_draws_the_best_setting_first_and_the_score_beside_it(kept, 
             rows.add(each | {"test": each["test"] | {"ca_exact_half": score}})
     ranking_figure(Kept(kept.folder), ["7"], kept.folder / "ranking.png")
     gained, score = drawn[0].axes
-    assert [tick.get_text() for tick in gained.get_yticklabels()] == ["dropout(0.2)", "dropout(0.3)"]  # 0.3 lacks b
+    assert [tick.get_text() for tick in gained.get_yticklabels()] == ["dropout 0.2", "dropout 0.3"]  # 0.3 lacks b
     assert [bars.get_label() for bars in gained.containers] == ["a", "b"]
     on_a, on_b = (bars[0].get_xydata() for bars in gained.containers)
     assert np.allclose(on_a[:, 0], (1.0, 4.0))

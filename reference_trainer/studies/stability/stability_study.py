@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.evaluation.results import machine
+from reference_trainer.evaluation.style import WIDTH
 from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.render.engine import engines_on, using_engine
 from reference_trainer.studies.stability.cases import Case, Probe, all_cases
@@ -254,37 +255,45 @@ def _ending_row(case: Record) -> dict[str, object]:
 
 
 def _draw(records: Records, figure: Any) -> None:
-    """Draw the errors as a heat map for each engine."""
-    cases = [case for case in records.values() if _worst_errors(case)]
-    engines = _engines(records) or [""]
-    rows = max(len(_of_engine(cases, engine)) for engine in engines)
-    figure.set_size_inches(6.5 * len(engines), max(4.0, 0.2 * rows + 2))
-    for part, engine in zip(figure.subfigures(1, len(engines), squeeze=False).flat, engines, strict=True):
-        _heat(part, engine, _of_engine(cases, engine))
-
-
-def _heat(figure: Any, engine: str, cases: Sequence[Record]) -> None:
-    """Draw the heat map of `_worst_errors` for one engine."""
+    """Draw the errors of every case and quantity as a heat map, of the worst engine; the tables have all engines."""
+    cases: dict[tuple[str, str], list[Record]] = {}
+    for record in records.values():
+        if _worst_errors(record):
+            cases.setdefault((record["family"], record["name"]), []).append(record)
     table = np.full((len(cases), len(SCENE_QUANTITIES)), math.nan)
-    for i, case in enumerate(cases):
-        for name, error in _worst_errors(case).items():
-            table[i, SCENE_QUANTITIES.index(name)] = math.log10(max(error, _FLOOR))
+    for i, of in enumerate(cases.values()):
+        for name, error in (pair for record in of for pair in _worst_errors(record).items()):
+            table[i, SCENE_QUANTITIES.index(name)] = np.fmax(table[i, SCENE_QUANTITIES.index(name)], max(error, _FLOOR))
+    figure.set_size_inches(WIDTH, max(4.0, 0.19 * len(cases) + 1.8))
     axes = figure.subplots()
     axes.set_facecolor("0.9")
-    picture = axes.imshow(table, cmap="viridis", vmin=math.log10(_FLOOR), vmax=-2, aspect="auto")
-    axes.set_xticks(range(len(SCENE_QUANTITIES)), SCENE_QUANTITIES, rotation=60, ha="right", fontsize=7)
-    axes.set_yticks(range(len(cases)), [_label(case) for case in cases], fontsize=6.5)
+    axes.grid(False)
+    heat = axes.imshow(table, cmap="viridis", norm="log", aspect="auto")
+    heat.set_clim(_FLOOR, GRADIENT_TOLERANCE)
+    axes.set_xticks(range(len(SCENE_QUANTITIES)), map(_quantity, SCENE_QUANTITIES), rotation=50, ha="right")
+    axes.set_yticks(range(len(cases)), [_label(of) for of in cases.values()], fontsize=8.5)
+    axes.tick_params(length=0)
+    families = [family for family, _ in cases]
     for i in range(1, len(cases)):
-        if cases[i]["family"] != cases[i - 1]["family"]:
-            axes.axhline(i - 0.5, color="white", linewidth=2)
-    axes.set_title(f"{engine}: largest error where all is right (gray: not part of the case)", fontsize=9)
-    bar = figure.colorbar(picture, ax=axes, shrink=0.4, aspect=30)
-    bar.set_label("log10 of the relative error", fontsize=7)
+        if families[i] != families[i - 1]:
+            axes.axhline(i - 0.5, color="white", linewidth=4)
+    bar = figure.colorbar(heat, ax=axes, location="top", aspect=50, pad=0.01)
+    bar.set_label("largest relative error where all is right (gray: not part)")
 
 
-def _label(case: Record) -> str:
-    """Return the name of a case with the magnitude up to which it was pushed, or from which on it fails."""
-    if not case["magnitudes"]:
-        return str(case["name"])
-    end = f"; ends at {case['onset']:.2g}" if case["onset"] is not None else f" (to {case['magnitudes'][1]:.0e})"
-    return f"{case['name']}{end}"
+def _quantity(name: str) -> str:
+    """Return people's name of a quantity of `SCENE_QUANTITIES`: "d means" is a gradient."""
+    return f"gradient of {name[2:]}" if name.startswith("d ") else name
+
+
+def _label(of: Sequence[Record]) -> str:
+    """Return the name of a case with the magnitude up to which it was pushed, or the least from which on it fails."""
+    name, magnitudes = of[0]["name"], of[0]["magnitudes"]
+    if not magnitudes:
+        return str(name)
+    onsets = [record["onset"] for record in of if record["onset"] is not None]
+    mantissa, exponent = f"{min(onsets) if onsets else magnitudes[1]:.1e}".split("e")
+    number = ("" if mantissa == "1.0" else rf"{mantissa} \times ") + f"10^{{{int(exponent)}}}"
+    if 0 <= int(exponent) < 3:  # shorter in full
+        number = f"{min(onsets) if onsets else magnitudes[1]:.3g}"
+    return f"{name}{'; ends at' if onsets else ', to'} ${number}$"
