@@ -11,8 +11,7 @@ import torch
 
 from benchmarks.calls import draw_of, gradients, image
 from benchmarks.workloads import WorkloadSpec
-from reference_trainer.runs.executors.executor import Failure, Task, run_all
-from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.executors import Failure, Processes, Task, run_all
 
 __all__ = ["PROCESS", "peak_memory", "process_status"]
 

@@ -22,7 +22,7 @@ from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render import render
-from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.executors import Processes
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions

@@ -15,9 +15,9 @@ from torch import Tensor
 from ca_reg import CAMonitor
 from reference_trainer.evaluation.evaluate import training_snapshot
 from reference_trainer.evaluation.pictures import as_pillow
-from reference_trainer.evaluation.trajectory import interpolate_cameras, measured_views
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.virtual_cameras import interpolate_cameras, measured_views
 from reference_trainer.training.trainer import Trainer
 from reference_trainer.viewer.picture import DisplayOptions, ViewerModel
 from reference_trainer.viewer.window import Viewer

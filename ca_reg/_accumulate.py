@@ -18,11 +18,10 @@ MAX_ALPHA = 1.01  # above what rounding to 16 bits makes of an alpha of 1
 class RenderMoments:
     """Running sums of renders and of their squares, pooled in groups that take turns.
 
-    The memory is two images, plus an image and a map per group, however many renders are added: in float32, or in
-    float64 if the renders are. The first render is subtracted from all: what they have in common, which would drown
-    their variance in E[x^2] - E[x]^2, is gone before anything is squared. At a pixel where the first render alone
-    differs from the K - 1 others, the squared mean still is K - 1 times the variance; the variance there is off by at
-    most about K^2 roundings, elsewhere usually by a few.
+    The memory is two images, plus an image and a map per group, however many renders are added. The first render is
+    subtracted from all: what they have in common, which would drown their variance in E[x^2] - E[x]^2, is gone before
+    anything is squared. The variance is off by usually a few roundings, by at most about K^2 where the first render
+    alone differs from the K - 1 others.
 
     Args:
         groups: number of groups; each pools every ``groups``-th render.

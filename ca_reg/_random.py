@@ -16,14 +16,9 @@ def draw_numbers(
 ) -> Tensor:
     """Return n float32 numbers of ``torch.rand`` or ``torch.randn``, drawn on the generator's device if one is given.
 
-    The draws of a regularizer take them: a generator need not be on the device of the Gaussians. That of a score is on
-    the CPU, so that its masks are the same on every device.
-
-    Args:
-        sample: ``torch.rand`` or ``torch.randn``.
-        n: number of Gaussians.
-        generator: source of the draw; None for the global one of ``device``.
-        device: device of the returned numbers, shape (n,); None for where they were drawn.
+    A generator need not be on the device of the Gaussians: that of a score is on the CPU, so that its masks are the
+    same on every device. Without a generator, the global one of ``device`` is taken. ``sample`` is ``torch.rand`` or
+    ``torch.randn``.
 
     Raises:
         RuntimeError: if a generator is used during a backward pass, where a recomputed draw would differ.

@@ -1,13 +1,12 @@
 """Which Gaussians co-adapt: two per-Gaussian attributions of the exact score.
 
-*Shares* (:func:`attribute`) add up to the score. The variance of a pixel is a sum over its splats, front to back
-(:func:`ca_reg.functional.contributions`); the share of a Gaussian is the variance due to its factor given those in
-front, averaged over those behind. The interaction of two Gaussians counts entirely for the one behind.
+*Shares* (:func:`attribute`) add up to the score, as :func:`ca_reg.functional.contributions` add up to the variance of a
+pixel; the interaction of two Gaussians counts entirely for the one behind.
 
 *Total effects* (:func:`total_effects`) do not depend on an order. The score is linear in the variance ``v_i`` of each
-Gaussian's factor, so ``v_i dV/dv_i`` is exactly how much the score would fall if the factor of this Gaussian alone were
-fixed at its mean (Sobol's total index, times the variance). Interactions count for each Gaussian involved: no total
-effect is below the share, and together they are at least the score.
+Gaussian's factor, so ``v_i dV/dv_i`` is exactly how much the score would fall if this factor were fixed at its mean
+(Sobol's total index, times the variance). Interactions count for each Gaussian involved, so no total effect is below
+the share.
 
 Both refer to the visible pixels of the score, and both remove only the randomness of a Gaussian: deleting it would also
 change the mean.
@@ -32,10 +31,9 @@ __all__ = ["CAAttribution", "CATotalEffects", "SharesFn", "attribute", "total_ef
 class SharesFn(Protocol):
     """A renderer that attributes the variance: ``shares_fn(opacity, view, multiplier, background, weights)``.
 
-    It takes the arguments of :class:`~ca_reg.types.MomentsFn` and weights of the pixels, (H, W) in float64. It returns
-    a tensor of shape (N,): for every Gaussian its :func:`~ca_reg.functional.contributions`, averaged over RGB and
-    summed over the pixels with these weights, 0 if the view does not see it, as
-    :meth:`ca_reg.lists.ListMoments.shares` does.
+    It takes the arguments of :class:`~ca_reg.types.MomentsFn` and weights of the pixels, (H, W) in float64. It returns,
+    (N,), the :func:`~ca_reg.functional.contributions` of every Gaussian, averaged over RGB and summed over the pixels
+    with these weights, as :meth:`ca_reg.lists.ListMoments.shares` does; 0 if the view does not see it.
 
     Example:
         >>> from ca_reg.functional import contributions
@@ -54,7 +52,7 @@ class SharesFn(Protocol):
 class CAAttribution(NamedTuple):
     """The score of a view, split over the Gaussians.
 
-    The shares, (N,) float64, at least 0, sum to ``result.value`` up to rounding; all are 0 if the score has no value.
+    The shares, (N,) float64, at least 0, sum to ``result.value``; all are 0 if the score has no value.
     """
 
     shares: Tensor
@@ -118,9 +116,7 @@ def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATota
     """Measure a view exactly and find how much the score would fall if one Gaussian's factor were fixed at its mean.
 
     Costs the score, and a forward and backward pass of its moments callable, which must be differentiable in the
-    multiplier: it is called with a variance per Gaussian, shape (N,), that requires grad.
-
-    The arguments are those of :func:`attribute`.
+    variance of the multiplier, a tensor (N,). The arguments are those of :func:`attribute`.
 
     Raises:
         TypeError: as for a call of the score.

@@ -20,17 +20,13 @@ class Chain(Regularizer):
     """Regularizers applied one after the other; trainers and hooks wrap whatever they are given in a chain.
 
     Use it in place of ``nn.Sequential``, which has no :attr:`keep`, :meth:`mask_radii` and :meth:`set_step`, and which
-    evaluates the mean of the second member at the mean of the first: in a chain the members whose test-time value is a
-    mean contribute their joint mean, in whatever order they are given. A Gaussian is dropped if any member drops it, so
-    :attr:`keep` is the product of their masks; a module that stands in a chain twice draws twice, and its own ``keep``
-    is only the last mask. Members in ``eval()`` apply their test-time value even in training.
+    evaluates the mean of the second member at the mean of the first: the members of a chain contribute their joint
+    mean, in whatever order. A Gaussian is dropped if any member drops it. A module that stands in a chain twice draws
+    twice. Members in ``eval()`` apply their test-time value even in training.
 
     Args:
-        members: regularizers; an ``nn.Sequential`` or another chain is flattened, and any other module is taken for a
-            function of the opacities alone, see :class:`WrappedModule`.
-
-    Raises:
-        TypeError: if a member is not a module.
+        members: regularizers; an ``nn.Sequential`` or another chain is flattened, any other module becomes a
+            :class:`WrappedModule`, and what is no module raises a TypeError.
 
     Example:
         >>> from ca_reg import GaussianDropout, OpacityNoise
@@ -135,14 +131,11 @@ class WrappedModule(Regularizer):
     """Adapter that lets any module on activated opacities (N,) act as a regularizer, called in its own mode.
 
     It drops the Gaussians where its attribute ``keep``, (N,) bool, is False, or, without that attribute, those whose
-    opacity it sets to 0. The step is passed to its ``set_step`` and to those of its submodules. Test-time values come
-    from a copy in ``eval()`` that shares all tensors, so they never change the mode of the module itself.
+    opacity it sets to 0. The step goes to its ``set_step`` and those of its submodules. Test-time values come from a
+    copy in ``eval()`` that shares all tensors.
 
     Args:
         module: called as ``module(opacity)``, or ``module(opacity, generator=...)`` if there is a generator.
-
-    Raises:
-        TypeError: if it is not a module; in a draw with a generator, if its ``forward`` takes none.
 
     Example:
         >>> WrappedModule(nn.Dropout(0.5)).eval()(torch.full((3,), 0.5))

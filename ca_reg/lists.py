@@ -1,8 +1,8 @@
 """Exact moments for any renderer that can list the Gaussians it composites at each pixel.
 
-Many code bases can: gsplat's ``rasterize_to_indices_in_range`` returns flat lists of Gaussian and pixel indices,
-several forks keep per-pixel buffers. Given the alphas of the entries, :class:`ListMoments` serves
-:class:`~ca_reg.CAScore` as its moments callable, and :meth:`ListMoments.shares` attributes the score to the Gaussians.
+Many code bases can: gsplat's ``rasterize_to_indices_in_range`` returns such lists, several forks keep per-pixel
+buffers. With the alphas of the entries, :class:`ListMoments` is the moments callable of a :class:`~ca_reg.CAScore`, and
+its :meth:`~ListMoments.shares` attribute the score to the Gaussians.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ __all__ = ["ListMoments", "PixelLists"]
 class PixelLists(NamedTuple):
     """What a renderer composites at every pixel of one view, as flat lists of P entries.
 
-    Convention: the entries of one pixel are ordered by depth, the nearest first; entries of different pixels may be
-    interleaved in any order. No Gaussian appears twice at a pixel.
+    Convention: the entries of one pixel are ordered by depth, the nearest first, no Gaussian twice; pixels may be
+    interleaved in any order.
 
     Attributes:
         gaussians: index of each entry's Gaussian, int32 or int64, shape (P,).
@@ -52,18 +52,13 @@ class ListMoments:
     The lists must be complete. Renderers stop at an opaque surface, but what lies behind it shows when splats of the
     surface are dropped, so a list that ends there misses part of the variance.
 
-    Pixels are processed in blocks of similar list length. Beyond the lists themselves, the peak memory is that of one
-    block, about 40 floats per padded entry; a backward pass retains all blocks. Differentiable in everything that
-    ``lists_fn`` is differentiable in, and in the multiplier.
+    Pixels are processed in blocks, of about 40 floats per padded entry; a backward pass retains all. Differentiable in
+    everything that ``lists_fn`` is differentiable in, and in the multiplier.
 
     Args:
         lists_fn: ``lists_fn(opacity, view)`` returns the :class:`PixelLists` of the view for these activated
             opacities, (N,) or (N, 1) as the caller gave them.
         elements: largest number of padded entries in a block; a longer list is a block of its own.
-
-    Raises:
-        TypeError: if ``lists_fn`` is not callable or ``elements`` not an integer.
-        ValueError: if ``elements`` is below 1.
 
     Example:
         Two Gaussians and two pixels; the second pixel sees the first Gaussian only.
@@ -94,11 +89,8 @@ class ListMoments:
     def __call__(self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None) -> ExactMoments:
         """Return the exact moments of a view: mean and variance (3, H, W) and the expected alpha (H, W).
 
-        Args:
-            opacity: activated opacities, shape (N,) or (N, 1).
-            view: passed on to ``lists_fn``.
-            multiplier: moments of the factors, numbers, or tensors of shape (N,) or (N, 1), one value per Gaussian.
-            background: shape (3,) or (3, H, W); None for that of the lists.
+        The multiplier is numbers or tensors of one value per Gaussian, the background (3,) or (3, H, W), or None for
+        that of the lists.
 
         Raises:
             TypeError: if ``lists_fn`` returns no :class:`PixelLists`, or a dtype does not fit.
@@ -121,9 +113,7 @@ class ListMoments:
     ) -> Tensor:
         """Return what each Gaussian contributes to a weighted sum of the variance map, shape (N,), float64.
 
-        A Gaussian's share is the sum over pixels of ``weights``, (H, W), times its
-        :func:`~ca_reg.functional.contributions`, averaged over RGB; 0 if it is in no list. The shares add up to the
-        weighted sum of the variances. The other arguments and errors are those of a call.
+        It is as described at :class:`~ca_reg.attribution.SharesFn`; the shares add up to the weighted sum.
 
         Example:
             >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:

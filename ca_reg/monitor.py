@@ -41,29 +41,26 @@ _log = logging.getLogger(__name__)
 class CAMonitor(AbstractContextManager["CAMonitor"]):
     """Log co-adaptation and PSNR of groups of views at regular steps (the paper's training dynamics).
 
-    Each measurement becomes one line of ``ca.jsonl``, on disk when the call returns: ``step``, ``gaussians`` and for
-    each group of views ``ca/<group>``, ``ca_std_error/<group>``, ``ca_reason/<group>``, ``ca_empty_views/<group>`` and
-    ``psnr/<group>``, then the settings of the score. A missing value is null. If tensorboard is installed,
-    ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` are written as scalars as well. ``backends`` and a message of the
-    logger ``ca_reg.monitor`` (level INFO) tell what is in use. :func:`ca_reg.monitor.plot_dynamics` plots the file.
+    Each measurement becomes one line of ``ca.jsonl``, on disk when the call returns: ``step``, ``gaussians``, the
+    settings of the score, and for each group of views ``ca/<group>``, ``ca_std_error/<group>``, ``ca_reason/<group>``,
+    ``ca_empty_views/<group>`` and ``psnr/<group>``; null is a missing value. Where tensorboard is installed,
+    ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` become scalars as well. :func:`plot_dynamics` plots the file.
 
-    As long as the number of Gaussians stays the same, every measurement of a view uses the same masks, which removes
-    sampling noise from the comparison of steps.
+    As long as the number of Gaussians stays the same, every measurement of a view uses the same masks: sampling noise
+    does not disturb the comparison of steps.
 
     Args:
         score: how to measure. Its ``p`` is also the rate by which opacities are scaled for ``psnr``.
         log_dir: directory of the log and the TensorBoard events; made if it does not exist.
-        views: non-empty groups of views by name, usually ``{"train": [...], "test": [...]}``; a group is any iterable.
-            The views are passed on to the callables as they are.
+        views: non-empty groups of views by name, usually ``{"train": [...], "test": [...]}``, passed on as they are.
         every: number of steps between measurements, at least 1.
-        last_step: the last step of the training, measured whether or not it is a multiple of ``every``.
+        last_step: the last step of the training, measured in any case.
         psnr: ``psnr(opacity, view)`` returns the PSNR in dB of the view rendered with these opacities, already scaled
             by ``1 - p`` for test time. Called without gradients. None leaves PSNR out.
         details: ``details(opacity, view)`` returns, by name, what TensorBoard shows of the first view of each group
-            besides the curves: images (3, H, W) in [0, 1], and numbers (N,), such as shares, as histograms. Called
-            without gradients, and only where TensorBoard is installed; images need Pillow.
-        resume_step: None for a new run, which replaces an existing log. For a resumed run, the step of its checkpoint:
-            lines up to this step are kept, later ones dropped.
+            besides the curves: images (3, H, W) in [0, 1], and numbers (N,) as histograms. Called without gradients.
+        resume_step: None for a new run, which replaces an existing log; else the step of the checkpoint, after which
+            the lines of the log are dropped.
 
     Attributes:
         backends: ``("jsonl",)`` or ``("jsonl", "tensorboard")``.
@@ -71,10 +68,9 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
 
     Raises:
         TypeError: if ``views`` is not a mapping or an argument is of the wrong type.
-        ValueError: if there are no views, a group is empty, ``every`` or ``resume_step`` is out of range, or a line of
-            the log to resume is damaged.
+        ValueError: if there are no views, a group is empty, a number is out of range, or a line of the log is damaged.
         OSError: if the log cannot be written, such as on a full disk; its earlier lines stay intact. A BlockingIOError
-            if another monitor, in this process or another, has the directory open: each would lose lines of the other.
+            if another monitor has the directory open.
 
     Example:
         >>> import tempfile
@@ -138,17 +134,8 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
     def __call__(self, step: int, opacity: Tensor | Params) -> dict[str, float | int | str | None] | None:
         """Measure and log if the step is due: a multiple of ``every`` or the last, and later than those in the log.
 
-        Args:
-            step: the training step.
-            opacity: activated opacities of the model in [0, 1], neither dropped nor scaled, shape (N,) or (N, 1); or
-                :class:`~ca_reg.Params`, as for a call of the score.
-
-        Returns:
-            The logged record, or None if the step was not due.
-
-        Raises:
-            TypeError: as for a call of the score, or if ``step`` is not an integer.
-            ValueError: as for a call of the score, if ``step`` is negative, or if the monitor is closed.
+        ``opacity`` is what the score is called with; the errors are those of the score, plus a ValueError if the step
+        is negative or the monitor closed. Returns the logged record, or None if the step was not due.
         """
         check_count(step, "step", minimum=0)
         step = int(step)
@@ -333,12 +320,8 @@ def _measurement(line: bytes) -> dict[str, Any]:
 def read_dynamics(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[np.float64]]:
     """Read the log of a :class:`ca_reg.CAMonitor`.
 
-    Args:
-        path: the log, or the directory that holds it.
-
-    Returns:
-        Every numeric column by name (``step``, ``gaussians``, ``ca/test``, ``psnr/test``, ...), shape (lines,) each,
-        sorted by step; nan where a line has no value. Text columns are left out.
+    Takes the log, or the directory that holds it. Returns every numeric column by name (``step``, ``gaussians``,
+    ``ca/test``, ``psnr/test``, ...), shape (lines,) each, sorted by step; nan where a line has no value.
 
     Raises:
         FileNotFoundError: if there is no log.
@@ -375,9 +358,8 @@ def plot_dynamics(
     """Plot co-adaptation and PSNR against the step, each on its own axes.
 
     ``runs`` is one log or log directory, or several by label. Each run has one color, by default the next of
-    matplotlib's, else that of its label in ``colors``; its last group of views (test) is solid, the others are dotted
-    or dashed; nan leaves a gap. Draws on two ``axes``, by default side by side in a new figure, and returns them:
-    co-adaptation, PSNR.
+    matplotlib's, else that of its label in ``colors``; its last group of views (test) is solid. Draws on two ``axes``,
+    by default in a new figure, and returns them: co-adaptation, PSNR.
 
     Raises:
         ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.

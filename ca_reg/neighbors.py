@@ -22,7 +22,7 @@ CHUNK_ROWS = 256  # sorted points per chunk; larger chunks span a wider strip, s
 def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Find the nearest other points of every point, exactly.
 
-    For many points, SciPy's k-d tree finds them on the CPU in O(N log N), if SciPy is installed
+    For many points SciPy's k-d tree finds them in O(N log N), if SciPy is installed
     (``pip install ca_reg[neighbors]``); otherwise a search along one axis takes nearly O(N^2). The two may break ties
     differently.
 
@@ -133,8 +133,8 @@ def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
 def rms_neighbor_distance(positions: Tensor) -> Tensor:
     """Return the root mean squared distance of each point to its three nearest others, at least float32.
 
-    Convention: the INRIA code takes the logarithm of this as the initial scale of a Gaussian. Coinciding points get
-    sqrt(1e-7) instead of 0. With fewer than three other points, all others count. Shapes (N, 3) and (N,).
+    The INRIA code takes its logarithm as the initial scale of a Gaussian. Coinciding points get sqrt(1e-7) instead of
+    0. With fewer than three other points, all others count. Shapes (N, 3) and (N,).
 
     Raises:
         ValueError: if the shape is not (N, 3) or N is less than 2.

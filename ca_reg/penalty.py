@@ -40,16 +40,15 @@ class CAPenalty(Scheduled):
         image, variance, penalty = ca_penalty(gaussians.get_opacity, view)
         loss = mse(image, target) + penalty
 
-    For the absolute error, the main term of the 3DGS loss, the variance enters in another way:
-    ``loss = expected_absolute_error(image, variance, target).mean()`` (:mod:`ca_reg.functional`), without ``penalty``.
-    With any other loss, ``penalty`` is a separate regularizer, whose weight is a free choice.
+    For the absolute error take ``loss = expected_absolute_error(image, variance, target).mean()``
+    (:mod:`ca_reg.functional`), without ``penalty``. With any other loss, ``penalty`` is a separate regularizer, whose
+    weight is a free choice.
 
-    ``image`` is also the test-time render, with all opacities multiplied by the mean of the multiplier. The two are
-    equal up to the renderer's treatment of large and small alphas (for a mean of at most 1, and with R the range of the
-    colors and the background): its clamp at 0.99 comes before the factor here and after it there, which moves a color
-    by at most ``R / 99``, whatever the length of the list; its cut-off at 1/255 omits splats of scaled opacity, at most
-    ``R / 255`` each. ``train()`` and ``eval()`` make no difference. No Gaussian is dropped, so density control needs no
-    masked radii.
+    ``image`` is also the test-time render, with all opacities multiplied by the mean of the multiplier, up to the
+    renderer's treatment of large and small alphas: its clamp at 0.99, before the factor here and after it there, moves
+    a color by at most ``R / 99``, R being the range of the colors and the background; its cut-off at 1/255 by at most
+    ``R / 255`` for each splat. ``train()`` and ``eval()`` make no difference. No Gaussian is dropped, so density
+    control needs no masked radii.
 
     Limits: the factors must be independent, one per Gaussian. The clamp and the cut-off of alphas that a factor changed
     are not modeled, see :class:`~ca_reg.functional.Multiplier`; plain dropout is exact but for the early termination of
@@ -68,14 +67,9 @@ class CAPenalty(Scheduled):
         weight: factor of the penalty, at least 0, or a schedule of it.
         layout: order of the axes of the images that ``moments_fn`` returns, ``"CHW"`` or ``"HWC"``.
 
-    Attributes:
-        weight: the factor at the current step.
-        step: the training step, set with :meth:`set_step`; a penalty with a schedule saves it in ``state_dict``.
-
     Raises:
         TypeError: if an argument is of the wrong type.
-        ValueError: if a constant ``weight`` is negative or not finite, or ``layout`` is unknown; a schedule is checked
-            at each use.
+        ValueError: if ``weight`` is negative or not finite, or ``layout`` is unknown.
 
     Example:
         One white splat over black that half of the draws leave out: a pixel is 0 or 0.8.
@@ -123,12 +117,8 @@ class CAPenalty(Scheduled):
     def forward(self, opacity: Tensor, view: Any, background: Tensor | None = None) -> PenalizedRender:
         """Render the moments of one view, with gradients.
 
-        View and background are passed on to ``moments_fn`` as they are: None for the model's own background, one color
-        (3,), or an image.
-
-        Raises:
-            TypeError: if ``opacity``, a multiplier or the moments are not of the right type.
-            ValueError: if a shape is wrong, or ``opacity`` looks like logits.
+        View and background are passed on as they are: None for the model's own background, one color (3,), or an image.
+        Raises TypeError or ValueError for opacities, a multiplier or moments of the wrong type, shape or range.
         """
         self._check(opacity)
         multiplier = self.multiplier

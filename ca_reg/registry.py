@@ -28,10 +28,10 @@ def imported(module: str, name: str) -> Any:
 class Registry(Generic[T]):
     """Factories by name, for expressions on a command line or in a file.
 
-    An expression is one call, or several joined by ``+``. A name without parentheses is a call without arguments; a
-    name of the form ``module:Class`` is imported, also from the working directory. Arguments are Python literals, or
-    calls of the registry's ``values``, such as schedules. Nothing else is evaluated or called: every callable is
-    registered or a subclass of ``base``.
+    An expression is one call, or several joined by ``+``. A name without parentheses is a call without arguments;
+    ``module:Class`` is imported, also from the working directory. Arguments are Python literals, or calls of the
+    registry's ``values``, such as schedules. Nothing else is evaluated: every callable is registered or a subclass of
+    ``base``.
 
     Args:
         kind: what the members are called in messages.
@@ -90,9 +90,7 @@ class Registry(Generic[T]):
     def make(self, text: str, *, imports: bool = True) -> list[T]:
         """Make the objects of an expression; an empty one makes none.
 
-        Args:
-            text: the expression.
-            imports: whether ``module:Class`` may be imported; False for text from an untrusted source.
+        ``imports`` says whether ``module:Class`` may be imported: not for text from an untrusted source.
 
         Raises:
             ValueError: if the text does not parse, a name is unknown, or an argument is rejected.
@@ -115,8 +113,7 @@ class Registry(Generic[T]):
     def make_one(self, text: str) -> T:
         """Make the object of an expression that has exactly one.
 
-        Raises:
-            ValueError: as `make`, and if there is not exactly one.
+        Raises a ValueError as `make` does, and if there is not exactly one.
         """
         made = self.make(text)
         if len(made) != 1:

@@ -102,9 +102,8 @@ class Regularizer(Scheduled):
 
     A custom regularizer is a subclass with ``draw`` and ``replay``; it also overrides ``expected`` if it does not
     render the plain model at test time, and ``alpha_factor`` if its draws are independent factors of the opacities. It
-    then works wherever the package's own do: in the bundled trainer, the INRIA hook and its launcher, gsplat,
-    splatfacto-ca, a :class:`~ca_reg.Chain`, and as the masks of a :class:`~ca_reg.CAScore`. To drop Gaussians
-    independently of each other, subclass :class:`~ca_reg.IndependentDropout` and define the rates only.
+    then works wherever the package's own do. To drop Gaussians independently of each other, subclass
+    :class:`~ca_reg.IndependentDropout` and define the rates only.
 
     A rate of at least 0, or a schedule of it, goes to ``super().__init__``, and ``self.rate_at(x.step)`` is the rate of
     a draw; with a schedule ``state_dict`` saves the step.
@@ -214,9 +213,9 @@ class Regularizer(Scheduled):
         Args:
             x: activated opacities in [0, 1], shape (N,) or (N, 1), or all parameters with such opacities. Without a
                 step in these, that of :meth:`set_step` counts; inside ``torch.compile`` only for :meth:`rate_at`.
-            drawn: an earlier draw to replay instead of a new one; in training only.
-            generator: source of this draw; the global random state is then untouched. It belongs to the call and not to
-                the constructor, so that the random numbers of a step can depend on the step alone.
+            drawn: an earlier draw to replay; in training only.
+            generator: source of this draw; the global random state is then untouched. It belongs to the call, so that
+                the random numbers of a step can depend on the step alone.
 
         Returns:
             The same type as ``x``; the very same object if nothing changes.
@@ -266,11 +265,9 @@ class Regularizer(Scheduled):
     def mask_radii(self, radii: Tensor) -> Tensor:
         """Zero the radii of the Gaussians that the last call dropped, so that density control does not count them.
 
-        Counted as seen, they would scale the mean gradients by ``1 - p``, which raises the effective densification
-        threshold by ``1 / (1 - p)``.
+        Counted as seen, they would raise the effective densification threshold by ``1 / (1 - p)``.
 
-        Takes the radii of all Gaussians as the rasterizer returned them, shape (N,) or (N, ...). Returns the same shape
-        and dtype, the very same tensor if nothing was dropped.
+        Takes the radii of all Gaussians, shape (N,) or (N, ...); returns the very same tensor if nothing was dropped.
 
         Raises:
             ValueError: if the number of Gaussians is not that of the last call.

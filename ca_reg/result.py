@@ -21,9 +21,8 @@ __all__ = ["CAResult", "CASettings", "CASummary", "LimitEstimate", "Method", "Re
 class Reason(Enum):
     """The outcome of a measurement: why a score has the value it has, as a message and a remedy.
 
-    Every member but ``OK`` and ``NO_EFFECT``, whose value is 0, comes with the value nan.
-
-    Convention: files store ``reason.name``, such as ``"EMPTY"``; people read ``str(reason)``.
+    Every member but ``OK`` and ``NO_EFFECT``, whose value is 0, comes with the value nan. Files store ``reason.name``,
+    such as ``"EMPTY"``; people read ``str(reason)``.
 
     Example:
         >>> Reason.OK.message
@@ -71,21 +70,17 @@ Method = Literal["sampling", "adaptive", "exact", "exact_neutral"]
 class CASettings:
     """The choices behind a score, without which it cannot be compared with another.
 
-    The background that the renderer composites over matters as well (up to ``1 - threshold`` of it shows inside the
-    visible region); the render callable decides it, so report it along with these.
-
-    Settings that do not apply to the method are None: an exact score has neither samples nor ddof nor a seed.
+    The background matters as well (up to ``1 - threshold`` of it shows inside the visible region); the render callable
+    decides it. Settings that do not apply to the method are None.
 
     Args:
-        method: ``"sampling"``, the paper's protocol with a fixed number of renders; ``"adaptive"``, as many renders as
-            the target error takes; ``"exact"``, the limit of infinitely many, from the renderer's moments; or
-            ``"exact_neutral"``, the same over the expected color of each pixel instead of the background.
+        method: ``"sampling"``, a fixed number of renders; ``"adaptive"``, as many as the target error takes;
+            ``"exact"``, infinitely many; ``"exact_neutral"``, the same over the expected color of each pixel.
         samples: number of renders K; also None for adaptive scores, where it is decided for each view.
         drop_rate: fraction of the Gaussians that each render drops; None if a regularizer drew instead.
         regularizer: the ``repr`` of the regularizer that drew instead of a dropout at ``drop_rate``; None for dropout.
-        threshold: a pixel is visible where the accumulated alpha exceeds this: in all K renders with ``"sampling"``, in
-            the render of the mean opacities (times ``1 - drop_rate`` without a regularizer) with ``"adaptive"``, in
-            expectation with the exact methods.
+        threshold: a pixel is visible where its alpha exceeds this: in all K renders with ``"sampling"``, in expectation
+            with the other methods.
         ddof: the divisor of the variance is ``samples - ddof``. With 0 it expects (K - 1)/K of the true variance.
         seed: seed of the masks.
         relative_error: standard error, as a fraction of the score, at which adaptive sampling stops.
@@ -140,9 +135,8 @@ class _Score(CASettings):
     def limit(self) -> LimitEstimate:
         """The score for infinitely many renders, as estimated from these: both numbers over ``expected_fraction``.
 
-        It corrects the bias of the variance and nothing else. The visible region of the paper's protocol shrinks with
-        every further render and favors pixels that vary little, so an exact or adaptive score, whose region is that of
-        the expected alpha, can differ by more than the error.
+        It corrects the bias of the variance alone. The visible region of the paper's protocol favors pixels that vary
+        little, so an exact or adaptive score can differ by more than the error.
 
         Example:
             >>> from ca_reg import CAScore
@@ -170,10 +164,8 @@ class CAResult(_Score):
     """The co-adaptation score of one view.
 
     Args:
-        value: the score: variance of the renders, mean over RGB and over the visible pixels; nan where ``reason`` says
-            that there is none.
-        std_error: standard error of ``value`` over the choice of masks; 0 for an exact score; nan below three samples,
-            without a value, and if no render of an adaptive score differed although some Gaussians were dropped.
+        value: the score: variance of the renders, mean over RGB and over the visible pixels; nan if there is none.
+        std_error: standard error of ``value`` over the choice of masks; 0 for an exact score; nan if unknown.
         variance: variance of every pixel, mean over RGB, shape (H, W), float64, visible or not.
         visible: pixels that count, shape (H, W), bool.
         reason: why the value is what it is.
@@ -188,8 +180,8 @@ class CAResult(_Score):
     def plot(self, ax: Axes | None = None) -> Axes:
         """Plot the standard deviation of every pixel as a heat map; pixels that do not count stay gray.
 
-        The map shows the square root of ``variance``, in units of color: a few pixels hold most of the variance, and
-        beside them the rest would be black. Draws on ``ax``, by default in a new figure, and returns it.
+        The map shows the square root of ``variance``, in units of color, as a few pixels hold most of the variance.
+        Draws on ``ax``, by default in a new figure, and returns it.
 
         Raises:
             ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
@@ -226,9 +218,6 @@ class CASummary(_Score):
 
 def summarize(results: Iterable[CAResult]) -> CASummary:
     """Average the scores of several views of one model.
-
-    Args:
-        results: at least one, all made with the same settings.
 
     Raises:
         ValueError: if there are no results, or their settings differ.

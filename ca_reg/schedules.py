@@ -1,4 +1,7 @@
-"""Rates that change during training, as callables ``schedule(step) -> float``, and the modules that follow them."""
+"""Rates that change during training, as callables ``schedule(step) -> float``, and the modules that follow them.
+
+Schedules raise a ValueError if a rate is not finite or the steps are not in order.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +28,6 @@ Schedule = Callable[[int], float]
 class Constant:
     """The same rate at every step, as in the paper.
 
-    Args:
-        value: the rate.
-
     Example:
         >>> Constant(0.2)(1000)
         0.2
@@ -52,9 +52,6 @@ class LinearRamp:
         end_value: rate from ``end_step`` on.
         start_step: first step of the ramp.
         end_step: last step of the ramp, greater than ``start_step``.
-
-    Raises:
-        ValueError: if a value is not finite or ``end_step`` does not come after ``start_step``.
 
     Example:
         The schedule of DropGaussian, whose rate grows from 0 to 0.2 over 10,000 steps:
@@ -94,9 +91,6 @@ class StartStop:
         start: first step with the rate.
         stop: first step at which the rate is 0 again; None for never.
 
-    Raises:
-        ValueError: if ``value`` is not finite or ``stop`` does not come after ``start``.
-
     Example:
         >>> late = StartStop(0.2, start=500)
         >>> late(499), late(500)
@@ -130,9 +124,6 @@ class ExponentialDecay:
         end_value: rate approached at ``stop``, above 0.
         start: first step of the decay.
         stop: first step at which the rate is 0 again, greater than ``start``.
-
-    Raises:
-        ValueError: if a value is not finite and above 0, or ``stop`` does not come after ``start``.
 
     Example:
         >>> decay = ExponentialDecay(0.08, 0.02, 2_000, 9_500)
@@ -201,9 +192,7 @@ class Scheduled(nn.Module):
 
         With ``torch.compile`` call this outside the compiled function: a graph then serves all steps.
 
-        Raises:
-            TypeError: if ``step`` is not an integer.
-            ValueError: if it is negative, or the schedule leaves its range there.
+        Raises a TypeError if it is no integer, a ValueError if it is negative or the schedule leaves its range there.
         """
         check_count(step, "step", minimum=0)
         self.step = int(step)

@@ -13,14 +13,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ca_reg._accumulate import Deviations, RenderMoments, effect_of, finite_colors, visible_mean
-from ca_reg._check import (
-    check_callable,
-    check_count,
-    check_finite,
-    check_opacity,
-    check_opacity_range,
-    check_rate,
-)  # fmt: skip
+from ca_reg._check import check_callable, check_count, check_finite, check_opacity, check_opacity_range, check_rate
 from ca_reg._random import seeded
 from ca_reg.functional import Multiplier
 from ca_reg.regularizer import Params, Regularizer
@@ -58,19 +51,16 @@ class CAScore:
     One view is rendered several times, each time without a random subset of the Gaussians. The score is the variance of
     these renders, per pixel and channel, averaged over RGB and over the visible pixels:
 
-    - ``CAScore(render_fn)`` is the protocol of the authors' released code: 5 renders, drop rate ``1 - (1 - p)/2``, over
-      the pixels with an alpha above 0.8 in every render, population variance, opacities not scaled and without noise,
+    - ``CAScore(render_fn)`` is the protocol of the authors' released code: 5 renders at drop rate ``1 - (1 - p)/2``,
+      the pixels with an alpha above 0.8 in every render, population variance, opacities neither scaled nor noisy,
       colors not clamped.
     - :meth:`CAScore.exact` is the limit of infinitely many renders, for renderers that offer moments.
     - :meth:`CAScore.adaptive` renders until the standard error is small enough.
 
-    Read a sampled score with its error. At 5 samples the variance of a single pixel is known to about 70 %. The mean
-    over an image is known better: ``std_error`` estimates its error by a delete-a-group jackknife over the renders,
-    with the visible region held fixed. With few samples it is too large (by some 15 % at 5, 50 % at 3); it needs at
-    least three. The memory does not grow with ``samples``.
-
-    The region of the protocol, the pixels that all renders cover, has no limit, because it shrinks with every render.
-    The two other methods take the pixels whose *expected* alpha exceeds the threshold, whatever is drawn.
+    Read a sampled score with its error, ``std_error``, a delete-a-group jackknife over the renders with the visible
+    region held fixed. With few samples it is too large (by some 15 % at 5, 50 % at 3); it needs at least three. The
+    memory does not grow with ``samples``. The region of the sampled score shrinks with every render; the other methods
+    take the pixels whose *expected* alpha exceeds the threshold, whatever is drawn.
 
     Convention: ``opacity`` is activated, in [0, 1], (N,) or (N, 1), and neither scaled nor dropped; images are
     (3, H, W), or (H, W, 3) with ``layout="HWC"``. Regularizers inside the callable must be off.
@@ -79,20 +69,19 @@ class CAScore:
         render_fn: the renderer of the model, ``render_fn(opacity, view)``; see :class:`ca_reg.types.RenderFn`.
         samples: number of renders K, at least 2.
         p: dropout rate that the model was trained with, 0 if it was trained without (or with compensated) dropout.
-        drop_rate: fraction of the Gaussians to drop in each render, in [0, 1); by default ``1 - (1 - p)/2``, which
+        drop_rate: fraction of the Gaussians to drop in each render, in [0, 1); ``1 - (1 - p)/2`` by default, which
             keeps half as many as training did.
-        regularizer: draws opacities in place of that dropout, such as
-            :class:`~ca_reg.regularizers.ClusteredDropout`, which drops neighbors together; ``p`` and ``drop_rate`` then
-            do not apply. An exact or adaptive score needs its ``alpha_factor``. If it reads more than opacities, call
-            the score with :class:`~ca_reg.Params`.
+        regularizer: draws opacities in place of that dropout; ``p`` and ``drop_rate`` then do not apply. An exact or
+            adaptive score needs its ``alpha_factor``. If it reads more than opacities, call the score with
+            :class:`~ca_reg.Params`.
         threshold: accumulated alpha above which a pixel is visible.
         ddof: the divisor of the variance is ``samples - ddof``: 0 as in the released code, 1 for an unbiased estimate.
         layout: order of the axes of the images, ``"CHW"`` or ``"HWC"``.
-        alpha_fn: for renderers that return no alpha: ``alpha_fn(opacity, view)`` renders the same view with all colors
-            1 over a background of 0, or returns the alpha itself. It is called once per render, which doubles the
-            cost, and replaces any alpha from ``render_fn``. The two may share an output buffer.
-        seed: seed of the masks. They are drawn on the CPU from (seed, view index) alone, so they are the same on every
-            device, and adding a view does not change those of the others. More renders extend the same sequence.
+        alpha_fn: for renderers without an alpha: ``alpha_fn(opacity, view)`` renders the view with all colors 1 over a
+            background of 0, or returns the alpha itself. It is called once per render, doubles the cost, and
+            replaces any alpha of ``render_fn``.
+        seed: seed of the masks. They are drawn on the CPU from (seed, view index) alone: the same on every device, and
+            whatever other views there are. More renders extend the same sequence.
 
     Raises:
         TypeError: if an argument is of the wrong type.
@@ -148,15 +137,13 @@ class CAScore:
     ) -> ExactScore:
         """Return the score of infinitely many renders, for a renderer that offers moments.
 
-        Nothing is sampled, the error is 0, and neither a seed nor the index of the view matters. A pixel is visible
-        where its expected alpha exceeds ``threshold``.
+        Nothing is sampled and the error is 0. A pixel is visible where its expected alpha exceeds ``threshold``.
 
-        ``moments_fn(opacity, view, multiplier, background)`` are the moments of the model's renderer, see
-        :class:`ca_reg.types.MomentsFn`; :class:`ca_reg.lists.ListMoments` makes them from lists of the Gaussians at
-        each pixel. With ``neutral`` each pixel is composited over its own expected color
-        (:func:`ca_reg.functional.neutral_background`), so that holes do not show the background, and only disagreement
-        between the colors of the Gaussians counts; this takes two calls. The other arguments are those of
-        :class:`CAScore`; a ``regularizer`` needs an ``alpha_factor``.
+        ``moments_fn(opacity, view, multiplier, background)`` is a :class:`ca_reg.types.MomentsFn`;
+        :class:`ca_reg.lists.ListMoments` makes one from lists of the Gaussians at each pixel. With ``neutral`` each
+        pixel is composited over its own expected color (:func:`ca_reg.functional.neutral_background`), so that only
+        disagreement between the colors of the Gaussians counts; this takes two calls. The other arguments are those of
+        :class:`CAScore`.
 
         Example:
             >>> from ca_reg.functional import alpha_moments
@@ -186,16 +173,13 @@ class CAScore:
     ) -> CAScore:
         """Return a score that renders each view until its standard error is small enough.
 
-        After the first 16 renders, 8 are added at a time. One more render, with all opacities multiplied by
-        ``1 - drop_rate``, decides the region: up to the renderer's clamp and cut-off of alpha it is the expected image.
-        The variance is unbiased (``ddof`` 1), as it would otherwise depend on the number of renders.
+        After the first 16 renders, 8 are added at a time. One more render, of the mean opacities, decides the region.
+        The variance is unbiased (``ddof`` 1). The standard error is itself an estimate, good to 18 % or better:
+        stopping where it looks small biases scores downward by up to 0.6 standard errors; docs/studies.md has the
+        calibration.
 
-        The standard error is itself an estimate, good to 18 % or better. In images of a dozen Gaussians, stopping where
-        it looks small biases scores downward by up to 0.6 standard errors; docs/studies.md has the calibration.
-
-        ``relative_error`` is the target of the standard error as a fraction of the score, above 0. Sampling stops at
-        ``max_samples`` renders, at least 16, in any case; the error may then exceed the target. The other arguments are
-        those of :class:`CAScore`; a ``regularizer`` needs an ``alpha_factor``.
+        ``relative_error``, above 0, is the target of the standard error as a fraction of the score. ``max_samples``, at
+        least 16, ends the sampling in any case. The other arguments are those of :class:`CAScore`.
 
         Example:
             >>> score = CAScore.adaptive(
@@ -244,11 +228,8 @@ class CAScore:
     def __call__(self, opacity: Tensor | Params, view: Any, *, index: int = 0) -> CAResult:
         """Measure one view without counting it in :meth:`compute`; return the score with its maps and its reason.
 
-        Args:
-            opacity: activated opacities in [0, 1], shape (N,) or (N, 1); or :class:`~ca_reg.Params` with all that the
-                regularizer needs.
-            view: passed on to the callables as it is.
-            index: position of the view among all views, at least 0; determines the masks together with the seed.
+        ``opacity`` is activated, in [0, 1], shape (N,) or (N, 1); or :class:`~ca_reg.Params`. ``view`` is passed on as
+        it is. ``index``, at least 0, is the position of the view among all; with the seed it determines the masks.
 
         Raises:
             TypeError: if ``opacity`` or a render is not of the right type.
@@ -270,9 +251,9 @@ class CAScore:
     def update(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> CAResult:
         """Measure one view and count it in the mean that :meth:`compute` returns; arguments and errors are a call's.
 
-        By default, views are counted from the last reset, and over ranks as if dealt out in turn, as
-        :class:`torch.utils.data.DistributedSampler` does without shuffling: the result then is that of a single
-        process. If they are split in another way, ``index`` is the position in the whole set.
+        Views are counted from the last reset, and over ranks as :class:`torch.utils.data.DistributedSampler` deals them
+        out without shuffling, which gives the result of a single process. If they are split in another way, ``index``
+        is the position in the whole set.
         """
         result = self(opacity, view, index=view_position(self._updates) if index is None else index)
         self._sums += row_of(result)
@@ -403,8 +384,7 @@ class _AdaptiveScore(CAScore):
     def _measure(self, x: Params, view: Any, index: int) -> CAResult:
         """Render until the error is small enough.
 
-        The region must not come from the sampled renders: pixels that they all happen to cover happen to vary little,
-        and the error would have to include the variation of the region.
+        The region must not come from the sampled renders: pixels that they all happen to cover happen to vary little.
         """
         settings = self.settings
         assert settings.max_samples is not None

@@ -29,8 +29,7 @@ _FORMS = (
 class RenderFn(Protocol):
     """A user's renderer of a model: ``render_fn(opacity, view)``.
 
-    It renders ``view``, an object of any type, with ``opacity`` in place of the model's own activated opacities, and
-    returns one of
+    It renders ``view``, of any type, with ``opacity`` in place of the model's activated opacities, and returns one of
 
     - a tuple ``(image, alpha)`` in either order, or ``(image,)``;
     - the image alone;
@@ -38,12 +37,11 @@ class RenderFn(Protocol):
       one, an alpha named ``alpha``, ``rendered_alpha`` or ``accumulation``.
 
     The image is RGB, (3, H, W) or (H, W, 3) as the layout says, the alpha (H, W), (1, H, W) or (H, W, 1); both are
-    floating-point torch tensors or numpy arrays, and a leading batch axis of 1 is dropped. Longer tuples are refused:
+    floating-point torch tensors or numpy arrays; a batch axis of 1 is dropped. Longer tuples are refused:
     in ``(color, radii, depth, alpha)`` nothing but the position tells depth from alpha.
 
-    A renderer that is faster on several sets of opacities at once may offer a method ``render_batch(opacities, view)``.
-    It takes up to 8 sets, stacked along a new first axis, and returns two sequences, images and alphas. A score then
-    calls it instead.
+    A faster way to render several sets of opacities is a method ``render_batch(opacities, view)``, which a score then
+    calls instead: up to 8 sets, stacked along a new first axis; it returns two sequences, images and alphas.
 
     Example:
         >>> def render_fn(opacity: Tensor, view: str) -> tuple[Tensor, Tensor]:
@@ -59,14 +57,14 @@ class MomentsFn(Protocol):
     """A renderer that offers exact moments: ``moments_fn(opacity, view, multiplier, background)``.
 
     It renders what :class:`RenderFn` does, but over all draws of an independent random factor on the alpha of every
-    splat (:func:`ca_reg.functional.pixel_moments` in every pixel), and returns a mapping or an object with
+    splat (:func:`ca_reg.functional.pixel_moments`), and returns a mapping or an object with
 
     - ``mean``: expected colors over the background, (3, H, W), or (H, W, 3) as the layout says;
     - ``variance``: variances of the colors, same shape;
     - ``alpha_mean``: expected accumulated alpha, (H, W), (1, H, W) or (H, W, 1); a score needs it, a penalty does not.
 
-    ``background`` is None for the model's own, one color of shape (3,), or an image, one color for each pixel. The
-    renderer must not stop early at an opaque surface: splats behind it show where those of the surface are dropped.
+    ``background`` is None for the model's own, one color (3,), or an image. The renderer must not stop early at an
+    opaque surface: splats behind it show where those of the surface are dropped.
 
     Example:
         >>> from ca_reg.functional import alpha_moments, pixel_moments
@@ -129,9 +127,7 @@ def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Te
 
     The result may also be the alpha itself, (H, W), (1, H, W) or (H, W, 1).
 
-    Raises:
-        TypeError: if the result is of an unsupported type, or not floating point.
-        ValueError: if its size is not that of ``image``, (3, H, W).
+    Raises TypeError or ValueError if it is neither, or its size is not that of ``image``, (3, H, W).
 
     Example:
         >>> white = torch.full((3, 4, 5), 0.9)

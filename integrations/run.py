@@ -30,9 +30,19 @@ from ca_reg.regularizers import parse
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
 from ._calls import MODULES
-from ._environment import Watch, explain_download, folder_of_reports, in_children, old_aliases, reports_of_children
 from ._report import Hook
-from ._sources import find_script, read_script, run_script, set_command_line
+from ._scripts import (
+    Watch,
+    explain_download,
+    find_script,
+    folder_of_reports,
+    in_children,
+    old_aliases,
+    read_script,
+    reports_of_children,
+    run_script,
+    set_command_line,
+)  # fmt: skip
 from .gsplat import Installation
 from .inria import DEFAULT_MODEL, RasterizerHook, Scope, Steps
 

@@ -1,5 +1,6 @@
 """The engines that the renderer is tested with, and the one table of how exact each is."""
 
+import os
 from typing import NamedTuple
 
 import torch
@@ -47,8 +48,11 @@ CASES = {
     "torch-float32": Case("torch", torch.float32, "cpu", 2e-4, 1e-3, 0.005),
     "numba-float32": Case("numba", torch.float32, "cpu", 2e-4, 1e-3, 0.005),
 }
+if os.environ.get("TRITON_INTERPRET") == "1":  # slow, to be asked for: pytest -k triton
+    CASES["triton-float32"] = CASES["numba-float32"]._replace(engine="triton")
 ON_CARDS = {
     f"torch-{device}-{name}": CASES[f"torch-{name}"]._replace(device=device)
     for device in (CARD, "cuda")
     for name in ("float64", "float32")
 }
+ON_CARDS["triton-cuda-float32"] = Case("triton", torch.float32, "cuda", 2e-4, 1e-3, 0.005)

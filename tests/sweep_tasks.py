@@ -78,8 +78,7 @@ def _kill_at_checkpoint(out, marker):
 
 def interrupted_sweep(folder):
     """A whole sweep of one task, for a process of its own that is to be ended from outside."""
-    from reference_trainer.runs.executors.executor import Task, run_all
-    from reference_trainer.runs.executors.processes import Processes
+    from reference_trainer.runs.executors import Processes, Task, run_all
 
     list(run_all(Processes(1), [Task("sleeper", note_the_interruption, (folder,))]))
 

@@ -10,7 +10,7 @@ import shlex
 import pytest
 from pages import ROOT, blocks, fenced_blocks, linked_files
 
-from ca_reg.integrations.run import _parse
+from reference_trainer.cli import _parse
 
 PAGES = {page.name: page for page in [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]}
 WITH_CODE = [name for name, page in PAGES.items() if blocks(page, "python") and name != "README.md"]  # see test_readme

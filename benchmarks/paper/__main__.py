@@ -20,7 +20,7 @@ from benchmarks.paper.scenes import chosen_scenes
 from reference_trainer.cli.options import Device, Rendering, RenderOptions
 from reference_trainer.devices import check_device
 from reference_trainer.files import write_text
-from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.executors import Processes
 from reference_trainer.runs.grid import Running
 from reference_trainer.scenes.options import SceneOptions
 

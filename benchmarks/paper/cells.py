@@ -21,7 +21,7 @@ from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.metrics import depth_errors, psnr
 from reference_trainer.evaluation.tables import mean_std
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
-from reference_trainer.runs.executors.executor import Failure, Task, attempt
+from reference_trainer.runs.executors import Failure, Task, attempt
 from reference_trainer.runs.folder import folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.runs.measure import load_run_model

@@ -10,8 +10,7 @@ from waiting import PATIENCE, until
 
 from benchmarks import plan as plan_module
 from benchmarks.plan import ALTERNATIVES, parts_of_a_step, plan_study, plan_table, shortened, variants
-from reference_trainer.runs.executors.executor import Task, run_all
-from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.executors import Processes, Task, run_all
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.studies.study import run_study
@@ -109,7 +108,7 @@ from pathlib import Path
 import sweep_tasks
 from reference_trainer.scenes.options import SceneOptions
 from benchmarks import plan
-from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.executors import Processes
 from reference_trainer.studies.study import run_study
 from reference_trainer.training.config import TrainConfig
 plan._train = sweep_tasks.note_the_interruption_here

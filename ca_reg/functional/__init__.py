@@ -1,4 +1,8 @@
-"""The pure functions behind the modules: they hold no state, change no argument and draw only when asked to."""
+"""The pure functions behind the modules: they hold no state, change no argument and draw only when asked to.
+
+All check their arguments: a wrong type, also an integer tensor, raises a TypeError; a shape or value other than
+documented, such as a negative opacity, a ValueError.
+"""
 
 from ca_reg._random import draw_numbers
 from ca_reg.functional.expected_losses import expected_absolute_error, expected_squared_error
@@ -24,24 +28,8 @@ from ca_reg.functional.opacities import (
 from ca_reg.functional.variance import ColorVariance, color_variance
 
 __all__ = [
-    "ColorVariance",
-    "Multiplier",
-    "PixelMoments",
-    "alpha_moments",
-    "apply_dropout",
-    "apply_opacity_noise",
-    "color_variance",
-    "contributions",
-    "draw_keep_mask",
-    "draw_numbers",
-    "draw_opacity_noise",
-    "expected_absolute_error",
-    "expected_opacity",
-    "expected_squared_error",
-    "first_order_variance",
-    "gaussian_dropout",
-    "neutral_background",
-    "opacity_noise",
-    "pixel_moments",
-    "scale_opacity",
-]
+    "ColorVariance", "Multiplier", "PixelMoments", "alpha_moments", "apply_dropout", "apply_opacity_noise",
+    "color_variance", "contributions", "draw_keep_mask", "draw_numbers", "draw_opacity_noise",
+    "expected_absolute_error", "expected_opacity", "expected_squared_error", "first_order_variance",
+    "gaussian_dropout", "neutral_background", "opacity_noise", "pixel_moments", "scale_opacity",
+]  # fmt: skip

@@ -1,8 +1,8 @@
 """Expected pixel losses over the random factors, from the mean and the variance of the pixel alone.
 
-Training with sampled dropout or noise minimizes an expected loss through single draws, with their noise in every
-gradient. With the exact moments of a pixel (:func:`~ca_reg.functional.pixel_moments`) the expectation itself can be
-minimized: that of the squared error exactly, that of the absolute error insofar as the pixel is normally distributed.
+Training with sampled dropout or noise minimizes an expected loss through single draws, whose noise is in every
+gradient. From the exact moments of a pixel (:func:`~ca_reg.functional.pixel_moments`) follows the expectation itself:
+exactly for the squared error, for the absolute error insofar as the pixel is normally distributed.
 """
 
 from __future__ import annotations
@@ -27,10 +27,8 @@ _FAR = 9.0
 def expected_squared_error(mean: Tensor, variance: Tensor, target: Tensor) -> Tensor:
     """Return ``E (x - t)^2 = (mean - t)^2 + variance``, pixel by pixel.
 
-    Exact for every distribution of ``x``: the bias-variance decomposition. Its average is what dropout training
-    minimizes on average when the loss is the mean squared error.
-
-    All arguments are floating-point tensors of one shape, else TypeError or ValueError; the variance is at least 0.
+    Exact for every distribution of ``x``. Its average is what dropout training minimizes when the loss is the mean
+    squared error. All arguments are floating-point tensors of one shape; the variance is at least 0.
 
     Example:
         One splat of alpha 0.8, white over black, is kept in half of the draws, so a pixel is 0 or 0.8:
@@ -62,26 +60,17 @@ def expected_absolute_error(mean: Tensor, variance: Tensor, target: Tensor, *, m
     sum of ``|d|`` instead, for comparison  -51 %             -11 %
     ======================================= ================= =================
 
-    and in single pixels by up to a factor of 3. Whatever the distribution,
-    ``|d| <= E |x - t| <= sqrt(d^2 + variance)`` (Jensen), and the approximation lies in the same interval, with
-    ``s^2`` in place of the variance: it is never below the absolute error of the mean.
+    and in single pixels by up to a factor of 3. Like the exact value, it is never below ``|d|``, the error of the mean,
+    nor above ``sqrt(d^2 + s^2)``.
 
-    ``min_std`` bounds the gradient in the variance, ``1 / (s sqrt(2 pi))`` at ``d = 0``. It models a normal error of
-    that size in the target; the default is the rounding of a photograph to 8 bits, 0.29 / 255. It adds at most
-    ``min_std sqrt(2 / pi)``, 0.23 / 255, to the result, and that only where ``d`` and the variance are 0.
+    ``min_std`` bounds the gradient in the variance, ``1 / (s sqrt(2 pi))`` at ``d = 0``. The default is the rounding of
+    a photograph to 8 bits, 0.29 / 255; it adds at most 0.23 / 255 to the result.
 
     Args:
         mean: expected value of ``x``, any shape, float32 or float64.
         variance: its variance, at least 0, same shape. Not checked, which would synchronize the GPU.
         target: ``t``, same shape.
         min_std: smallest standard deviation, above 0, in the units of ``x``; its square must not underflow.
-
-    Returns:
-        The expectation of every element, same shape.
-
-    Raises:
-        TypeError: if an argument is not a floating-point tensor, or ``min_std`` not a number.
-        ValueError: if the shapes differ, or ``min_std`` is not finite or too small for the dtype.
 
     Example:
         The splat of :func:`expected_squared_error`. The exact value is (0.7 + 0.1) / 2 = 0.4:

@@ -10,11 +10,11 @@ independent of everything behind it. Hence, by the law of total variance and per
 with ``mu_{n+1} = b`` and ``V_{n+1} = 0``. ``V_1`` is the limit of the paper's co-adaptation at the pixel for infinitely
 many samples. From the front it reads ``sum_i v alpha_i^2 (c_i - mu_{i+1})^2 S_i``, where ``S_i`` is the product of the
 brackets of all splats in front: a sum of non-negative terms, one per splat, without the cancellation of a difference of
-mean squares. A splat counts by how much its color differs from the expected color behind it.
+mean squares.
 
 Limits: the factors must be independent, one per Gaussian (not one per anchor or cluster). The variance is over all
-draws, whereas the paper's score takes only pixels that stay covered in every sample. Renderers skip alphas below 1/255,
-clamp them at 0.99 and stop behind opaque splats; :class:`~ca_reg.functional.Multiplier` says what this changes.
+draws, whereas the paper's score takes only pixels that stay covered in every sample. What renderers skip, clamp and
+stop at is not modeled; :class:`~ca_reg.functional.Multiplier` says what this changes.
 """
 
 from __future__ import annotations
@@ -56,10 +56,6 @@ def pixel_moments(
         multiplier: moments of the factor. Tensors in it must broadcast to the shape of ``alphas``.
         background: color behind the last splat, shape (C,) or (..., C); None for zero.
 
-    Raises:
-        TypeError: if an argument is not a tensor, or the dtypes are not float32 or float64, or differ.
-        ValueError: if the shapes do not match, an alpha is outside [0, 1], or a color is nan or infinite.
-
     Example:
         >>> alphas = torch.tensor([0.5, 0.5])
         >>> colors = torch.tensor([[1.0], [0.0]])
@@ -75,11 +71,10 @@ def contributions(
 ) -> Tensor:
     """Return what each splat contributes to the variance of the pixel: ``v alpha_i^2 (c_i - mu_{i+1})^2 S_i``.
 
-    The contributions are at least 0 and sum to the variance; summed over pixels by the index of the Gaussian, they
-    attribute the whole score. The i-th is the part of the variance due to the factor of splat i, given those in front,
-    averaged over those behind; splats behind it matter only through their expected color.
+    They are at least 0 and sum to the variance. The i-th is the variance due to the factor of splat i, given those in
+    front, averaged over those behind. Summed over pixels by the index of the Gaussian, they attribute the whole score.
 
-    Arguments, order and errors are those of :func:`pixel_moments`. Returns shape (..., n, C), 0 in the padding.
+    Arguments are those of :func:`pixel_moments`. Returns shape (..., n, C), 0 in the padding.
 
     Example:
         >>> alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[1.0], [1.0]])
@@ -92,7 +87,7 @@ def contributions(
 def alpha_moments(alphas: Tensor, multiplier: Multiplier) -> PixelMoments:
     """Return the exact mean and variance of the accumulated alpha, as of a pixel of white splats over black.
 
-    Arguments, order and errors are those of :func:`pixel_moments`. Mean and variance have shape (...).
+    Arguments are those of :func:`pixel_moments`. Mean and variance have shape (...).
 
     Example:
         >>> alpha_moments(torch.tensor([0.5, 0.5]), Multiplier.dropout(0.5)).mean
@@ -105,18 +100,17 @@ def alpha_moments(alphas: Tensor, multiplier: Multiplier) -> PixelMoments:
 def neutral_background(alphas: Tensor, colors: Tensor, multiplier: Multiplier) -> Tensor:
     """Return the background ``b`` over which the expected pixel is ``b`` itself.
 
-    Over a fixed background a pixel also varies because dropped splats open holes. Composited over the expected color,
-    a hole shows what was expected there, and only disagreement between the colors of the splats counts; the variance
-    no longer depends on the choice of a background. From ``mu_1 = sum_i w_i c_i + (1 - sum_i w_i) b`` with the
-    expected blend weights ``w_i = m alpha_i prod_{j<i} (1 - m alpha_j)``, the condition ``mu_1 = b`` gives
+    Over a fixed background a pixel also varies because dropped splats open holes. Over the expected color a hole shows
+    what was expected there, and only disagreement between the colors of the splats counts. From
+    ``mu_1 = sum_i w_i c_i + (1 - sum_i w_i) b``, with ``w_i = m alpha_i prod_{j<i} (1 - m alpha_j)``, ``mu_1 = b``
+    gives
 
         b = sum_i w_i c_i / sum_i w_i
 
-    Pass it as ``background`` of :func:`pixel_moments` or :func:`contributions`; the mean is then ``b``.
-    Differentiable; detach it to hold it fixed in a penalty.
+    Pass it as ``background``. It is differentiable; detach it to hold it fixed in a penalty.
 
-    Arguments, order and errors are those of :func:`pixel_moments`; of the multiplier only the mean matters. Returns
-    shape (..., C), 0 where nothing covers the pixel, whose variance is 0 over any background.
+    Arguments are those of :func:`pixel_moments`; of the multiplier only the mean matters. Returns shape (..., C), 0
+    where nothing covers the pixel, whose variance is 0 over any background.
 
     Example:
         >>> alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[1.0], [0.0]])
@@ -137,13 +131,11 @@ def neutral_background(alphas: Tensor, colors: Tensor, multiplier: Multiplier) -
 def first_order_variance(alphas: Tensor, colors: Tensor, multiplier: Multiplier) -> Tensor:
     """Return the paper's closed form ``v sum_i (c_i alpha_i)^2`` (appendix, Eq. ca_final, where v is ``p (1 - p)``).
 
-    An approximation, for comparison with :func:`pixel_moments`. It ignores the transmittance, so that hidden splats
-    count like visible ones, and what lies behind a splat, so that its color counts instead of its contrast; there is no
-    background. It is right over black for a single splat and in the limit of small accumulated alpha; otherwise it is
-    mostly too large, the more so the longer the list.
+    An approximation, for comparison with :func:`pixel_moments`. It ignores transmittance, so hidden splats count like
+    visible ones, and what lies behind a splat, so its color counts instead of its contrast. It is right over black for
+    a single splat and for small accumulated alpha; otherwise mostly too large, the more so the longer the list.
 
-    Arguments and errors are those of :func:`pixel_moments`; of the multiplier only the variance matters. Returns the
-    approximate variance per pixel and channel, shape (..., C).
+    Arguments are those of :func:`pixel_moments`; of the multiplier only the variance matters. Returns shape (..., C).
 
     Example:
         >>> alphas, colors = torch.tensor([0.5, 0.5]), torch.tensor([[1.0], [1.0]])

@@ -31,15 +31,10 @@ class Multiplier:
     opacity noise, clipped draw     ``1``                   ``0.516 sigma^2``
     =============================== ======================= ==================
 
-    The product of two multipliers is that of both factors applied in turn, drawn independently.
-
     Args:
-        mean: at least 0; a number for all splats, or a tensor with one value per splat or Gaussian.
+        mean: at least 0; a number for all splats, or a tensor with one value per splat or Gaussian, which is checked
+            and thereby synchronizes a GPU.
         variance: at least 0, likewise.
-
-    Raises:
-        TypeError: if a field is neither a number nor a tensor.
-        ValueError: if a value is negative or not finite. For tensors the check synchronizes a GPU.
 
     Example:
         >>> both = Multiplier.dropout(0.5) * Multiplier.opacity_noise(1.0)
@@ -73,13 +68,10 @@ class Multiplier:
 
         Exact even for renderers that clamp alpha, because a factor of 0 or 1 commutes with the clamp. With
         ``compensate`` it is exact only where ``alpha <= 0.99 (1 - p)``: survivors above that are clamped by the
-        renderer but not here, which shifts mean and variance without a useful bound. For compensated dropout that is
-        exact at any alpha, give the renderer the survivors' opacities, ``opacity / (1 - p)``, and use the multiplier
-        *without* ``compensate``.
+        renderer but not here. To be exact at any alpha, give the renderer the survivors' opacities,
+        ``opacity / (1 - p)``, and use the multiplier *without* ``compensate``.
 
-        Raises:
-            TypeError: if ``p`` is neither a number nor a tensor.
-            ValueError: if ``p`` is outside [0, 1), or a tensor not of shape (N,).
+        ``p`` is a number in [0, 1) or a tensor (N,) of such.
         """
         check_rates(p)
         return cls(1.0, p / (1.0 - p)) if compensate else cls(1.0 - p, p * (1.0 - p))
@@ -89,13 +81,8 @@ class Multiplier:
         """Return the multiplier ``1 + eps`` of opacity noise, eps normal, without the clamp of the opacity to [0, 1].
 
         A good approximation while few draws reach the clamp, that is for ``sigma`` well below 1 and opacities well
-        below ``1 / (1 + sigma)``; :meth:`clamped_noise` includes the clamp.
-
-        With ``clip`` the draw is clipped to [-sigma, sigma], which leaves 0.516 of its variance.
-
-        Raises:
-            TypeError: if ``sigma`` is not a number.
-            ValueError: if ``sigma`` is negative, not finite, or its square overflows.
+        below ``1 / (1 + sigma)``; :meth:`clamped_noise` includes the clamp. With ``clip`` the draw is clipped to
+        [-sigma, sigma], which leaves 0.516 of its variance.
         """
         check_finite(sigma, "sigma", minimum=0.0)
         unit = 2.0 * _upper_half(torch.tensor(1.0, dtype=torch.float64))[1].item() if clip else 1.0
@@ -106,19 +93,16 @@ class Multiplier:
         """Return the multiplier of :func:`~ca_reg.functional.opacity_noise`, including the clamp to [0, 1].
 
         Per Gaussian, ``xi = clamp(o (1 + eps), 0, 1) / o`` is one plus ``sigma`` times a standard normal number clamped
-        to ``[-1 / sigma, (1 / o - 1) / sigma]``, whose moments have a closed form. The upper bound lowers the mean of
-        opacities near 1, the lower one raises that of all. Differentiable in ``opacity``.
+        to ``[-1 / sigma, (1 / o - 1) / sigma]``, whose moments have a closed form. Differentiable in ``opacity``.
 
         After compensated dropout the noise acts on the survivors' opacities, ``o / (1 - p)``, which may exceed 1: pass
         those. The result is then the factor on ``min(o, 1)``, which the renderer must be given; its product with
         ``Multiplier.dropout(p)``, without ``compensate``, covers both.
 
-        The renderer's treatment of the noisy alpha is not modeled. With R the range of the colors and the background:
-
-        - its clamp at 0.99 moves each sampled color, hence the mean and the standard deviation of the pixel, by at
-          most ``R / 99``, whatever the length of the list;
-        - its cut-off of alphas below 1/255 moves a sampled color by at most ``R / 255`` for each splat that the noise
-          takes across the cut-off.
+        The renderer's treatment of the noisy alpha is not modeled. With R the range of the colors and the background,
+        its clamp at 0.99 moves the mean and the standard deviation of a pixel by at most ``R / 99``, whatever the
+        length of the list; its cut-off at 1/255 moves a sampled color by at most ``R / 255`` for each splat that
+        crosses it.
 
         Args:
             opacity: activated opacities ``o``, at least 0, any shape.
@@ -128,11 +112,6 @@ class Multiplier:
         Returns:
             Mean and variance per Gaussian of ``clamp(o (1 + eps), 0, 1) / min(o, 1)``, shape and dtype of ``opacity``.
             At ``o = 0`` it is the limit of small opacities.
-
-        Raises:
-            TypeError: if ``opacity`` is not a floating-point tensor, or ``sigma`` not a number.
-            ValueError: if an opacity is negative or not finite, ``sigma`` negative or not finite, or a variance
-                overflows.
 
         Example:
             >>> noise = Multiplier.clamped_noise(torch.tensor([0.01, 1.0]), 0.2)

@@ -37,18 +37,15 @@ def draw_keep_mask(
     Args:
         n: number of Gaussians.
         p: drop rate in [0, 1); a number, or one for each Gaussian, shape (n,).
-        generator: source of the draw; the global random state is then untouched. The numbers are drawn on its device,
-            so a CPU generator gives the same mask on every device. Not inside a function that
-            ``torch.utils.checkpoint`` recomputes: draw outside it.
+        generator: source of the draw, on whose device the numbers are drawn: a CPU generator gives the same mask on
+            every device. The global random state is then untouched.
         device: device of the returned mask; by default where it was drawn.
 
     Returns:
         True where the Gaussian stays, shape (n,), bool.
 
     Raises:
-        TypeError: if ``n`` is not an integer or ``p`` not a number.
-        ValueError: if ``n`` is negative, ``p`` outside [0, 1), or not one number per Gaussian.
-        RuntimeError: if the draw with a generator is repeated during ``backward()``.
+        RuntimeError: if a draw with a generator is repeated by ``torch.utils.checkpoint``; draw outside it.
 
     Example:
         >>> keep = draw_keep_mask(1000, 0.2, generator=torch.Generator().manual_seed(0))
@@ -68,24 +65,18 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: b
     """Set the opacities of dropped Gaussians to zero (paper, Eq. dropout_train).
 
     A dropped Gaussian gets an opacity and a gradient of exactly zero. The rasterizer may still report a radius for it:
-    zero that as well (``radii * keep``) before density control sees it, or the mean gradients shrink by ``1 - p`` and
-    fewer Gaussians are densified.
+    zero that as well (``radii * keep``) before density control sees it, or fewer Gaussians are densified.
 
     Args:
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1).
         keep: True where the Gaussian stays, shape (N,), bool.
         p: the rate or rates that ``keep`` was drawn with; used only by ``compensate``.
         compensate: multiply the survivors by ``1 / (1 - p)``, so that the mean over masks is ``opacity`` and nothing
-            needs to be scaled at test time. Survivors may then exceed 1; they are not clamped here, because every
-            3DGS rasterizer clamps the alpha of a splat, at 0.99 or 0.999. Where ``opacity`` exceeds ``0.99 (1 - p)``
-            that clamp lowers the mean alpha.
+            needs to be scaled at test time. They may then exceed 1; rasterizers clamp them, at 0.99 or 0.999, which
+            lowers the mean alpha.
 
     Returns:
         The masked opacities, a new tensor of the same shape and dtype.
-
-    Raises:
-        TypeError: if an argument is not a tensor, ``opacity`` not floating point or ``keep`` not bool.
-        ValueError: if the shapes are not as above or ``p`` is outside [0, 1).
 
     Example:
         >>> opacity, keep = torch.tensor([0.5, 0.8]), torch.tensor([True, False])
@@ -109,8 +100,8 @@ def gaussian_dropout(
 ) -> tuple[Tensor, Tensor | None]:
     """Draw a mask and apply it: :func:`draw_keep_mask`, then :func:`apply_dropout`.
 
-    Arguments and errors are theirs. Returns the masked opacities and the mask of shape (N,). With ``p = 0`` nothing is
-    drawn: returns the very same ``opacity`` and None.
+    Returns the masked opacities and the mask of shape (N,); with ``p = 0``, where nothing is drawn, the very same
+    ``opacity`` and None.
 
     Example:
         >>> opacity, keep = gaussian_dropout(torch.full((4, 1), 0.5), 0.2)
@@ -146,11 +137,6 @@ def draw_opacity_noise(
     Returns:
         The relative noise, shape (n,), float32 whatever the opacities are.
 
-    Raises:
-        TypeError: if ``n`` is not an integer or ``sigma`` not a number.
-        ValueError: if ``n`` or ``sigma`` is negative, or ``sigma`` above 1e30.
-        RuntimeError: if the draw with a generator is repeated during ``backward()``.
-
     Example:
         >>> noise = draw_opacity_noise(1000, 0.8, clip=True)
         >>> noise.shape, noise.abs().max() <= 0.8
@@ -165,16 +151,11 @@ def draw_opacity_noise(
 def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:
     """Return ``opacity * (1 + noise)``, clamped to [0, 1] (paper, opacity noise injection).
 
-    Where the clamp acts, the gradient is 0. It removes some of the upward noise of opacities near 1, which lowers their
-    mean.
+    Where the clamp acts, the gradient is 0. The clamp lowers the mean of opacities near 1.
 
     Args:
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1); the result has the same shape and dtype.
         noise: relative noise, shape (N,).
-
-    Raises:
-        TypeError: if an argument is not a tensor, or ``opacity`` is not floating point.
-        ValueError: if the shapes are not as above.
 
     Example:
         >>> apply_opacity_noise(torch.tensor([0.5, 0.5, 0.5]), torch.tensor([0.2, -1.5, 3.0]))
@@ -193,8 +174,8 @@ def opacity_noise(
 ) -> tuple[Tensor, Tensor | None]:
     """Draw noise and apply it: :func:`draw_opacity_noise`, then :func:`apply_opacity_noise`.
 
-    Arguments and errors are theirs; the paper tunes ``sigma`` in [0.05, 0.8]. Returns the noisy opacities in [0, 1] and
-    the noise of shape (N,). With ``sigma = 0`` nothing is drawn: returns the very same ``opacity`` and None.
+    The paper tunes ``sigma`` in [0.05, 0.8]. Returns the noisy opacities in [0, 1] and the noise of shape (N,); with
+    ``sigma = 0``, where nothing is drawn, the very same ``opacity`` and None.
 
     Example:
         >>> noisy, noise = opacity_noise(torch.full((4,), 0.5), 0.1)
@@ -237,15 +218,12 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
 def expected_opacity(opacity: Tensor, sigma: float, *, clip: bool = False) -> Tensor:
     """Return the mean of the opacities under clamped noise, the counterpart of :func:`scale_opacity`.
 
-    The mean of :func:`~ca_reg.functional.opacity_noise` is not ``opacity``, because the clamp to [0, 1] cuts the draws
-    of opaque Gaussians from above and those of all from below: at ``sigma = 0.8`` an opacity of 1 has the mean 0.72, a
-    faint one 1.04 times itself. A pixel is linear in the opacity of each of its splats, so the image of the means *is*
-    the mean image over all draws, up to the rasterizer's clamp and cut-off of alpha. The paper renders with
-    ``opacity`` itself.
+    The clamp to [0, 1] cuts off high draws of opaque Gaussians and low draws of all: at ``sigma = 0.8`` an opacity of 1
+    has the mean 0.72, a faint one 1.04 times itself. As with :func:`scale_opacity`, the image of the means *is* the
+    mean image, up to the rasterizer's clamp and cut-off of alpha. The paper renders with ``opacity`` itself.
 
     Apply it once: to a model trained with the noise, when it is rendered at test time or exported. If dropout was used
-    as well, ``scale_opacity(expected_opacity(opacity, sigma), p)`` is the mean under both. The other order is not,
-    because the factor of the noise depends on the opacity.
+    as well, take ``scale_opacity(expected_opacity(opacity, sigma), p)``; the other order is not the mean under both.
 
     Args:
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1); returned as they are with ``sigma = 0``.

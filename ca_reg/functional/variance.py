@@ -41,10 +41,6 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
             of different lengths are padded with zeros.
         colors: their colors, shape (..., n, 3).
 
-    Raises:
-        TypeError: if an argument is not a tensor.
-        ValueError: if the shapes do not match, a weight is negative, or a weight or color is NaN or infinite.
-
     Example:
         >>> weights = torch.tensor([[0.5, 0.5], [0.3, 0.0], [0.0, 0.0]])
         >>> colors = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]).expand(3, 2, 3)

@@ -41,13 +41,8 @@ REGULARIZERS: Registry[Regularizer] = Registry(
 def parse(text: str, *, imports: bool = True) -> Chain:
     """Parse an expression into regularizers: registered names or ``module:Class``, joined by ``+``.
 
-    Args:
-        text: such as ``"dropout(0.2) + noise(0.8, scale=True)"``, ``"dropout(ramp(0, 0.2, 0, 10_000))"`` or
-            ``"my_module:MyDropout(0.3)"``; an empty text makes an empty chain.
-        imports: whether ``module:Class`` may be imported; False for text from an untrusted source.
-
-    Raises:
-        ValueError: as :meth:`Registry.make <ca_reg.registry.Registry.make>`.
+    An empty text makes an empty chain. With ``imports=False``, for text from an untrusted source, ``module:Class``
+    raises a ValueError, as everything does that :meth:`Registry.make <ca_reg.registry.Registry.make>` cannot parse.
 
     Example:
         >>> [type(member).__name__ for member in parse("dropout(0.2) + noise(0.8)")]

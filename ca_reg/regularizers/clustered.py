@@ -19,11 +19,10 @@ __all__ = ["AnchorDropout", "ClusteredDropout", "SHDropout"]
 class ClusteredDropout(Regularizer):
     """Drop random anchors together with their k nearest neighbors, an expected share ``p`` of all Gaussians.
 
-    Each Gaussian is an anchor with probability ``a``. One that is in ``c`` clusters (its own, and one for each Gaussian
-    that has it among its neighbors) is kept with probability ``(1 - a)^c``. The mean of that over all Gaussians is
-    solved for ``a``, so the expected dropped share is ``p``, to 1e-6, whatever the overlaps; the share of a single draw
-    scatters about ``sqrt(k + 1)`` times as much as with independent masks. Gaussians differ: a neighbor of many is
-    dropped more often than an outlier.
+    Each Gaussian is an anchor with a probability ``a`` that makes the expected dropped share ``p``, to 1e-6, whatever
+    the overlaps: one that is in ``c`` clusters is kept with probability ``(1 - a)^c``. The share of a single draw
+    scatters about ``sqrt(k + 1)`` times as much as with independent masks. A neighbor of many is dropped more often
+    than an outlier.
 
     ``train()``: ``opacity * keep``; ``eval()``: unchanged. The draws are not independent, so there is no multiplier.
 
@@ -90,13 +89,12 @@ RATE = LinearRamp(0.0, 0.02, 0, 10_000)
 class AnchorDropout(ClusteredDropout):
     """Drop anchors, drawn at ``rate``, and their k nearest neighbors (Fang et al., "DropAnSH-GS", CVPR 2026).
 
-    ``train()``: ``opacity * keep``, without compensation; ``eval()``: unchanged. After arXiv 2602.20933, as no code was
-    published. :class:`~ca_reg.regularizers.clustered.ClusteredDropout` is parameterized by the dropped share instead,
-    which is here ``1 - (1 - rate)^(k + 1)`` at most in expectation: 20 % at a rate of 0.02.
+    ``train()``: ``opacity * keep``; ``eval()``: unchanged. After arXiv 2602.20933, as no code was published.
+    :class:`ClusteredDropout` is parameterized by the dropped share instead, here at most ``1 - (1 - rate)^(k + 1)``: 20
+    % at a rate of 0.02.
 
     Args:
-        rate: of the anchors, or a schedule of it. The paper's rises from 0 to 0.02 until the end of training; the
-            default takes 10,000 steps for that.
+        rate: of the anchors, or a schedule of it. The paper's rises from 0 to 0.02 until the end of training.
         k: neighbors dropped with an anchor, as in the paper.
         every: steps between neighbor searches; the paper does not say.
 
@@ -124,10 +122,9 @@ class AnchorDropout(ClusteredDropout):
 class SHDropout(Regularizer):
     """Drop the spherical harmonics of random Gaussians above a rising degree (Fang et al., "DropAnSH-GS", CVPR 2026).
 
-    A share ``p`` keeps only the degrees up to ``l``, where ``l`` is 0 before the first of ``until``, 1 before the
-    second and so on; from the last on nothing is dropped. ``eval()``: unchanged. After arXiv 2602.20933, as no code was
-    published; with :class:`~ca_reg.regularizers.clustered.AnchorDropout` it is the whole scheme:
-    ``drop_anchors + drop_sh``. Only colors change, so there is no multiplier, and density control counts all Gaussians.
+    A share ``p`` keeps only the degrees up to ``l``, which is 0 before the first of ``until``, 1 before the second and
+    so on; from the last on nothing is dropped. ``eval()``: unchanged. After arXiv 2602.20933, as no code was published;
+    the whole scheme is ``drop_anchors + drop_sh``. Only colors change, so there is no multiplier.
 
     Args:
         p: rate in [0, 1), or a schedule of it. 0.2 in the paper.

@@ -84,9 +84,9 @@ def concrete_moments(logits: Rate, temperature: float, floor: float = 0.0) -> tu
 
         E y = floor + integral T(s) ds,     E (y - floor)^2 = integral 2 (s - floor) T(s) ds
 
-    which double-exponential quadrature evaluates up to rounding, including the logarithms at 0 and 1. This is done for
-    rates above 1/2, and mirrored, ``y -> 1 - y``, for those below, so that nothing cancels at either end. The logits,
-    ``log(p / (1 - p))``, are a number or a tensor of any shape; so are mean and variance, which are differentiable.
+    which double-exponential quadrature evaluates up to rounding, for rates above 1/2, and mirrored, ``y -> 1 - y``, for
+    those below, so that nothing cancels at either end. The logits, ``log(p / (1 - p))``, are a number or a tensor of
+    any shape; so are mean and variance, which are differentiable.
 
     Example:
         >>> mean, variance = concrete_moments(torch.tensor([-2.0, 0.0, 2.0]), 0.1)
@@ -113,17 +113,15 @@ def concrete_moments(logits: Rate, temperature: float, floor: float = 0.0) -> tu
 class ConcreteDropout(BinaryConcrete):
     """Multiply opacities by ``1 - z``, z binary concrete with a rate per Gaussian that is learned (paper, appendix).
 
-    ``train()``: ``opacity * (1 - z)``, ``z = sigmoid((logit p + logit u) / 0.1)`` with ``u ~ U(0, 1)``. ``eval()``: the
-    opacity times the mean of ``1 - z``; the paper does not say what it renders. The logit of p is a parameter of the
-    Gaussian, ``Params.learned["dropout_logits"]``, cloned, split, pruned and saved with it. The exact multiplier is
-    differentiable in it.
+    The paper does not say what it renders at test time; ``eval()`` is that of :class:`BinaryConcrete`. The logit of p
+    is a parameter of the Gaussian, ``Params.learned["dropout_logits"]``, cloned, split, pruned and saved with it.
 
     Nothing keeps the rates up: a loss that only fits the photographs lowers them, and the paper finds more
     co-adaptation than without a regularizer (test CA 0.0053 against 0.0020).
 
     Args:
         p: initial rate of each Gaussian, in (0, 1). The paper does not give it; Gal et al. 2017 start at 0.1.
-        rate: learning rate of the logits. The paper does not give it; the default is that of the opacity logits.
+        rate: learning rate of the logits, by default that of the opacity logits; the paper does not give it.
         temperature: 0.1 in the paper.
 
     Example:
@@ -157,17 +155,14 @@ class ConcreteDropout(BinaryConcrete):
 class SoftDropout(BinaryConcrete):
     """Multiply opacities by ``omega = clamp(1 - sigmoid((logit u + logit q) / temperature), 0.2, 0.8)``, q ~ U(0, 1).
 
-    The soft mask of UGOD (ICRA 2026). There a network predicts the uncertainty u of a Gaussian from its position,
-    rotation, scale and the view; here it follows a rule: the same u for all, or, with ``by_size``, proportional to the
-    rank of the largest scale, from about 0 for the smallest Gaussian to about 2 u for the largest, because large
-    Gaussians are constrained by few pixels of few views. UGOD renders ``opacity * (1 - u) * omega``; the factor
-    ``1 - u``, which is not random, is left to the opacity here.
-
-    ``eval()``: the opacity times the mean of omega. UGOD draws at test time, too, as a module left in ``train()`` does.
+    The soft mask of UGOD (ICRA 2026), whose network predicts the uncertainty u of a Gaussian from its position,
+    rotation, scale and the view. Here u is the same for all, or, with ``by_size``, proportional to the rank of the
+    largest scale, because large Gaussians are constrained by few pixels of few views. UGOD's other factor, ``1 - u``,
+    which is not random, is left to the opacity here. ``eval()``: the opacity times the mean of omega; UGOD draws at
+    test time, too, as a module left in ``train()`` does.
 
     Args:
-        u: the (mean) uncertainty, in (0, 1), with ``by_size`` in (0, 0.5]. UGOD has no such constant; 0.2 is the drop
-            rate of the paper.
+        u: the (mean) uncertainty, in (0, 1), with ``by_size`` in (0, 0.5]; 0.2 is the drop rate of the paper.
         by_size: whether the uncertainty grows with the rank of the size.
         temperature: above 0 and at most 1; 0.1 in UGOD's code, 0.2 for its results on Mip-NeRF 360.
         floor: the smallest omega; the largest is ``1 - floor``. 0.2 in UGOD.

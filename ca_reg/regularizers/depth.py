@@ -35,15 +35,13 @@ class D2GSDropout(SurroundingsDropout):
     - densities are computed only at step 1 and every ``every`` steps: if Gaussians have been added since, all count as
       0.5; if some were removed, the first N values are taken, whichever Gaussians they belonged to.
 
-    The published code counts each point among its own neighbors, which only adds a factor that cancels.
-
     Convention: the view matrix is world to camera; depth is along its third axis.
 
     Args:
         rate: the largest rate, or a schedule of it. The source's rises from 0.05 to 0.3 over 10,000 steps.
         depth_weight: of nearness, at least 0. In the source 0.3, and 0.15 to 0.7 in its script for single scenes.
         density_weight: of density, at least 0. In the source 0.7, and 0.3 to 0.85 for single scenes.
-        k: number of neighbors. In the source 6, including the point itself.
+        k: number of neighbors. In the source 6, including the point itself, a factor that cancels.
         every: steps between neighbor searches, as in the source.
         literal: do what the published code does.
         scale: scale the opacities in evaluation, which the source does not.
@@ -126,10 +124,10 @@ class DepthDropout(IndependentDropout):
     ``p = rate(step) (near + (far - near) rank)``, with the rank in [0, 1] of the depth. ``train()``: ``opacity *
     keep``; ``eval()``: unchanged.
 
-    Known from the source: the rate of a Gaussian is a continuous function of its depth and rises during training;
-    replacing D2GS's three tiers by it raised the PSNR from 20.74 to 21.12 dB (LLFF, 3 views). Not known: the function,
-    its direction and its constants. Here it is linear in the rank between D2GS's outer tiers, at D2GS's rates; the
-    opposite direction is ``depth(near=0.3, far=1.0)``.
+    Known from the source: the rate is a continuous function of the depth and rises during training; in place of D2GS's
+    three tiers it raised the PSNR from 20.74 to 21.12 dB (LLFF, 3 views). Not known: the function, its direction and
+    constants. Here it is linear in the rank between D2GS's outer tiers; the opposite direction is ``depth(near=0.3,
+    far=1.0)``.
 
     Convention: the view matrix is world to camera; depth is along its third axis.
 

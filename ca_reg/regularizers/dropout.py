@@ -96,21 +96,17 @@ class GaussianDropout(IndependentDropout):
 
     ``train()``: ``opacity * keep``. ``eval()``: ``opacity * (1 - p)``, the mean over all masks. With ``compensate`` the
     survivors are multiplied by ``1 / (1 - p)`` in training instead, and evaluation leaves the opacities as they are.
-    The two schemes are not equivalent: compositing is not linear in the opacities, and rasterizers clamp the alpha of
-    survivors, so that Gaussians of opacity above ``0.99 (1 - p)`` are more opaque in evaluation than in the mean over
-    all masks.
+    The two are not equivalent: rasterizers clamp the alpha of survivors, so that Gaussians of opacity above
+    ``0.99 (1 - p)`` are more opaque in evaluation than in the mean over all masks.
 
     Dropped Gaussians must leave no trace in density control: pass the radii through
     :meth:`~ca_reg.Regularizer.mask_radii`.
 
-    A draw comes from the global random state, or from a generator given to the call: ``dropout(opacity,
-    generator=generator)``. Under ``torch.vmap`` draw the masks outside, and map
-    :func:`~ca_reg.functional.apply_dropout` over them.
-
-    Inside ``torch.compile`` one graph serves all steps, even with ``fullgraph=True``, and the next all numbers of
-    Gaussians: the values of the opacities are then not checked, and a schedule draws even where its rate is 0. Inside
-    ``torch.utils.checkpoint`` draw without ``generator``, or draw outside and pass ``drawn``. The same holds for
-    :class:`OpacityNoise`.
+    A draw comes from the global random state, or from a generator given to the call. Under ``torch.vmap`` draw the
+    masks outside, and map :func:`~ca_reg.functional.apply_dropout` over them. Inside ``torch.compile`` one graph serves
+    all steps, even with ``fullgraph=True``, and the next all numbers of Gaussians; the values of the opacities are then
+    not checked, and a schedule draws even where its rate is 0. Inside ``torch.utils.checkpoint`` draw without
+    ``generator``, or draw outside and pass ``drawn``. The same holds for :class:`OpacityNoise`.
 
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call rejects negative ones as logits.
 
@@ -152,14 +148,12 @@ class GaussianDropout(IndependentDropout):
 class DropGaussian(GaussianDropout):
     """Drop all Gaussians at the rate ``p t / steps`` at step t, and multiply survivors by ``1 / (1 - rate)``.
 
-    DropGaussian (CVPR 2025): uniform over all N Gaussians, no factor at test time. Survivors may exceed 1, which the
-    renderer clamps. It is :class:`~ca_reg.GaussianDropout` with ``compensate`` and a ramp, and has the same exact
-    multiplier.
+    DropGaussian (CVPR 2025): :class:`~ca_reg.GaussianDropout` with ``compensate`` and a ramp. No factor at test time;
+    survivors may exceed 1, which the renderer clamps.
 
     Args:
         p: rate at the end of the ramp, in [0, 1); 0.2 in the source.
-        steps: length of the ramp, after which the rate is constant; the source trains for 10,000 steps. Shorter
-            trainings should pass their own length: 3,000 steps of the default reach 0.06.
+        steps: length of the ramp; the source trains for 10,000 steps, shorter trainings should pass their own length.
 
     Example:
         >>> import torch

@@ -29,10 +29,6 @@ class ParameterNoise(Regularizer):
     Attributes:
         field: the field of :class:`~ca_reg.Params` that is perturbed.
 
-    Raises:
-        TypeError: if ``sigma`` is neither a number nor callable.
-        ValueError: if a constant ``sigma`` is out of range; a schedule is checked at each use.
-
     Example:
         >>> class PositionShake(ParameterNoise):
         ...     needs = ("means",)
@@ -91,17 +87,13 @@ class ParameterNoise(Regularizer):
 class OpacityNoise(ParameterNoise):
     """Multiply opacities by random factors in training, change nothing in evaluation (paper, opacity noise).
 
-    ``train()``: ``clamp(opacity * (1 + noise), 0, 1)`` with ``noise ~ N(0, sigma^2)`` per Gaussian. ``eval()``: the
-    very same tensor.
+    ``train()``: ``clamp(opacity * (1 + noise), 0, 1)``, ``noise ~ N(0, sigma^2)``. ``eval()``: the very same tensor.
 
     With ``scale``, which the paper does not have, ``eval()`` returns the mean over all draws instead,
-    :func:`~ca_reg.functional.expected_opacity` at the current ``sigma``; training is the same. The clamp makes that
-    mean differ from the opacity (0.72 for an opacity of 1 at ``sigma = 0.8``), so without ``scale`` the model is
-    evaluated at opacities other than those it was fitted with: ``scale`` raises the test PSNR by 0.3 to 0.7 dB on four
-    scenes at ``sigma = 0.8``, see docs/results.md. To combine it with dropout use
-    ``Chain(OpacityNoise(0.8, scale=True), GaussianDropout(0.2))``, whose order does not matter: in training a factor of
-    0 or 1 commutes with the clamp, and in evaluation :class:`~ca_reg.Chain` takes the joint mean. An ``nn.Sequential``
-    with dropout first would hand opacities to the noise that are scaled already.
+    :func:`~ca_reg.functional.expected_opacity` at the current ``sigma``. The clamp makes that mean differ from the
+    opacity (0.72 for an opacity of 1 at ``sigma = 0.8``), so ``scale`` raises the test PSNR by 0.3 to 0.7 dB on four
+    scenes at ``sigma = 0.8``, see docs/results.md. Combine it with dropout in a :class:`~ca_reg.Chain`, which takes the
+    joint mean in either order; an ``nn.Sequential`` with dropout first would hand scaled opacities to the noise.
 
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call rejects negative ones as logits.
 
@@ -143,8 +135,7 @@ class OpacityNoise(ParameterNoise):
     def alpha_factor(self, x: Params) -> tuple[Params, Multiplier]:
         """Return the opacities, clamped to 1, and the moments of their clamped noise.
 
-        The renderer's clamp and cut-off of the noisy alphas are not modeled, see
-        :meth:`~ca_reg.functional.Multiplier.clamped_noise`.
+        See :meth:`~ca_reg.functional.Multiplier.clamped_noise` for what this leaves out.
         """
         sigma = self.rate_at(x.step)
         if is_zero(sigma):
@@ -157,12 +148,11 @@ class ScaleNoise(ParameterNoise):
     """Multiply each scale by ``1 + noise`` in training, ``noise ~ N(0, sigma^2)`` (paper, appendix, scale noise).
 
     ``eval()`` changes nothing, as in the paper. The three axes of a Gaussian are drawn independently, which the paper
-    leaves open. Negative scales are replaced by their absolute values, which give the same covariance. The noise does
-    not multiply alphas, so there is no exact multiplier.
+    leaves open. Negative scales are replaced by their absolute values, which give the same covariance.
 
     Args:
-        sigma: standard deviation of the relative noise, at least 0, or a schedule of it. The paper tries 0.1 to 0.7:
-            PSNR is best at 0.2, the default, co-adaptation lowest from 0.6 on.
+        sigma: of the relative noise, or a schedule of it. The paper tries 0.1 to 0.7: PSNR is best at 0.2,
+            co-adaptation lowest from 0.6 on.
         clip: clip the noise to [-sigma, sigma].
 
     Example:
@@ -191,12 +181,10 @@ class SHNoise(ParameterNoise):
     """Multiply each SH coefficient by ``1 + noise`` in training, ``noise ~ N(0, sigma^2)`` (paper, appendix, SH noise).
 
     ``eval()`` changes nothing, as in the paper. Each coefficient of each channel has its own noise, in all bands
-    including the constant one, which the paper leaves open. Colors do not affect occlusion: the paper finds little
-    effect on co-adaptation. The noise does not multiply alphas, so there is no exact multiplier.
+    including the constant one, which the paper leaves open. The paper finds little effect on co-adaptation.
 
     Args:
-        sigma: standard deviation of the relative noise, at least 0, or a schedule of it. The paper tries 0.1, 0.3 and
-            0.5: PSNR is best at 0.1, the default.
+        sigma: of the relative noise, or a schedule of it. The paper tries 0.1, 0.3 and 0.5: PSNR is best at 0.1.
         clip: clip the noise to [-sigma, sigma].
 
     Example:
@@ -219,15 +207,12 @@ class PositionNoise(ParameterNoise):
     """Shift every center at random, in units of the distance to its nearest neighbor (paper, appendix, position noise).
 
     ``train()``: ``mean + sigma d n`` with ``n`` three standard normal numbers and ``d`` the distance; ``eval()``:
-    unchanged. Coinciding Gaussians do not move. The noise does not multiply alphas, so there is no multiplier.
+    unchanged. Coinciding Gaussians do not move.
 
     Args:
         sigma: standard deviation per axis in units of ``d``, at least 0, or a schedule of it. The paper tries 0.1, 0.3
             and 0.5, and finds that all of them blur the images.
         every: steps between neighbor searches; by default 3DGS's densification interval.
-
-    Raises:
-        ValueError: if ``sigma`` is negative or not finite, or ``every`` below 1.
 
     Example:
         >>> means = torch.tensor([[0.0, 0, 0], [0.0, 0, 0], [5.0, 0, 0]])

@@ -27,8 +27,7 @@ class SEGSNoise(Regularizer):
 
     Unlike here, the source trains two fields and perturbs the second, every 500 steps, permanently, and only the
     Gaussians under pixels that its first field has rendered differently over time; the trainer's density control
-    ``self_ensembling`` does that. With one field there is no such selection: all Gaussians are perturbed, anew at each
-    step, and trained as perturbed. The noise does not just multiply alphas, so there is no exact multiplier. The floor
+    ``self_ensembling`` does that. The noise does not just multiply alphas, so there is no exact multiplier. The floor
     of 1 on the mean makes the noise of the centers depend on the world unit.
 
     Args:
@@ -36,9 +35,6 @@ class SEGSNoise(Regularizer):
         last: the ratio at ``stop``, above 0.
         start: first step with noise. The source collects its first three sets of images until 2,000.
         stop: first step without noise again; 500 before the end of the source's 10,000.
-
-    Raises:
-        ValueError: if a ratio is not above 0 or ``stop`` does not come after ``start``.
 
     Example:
         >>> noise = SEGSNoise(start=0)

@@ -25,10 +25,10 @@ __all__ = [
 class Refreshed(nn.Module):
     """Keeps a measurement of the surroundings between steps, because a neighbor search takes longer than a step.
 
-    It is a tensor with one row per Gaussian, measured again every ``every`` steps and when their number changes.
-    If the step has not advanced it is recomputed unless the very same means come again, unmodified: one object may
-    score several models. ``state_dict`` holds the tensor and its step, so that a resumed run continues with them; a
-    checkpoint without them starts afresh. Pruning as many Gaussians as are added goes unnoticed until the next refresh.
+    A tensor with one row per Gaussian, measured again every ``every`` steps and when their number changes. If the step
+    has not advanced it is recomputed unless the very same means come again, unmodified: one object may score several
+    models. ``state_dict`` holds the tensor and its step; a checkpoint without them starts afresh. Pruning as many
+    Gaussians as are added goes unnoticed until the next refresh.
     """
 
     value: Tensor | None
@@ -173,9 +173,8 @@ class DensityDropout(RankedDropout):
     """Drop at rates from ``low``, the sparsest, to ``high``, the densest (paper, appendix, density-based dropout).
 
     ``p = low + (high - low) rank``, with the rank in [0, 1] of the density, which falls with the mean distance to the k
-    nearest neighbors. As for dropout, ``train()`` returns ``opacity * keep`` and ``eval()`` ``opacity * (1 - p)``. The
-    paper gives the rates and their linear mapping, but neither ``k`` nor the measure of density; with ranks neither an
-    outlier nor two coinciding Gaussians dominate the rates, whose mean is always ``(low + high) / 2``.
+    nearest neighbors. ``train()``: ``opacity * keep``; ``eval()``: ``opacity * (1 - p)``. The paper gives the rates and
+    their linear mapping, but neither ``k`` nor the measure of density; with ranks, no outlier dominates the rates.
 
     Args:
         low: rate of the sparsest, in [0, 1). The paper uses 0.2.
@@ -204,20 +203,19 @@ EIGEN_CHUNK = 16_384  # matrices; cuSOLVER's batches end at 32k
 class GeometryDropout(RankedDropout):
     """Drop at rates from ``low``, on planes, to ``high``, in scattered volumes (paper, geometry-aware dropout).
 
-    ``p = low + (high - low) rank``, with the rank in [0, 1] of :func:`surface_variation`. As for dropout, ``train()``
-    returns ``opacity * keep`` and ``eval()`` ``opacity * (1 - p)``.
+    ``p = low + (high - low) rank``, with the rank in [0, 1] of :func:`surface_variation`. ``train()``: ``opacity *
+    keep``; ``eval()``: ``opacity * (1 - p)``.
 
     The paper has one sentence about it, "estimate local geometric complexity by computing structural variation among
-    each Gaussian's nearest neighbors", and calls it infeasible at O(N^3). It does not give the measure, its direction,
-    the rates or ``k``: here the measure is the standard one for point clouds, and the rates are those of the paper's
-    density-based dropout. With neighbors from a k-d tree it takes O(N log N).
+    each Gaussian's nearest neighbors", without the measure, its direction, the rates or ``k``: here the measure is the
+    standard one for point clouds, and the rates are those of the paper's density-based dropout.
 
     Args:
         low: rate where the surroundings vary least, in [0, 1).
         high: rate where they vary most, in [0, 1).
         k: number of neighbors.
-        every: steps between neighbor searches; by default 3DGS's densification interval.
-        compensate: as in :class:`~ca_reg.IndependentDropout`.
+        every: as in :class:`DensityDropout`.
+        compensate: likewise.
         scale: likewise.
 
     Example:

@@ -62,9 +62,9 @@ class Evaluate:
 
     def __call__(self) -> None:
         from reference_trainer.evaluation.lpips import load_lpips
-        from reference_trainer.evaluation.trajectory import measured_views
         from reference_trainer.runs.measure import load_run_model, measure
         from reference_trainer.runs.ply import score_ply
+        from reference_trainer.scenes.virtual_cameras import measured_views
 
         place = place_of(self.run, self.scene, self.orbit)
         self.rendering.begin(self.device)
@@ -167,9 +167,9 @@ class View:
         check_model(self.run, place_of(self.run, self.scene, self.orbit))
 
     def __call__(self) -> None:
-        from reference_trainer.evaluation.trajectory import measured_views
         from reference_trainer.runs.measure import load_run_model
         from reference_trainer.runs.ply import load_for_views
+        from reference_trainer.scenes.virtual_cameras import measured_views
         from reference_trainer.viewer.window import Viewer
 
         where = place_of(self.run, self.scene, self.orbit)

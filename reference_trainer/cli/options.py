@@ -17,12 +17,10 @@ from reference_trainer.runs.folder import check_run
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 
 __all__ = [
-    "BUILT_IN", "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_scenes",
+    "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_scenes",
     "place_of", "refuse_old_options",
 ]  # fmt: skip
 
-BUILT_IN = ("builtin",)  # names of this package's own renderer
-_ENGINES = {"numba": "loops"}  # until the renderer itself uses the new names
 
 _OLD = {
     ("--renderer", "torch"): "the renderer of this package is called builtin: --renderer builtin",
@@ -60,7 +58,7 @@ class RenderOptions:
         from reference_trainer.render import describe_engine, use_engine
 
         if self.engine is not None:
-            use_engine(_ENGINES.get(self.engine, self.engine))
+            use_engine(self.engine)
         print(f"Engine: {describe_engine(device)}", flush=True)
         if trains and device == "cpu":
             from reference_trainer.runs.warmup import warm_up

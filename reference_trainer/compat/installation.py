@@ -12,8 +12,7 @@ from tempfile import TemporaryDirectory
 from types import ModuleType
 from unittest.mock import patch
 
-from ca_reg.integrations._environment import in_children
-from ca_reg.integrations._sources import Sources, read_folder
+from ca_reg.integrations._scripts import Sources, in_children, read_folder
 from reference_trainer.compat.cuda import cuda_on_cpu
 from reference_trainer.compat.extensions import (
     FreqEncoder,

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from ca_reg import CAResult, CAScore, attribute
 from reference_trainer.evaluation.lpips import LPIPS
-from reference_trainer.evaluation.maps import color_variance_map
-from reference_trainer.evaluation.metrics import DepthErrors, depth_errors, on_white, psnr, ssim
+from reference_trainer.evaluation.metrics import DepthErrors, color_variance_map, depth_errors, on_white, psnr, ssim
 from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.results import ResultStore, machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel

@@ -17,16 +17,9 @@ from reference_trainer.render.densification import splat_weights
 from reference_trainer.scenes.scene import Viewpoint
 
 __all__ = [
-    "PER_WEIGHT_SCALE",
-    "Heat",
-    "all_but_highest",
-    "blend_weights",
-    "colored_by",
-    "concentration",
-    "mean_effects",
-    "mean_shares",
-    "share_per_weight",
-]
+    "PER_WEIGHT_SCALE", "Heat", "all_but_highest", "blend_weights", "colored_by", "concentration", "mean_effects",
+    "mean_shares", "share_per_weight",
+]  # fmt: skip
 
 PER_WEIGHT_SCALE = (0.1, 10.0)
 """Ends of the color scale for shares per blend weight, in units of the mean."""
@@ -78,14 +71,8 @@ class Heat:
 def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:
     """Return the weight of every Gaussian in the test-time renders, summed over all pixels and views.
 
-    The image is linear in the colors, so these are exactly the gradient of its sum.
-
-    Args:
-        model: what to measure.
-        views: on the model's device.
-
-    Returns:
-        Sums of alpha times transmittance, shape (N,), float64.
+    The image is linear in the colors, so these are exactly the gradient of its sum: sums of alpha times transmittance,
+    shape (N,), float64. The views are on the model's device.
     """
     opacities = model.test_opacities
     total = torch.zeros_like(opacities, dtype=torch.float64)
@@ -98,13 +85,8 @@ def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:
 def share_per_weight(shares: Tensor, weights: Tensor) -> Tensor:
     """Return how much Gaussians co-adapt relative to what they contribute.
 
-    Args:
-        shares: shape (N,), float64.
-        weights: from `blend_weights`, shape (N,).
-
-    Returns:
-        The quotients, shape (N,): 0 for a Gaussian without a share, infinite for one that is visible only when others
-        are dropped.
+    Takes shares and `blend_weights`, (N,) each, and returns the quotients: 0 for a Gaussian without a share, infinite
+    for one that is visible only when others are dropped.
 
     Example:
         >>> share_per_weight(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([4.0, 0.0, 0.0]))
@@ -132,14 +114,8 @@ def mean_shares(
 ) -> tuple[Tensor, list[CAResult]]:
     """Attribute the exact score of several views to the Gaussians.
 
-    Args:
-        model: what to measure.
-        views: on the model's device.
-        drop_rate: of the score.
-
-    Returns:
-        Shares, averaged over the views that have a score, shape (N,), float64, which add up to the mean score; and the
-        result of every view.
+    The views are on the model's device. Returns the shares, averaged over the views that have a score, shape (N,),
+    float64, which add up to the mean score; and the result of every view.
 
     Raises:
         ValueError: if no view has a score.
@@ -157,12 +133,9 @@ def mean_effects(model: TrainedModel, views: Sequence[Viewpoint], *, drop_rate: 
 def concentration(shares: Tensor) -> dict[str, float]:
     """Return how concentrated the score is on few Gaussians.
 
-    Args:
-        shares: at least 0, not all 0, shape (N,).
-
-    Returns:
-        Under ``"top 1%"`` and the like the fraction of the score held by the Gaussians with the largest shares; under
-        ``"half"`` the smallest fraction of the Gaussians that holds half of the score.
+    The shares are at least 0, not all 0, shape (N,). Under ``"top 1%"`` and the like stands the fraction of the score
+    held by the Gaussians with the largest shares, under ``"half"`` the smallest fraction of the Gaussians that holds
+    half of the score.
 
     Example:
         >>> shares = torch.ones(1000)

@@ -15,14 +15,9 @@ from reference_trainer.render.splats import Rendering, Splats
 from reference_trainer.render.torch.projection import project
 
 __all__ = [
-    "SMALLEST_SPREAD",
-    "absgrad_sink",
-    "in_front",
-    "longer_radii",
-    "splat_weights",
-    "visible_radii",
+    "SMALLEST_SPREAD", "absgrad_sink", "in_front", "longer_radii", "splat_weights", "visible_radii",
     "with_absolute_gradients",
-]
+]  # fmt: skip
 
 SMALLEST_SPREAD = 0.1**0.5  # px^2, of the INRIA code
 # Pixels; a Gaussian is visible to the INRIA code if the square around it meets a tile of the image.

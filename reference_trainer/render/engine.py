@@ -27,7 +27,7 @@ __all__ = [
     "using_engine"
 ]  # fmt: skip
 
-ENGINES = ("auto", "torch", "numba")
+ENGINES = ("auto", "torch", "numba", "triton")
 _RENAMED = {"loops": "numba"}
 _VARIABLE = "CA_REG_ENGINE"
 _TORCH = TorchEngine()
@@ -37,12 +37,12 @@ def use_engine(name: str) -> None:
     """Choose the engine of this process and, by ``CA_REG_ENGINE``, of those that it starts.
 
     Args:
-        name: ``torch``, ``numba``, or ``auto``, the default: numba for float32 on a CPU where it is
-            installed.
+        name: ``torch``, ``numba``, ``triton``, or ``auto``, the default: for float32, numba on a CPU
+            and triton on a card, where they are installed; Triton comes with torch there.
 
     Raises:
         ValueError: if there is no such engine.
-        ImportError: if numba is asked for and missing.
+        ImportError: if numba or triton is asked for and missing.
 
     Example:
         >>> use_engine("torch")
@@ -53,6 +53,8 @@ def use_engine(name: str) -> None:
     _check_name(name, "there is no engine {name!r}")
     if name == "numba" and _numba_engine() is None:
         raise ImportError("the engine numba needs numba: pip install 'ca_reg[trainer]', or use the engine torch.")
+    if name == "triton" and _triton_engine() is None:
+        raise ImportError("the engine triton needs Triton: pip install triton (Linux), or use the engine torch.")
     os.environ[_VARIABLE] = name
 
 
@@ -75,16 +77,24 @@ def _check_name(name: str, complaint: str) -> None:
 
 
 def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engine:
-    """Return the engine for a device and dtype; errors are those of `chosen_engine`."""
-    # Loops are compiled for float32 on a CPU; whoever asks for anything else gets it, by the other
-    # engine.
-    if chosen_engine() == "torch" or device.type != "cpu" or dtype != torch.float32:
+    """Return the engine for a device and dtype; errors are those of `chosen_engine`.
+
+    On a CPU, Triton renders only if chosen and interpreted (``TRITON_INTERPRET=1``).
+    """
+    # Loops are compiled for float32 on a CPU, kernels for float32 on a card; whoever asks for
+    # anything else gets it, by the other engine.
+    chosen = chosen_engine()
+    if chosen == "torch" or dtype != torch.float32:
         return _TORCH
-    return _numba_engine() or _TORCH
+    if _runs_triton(device, chosen):
+        return _triton_engine() or _TORCH
+    return (_numba_engine() if device.type == "cpu" else None) or _TORCH
 
 
 def engines_on(device: torch.device) -> tuple[str, ...]:
-    """Return the engines that render float32 on a device; "numba" only on a CPU."""
+    """Return the engines that render float32 on a device; "numba" only on a CPU, "triton" on a card."""
+    if _runs_triton(device, "auto") and _triton_engine() is not None:
+        return ("triton", "torch")
     return ("numba", "torch") if device.type == "cpu" and _numba_engine() is not None else ("torch",)
 
 
@@ -105,8 +115,11 @@ def using_engine(engine: str) -> Iterator[None]:
 
 def describe_engine(device: torch.device | str) -> str:
     """Describe for people which engine renders on a device, which need not be present."""
-    if engine_for(torch.device(device)).name == "torch":
-        return "torch"
+    name = engine_for(torch.device(device)).name
+    if name == "torch":
+        return name
+    if name == "triton":
+        return f"triton ({version('triton')}{', interpreted' if torch.device(device).type == 'cpu' else ''})"
     count = torch.get_num_threads()
     return f"numba ({version('numba')}, {count} thread{'s' if count > 1 else ''})"
 
@@ -122,3 +135,26 @@ def _numba_engine() -> Engine | None:
         warnings.warn(f"numba is installed but cannot be imported ({error}): the engine torch renders.", stacklevel=2)
         return None
     return NumbaEngine()
+
+
+def _runs_triton(device: torch.device, chosen: str) -> bool:
+    """Return whether Triton is to render on a device; of NVIDIA's cards those since Turing, which it supports."""
+    if device.type == "cpu":
+        return chosen == "triton" and os.environ.get("TRITON_INTERPRET") == "1"
+    if device.type != "cuda" or chosen == "numba":
+        return False
+    known = torch.cuda.is_available() and torch.version.hip is None
+    return not known or torch.cuda.get_device_capability(device) >= (7, 5)
+
+
+@functools.cache
+def _triton_engine() -> Engine | None:
+    """Return the engine of Triton kernels, or None if Triton is missing or does not work."""
+    if importlib.util.find_spec("triton") is None:
+        return None
+    try:
+        from reference_trainer.render.triton.engine import TritonEngine
+    except ImportError as error:
+        warnings.warn(f"triton is installed but cannot be imported ({error}): the engine torch renders.", stacklevel=2)
+        return None
+    return TritonEngine()

@@ -17,12 +17,12 @@ from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.shares import Heat, concentration
 from reference_trainer.evaluation.tables import EXACT
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.report.packing import jpeg, numbers
 from reference_trainer.rotations import rotation_matrices
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.load import evenly_spaced
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
+from reference_trainer.scenes.virtual_cameras import measured_views
 
 __all__ = ["Findings", "find"]
 
@@ -36,7 +36,7 @@ class Findings:
         model: at its last checkpoint.
         opacities: that the page draws it with, (N,).
         scene: what it was trained on.
-        views: that it is shown from, by split, the training views last.
+        views: that it is shown from, by split, those that were not trained on first if they have photographs.
         pictures: per view, ``"render"`` and where they exist ``"error"`` and ``"co-adaptation"``, and a ``"caption"``.
         heat: of the exact score over these views; None if there is no score to attribute.
         notes: what is missing, and why.
@@ -114,7 +114,8 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
     notes: list[str] = []
     if model.depends_on_camera:
         notes.append(f"{label}: its test-time opacities depend on the camera; the model is drawn with the plain ones.")
-    found = sorted(measured_views(scene).items(), key=lambda item: item[0] == "train")
+    last = "train" if scene.test else ""  # what can be compared with a photograph comes first
+    found = sorted(measured_views(scene).items(), key=lambda item: (item[0] == last, item[0] != "train"))
     chosen = {split: [of[i].to(device) for i in evenly_spaced(len(of), min(views, len(of)))] for split, of in found}
     flat = [view for of in chosen.values() for view in of]
     heat = None

@@ -6,8 +6,10 @@ import dataclasses
 import json
 import logging
 import os
+import shlex
 import tempfile
 from collections.abc import Collection, Sequence
+from datetime import datetime
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -15,20 +17,38 @@ from typing import Any
 
 import torch
 
+import ca_reg
 from ca_reg.monitor import read_dynamics
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ERROR_PICTURE_RANGE
 from reference_trainer.evaluation.pictures import dynamics_figure, heat_map
 from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE
-from reference_trainer.evaluation.tables import comparison_table, evaluation_table, markdown_table
+from reference_trainer.evaluation.tables import evaluation_table, markdown_table
 from reference_trainer.files import write_text
 from reference_trainer.report.findings import Findings, find
 from reference_trainer.report.packing import data_uri, jpeg
-from reference_trainer.runs.folder import CONFIG, RESULTS, read_results, read_run_settings, report_file, runs_of
+from reference_trainer.report.verdict import (
+    Rows,
+    natural_name,
+    natural_order,
+    score_columns,
+    unique_names,
+    verdict,
+)
+from reference_trainer.runs.folder import (
+    CONFIG,
+    RESULTS,
+    check_run,
+    read_results,
+    read_run_settings,
+    report_file,
+    runs_of,
+)
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.virtual_cameras import interpolate_cameras
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["labels", "write_report"]
+__all__ = ["labels", "view_name", "write_report"]
 
 _log = logging.getLogger(__name__)
 
@@ -43,14 +63,16 @@ def write_report(
 ) -> Path:
     """Write a page about runs on one scene that opens without a server or a network.
 
-    It shows what was trained on what, the scores, CA and PSNR against the step, every model in 3D (all turn together)
-    in its colors or its co-adaptation heat, the views as photograph, render, error and CA map, and how concentrated the
-    score is on few Gaussians. The heat is the share of the exact score at drop rate 1/2 per blend weight, over the
-    views of the page, on one logarithmic scale for all runs around the mean of the first run that has one. What a run
-    lacks is left out, and the page says so.
+    It begins with a verdict and its evidence, and shows the scores with their differences to the first run, CA and PSNR
+    against the step, every model in 3D (all turn together) in its colors or its co-adaptation heat, any two of
+    photograph, render, error and CA map of all runs upon each other, and how concentrated the score is on few
+    Gaussians. Runs come in the order baseline, dropout, noise, both, under natural names. The heat is the share of the
+    exact score at drop rate 1/2 per blend weight, over the views of the page, on one logarithmic scale for all runs
+    around the mean of the first run that has one. What a run lacks is left out, and the page says so.
 
     Args:
-        runs: their folders, finished or not; the folder of a comparison stands for the first seed of each strategy.
+        runs: their folders, finished or not; the folder of a comparison stands for the first seed of each strategy, and
+            its scores are those of all seeds.
         out: the file; by default ``report.html`` in the folder of the run, or in the deepest folder common to all.
         views: how many views of each split are shown and measured, evenly spaced.
         device: where to render.
@@ -67,8 +89,14 @@ def write_report(
     if views < 1:
         raise ValueError(f"expected at least 1 view of each split, got {views}.")
     folders, runs = runs, [run for folder in runs for run in runs_of(folder) or [folder]]
-    names, found = labels(runs), list[Findings]()
+    paths = labels(runs)
     out = report_file(folders, out)
+    for run in runs:
+        check_run(run)
+    settings = {run: read_run_settings(run / CONFIG) for run in runs}
+    path_of = dict(zip(runs, paths, strict=True))
+    runs = sorted(runs, key=lambda run: natural_order(settings[run][1]))
+    names, found = unique_names([settings[run][1] for run in runs], [path_of[run] for run in runs]), list[Findings]()
     for run, label in zip(runs, names, strict=True):
         _log.info("[%d/%d] %s", len(found) + 1, len(runs), run)
         found.append(find(run, label, views=views, device=device, trust=trust))
@@ -77,7 +105,9 @@ def write_report(
                 f"a report is about one scene, whose models turn together, but {runs[0]} was trained on "
                 f"{found[0].scene.name} and {run} on {found[-1].scene.name}: write a report for each."
             )
-    data = _data(dict(zip(names, runs, strict=True)), found)
+    data = _data(dict(zip(names, runs, strict=True)), found, whole=set(runs) - set(folders))
+    made = f"{shlex.join(['ca-reg', 'report', *map(str, folders)])} · ca_reg {ca_reg.__version__} · "
+    data["made"] = made + datetime.now().strftime("%Y-%m-%d %H:%M")
     page = Template(_part("page.html")).substitute(
         title=f"{found[0].scene.name}: {', '.join(names)}".replace("&", "&amp;").replace("<", "&lt;"),
         style=_part("page.css"),
@@ -111,9 +141,13 @@ def _part(name: str) -> str:
     return (files(__package__) / name).read_text("utf-8")
 
 
-def _data(runs: dict[str, Path], found: Sequence[Findings]) -> dict[str, Any]:
-    """Return all that the page shows, as plain data."""
+def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Path]) -> dict[str, Any]:
+    """Return all that the page shows, as plain data; runs in ``whole`` stand for all seeds of their strategy."""
+    configs = {label: read_run_settings(run / CONFIG) for label, run in runs.items()}
     results = {label: read_results(run) for label, run in runs.items() if (run / RESULTS).exists()}
+    strategies = _strategies(runs, results, configs, whole)
+    table, differing = _settings(configs)
+    said, evidence = verdict(strategies, differing)
     notes = [note for each in found for note in each.notes]
     notes += [f"{label}: no scores, it has not been trained to its end." for label in runs.keys() - results.keys()]
     dynamics, missing = _dynamics(runs)
@@ -123,16 +157,29 @@ def _data(runs: dict[str, Path], found: Sequence[Findings]) -> dict[str, Any]:
     return {
         "about": [str(found[0].scene), *_trained(found)],
         "notes": notes + missing,
-        "scores": comparison_table({label: [of] for label, of in results.items()}, first="run") if results else "",
-        "settings": _settings(runs),
+        "scene": found[0].scene.name,
+        "verdict": said,
+        "evidence": evidence,
+        "strategies": [{"name": of.name, "seeds": len(of.results)} for of in strategies],
+        "scores": score_columns(strategies),
+        "settings": table,
         "dynamics": dynamics,
-        "perView": {label: evaluation_table(of) for label, of in results.items()},
+        "perView": {label: evaluation_table(_renamed(of)) for label, of in results.items()},
         "attribution": markdown_table(attribution, list(attribution[0])) if attribution else "",
         "legend": jpeg(heat_map(torch.linspace(0, 1, 256)[None].expand(8, -1), 1.0)),
         "ends": {"heat": [f"{low:.2g}", f"{high:.2g}"], "error": ERROR_PICTURE_RANGE, "ca": CA_PICTURE_RANGE},
         "views": _views(found),
+        "flight": _flight(found[0]),
         "runs": [each.packed(low, high) for each in found],
     }
+
+
+def _renamed(results: dict[str, Any]) -> dict[str, Any]:
+    """Return results whose views are named for people: no "test test_0"."""
+    views = [
+        view | {"name": view_name(view["split"], view["name"])[len(view["split"]) + 1 :]} for view in results["views"]
+    ]
+    return results | {"views": views}
 
 
 def _trained(found: Sequence[Findings]) -> list[str]:
@@ -144,18 +191,44 @@ def _trained(found: Sequence[Findings]) -> list[str]:
     ]
 
 
-def _settings(runs: dict[str, Path]) -> str:
-    """Return the settings that differ between the runs, or from the defaults, as a table."""
-    configs = {
-        label: {name: x for of in read_run_settings(run / CONFIG) for name, x in dataclasses.asdict(of).items()}
-        for label, run in runs.items()
-    }
+def _strategies(
+    runs: dict[str, Path],
+    results: dict[str, dict[str, Any]],
+    configs: dict[str, tuple[SceneOptions, TrainConfig]],
+    whole: Collection[Path],
+) -> list[Rows]:
+    """Return the rows of every strategy: runs that differ in nothing but the seed are one, as in a comparison."""
+    found: dict[object, tuple[str, list[str], dict[int, dict[str, Any]]]] = {}
+    for label, of in results.items():
+        scene, config = configs[label]
+        key: object = label if runs[label] in whole else (scene, dataclasses.replace(config, seed=0))
+        if key in found and config.seed in found[key][2]:
+            key = label
+        rows = found.setdefault(key, (label, [], {}))[2]
+        found[key][1].append(label)
+        rows[config.seed] = of
+        if runs[label] in whole:
+            for seed in sorted(runs[label].parent.glob(f"seed_*/{RESULTS}")):
+                other = read_results(seed.parent)
+                rows.setdefault(other["config"]["seed"], other)
+    return [
+        Rows(name if len(names) == 1 else natural_name(config), not natural_order(config)[0], list(rows.values()))
+        for name, names, rows in found.values()
+        for config in [configs[name][1]]
+    ]
+
+
+def _settings(configs: dict[str, tuple[SceneOptions, TrainConfig]]) -> tuple[str, list[str]]:
+    """Return a table of the settings that differ between runs or from the defaults, and those a verdict must name."""
+    flat = {label: {k: x for of in both for k, x in dataclasses.asdict(of).items()} for label, both in configs.items()}
     rows: list[dict[str, object]] = []
     for name, usual in (dataclasses.asdict(SceneOptions()) | dataclasses.asdict(TrainConfig())).items():
-        values = {label: config[name] for label, config in configs.items()}
+        values = {label: config[name] for label, config in flat.items()}
         if name != "path" and set(values.values()) != {usual}:
             rows.append({"setting": name, **{label: str(value) for label, value in values.items()}})
-    return markdown_table(rows, ["setting", *configs]) if rows else ""
+    differing = [str(row["setting"]) for row in rows if len({row[label] for label in configs}) > 1]
+    named = {"seed", "dropout", "noise", "regularizer", "analytic", "loss", "density"}  # in the names of the runs
+    return markdown_table(rows, ["setting", *configs]) if rows else "", [x for x in differing if x not in named]
 
 
 def _dynamics(runs: dict[str, Path]) -> tuple[str, list[str]]:
@@ -177,6 +250,23 @@ def _dynamics(runs: dict[str, Path]) -> tuple[str, list[str]]:
         return data_uri(path.read_bytes(), "image/svg+xml"), missing
 
 
+def view_name(split: str, name: str) -> str:
+    """Return what people call a view.
+
+    Example:
+        >>> view_name("test", "test_0"), view_name("train", "IMG_4026")
+        ('test 0', 'train IMG_4026')
+    """
+    return f"{split} {name.removeprefix(split + '_')}"
+
+
+def _flight(each: Findings) -> list[list[float]]:
+    """Return the poses of a flight along the training views of a page, empty with a single one."""
+    cameras = [view.camera for view in each.views["train"]]
+    frames = interpolate_cameras(cameras, 30 * (len(cameras) - 1) + 1) if len(cameras) > 1 else []
+    return [[round(x, 5) for x in camera.world_to_camera[:3].flatten().tolist()] for camera in frames]
+
+
 def _views(found: Sequence[Findings]) -> list[dict[str, Any]]:
     """Return every view with its camera, its photograph, and the pictures of every run that was drawn there."""
     views: dict[tuple[str, str, str], dict[str, Any]] = {}
@@ -187,7 +277,7 @@ def _views(found: Sequence[Findings]) -> list[dict[str, Any]]:
                 camera = view.camera
                 pose = camera.world_to_camera[:3].flatten().tolist()
                 entry = views.setdefault((split, view.name, str(pose)), {
-                    "name": f"{split} {view.name}",
+                    "name": view_name(split, view.name),
                     "photograph": jpeg(view.image) if isinstance(view, View) else "",
                     "pose": pose,
                     "focal": [camera.fx, camera.fy],

@@ -14,7 +14,7 @@ from reference_trainer.evaluation.pictures import comparison_figure, dynamics_fi
 from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.evaluation.tables import comparison_table
 from reference_trainer.files import write_text
-from reference_trainer.runs.executors.executor import Failure
+from reference_trainer.runs.executors import Failure
 from reference_trainer.runs.folder import COMPARISON, RESULTS, check_output, folder_name
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.scenes import load_scene
@@ -178,23 +178,14 @@ class Comparison:
 
 
 def save(comparison: Comparison, out: Path) -> None:
-    """Write the results as JSON, and the table if any run finished.
-
-    Args:
-        comparison: the results.
-        out: folder of the comparison.
-    """
+    """Write the results as JSON, and the table if any run finished."""
     write_json(out / COMPARISON, {**dataclasses.asdict(comparison), "machine": machine()})
     if comparison.runs:
         write_text(out / TABLE, comparison_table(comparison.runs) + "\n")
 
 
 def report(comparisons: Mapping[Path, Comparison]) -> None:
-    """Log the table of every scene, draw the figures of its first seed, and name the runs that failed.
-
-    Args:
-        comparisons: the results by folder.
-    """
+    """Log the table of every scene, draw the figures of its first seed, and name the runs that failed."""
     for out, comparison in comparisons.items():
         _log.info(f"\n{out.name}:\n" if len(comparisons) > 1 else "")
         if comparison.runs:

@@ -19,7 +19,6 @@ from typing import Any
 from reference_trainer.json_files import read_json, settings_from
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig, saved_config
-from reference_trainer.training.plan import Plan
 
 __all__ = [
     "BAKED_PLY", "CHECKPOINT", "COMPARISON", "CONFIG", "LOCK", "PLAN", "PLY", "RESULTS", "VIEWS", "FolderInUseError",
@@ -95,6 +94,8 @@ def settings_of_run(
         ValueError: if the folder holds a run with other settings, a checkpoint without settings, or a damaged file;
             or no run, but files that a run would overwrite, or the photographs.
     """
+    from reference_trainer.training.plan import Plan  # needs torch
+
     trained = (out / CHECKPOINT).exists()  # looked for first: another process writes it last
     if not (out / CONFIG).exists():
         if trained:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from reference_trainer.render import chosen_engine, use_engine
-from reference_trainer.runs.executors.executor import Executor, Failure, Task, Value, attempt, run_all
+from reference_trainer.runs.executors import Executor, Failure, Task, Value, attempt, run_all
 from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes.options import SceneOptions
@@ -72,13 +72,8 @@ def run_grid(
 
     The folders of the runs are made here, so that a worker on another machine can tell whether it shares them.
 
-    Args:
-        runs: what to run.
-        running: where and how.
-        done: called in this process with each finished run and its results, before another run takes its place.
-
-    Returns:
-        For every run the content of ``results.json``, or its failure.
+    ``done`` is called in this process with each finished run and its results, before another run takes its place.
+    Returns, for every run, the content of ``results.json`` or its failure.
     """
     outcomes: dict[int, dict[str, Any] | Failure] = {}
 

@@ -17,11 +17,11 @@ from reference_trainer.evaluation.pictures import file_names, is_own_png, save_g
 from reference_trainer.evaluation.results import PARTIAL, machine, write_json
 from reference_trainer.evaluation.tables import evaluation_table
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.evaluation.trajectory import interpolate_cameras
 from reference_trainer.files import remove_leftovers, write_text
 from reference_trainer.runs.folder import VIEWS, check_output, run_lock
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene, Viewpoint
+from reference_trainer.scenes.virtual_cameras import interpolate_cameras
 from reference_trainer.threads import threads_for
 
 __all__ = ["load_run_model", "measure", "render_run"]

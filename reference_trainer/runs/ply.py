@@ -17,7 +17,6 @@ from reference_trainer.evaluation.evaluate import Evaluation
 from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.metrics import counted, psnr
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
@@ -26,18 +25,12 @@ from reference_trainer.runs.measure import measure
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import BACKGROUNDS, OrbitOptions, SceneOptions
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
-from reference_trainer.scenes.virtual_cameras import bounding_sphere, orbit_views
+from reference_trainer.scenes.virtual_cameras import bounding_sphere, measured_views, orbit_views
 
 __all__ = [
-    "ModelWithViews",
-    "PlyFacts",
-    "check_frame",
-    "load_for_views",
-    "load_plain_ply_model",
-    "load_ply_model",
-    "scaled",
-    "score_ply",
-]
+    "ModelWithViews", "PlyFacts", "check_frame", "load_for_views", "load_plain_ply_model", "load_ply_model",
+    "scaled", "score_ply",
+]  # fmt: skip
 
 _log = logging.getLogger(__name__)
 

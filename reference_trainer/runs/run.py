@@ -21,7 +21,6 @@ from reference_trainer.evaluation.lpips import LPIPS, load_lpips
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import PARTIAL, machine, write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.files import remove_leftovers
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import (
@@ -44,6 +43,7 @@ from reference_trainer.runs.folder import (
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.scenes.virtual_cameras import measured_views
 from reference_trainer.threads import threads_for
 from reference_trainer.training.assembly import check
 from reference_trainer.training.checkpoint import load_checkpoint
@@ -99,10 +99,7 @@ def model_of(trainer: Trainer) -> TrainedModel:
 def save_for_viewers(model: TrainedModel, path: Path, *, pad_to_degree: int | None = None) -> None:
     """Write a model as a PLY with its test-time opacities, marked so that nothing scales them again.
 
-    Args:
-        model: what to write.
-        path: the file.
-        pad_to_degree: as in `save_ply`.
+    ``pad_to_degree`` is that of `save_ply`.
     """
     factor = model.factor  # a uniform one, which a reader can undo, or None
     save_ply(
@@ -129,7 +126,7 @@ def run_experiment(
     progress: bool = False,
     on_step: Callable[[Trainer], None] = lambda trainer: None,
 ) -> dict[str, Any]:
-    """Train on a scene and measure the result; continues where an earlier call stopped.
+    """Train on a scene, measure, and return what ``results.json`` holds; continues where an earlier call stopped.
 
     The folder receives ``config.json`` with the settings of the training; with ``auto`` also ``plan.json`` with the
     reasons for those that were not asked for; ``checkpoint.pt``; ``ca.jsonl`` and TensorBoard events;
@@ -149,9 +146,6 @@ def run_experiment(
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
         progress: whether to show a progress bar.
         on_step: called with the trainer, which it must not change, after every step and before each view is measured.
-
-    Returns:
-        The content of ``results.json``.
 
     Raises:
         ValueError: if the folder holds a run with other settings, a damaged file, or files that this program did not
@@ -287,7 +281,8 @@ def _train(
             score,
             out,
             views={name: group for name, group in views.items() if group},
-            every=1,  # `due` decides, because the last step is measured, too
+            every=every,
+            last_step=last,
             psnr=quality,
             details=details if monitoring.pictures else None,
             resume_step=trainer.step if resumed else None,
@@ -297,15 +292,13 @@ def _train(
             where = " and ".join(monitor.backends)
             _log.info("%s: CA and PSNR go to %s every %d steps and after the last", out, where, every)
             _write_settings(monitor, trainer)
-            step = trainer.step
-            if step > 0 and (step % every == 0 or step == last):  # perhaps missing; what is logged is not repeated
+            if trainer.step > 0:  # perhaps missing; what is logged is not repeated
                 monitor(trainer.step, trainer.gaussians.opacities)
 
         def after_step(trainer: Trainer) -> None:
             step = trainer.step
             if monitor is not None:
-                if step % every == 0 or step == last:
-                    monitor(step, trainer.gaussians.opacities)
+                monitor(step, trainer.gaussians.opacities)
                 _write_curves(monitor, trainer)
             if step % monitoring.checkpoint_every == 0 or step == last:
                 trainer.save(out / CHECKPOINT)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from reference_trainer.json_files import read_json
 from reference_trainer.scenes.colmap import COLMAP
+from reference_trainer.scenes.dense import dense_start
 from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
 from reference_trainer.scenes.formats import Capture, find_format, only_default, register_format
 from reference_trainer.scenes.frames import Frame, corner_displacement, load_view
@@ -87,6 +88,8 @@ def load_scene(options: SceneOptions, *, seed: int = 0) -> Scene:
     downscale, about_size = _downscale([*train, *test], options.downscale)
     load = partial(load_view, background=color, downscale=downscale, undistort=options.undistort)
     views = {"train": tuple(map(load, train)), "test": tuple(map(load, test))}
+    if options.points == "dense":
+        cloud, about_points = dense_start(views["train"], cloud)
     if options.depth == "points":
         views["train"] = tuple(point_prior(view, cloud) for view in views["train"])
     elif options.depth is not None:
@@ -115,9 +118,8 @@ def load_scene(options: SceneOptions, *, seed: int = 0) -> Scene:
 
 def _built_in(options: SceneOptions, seed: int) -> Scene:
     """Make the built-in scene."""
-    only_default(
-        "synthetic", images=options.images, split=options.split, points=options.points, background=options.background
-    )
+    points = None if options.points == "dense" else options.points
+    only_default("synthetic", images=options.images, split=options.split, points=points, background=options.background)
     downscale = options.downscale or 1.0
     width, height = (max(1, round(side / downscale)) for side in (160, 120))
     scene = synthetic_scene(width, height, train_views=options.views or 3, seed=seed)
@@ -125,6 +127,9 @@ def _built_in(options: SceneOptions, seed: int) -> Scene:
     if options.init is not None:
         start, cloud, note = model_start(options.init)
         scene = replace(scene, start=start, points=cloud, notes=(note,))
+    elif options.points == "dense":
+        cloud, note = dense_start(scene.train, scene.points)
+        scene = replace(scene, points=cloud, notes=(note,))
     return scene if options.depth is None else true_priors(scene, options.depth)
 
 

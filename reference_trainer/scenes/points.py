@@ -43,7 +43,9 @@ def choose_points(
     """Return the initial points that the option ``points`` asks for, and a note on the choice.
 
     It is ``"auto"``, ``"random"``, ``"random:<count>"``, or a ``.ply`` file or COLMAP folder within the scene;
-    ``held_out`` names the photographs that do not train; ``own`` are the points that the scene file names.
+    ``held_out`` names the photographs that do not train; ``own`` are the points that the scene file names. For
+    ``"dense"`` these are the points of ``"auto"`` that tell a dense start (`reference_trainer.scenes.dense`) how far
+    the scene is, or none.
 
     Raises:
         FileNotFoundError: if the file or folder is missing.
@@ -51,7 +53,7 @@ def choose_points(
     """
     kind, _, count = points.partition(":")
     passed = ""
-    if points == "auto":
+    if points in ("auto", "dense"):
         offered = [own] if own is not None else []
         offered += [cloud for folder in colmap_folders(root) if (cloud := colmap_points(folder)) is not None]
         names, held_out = [frame.name for frame in train], list(held_out)
@@ -59,6 +61,8 @@ def choose_points(
         if honest:
             best = max(reversed(honest), key=lambda cloud: len(cloud.positions))
             return best, f"initial points: {len(best.positions):,} from {best.source}"
+        if points == "dense":
+            return PointCloud(torch.empty(0, 3), torch.empty(0, 3), source="none", seen_by=frozenset()), ""
         kind = "random"
         if offered:
             passed = (

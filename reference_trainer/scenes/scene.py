@@ -65,13 +65,14 @@ class PointCloud:
     """Points to initialize Gaussians from: world coordinates and RGB in [0, 1], both (M, 3), float32.
 
     ``source`` says for the log where they come from; ``seen_by`` names all images that they were triangulated from, if
-    that is known.
+    that is known; ``confidence`` is in [0, 1], (M,), where the points were measured by a dense start.
     """
 
     positions: Tensor
     colors: Tensor
     source: str
     seen_by: frozenset[str] | None = None
+    confidence: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
-"""Cameras where no photograph was taken: around a model that has no scene, and between the training cameras."""
+"""Cameras where no photograph was taken, around a model or between the training cameras, and where to measure it."""
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, get_args
@@ -12,14 +13,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.options import World
-from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.scene import Scene, Viewpoint
 
 __all__ = [
     "VIRTUAL_VIEWS", "BoundingSphere", "CameraPath", "bounding_sphere", "camera_between", "cameras_between",
-    "depth_bounds", "look_at", "orbit_views", "pseudo_cameras",
+    "depth_bounds", "interpolate_cameras", "look_at", "measured_views", "orbit_views", "pseudo_cameras",
 ]  # fmt: skip
+
+_log = logging.getLogger(__name__)
 
 ELEVATION = math.radians(20)
 """Elevation of the cameras above the center: objects are mostly looked at from a little above."""
@@ -299,3 +303,52 @@ def depth_bounds(scene: Scene) -> tuple[float, float]:
     if not bounds:
         raise ValueError(f"scene {scene.name!r} has no initial point in a training picture: give other points.")
     return min(near for near, _ in bounds), max(far for _, far in bounds)
+
+
+def interpolate_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """Move through cameras in order, in equal steps: positions along straight lines, orientations along great arcs.
+
+    ``frames`` includes the first and the last camera; intrinsics and size are those of the first. Raises ValueError if
+    there are fewer than two cameras or frames.
+
+    Example:
+        >>> first = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
+        >>> pose = torch.eye(4)
+        >>> pose[0, 3] = 1.0
+        >>> [c.position[0].item() for c in interpolate_cameras([first, replace(first, world_to_camera=pose)], 3)]
+        [0.0, -0.5, -1.0]
+    """
+    if len(cameras) < 2 or frames < 2:
+        raise ValueError(f"a path needs at least 2 cameras and 2 frames, got {len(cameras)} and {frames}.")
+    path = []
+    for along in torch.linspace(0, len(cameras) - 1, frames).tolist():
+        i = min(int(along), len(cameras) - 2)
+        pose = camera_between(cameras[i], cameras[i + 1], along - i).world_to_camera
+        path.append(replace(cameras[0], world_to_camera=pose))
+    return path
+
+
+def measured_views(scene: Scene) -> dict[str, Sequence[Viewpoint]]:
+    """Return the views of a scene that a model is measured at, by split: ``"train"`` and ``"test"``.
+
+    If all photographs are trained on, viewpoints without one replace the test views, and the log says so:
+    ``"between"``, halfway from each training camera to its nearest neighbor, and ``"around"``, as far in the opposite
+    direction. Orientations are inter- and extrapolated alike. A single camera has neither.
+    """
+    if scene.test:
+        return {"train": scene.train, "test": scene.test}
+    _log.info(
+        "No test views: no quality at unseen views, only what needs no photograph there, such as exact CA, measured "
+        "between and around the training views."
+    )
+    cameras = [view.camera for view in scene.train]
+    if len(cameras) < 2:
+        return {"train": scene.train}
+    nearest = nearest_neighbors(torch.stack([camera.position for camera in cameras]), 1)[1][:, 0].tolist()
+    pairs = sorted({(min(pair), max(pair)) for pair in enumerate(nearest)})
+    new = {
+        "between": [camera_between(cameras[i], cameras[j], 0.5) for i, j in pairs],
+        "around": [camera_between(cameras[i], cameras[j], -0.5) for i, j in enumerate(nearest)],
+    }
+    numbered = {split: [Viewpoint(f"{i:03d}", camera) for i, camera in enumerate(of)] for split, of in new.items()}
+    return {"train": scene.train, **numbered}

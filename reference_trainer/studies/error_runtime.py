@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
-from reference_trainer.evaluation.maps import first_order_map
+from reference_trainer.evaluation.metrics import first_order_map
 from reference_trainer.evaluation.style import COLORS, WIDTH
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel

@@ -15,7 +15,7 @@ import torch
 from reference_trainer.evaluation.results import ResultStore, fingerprint, machine, write_json
 from reference_trainer.evaluation.style import new_figure
 from reference_trainer.files import write_text
-from reference_trainer.runs.executors.executor import Executor, Failure, Task, run_all
+from reference_trainer.runs.executors import Executor, Failure, Task, run_all
 from reference_trainer.runs.folder import CHECKPOINT, run_lock
 
 if TYPE_CHECKING:  # an extra

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,9 +18,8 @@ from reference_trainer.model.rendering import arguments
 from reference_trainer.render import splat
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.density import DensityStrategy
 
-__all__ = ["ModelState", "initial_gaussians", "seen_by_any"]
+__all__ = ["Density", "ModelState", "initial_gaussians", "seen_by_any"]
 
 
 def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
@@ -74,7 +73,26 @@ def seen_by_any(gaussians: Gaussians, views: tuple[View, ...]) -> Tensor:
     return seen
 
 
-class ModelState:
+class Density(Protocol):
+    """What a `ModelState` asks of its density control, of any `DensityStrategy`."""
+
+    def begin(self, config: TrainConfig, scene: Scene, device: torch.device, count: int) -> None:
+        """Prepare for a training that begins with ``count`` Gaussians."""
+
+    def reset(self, count: int) -> None:
+        """Start counting anew, for ``count`` Gaussians."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the counts."""
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+
+
+D = TypeVar("D", bound=Density)
+
+
+class ModelState(Generic[D]):
     """Gaussians with an optimizer, density control and regularizers of their own; a training has one, or several.
 
     All models of a training start from the same points and diverge by their random numbers: every model has its own for
@@ -96,7 +114,8 @@ class ModelState:
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
-        >>>         >>> scene, config = synthetic_scene(width=16, height=12, points=50), TrainConfig()
+        >>> from reference_trainer.training.assembly import make_density, make_regularizer
+        >>> scene, config = synthetic_scene(width=16, height=12, points=50), TrainConfig()
         >>> state = ModelState(scene, config, make_density(config), make_regularizer(config))
         >>> len(state.gaussians)
         50
@@ -106,7 +125,7 @@ class ModelState:
         self,
         scene: Scene,
         config: TrainConfig,
-        density: DensityStrategy,
+        density: D,
         regularizer: Chain,
         *,
         device: torch.device | str = "cpu",

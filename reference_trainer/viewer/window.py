@@ -20,12 +20,12 @@ from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.camera import Camera
 from reference_trainer.evaluation.pictures import as_pillow
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import NotFiniteError
 from reference_trainer.rotations import rotation_matrices
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import Viewpoint
+from reference_trainer.scenes.virtual_cameras import measured_views
 from reference_trainer.threads import threads_for
 from reference_trainer.training.trainer import Trainer
 from reference_trainer.viewer.picture import DisplayOptions, Mode, ViewerModel

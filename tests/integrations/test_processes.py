@@ -10,7 +10,7 @@ from urllib.error import URLError
 import numpy as np
 import pytest
 
-from ca_reg.integrations._environment import Watch, in_children
+from ca_reg.integrations._scripts import Watch, in_children
 from ca_reg.integrations.run import main
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path), "OMP_NUM_THREADS": "1"}

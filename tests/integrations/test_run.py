@@ -15,7 +15,7 @@ from launched import draws, launch, seen
 from stand_ins.inria import Model, make_rasterizer, make_render
 
 from ca_reg import Chain
-from ca_reg.integrations._sources import find_script
+from ca_reg.integrations._scripts import find_script
 from ca_reg.integrations.gsplat import Installation
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.integrations.run import _parse, main

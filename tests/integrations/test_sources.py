@@ -6,7 +6,7 @@ import textwrap
 
 import pytest
 
-from ca_reg.integrations._sources import Sources, read_folder, read_script
+from ca_reg.integrations._scripts import Sources, read_folder, read_script
 from ca_reg.integrations.run import main
 
 

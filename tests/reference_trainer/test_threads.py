@@ -3,7 +3,7 @@ import os
 import pytest
 import torch
 
-from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.executors import Processes
 from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.threads import chosen_threads, thread_count, threads_for
 from reference_trainer.training.trainer import Trainer

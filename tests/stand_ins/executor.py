@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from reference_trainer.runs.executors.executor import Answer, Task, attempt
+from reference_trainer.runs.executors import Answer, Task, attempt
 
 __all__ = ["Here"]
 

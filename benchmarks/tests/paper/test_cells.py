@@ -22,7 +22,7 @@ from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.runs import grid as grid_module
-from reference_trainer.runs.executors.executor import Failure
+from reference_trainer.runs.executors import Failure
 from reference_trainer.runs.grid import Running
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions

@@ -28,21 +28,9 @@ from reference_trainer.render.constants import (
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
-    "PIXELS",
-    "Block",
-    "blend_weights",
-    "blocks",
-    "composite",
-    "first_order",
-    "geometry_rows",
-    "moments",
-    "over",
-    "pad_entries",
-    "pixel_offsets",
-    "tile",
-    "untile",
-    "walk",
-]
+    "PIXELS", "Block", "blend_weights", "blocks", "composite", "first_order", "geometry_rows", "moments", "over",
+    "pad_entries", "pixel_offsets", "tile", "untile", "walk",
+]  # fmt: skip
 
 PIXELS = TILE * TILE
 _ABSENT = -1e4  # binary logarithm of the opacity of padding: its alpha is exactly 0

@@ -15,22 +15,10 @@ from reference_trainer.render import Splats, rasterize, splat
 from reference_trainer.render.renderer import render_moments
 
 __all__ = [
-    "IMAGES",
-    "PARAMETERS",
-    "RATE",
-    "SCENE_QUANTITIES",
-    "Quantities",
-    "StressScene",
-    "base_scene",
-    "camera_of",
-    "independent_images",
-    "loss_weights",
-    "reference_quantities",
-    "render_simply",
-    "scene_quantities",
-    "splats_of",
+    "IMAGES", "PARAMETERS", "RATE", "SCENE_QUANTITIES", "Quantities", "StressScene", "base_scene", "camera_of",
+    "independent_images", "loss_weights", "reference_quantities", "render_simply", "scene_quantities", "splats_of",
     "stack",
-]
+]  # fmt: skip
 
 PARAMETERS = ("means", "quaternions", "scales", "opacities", "colors")
 """Names of the Gaussians' tensors, in the order of the renderer's arguments."""

@@ -24,14 +24,9 @@ from reference_trainer.studies.stability.quantities import SCENE_QUANTITIES
 from reference_trainer.studies.study import Record, Records, Study, run_study
 
 __all__ = [
-    "GRADIENT_TOLERANCE",
-    "VALUE_TOLERANCE",
-    "judge",
-    "judge_with",
-    "relative_error",
-    "stability_study",
+    "GRADIENT_TOLERANCE", "VALUE_TOLERANCE", "judge", "judge_with", "relative_error", "stability_study",
     "study_stability",
-]
+]  # fmt: skip
 
 VALUE_TOLERANCE = 1e-3
 """Largest error of an image, a moment or a score that counts as right: a quarter of an 8-bit step."""

@@ -8,17 +8,9 @@ from reference_trainer.training.density.pruning import CoPruning, SelfEnsembling
 from reference_trainer.training.density.strategy import DensityStrategy
 
 __all__ = [
-    "DENSITY",
-    "AbsGradDensity",
-    "AdaptiveDensity",
-    "CoPruning",
-    "DensityStrategy",
-    "MCMCDensity",
-    "ProximityDensity",
-    "RayBoxDensity",
-    "SelfEnsembling",
-    "SharePruning",
-]
+    "DENSITY", "AbsGradDensity", "AdaptiveDensity", "CoPruning", "DensityStrategy", "MCMCDensity",
+    "ProximityDensity", "RayBoxDensity", "SelfEnsembling", "SharePruning",
+]  # fmt: skip
 
 DENSITY: Registry[DensityStrategy] = Registry(
     "density strategy",

@@ -13,15 +13,9 @@ from reference_trainer.rotations import rotation_matrices
 from reference_trainer.training.interruption import TrainingStoppedError
 
 __all__ = [
-    "DensityStatistics",
-    "clone",
-    "decay_opacity",
-    "is_large",
-    "prune",
-    "refuse_not_finite",
-    "reset_opacity",
+    "DensityStatistics", "clone", "decay_opacity", "is_large", "prune", "refuse_not_finite", "reset_opacity",
     "split",
-]
+]  # fmt: skip
 
 
 @dataclass

@@ -5,30 +5,19 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.render import ViewSplats
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.model_state import ModelState
 
-__all__ = ["ControlledModel", "DensityStrategy"]
-
-
-class ControlledModel(Protocol):
-    """What a strategy may look at and change of a `ModelState`."""
-
-    optimizer: GaussianOptimizer
-    density: DensityStrategy
-
-    @property
-    def gaussians(self) -> Gaussians:
-        """The model as it stands."""
+__all__ = ["DensityStrategy"]
 
 
 class DensityStrategy(abc.ABC):
@@ -92,7 +81,7 @@ class DensityStrategy(abc.ABC):
             TrainingStoppedError: if the Gaussians are not finite, or none is left.
         """
 
-    def together(self, models: Sequence[ControlledModel], step: int) -> None:  # noqa: B027
+    def together(self, models: Sequence[ModelState[DensityStrategy]], step: int) -> None:  # noqa: B027
         """Change models by comparing them with each other: pruning what another one lacks, for example.
 
         Called once a step, of the first model's strategy, after `before_step` of every model's. Most

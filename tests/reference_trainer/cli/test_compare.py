@@ -9,8 +9,7 @@ from reference_trainer.cli import main
 from reference_trainer.runs import compare as compare_module
 from reference_trainer.runs import executors as choice_module
 from reference_trainer.runs.compare import Comparison
-from reference_trainer.runs.executors.executor import Failure
-from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.executors import Failure, Processes
 from reference_trainer.scenes.options import SceneOptions
 
 

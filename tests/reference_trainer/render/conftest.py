@@ -16,8 +16,8 @@ def engine(request, monkeypatch) -> str:
 
 
 def chosen(name: str, monkeypatch: pytest.MonkeyPatch) -> str:
-    if name == "numba":
-        pytest.importorskip("numba")
+    if name in ("numba", "triton"):
+        pytest.importorskip(name)
     monkeypatch.setenv("CA_REG_ENGINE", name)
     return name
 

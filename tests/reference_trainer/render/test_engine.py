@@ -1,13 +1,14 @@
 """Which engine renders, and the choice of the user afterwards."""
 
 import os
+from importlib.util import find_spec
 
 import pytest
 import torch
 from oracles import random_scene
 
 from reference_trainer.render import describe_engine, render, use_engine
-from reference_trainer.render.engine import engines_on, using_engine
+from reference_trainer.render.engine import engine_for, engines_on, using_engine
 
 pytest.importorskip("numba")
 
@@ -39,7 +40,9 @@ def test_the_line_that_says_which():
     threads = torch.get_num_threads()
     assert describe_engine("cpu").startswith("numba (")
     assert describe_engine("cpu").endswith(f", {threads} thread{'s' * (threads > 1)})")
-    assert describe_engine("cuda") == "torch"  # also where there is no card, as before a sweep on other machines
+    assert describe_engine("cuda").split()[0] == (
+        "triton" if find_spec("triton") else "torch"
+    )  # also where there is no card, as before a sweep on other machines
     use_engine("torch")
     assert describe_engine("cpu") == "torch"
 
@@ -87,4 +90,32 @@ def test_an_engine_that_is_not_there_changes_nothing(monkeypatch):
 
 def test_loops_draw_on_a_cpu_alone():
     assert engines_on(torch.device("cpu")) == ("numba", "torch")
+    assert engines_on(torch.device("cuda")) == (("triton", "torch") if find_spec("triton") else ("torch",))
+
+
+def test_triton_renders_float32_on_a_card_and_if_interpreted_on_a_cpu(monkeypatch):
+    """Also where there is no card, as before a sweep on other machines."""
+    pytest.importorskip("triton")
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    for chosen, device, dtype, name in [
+        ("auto", "cuda", torch.float32, "triton"),
+        ("auto", "cuda", torch.float64, "torch"),
+        ("torch", "cuda", torch.float32, "torch"),
+        ("triton", "cuda", torch.float32, "triton"),
+        ("triton", "cpu", torch.float64, "torch"),
+    ]:
+        monkeypatch.setenv("CA_REG_ENGINE", chosen)
+        assert engine_for(torch.device(device), dtype).name == name
+    assert engine_for(torch.device("cpu")).name != "triton"  # compiled kernels cannot run there
+    monkeypatch.setenv("CA_REG_ENGINE", "triton")
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    assert engine_for(torch.device("cpu")).name == "triton"
+    assert describe_engine("cpu").startswith("triton ")
+    assert describe_engine("cpu").endswith("interpreted)")
+
+
+def test_triton_that_is_missing_is_an_error_only_if_asked_for(monkeypatch):
+    monkeypatch.setattr("reference_trainer.render.engine._triton_engine", lambda: None)
     assert engines_on(torch.device("cuda")) == ("torch",)
+    with pytest.raises(ImportError, match="pip install triton"), using_engine("triton"):
+        pass

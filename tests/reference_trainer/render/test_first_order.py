@@ -5,7 +5,7 @@ import torch
 from oracles import brute_force, random_scene
 
 from ca_reg.functional import Multiplier, first_order_variance
-from reference_trainer.evaluation.maps import first_order_map
+from reference_trainer.evaluation.metrics import first_order_map
 from reference_trainer.render import splat
 
 

@@ -3,7 +3,7 @@
 import torch
 from oracles import brute_force, random_scene
 
-from reference_trainer.evaluation.maps import color_variance_map
+from reference_trainer.evaluation.metrics import color_variance_map
 from reference_trainer.render import splat
 
 

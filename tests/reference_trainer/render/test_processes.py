@@ -90,9 +90,9 @@ def test_ray_workers_draw_with_the_chosen_engine():
     assert "done" in run(
         DRAW
         + """
-from reference_trainer.runs.executors.executor import Task, Value
-from reference_trainer.runs.executors.ray_cluster import RayCluster
-from reference_trainer.runs.executors.executor import run_all
+from reference_trainer.runs.executors import Task, Value
+from reference_trainer.runs.executors import RayCluster
+from reference_trainer.runs.executors import run_all
 expected = picture()
 answers = [answer for _, answer in run_all(RayCluster(2), [Task(str(i), picture, ()) for i in range(4)])]
 assert answers == [Value(expected)] * 4, answers

@@ -87,25 +87,33 @@ def test_a_page_holds_all_that_it_shows(pair):
 
 def test_the_tables_are_those_of_the_runs(pair):
     runs, page = pair
-    for run in runs:
+    names = ["Dropout 0.2 + noise 0.3", "Dropout 0.2 + noise(0.3, scale=True)"]
+    assert [each["label"] for each in page.data["runs"]] == names
+    assert [each["name"] for each in page.data["strategies"]] == names
+    for i, (run, name) in enumerate(zip(runs, names, strict=True)):
         results = json.loads((run / "results.json").read_text())
         for view in results["views"]:
-            assert f"| {view['split']} {view['name']} | {view['psnr']:.2f} |" in page.data["perView"][run.name]
-        assert f"| {run.name} | {results['mean']['test']['psnr']:.2f} |" in page.data["scores"]
-        assert f"{run.name}: 11 steps with dropout(0.2) + noise(0.3" in " ".join(page.data["about"])
-        assert f"| {run.name} | " in page.data["attribution"]
+            shown = page_module.view_name(view["split"], view["name"])
+            assert f"| {shown} | {view['psnr']:.2f} |" in page.data["perView"][name]
+        column = page.data["scores"][0]
+        assert (column["split"], column["title"]) == ("test", "PSNR")
+        assert column["cells"][i]["text"] == f"{results['mean']['test']['psnr']:.2f}"
+        assert f"{name}: 11 steps with dropout(0.2) + noise(0.3" in " ".join(page.data["about"])
+        assert f"| {name} | " in page.data["attribution"]
+    assert "ca-reg report " in page.data["made"]
     assert "| noise | 0.3 | 0.0 |" in page.data["settings"]
     assert "\n| sh_rate |" not in page.data["settings"]  # the default in both
 
 
 def test_the_curves_are_those_that_were_measured(pair):
-    (without, with_), page = pair
+    _, page = pair
+    without, with_ = (each["label"] for each in page.data["runs"])
     assert page.data["dynamics"].startswith("data:image/svg+xml;base64,")
     figure = b64decode(page.data["dynamics"].partition(",")[2])
-    assert f"{with_.name} test".encode() in figure  # the legend
-    assert without.name.encode() not in figure
+    assert f"{with_} test".encode() in figure  # the legend
+    assert without.encode() + b" test" not in figure
     assert [note for note in page.data["notes"] if "against the step" in note] == [
-        f"{without.name}: no CA and PSNR against the step, because nothing was measured while it trained."
+        f"{without}: no CA and PSNR against the step, because nothing was measured while it trained."
     ]
 
 
@@ -113,10 +121,10 @@ def test_the_views_come_with_their_pictures(pair):
     runs, page = pair
     names = [view["name"] for view in page.data["views"]]
     assert names == [
-        "test test_0",
-        "test test_outside",
-        "train train_0",
-        "train train_2",
+        "test 0",
+        "test outside",
+        "train 0",
+        "train 2",
     ]
     model, scene = load_run_model(runs[1])
     for view, entry in zip(two_of_each(scene), page.data["views"], strict=True):
@@ -174,19 +182,23 @@ def test_what_a_run_lacks_is_left_out_with_a_word(tmp_path, options, short, opac
     out = write_report([tmp_path / "mine"])
     assert out == tmp_path / "mine" / "report.html"
     page = Parsed(out)
-    assert page.data["scores"] == page.data["dynamics"] == ""
+    assert page.data["scores"] == []
+    assert page.data["dynamics"] == ""
+    assert page.data["verdict"] == "No verdict: no run has been trained to its end."
+    name = "Dropout 0.2 + noise 0.3"
     assert page.data["perView"] == {}
     notes = " ".join(page.data["notes"])
-    assert "mine: no scores, it has not been trained to its end." in notes
-    assert "mine: no CA and PSNR against the step" in notes
+    assert f"{name}: no scores, it has not been trained to its end." in notes
+    assert f"{name}: no CA and PSNR against the step" in notes
     assert {view["name"].split()[0] for view in page.data["views"]} == {"between", "around", "train"}
+    assert page.data["views"][0]["photograph"]  # nothing else can be compared with one
     for view in page.data["views"]:
         trained = view["name"].startswith("train")
         assert bool(view["photograph"]) == ("error" in view["pictures"][0]) == trained
         assert "render" in view["pictures"][0]
         assert ("co-adaptation" in view["pictures"][0]) == (opacity == 0.9)
     assert bool(page.data["attribution"]) == (opacity == 0.9)
-    assert ("mine: no co-adaptation: none of the" in notes) == (opacity != 0.9)
+    assert (f"{name}: no co-adaptation: none of the" in notes) == (opacity != 0.9)
 
 
 def test_a_damaged_log_is_told_from_none(tmp_path):
@@ -219,16 +231,17 @@ def test_what_is_no_run_or_no_pair_is_refused(run, found, tmp_path, monkeypatch)
     with pytest.raises(ValueError, match="at least 1 view"):
         write_report([run[0]], views=0)
     elsewhere = dataclasses.replace(found, scene=dataclasses.replace(found.scene, name="elsewhere"))
+    shutil.copytree(run[0], tmp_path / "other")
     monkeypatch.setattr(page_module, "find", lambda folder, *_, **__: found if folder == run[0] else elsewhere)
     with pytest.raises(ValueError, match=r"a report is about one scene.*synthetic.*elsewhere"):
-        write_report([run[0], tmp_path], tmp_path / "page.html")
+        write_report([run[0], tmp_path / "other"], tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
 
 def test_text_from_files_cannot_end_the_data(run, found, tmp_path, monkeypatch):
     bad = "</script><script>alert(1)</script>"
     monkeypatch.setattr(page_module, "find", lambda *_, **__: dataclasses.replace(found, label=bad))
-    monkeypatch.setattr(page_module, "labels", lambda runs: [bad])
+    monkeypatch.setattr(page_module, "unique_names", lambda *_: [bad])
     page = Parsed(write_report([run[0]], tmp_path / "page.html"))
     assert sum(tag == "script" for tag, _ in page.tags) == 2
     assert page.data["runs"][0]["label"] == bad
@@ -320,7 +333,9 @@ def test_a_browser_shows_the_heat_and_hides_what_co_adapts_most(turned, opened):
 @needs_browser
 def test_a_drag_turns_all_models_about_one_point(turned, opened):
     before = shown(opened, "$('from').value = 0; $('from').onchange()")
-    at = opened.run("scrollTo(0, 0); (({ x, y }) => ({ x, y }))(models[1].canvas.getBoundingClientRect())")
+    at = opened.run(
+        "models[1].canvas.scrollIntoView(); (({ x, y }) => ({ x, y }))(models[1].canvas.getBoundingClientRect())"
+    )
     start = {"x": at["x"] + 20, "y": at["y"] + 20}
     opened("Input.dispatchMouseEvent", type="mousePressed", button="left", **start)
     moved = {"x": start["x"] + 40, "y": start["y"] - 15}
@@ -340,12 +355,63 @@ def test_a_drag_turns_all_models_about_one_point(turned, opened):
 
 @pytest.mark.slow
 @needs_browser
-def test_a_slider_reveals_one_picture_after_the_other(opened):
-    clips = "[...document.querySelector('.stack').children].map(image => image.style.clipPath)"
-    for value, hidden in ((0, [0, 100, 100, 100]), (1.5, [0, 0, 50, 100]), (3, [0, 0, 0, 0])):
-        assert opened.run(f"$('kind').value = {value}; $('kind').oninput(); {clips}") == [
-            f"inset(0px {part}% 0px 0px)" for part in hidden
-        ]
+def test_any_two_pictures_are_wiped_flickered_and_enlarged(turned, opened):
+    view = Parsed(turned[1]).data["views"][0]
+    assert opened.run("[$('left').value, $('right').value]") == ["photograph", "render"]
+    images = "[...document.querySelectorAll('#views .stack')].slice(0, 2).map(box => [...box.children].slice(0, 2)"
+    sources, clip = f"{images}.map(image => image.src))", f"{images}.map(image => image.style.clipPath))"
+    expected = [[view["photograph"], view["pictures"][run]["render"]] for run in (0, 1)]
+    assert opened.run(sources) == expected
+    assert opened.run(f"$('wipe').value = 30; $('wipe').oninput(); {clip}")[0][1] == "inset(0px 0px 0px 30%)"
+    # Each run's CA map against the render of the second.
+    opened.run("$('left').value = 'co-adaptation'; $('right').value = 'render/1'; $('left').oninput()")
+    expected = [[view["pictures"][run]["co-adaptation"], view["pictures"][1]["render"]] for run in (0, 1)]
+    assert opened.run(sources) == expected
+    turns = f"$('flicker').click(), new Promise(done => setTimeout(() => done({clip}[0][1]), 900))"
+    assert opened.run(turns) == "inset(0px 0px 0px 0%)"  # after one turn the right picture covers the left
+    assert opened.run(f"$('flicker').click(); {clip}")[0][1] == "inset(0px 0px 0px 30%)"
+    opened.run("stacks[1].box.focus()")
+    for key in ("Enter", "PageDown"):
+        opened("Input.dispatchKeyEvent", type="keyDown", key=key, text="\r" if key == "Enter" else "")
+        opened("Input.dispatchKeyEvent", type="keyUp", key=key)
+    assert opened.run("[$('large').open, $('which').textContent.split(' · ')[1], document.activeElement.id]") == [
+        True, Parsed(turned[1]).data["views"][1]["name"], "wide",
+    ]  # fmt: skip
+    opened.run("$('close').click()")
+
+
+@pytest.mark.slow
+@needs_browser
+def test_the_models_move_by_keys_and_along_the_flight_and_are_reset(turned, opened):
+    flight, state = Parsed(turned[1]).data["flight"], "JSON.stringify(camera)"
+    before = opened.run(f"$('reset').click(); {state}")
+    key = "models[0].canvas.dispatchEvent(new KeyboardEvent('keydown', {{ key: '{}' }}))"
+    for name in ("ArrowLeft", "+"):
+        assert (after := opened.run(f"{key.format(name)}; {state}")) != before
+        assert opened.run(f"$('reset').click(); {state}") == before != after
+    moved = "new Promise(done => setTimeout(() => { $('play').click(); done([...camera.rotation]) }, 300))"
+    rotation = opened.run(f"$('play').click(), {moved}")
+    assert any(np.allclose(np.array(pose).reshape(3, 4)[:, :3].flatten(), rotation) for pose in flight)
+    assert opened.run(f"$('reset').click(); {state}") == before
+
+
+@pytest.mark.slow
+@needs_browser
+@pytest.mark.parametrize("width", [360, 1200, 2560])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_fits_its_window_in_light_and_dark(turned, width, scheme):
+    with Page(turned[1], width=width) as page:
+        page("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        page.run("document.querySelectorAll('details').forEach(part => { part.open = true; })")
+        assert page.run("document.documentElement.scrollWidth") == width
+        corner = page.picture()[:, :5, :5].mean()
+        assert corner < 0.2 if scheme == "dark" else corner > 0.9
+        first, second = page.run("models.map(({ canvas }) => canvas.getBoundingClientRect().toJSON())")
+        assert (second["top"] > first["top"]) == (width < 700)  # stacked
+        hint = page.run("document.querySelector('.hint').focus(); hint.ariaDescription")
+        tip = page.run("[$('tip').hidden, $('tip').textContent, $('tip').getBoundingClientRect().right]")
+        assert tip[:2] == [False, hint]
+        assert tip[2] <= width
 
 
 @pytest.mark.slow
@@ -372,4 +438,25 @@ def test_a_comparison_stands_for_the_first_seed_of_each_strategy(run, tmp_path):
     write_json(tmp_path / "comparison.json", {"runs": {"baseline": [], "dropout": []}, "failures": {}})
     out = write_report([tmp_path], views=1)
     assert out == tmp_path / "report.html"
-    assert [each["label"] for each in Parsed(out).data["runs"]] == ["baseline/seed_0", "dropout/seed_2"]
+    labels = [each["label"] for each in Parsed(out).data["runs"]]
+    assert labels == [f"Dropout 0.2 + noise 0.3 ({name})" for name in ("baseline/seed_0", "dropout/seed_2")]
+
+
+def test_the_scores_of_a_comparison_are_those_of_all_its_seeds(run, tmp_path):
+    settings, results = (json.loads((run[0] / name).read_text()) for name in (CONFIG, "results.json"))
+    for name, dropout, noise, psnr in (("mine", 0.2, 0.0, (20.0, 22.0)), ("baseline", 0.0, 0.0, (19.0, 20.0))):
+        for seed, value in enumerate(psnr):
+            folder = tmp_path / name / f"seed_{seed}"
+            shutil.copytree(run[0], folder)
+            changed = {"seed": seed, "dropout": dropout, "noise": noise}
+            write_json(folder / CONFIG, settings | {"config": settings["config"] | changed})
+            means = results["mean"] | {"test": results["mean"]["test"] | {"psnr": value}}
+            write_json(folder / "results.json", results | {"config": results["config"] | changed, "mean": means})
+    data = Parsed(write_report([tmp_path], views=1)).data
+    assert [each["label"] for each in data["runs"]] == ["Baseline", "Dropout 0.2"]
+    assert data["strategies"] == [{"name": "Baseline", "seeds": 2}, {"name": "Dropout 0.2", "seeds": 2}]
+    cells = data["scores"][0]["cells"]
+    assert [cell["text"] for cell in cells] == ["19.50 ± 0.71", "21.00 ± 1.41"]
+    assert (cells[1]["delta"], cells[1]["better"], cells[1]["best"], cells[0]["best"]) == ("+1.50", True, True, False)
+    # Two standard errors are 2 sqrt(0.5 / 2 + 2 / 2) = 2.24.
+    assert data["verdict"].startswith("Dropout 0.2: a PSNR that cannot be told apart (+1.50 dB) and ")

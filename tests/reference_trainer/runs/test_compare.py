@@ -29,8 +29,7 @@ from reference_trainer.runs.compare import (
     scene_folders,
     strategies,
 )
-from reference_trainer.runs.executors import choose_executor
-from reference_trainer.runs.executors.executor import Failure
+from reference_trainer.runs.executors import Failure, choose_executor
 from reference_trainer.runs.folder import RESULTS
 from reference_trainer.runs.grid import Running
 from reference_trainer.runs.measure import render_run

@@ -13,7 +13,7 @@ from filelock import FileLock
 from stand_ins.executor import Here
 
 from reference_trainer.runs.compare import compare
-from reference_trainer.runs.executors.executor import Value
+from reference_trainer.runs.executors import Value
 from reference_trainer.runs.folder import CHECKPOINT, LOCK, RESULTS, FolderInUseError, run_lock
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.runs.measure import load_run_model

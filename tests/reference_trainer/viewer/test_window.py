@@ -7,13 +7,12 @@ import pytest
 import torch
 from browser import CHROMIUM, Page
 
-from reference_trainer.evaluation.trajectory import measured_views
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.scene import Viewpoint
-from reference_trainer.scenes.virtual_cameras import orbit_views
+from reference_trainer.scenes.virtual_cameras import measured_views, orbit_views
 from reference_trainer.viewer import window
 from reference_trainer.viewer.picture import DisplayOptions, ViewerModel
 from reference_trainer.viewer.window import MOST, Viewer, _camera, _pose

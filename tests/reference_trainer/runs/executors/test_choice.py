@@ -2,9 +2,7 @@ import sys
 
 import pytest
 
-from reference_trainer.runs.executors import choose_executor
-from reference_trainer.runs.executors.processes import Processes
-from reference_trainer.runs.executors.ray_cluster import RayCluster
+from reference_trainer.runs.executors import Processes, RayCluster, choose_executor
 
 
 @pytest.fixture(autouse=True)

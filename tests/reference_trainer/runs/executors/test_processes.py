@@ -12,8 +12,7 @@ import sweep_tasks
 from subprocesses import subprocess_environment
 from waiting import PATIENCE, until
 
-from reference_trainer.runs.executors.executor import Failure, Task, Value, run_all
-from reference_trainer.runs.executors.processes import Processes
+from reference_trainer.runs.executors import Failure, Processes, Task, Value, run_all
 
 
 def gone(pid):

@@ -11,8 +11,7 @@ import sweep_tasks
 from subprocesses import PYTHONPATH
 from waiting import until
 
-from reference_trainer.runs.executors.executor import Failure, Task, Value, run_all
-from reference_trainer.runs.executors.ray_cluster import RayCluster
+from reference_trainer.runs.executors import Failure, RayCluster, Task, Value, run_all
 
 
 @pytest.fixture(autouse=True)

@@ -4,7 +4,7 @@ from collections import defaultdict
 
 import pytest
 
-from reference_trainer.runs.executors.executor import Death, Failure, Task, Value, attempt, run_all
+from reference_trainer.runs.executors import Death, Failure, Task, Value, attempt, run_all
 
 
 class Told:

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.trajectory import interpolate_cameras, measured_views
 from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.scenes.virtual_cameras import interpolate_cameras, measured_views
 
 
 def rotation(axis: torch.Tensor, degrees: float) -> torch.Tensor:

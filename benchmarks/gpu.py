@@ -1,0 +1,407 @@
+"""The first minute on a card: tests, agreement, times, memory, launches, as a table to paste into an issue.
+
+    python -m benchmarks.gpu          # everything that this machine can do; what fails is named, and the rest goes on
+    python -m benchmarks.gpu ahead    # without a card: all kernels compiled for all targets (or for those named)
+    python -m benchmarks.gpu count    # without a card: operations, read-backs and bytes of an exact score
+
+``count`` runs the kernels in Triton's interpreter where there is no card.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import time
+import traceback
+import warnings
+import weakref
+from collections import Counter
+from collections.abc import Callable
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from ca_reg import CAScore
+from ca_reg.functional import Multiplier
+from reference_trainer.camera import Camera
+from reference_trainer.render import describe_engine, rasterize, render_masks, render_moments, splat, use_engine
+
+__all__ = ["Counts", "bytes_per_entry", "count_exact_score", "main"]
+
+ROOT = Path(__file__).resolve().parents[1]
+TESTS = "tests/reference_trainer/render/triton"
+_SIZES = {"small": (20_000, 400, 0.02), "middle": (100_000, 800, 0.012), "large": (500_000, 800, 0.006)}
+
+
+class Model(NamedTuple):
+    """Random Gaussians in a cube before a square picture: what is measured, the same on every machine."""
+
+    tensors: list[Tensor]  # means, quaternions, scales, opacities, colors
+    camera: Camera
+
+    @classmethod
+    def of(cls, count: int, width: int, scale: float, device: torch.device | str) -> Model:
+        """Draw a number of Gaussians of a size."""
+        g = torch.Generator().manual_seed(0)
+        means, quaternions = torch.rand(count, 3, generator=g) - 0.5, torch.randn(count, 4, generator=g)
+        scales = scale * torch.exp(torch.rand(count, 3, generator=g) - 0.5)
+        opacities, colors = 0.1 + 0.8 * torch.rand(count, generator=g), torch.rand(count, 3, generator=g)
+        pose = torch.eye(4)
+        pose[2, 3] = 1.5
+        camera = Camera(pose, 1.2 * width, 1.2 * width, width / 2, width / 2, width, width).to(device, torch.float32)
+        return cls([x.to(device) for x in (means, quaternions, scales, opacities, colors)], camera)
+
+    def moments(self, opacity: Tensor, view: Camera, multiplier: Multiplier, background: Tensor | None) -> Any:
+        """Render exact moments: what `CAScore` takes."""
+        means, quaternions, scales, _, colors = self.tensors
+        return render_moments(
+            splat(means, quaternions, scales, opacity, view, colors=colors), multiplier, background=background
+        )
+
+
+class Counts(NamedTuple):
+    """What an exact score costs, beyond its arithmetic.
+
+    ``rendering`` of the operations (kernels of Triton included) are those of the engine, without the checks of its
+    inputs and without what the score does with the moments.
+    """
+
+    operations: int
+    rendering: int
+    read_backs: int
+    entries: int
+
+
+class _Operations(TorchDispatchMode):
+    """Counts operations that would launch something on a card, waits for a card, and the bytes of what lives."""
+
+    _FREE = ("empty", "detach", "alias", "lift_fresh", "_unsafe_view", "_local_scalar_dense", "set_", "new_empty")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: Counter[str] = Counter()
+        self.alive: dict[int, tuple[int, int]] = {}  # bytes and tensors of a storage, by its address
+        self.now = self.peak = 0
+        self.paused = False
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        if self.paused:
+            return out
+        schema = func._schema
+        view = any(x.alias_info is not None and not x.alias_info.is_write for x in schema.arguments)
+        if not view:
+            self.names[schema.name.removeprefix("aten::")] += 1
+        for x in pytree.tree_leaves(out):
+            if isinstance(x, Tensor):
+                self._hold(x)
+        return out
+
+    def _hold(self, x: Tensor) -> None:
+        storage = x.untyped_storage()
+        key = storage.data_ptr()
+        size, holders = self.alive.get(key, (storage.nbytes(), 0))
+        self.alive[key] = size, holders + 1
+        self.now += size if holders == 0 else 0
+        self.peak = max(self.peak, self.now)
+        weakref.finalize(x, self._release, key)
+
+    def _release(self, key: int) -> None:
+        size, holders = self.alive.pop(key)
+        if holders > 1:
+            self.alive[key] = size, holders - 1
+        else:
+            self.now -= size
+
+    @property
+    def launches(self) -> int:
+        return sum(n for name, n in self.names.items() if name not in self._FREE)
+
+    @property
+    def read_backs(self) -> int:
+        return self.names["_local_scalar_dense"] + self.names["nonzero"]
+
+
+@contextmanager
+def _outside_of_kernels(mode: _Operations) -> Any:
+    """Do not count what Triton's interpreter itself does, where it runs."""
+    import triton.runtime.interpreter as interpreter
+
+    run = interpreter.GridExecutor.__call__
+
+    def paused(*args: Any, **kwargs: Any) -> Any:
+        mode.paused = True
+        try:
+            return run(*args, **kwargs)
+        finally:
+            mode.paused = False
+
+    interpreter.GridExecutor.__call__ = paused
+    try:
+        yield
+    finally:
+        interpreter.GridExecutor.__call__ = run
+
+
+def _counted(work: Callable[[], Any]) -> tuple[int, _Operations, Any]:
+    """Return the launches of a call, what was counted, and what it returned."""
+    from reference_trainer.render.triton import tiles
+
+    mode, before = _Operations(), sum(tiles.LAUNCHED.values())
+    with _outside_of_kernels(mode), mode:
+        out = work()
+    return mode.launches + sum(tiles.LAUNCHED.values()) - before, mode, out
+
+
+@torch.no_grad()
+def count_exact_score(count: int, width: int, scale: float, device: torch.device | str = "cpu") -> Counts:
+    """Count what the exact score of a view costs with the engine triton, by PyTorch's dispatcher."""
+    use_engine("triton")
+    model = Model.of(count, width, scale, device)
+    means, quaternions, scales, opacities, colors = model.tensors
+    score = partial(CAScore(exact=model.moments, drop_rate=0.5), opacities, model.camera)
+    score()  # loads what is loaded once
+    splats = splat(means, quaternions, scales, opacities, model.camera, colors=colors)
+    inputs = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities, "colors": colors}
+    multiplier, behind = torch.full((count, 2), 0.25, device=device), torch.zeros(3, width, width, device=device)
+
+    def rendering() -> Any:
+        projection, shown = splats.engine.project(inputs, splats.indices, model.camera, None)
+        lists = splats.engine.bin(projection, opacities, width, width)
+        shown_splats = splats._replace(projection=projection, colors=shown, lists=lists)
+        return splats.engine.moments(shown_splats, multiplier, behind)
+
+    operations, mode, _ = _counted(score)
+    return Counts(operations, _counted(rendering)[0], mode.read_backs, len(splats.lists.gaussians))
+
+
+@torch.no_grad()
+def bytes_per_entry(device: torch.device | str = "cpu") -> float:
+    """Return the bytes that every further list entry takes at the peak, which is while lists are made.
+
+    Of the tensors that PyTorch hands out: what `torch.sort` takes for itself on a card is not seen here.
+    """
+    use_engine("triton")
+    peaks, entries = [], []
+    for scale in (0.1, 2.0):
+        model = Model.of(60, 64, scale, device)
+        splats = splat(*model.tensors[:4], model.camera, colors=model.tensors[4])
+        _, mode, lists = _counted(partial(splats.engine.bin, splats.projection, splats.opacities, 64, 64))
+        peaks.append(mode.peak)
+        entries.append(len(lists.gaussians))
+    return (peaks[1] - peaks[0]) / (entries[1] - entries[0])
+
+
+def _count() -> str:
+    """Return the table of counts, in the interpreter where there is no card."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    if device == "cpu" and os.environ.get("TRITON_INTERPRET") != "1":
+        command, environment = [sys.executable, "-m", "benchmarks.gpu", "count"], os.environ | {"TRITON_INTERPRET": "1"}
+        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+    rows = [count_exact_score(*size, device) for size in ((24, 24, 0.05), (24, 24, 0.2), (48, 40, 0.1))]
+    out = ["| entries | operations of an exact score | of them the engine's | read-backs |", "|---:|---:|---:|---:|"]
+    out += [f"| {x.entries} | {x.operations} | {x.rendering} | {x.read_backs} |" for x in rows]
+    return "\n".join(out) + f"\n\n{bytes_per_entry(device):.1f} bytes per list entry at the peak."
+
+
+def _ahead(targets: list[str]) -> str:
+    """Return the table of what the kernels need; raise if one spills."""
+    from benchmarks.ahead import KERNELS, TARGETS, compile_ahead, markdown
+
+    rows, unknown = [], []
+    for target in targets or TARGETS:
+        try:
+            rows += [compile_ahead(kernel, target) for kernel in KERNELS]
+        except Exception as error:
+            unknown.append(f"{target}: {str(error).splitlines()[0][:200]}")
+    spilled = [f"{x.kernel} on {x.target}: {x.spills}" for x in rows if x.spills]
+    if spilled or not rows:
+        raise RuntimeError("\n".join([markdown(rows), "", "spills: " + ", ".join(spilled), *unknown]))
+    return "\n".join([markdown(rows), "", *(f"not compiled: {x}" for x in unknown)])
+
+
+def _tests() -> str:
+    """Run the tests that need a card; raise with their last lines if one fails."""
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "gpu", "-p", "no:cacheprovider"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(done.stdout[-3000:])
+    return done.stdout.strip().splitlines()[-1]
+
+
+def _times() -> str:
+    """Return milliseconds, peak memory, kernel launches and waits of renders, gradients, masks and scores."""
+    device = torch.device("cuda")
+    out = [
+        "| workload | work | engine | ms, median of 20 | peak MiB | launches | waits |",
+        "|:--|:--|:--|---:|---:|---:|---:|",
+    ]
+    for name, size in _SIZES.items():
+        model = Model.of(*size, device)
+        keep = (torch.rand(5, size[0], device=device) > 0.5).float()
+        score = CAScore(exact=model.moments, drop_rate=0.5)
+
+        def forward() -> Any:
+            return rasterize(splat(*model.tensors[:4], model.camera, colors=model.tensors[4])).image  # noqa: B023
+
+        def backward() -> Any:
+            leaves = [x.clone().requires_grad_() for x in model.tensors]  # noqa: B023
+            rasterize(splat(*leaves[:4], model.camera, colors=leaves[4])).image.square().sum().backward()  # noqa: B023
+
+        def masks() -> Any:
+            splats = splat(*model.tensors[:4], model.camera, colors=model.tensors[4])  # noqa: B023
+            return render_masks(splats, model.tensors[3] * keep)  # noqa: B023
+
+        works = {
+            "render": torch.no_grad()(forward),
+            "render and gradients": backward,
+            "five masks": torch.no_grad()(masks),
+            "exact score": torch.no_grad()(partial(score, model.tensors[3], model.camera)),
+        }
+        for engine in ("triton", *(["torch"] if name == "small" else [])):
+            use_engine(engine)
+            for label, work in works.items():
+                out.append(f"| {name} | {label} | {engine} | {' | '.join(_measure(work))} |")
+        out += _gsplat_times(name, model)
+    return "\n".join(out)
+
+
+def _measure(work: Callable[[], Any]) -> list[str]:
+    """Return the median time, the peak of memory, launches and waits of a call, as text; or what it failed with."""
+    try:
+        return _measured(work)
+    except Exception as error:  # name it, and measure the next
+        return [f"FAILED: {str(error).splitlines()[0][:100] if str(error) else type(error).__name__}", "", "", ""]
+
+
+def _measured(work: Callable[[], Any]) -> list[str]:
+    for _ in range(3):
+        work()
+    times = []
+    for _ in range(20):
+        begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        begin.record()
+        work()
+        end.record()
+        torch.cuda.synchronize()
+        times.append(begin.elapsed_time(end))
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    work()
+    peak = (torch.cuda.max_memory_allocated() - before) / 2**20
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        work()
+        torch.cuda.synchronize()
+    on_card = (x for x in profile.events() if x.device_type == torch.autograd.DeviceType.CUDA)
+    kernels = sum(not x.name.startswith(("Memcpy", "Memset")) for x in on_card)
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            work()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    waits = sum("synchronizing" in str(x.message) for x in caught)
+    return [f"{statistics.median(times):.2f}", f"{peak:.0f}", str(kernels), str(waits)]
+
+
+def _gsplat_times(name: str, model: Model) -> list[str]:
+    """Return rows of gsplat's own render, and of the exact score over its lists; none where it is missing."""
+    try:
+        import gsplat
+    except ImportError:
+        return []
+    from reference_trainer.render.triton.gsplat import GsplatMoments
+
+    means, quats, scales, opacities, colors = model.tensors
+    render = partial(_rasterize, gsplat, model)
+    moments = GsplatMoments(lambda opacity, _: (colors, render(means, quats, scales, opacity, colors)[2]))
+
+    def backward() -> None:
+        leaves = [x.clone().requires_grad_() for x in model.tensors]
+        render(*leaves)[0].square().sum().backward()
+
+    works = {
+        "render": torch.no_grad()(lambda: render(means, quats, scales, opacities, colors)),
+        "render and gradients": backward,
+        "exact score over its lists": lambda: CAScore(exact=moments, drop_rate=0.5)(opacities, None),
+    }
+    label = f"gsplat {gsplat.__version__}"
+    return [f"| {name} | {what} | {label} | {' | '.join(_measure(work))} |" for what, work in works.items()]
+
+
+def _rasterize(gsplat: Any, model: Model, *tensors: Tensor) -> Any:
+    """Render with gsplat, not packed."""
+    c = model.camera
+    intrinsics = torch.tensor([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]], device=tensors[0].device)
+    pose = c.world_to_camera[None]
+    return gsplat.rasterization(*tensors, pose, intrinsics[None], c.width, c.height, near_plane=0.2, packed=False)
+
+
+def _agreement() -> str:
+    """Return how far gsplat and the engines torch and triton are apart, on a card."""
+    model = Model.of(5_000, 256, 0.03, "cuda")
+    images, variances = {}, {}
+    for engine in ("torch", "triton"):
+        use_engine(engine)
+        with torch.no_grad():
+            splats = splat(*model.tensors[:4], model.camera, colors=model.tensors[4])
+            images[engine] = rasterize(splats).image
+            variances[engine] = render_moments(splats, Multiplier.dropout(0.5)).variance
+    try:
+        import gsplat
+
+        from reference_trainer.render.triton.gsplat import GsplatMoments
+
+        with torch.no_grad():
+            shown, _, meta = _rasterize(gsplat, model, *model.tensors)
+        moments = GsplatMoments(lambda opacity, view: (model.tensors[4], meta))
+        images["gsplat"] = shown[0].permute(2, 0, 1)
+        variances["gsplat"] = moments(model.tensors[3], None, Multiplier.dropout(0.5), None).variance
+    except ImportError:
+        pass
+    out = ["| against the engine torch | largest difference of a color | of a variance |", "|:--|---:|---:|"]
+    for name in images.keys() - {"torch"}:
+        apart = ((x[name] - x["torch"]).abs().max().item() for x in (images, variances))
+        out.append(f"| {name} | {' | '.join(f'{x:.1e}' for x in apart)} |")
+    return "\n".join(out)
+
+
+def main(arguments: list[str]) -> int:
+    """Print one section, or all that this machine can do; return the number of those that failed."""
+    alone: dict[str, Callable[[], str]] = {"ahead": partial(_ahead, arguments[1:]), "count": _count}
+    if arguments and arguments[0] not in alone:
+        print(f"there is no {arguments[0]!r}: give ahead, count, or nothing.", file=sys.stderr)
+        return 2
+    if arguments:
+        sections = {arguments[0]: alone[arguments[0]]}
+    elif torch.cuda.is_available():
+        sections = {"agreement": _agreement, "times": _times, "count": _count, "tests on the card": _tests}
+        print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}, {describe_engine('cuda')}\n")
+    else:
+        sections = alone
+        print("No card: what follows was compiled, or interpreted on a processor. Nothing here ran on a card.\n")
+    failed = 0
+    for name, section in sections.items():
+        begun = time.perf_counter()
+        try:
+            text = section()
+        except Exception as error:  # a card can refuse anything: name it, and go on
+            failed += 1
+            text = f"FAILED: {''.join(traceback.format_exception_only(error)).strip()}"
+        if not arguments:
+            print(f"### {name} ({time.perf_counter() - begun:.0f} s)\n")
+        print(text + "\n", flush=True)
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""The engine of Triton kernels, for NVIDIA and AMD cards."""

@@ -1,0 +1,113 @@
+"""Which Gaussian touches which tile of the image, in depth order: one sort, and one number that the processor reads."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from reference_trainer.render.constants import MIN_ALPHA, TILE
+from reference_trainer.render.splats import Projection, TileLists
+from reference_trainer.render.triton.tiles import launch
+
+__all__ = ["bin_gaussians"]
+
+_MIN_ALPHA = tl.constexpr(MIN_ALPHA)
+_GROUP = 16  # Gaussians of a program, and columns of tiles that it lists at once: most cover fewer than 8,
+_LANES = 8  # and one that covers 10,000 tiles keeps a program busy for 1,250 steps, not for 10,000
+
+
+@triton.jit
+def _boundary(dy, side, limit, x, l11, l21, l22):
+    """Return the x of the left (side -1) or right (1) boundary of an ellipse, dy below its center."""
+    half = tl.sqrt(tl.maximum(limit - (l22 * dy) * (l22 * dy), 0.0))
+    return x + (side * half - l21 * dy) / l11
+
+
+@triton.jit(do_not_specialize=["count", "width", "height", "columns", "listing"])
+def list_tiles(
+    order, means, factors, covariances, opacities, counts, ends, touched,
+    keys, gaussians, count, width, height, columns, listing, TILE: tl.constexpr,
+    GROUP: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
+    """Count the tiles of Gaussians, nearest first, or list them, from ``ends - counts`` on.
+
+    Both by the same machine code: two compilations could contract products and sums differently, and a tile on the
+    boundary of an ellipse be counted and not listed.
+
+    Within a row of tiles, the pixel centers from dy = upper to lower, an ellipse |(l11 dx + l21 dy, l22 dy)|^2 < limit
+    reaches furthest to the right at its tip, dy = xy sqrt(limit / xx), or at the end of the row that is nearest to it;
+    furthest to the left likewise, at -tip. So a row's tiles are an interval, exactly.
+    """
+    k = tl.program_id(0) * GROUP + tl.arange(0, GROUP)
+    real = k < count
+    i = tl.load(order + k, mask=real, other=0).to(tl.int32)
+    x, y = tl.load(means + 2 * i, mask=real), tl.load(means + 2 * i + 1, mask=real)
+    l11, l21 = tl.load(factors + 3 * i, mask=real, other=1.0), tl.load(factors + 3 * i + 1, mask=real, other=0.0)
+    l22 = tl.load(factors + 3 * i + 2, mask=real, other=1.0)
+    xx, xy = tl.load(covariances + 3 * i, mask=real, other=1.0), tl.load(covariances + 3 * i + 1, mask=real, other=0.0)
+    yy = tl.load(covariances + 3 * i + 2, mask=real, other=1.0)
+    limit = 2 * tl.maximum(tl.log(tl.load(opacities + i, mask=real, other=1.0) / _MIN_ALPHA), 0.0)
+    reach, tip = tl.sqrt(limit * yy), xy * tl.sqrt(limit / xx)
+    top = tl.minimum(tl.maximum(tl.ceil(y - reach - 0.5), 0.0), height.to(tl.float32)).to(tl.int32)
+    bottom = tl.maximum(tl.minimum(tl.floor(y + reach - 0.5), height.to(tl.float32) - 1), -1.0).to(tl.int32)
+    first_row = top // TILE
+    rows = tl.where(real & (bottom >= top), bottom // TILE - first_row + 1, 0)
+    found = tl.zeros([GROUP], tl.int32)
+    # While counting, both are not yet written, and the difference not used.
+    place = tl.load(ends + k, mask=real, other=0) - tl.load(counts + k, mask=real, other=0)
+    for r in range(0, tl.max(rows)):
+        row = first_row + r
+        upper = (row * TILE).to(tl.float32) + 0.5 - y
+        lower = tl.minimum(row * TILE + TILE, height).to(tl.float32) - 0.5 - y
+        left = _boundary(tl.minimum(tl.maximum(-tip, upper), lower), -1.0, limit, x, l11, l21, l22)
+        right = _boundary(tl.minimum(tl.maximum(tip, upper), lower), 1.0, limit, x, l11, l21, l22)
+        left = tl.minimum(tl.maximum(tl.ceil(left - 0.5), 0.0), width.to(tl.float32)).to(tl.int32)
+        right = tl.maximum(tl.minimum(tl.floor(right - 0.5), width.to(tl.float32) - 1), -1.0).to(tl.int32)
+        first = left // TILE
+        spanned = tl.where((r < rows) & (right >= left), right // TILE - first + 1, 0)
+        if listing != 0:
+            for j in range(0, tl.max(spanned), LANES):
+                lane = j + tl.arange(0, LANES)
+                mask = lane[None, :] < spanned[:, None]
+                at = (place + found)[:, None] + lane[None, :]
+                tl.store(keys + at, (row * columns + first)[:, None] + lane[None, :], mask=mask)
+                tl.store(gaussians + at, i[:, None] + tl.zeros([1, LANES], tl.int32), mask=mask)
+        found += spanned
+    if listing == 0:
+        tl.store(counts + k, found, mask=real)
+        tl.store(touched + i, found > 0, mask=real)
+
+
+def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
+    """List the Gaussians of every tile, see `Engine.bin`.
+
+    Listed nearest first, they only need a stable sort by tile: of 16-bit numbers in two passes, where keys of tile and
+    depth would take eight. It holds at most 24 bytes per entry, the lists among them.
+    """
+    columns, count = -(-width // TILE), len(opacities)
+    tiles = columns * -(-height // TILE)
+    short = torch.int16 if tiles < 2**15 else torch.int32
+    order = torch.argsort(projection.depths, stable=True)
+    shapes = (
+        x.detach().contiguous() for x in (projection.means, projection.factors, projection.covariances, opacities)
+    )
+    counts, ends = order.new_empty(count, dtype=torch.int32), torch.empty_like(order)
+    touched = order.new_empty(count, dtype=torch.bool)
+    given = order, *shapes, counts, ends, touched.view(torch.uint8)
+
+    def fill(keys: Tensor, gaussians: Tensor, listing: int) -> None:
+        size = count, width, height, columns, listing
+        constants = {"warps": 4, "TILE": TILE, "GROUP": _GROUP, "LANES": _LANES}
+        launch(list_tiles, (-(-count // _GROUP),), *given, keys, gaussians, *size, **constants)
+
+    nothing = counts[:0]
+    fill(nothing.view(short), nothing, 0)
+    total = int(torch.cumsum(counts, 0, out=ends)[-1]) if count else 0  # the one number read back
+    keys, gaussians = counts.new_empty(total, dtype=short), counts.new_empty(total)
+    if total:
+        fill(keys, gaussians, 1)
+    keys, by_tile = torch.sort(keys, stable=True)
+    edges = torch.arange(tiles + 1, dtype=short, device=order.device)
+    return TileLists(width, height, torch.searchsorted(keys, edges, out_int32=True), gaussians[by_tile], touched)

@@ -1,0 +1,333 @@
+"""From 3D Gaussians to colored 2D ellipses, a Gaussian per lane; formulas as in the engine of PyTorch operations."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from reference_trainer.camera import Camera
+from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
+from reference_trainer.render.splats import Projection
+from reference_trainer.render.triton.tiles import launch
+
+__all__ = ["project"]
+
+_DILATION = tl.constexpr(DILATION)
+_BLOCK = 128  # Gaussians of a program, one per lane: neighbors in memory, whose rows share cache lines
+
+# Normalization of the real spherical harmonics of degrees 0 to 3, as in `evaluate_sh`.
+_A, _B = tl.constexpr(math.sqrt(1 / (4 * math.pi))), tl.constexpr(math.sqrt(3 / (4 * math.pi)))
+_C, _D = tl.constexpr(math.sqrt(15 / (4 * math.pi))), tl.constexpr(math.sqrt(5 / (16 * math.pi)))
+_E, _F = tl.constexpr(math.sqrt(35 / (32 * math.pi))), tl.constexpr(math.sqrt(105 / (4 * math.pi)))
+_G, _H = tl.constexpr(math.sqrt(21 / (32 * math.pi))), tl.constexpr(math.sqrt(7 / (16 * math.pi)))
+
+
+@triton.jit
+def _load3(at, mask):
+    return (
+        tl.load(at, mask=mask, other=1.0),
+        tl.load(at + 1, mask=mask, other=1.0),
+        tl.load(at + 2, mask=mask, other=1.0),
+    )
+
+
+@triton.jit
+def _store3(at, a, mask):
+    tl.store(at, a[0], mask=mask)
+    tl.store(at + 1, a[1], mask=mask)
+    tl.store(at + 2, a[2], mask=mask)
+
+
+@triton.jit
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@triton.jit
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@triton.jit
+def _plus(a, scale, b):
+    """Return a + scale b."""
+    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
+
+
+@triton.jit
+def _times(scale, a):
+    return scale * a[0], scale * a[1], scale * a[2]
+
+
+@triton.jit
+def _by_column(row, r0, r1, r2):
+    """Return a row vector times the matrix with rows r0, r1, r2."""
+    return _plus(_plus(_times(row[0], r0), row[1], r1), row[2], r2)
+
+
+@triton.jit
+def _rotation(at, mask):
+    """Return a quaternion's rotation matrix by rows, the unit quaternion, and the factor that normalizes it."""
+    w, x = tl.load(at, mask=mask, other=1.0), tl.load(at + 1, mask=mask, other=0.0)
+    y, z = tl.load(at + 2, mask=mask, other=0.0), tl.load(at + 3, mask=mask, other=0.0)
+    # Divided by the largest component first: its square would overflow from 1e19 on, or underflow.
+    largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
+    scale = 1 / tl.maximum(largest, 1e-30)
+    w, x, y, z = w * scale, x * scale, y * scale, z * scale
+    norm = tl.sqrt(w * w + x * x + y * y + z * z)
+    inverse = tl.where(norm > 1e-12, 1 / tl.maximum(norm, 1e-12), 0.0)  # a zero quaternion gives the identity
+    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+    r0 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    r1 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    r2 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return r0, r1, r2, (w, x, y, z), scale * inverse
+
+
+@triton.jit
+def _view(view):
+    """Return the three rows of the view rotation."""
+    right = tl.load(view), tl.load(view + 1), tl.load(view + 2)
+    down = tl.load(view + 4), tl.load(view + 5), tl.load(view + 6)
+    return right, down, (tl.load(view + 8), tl.load(view + 9), tl.load(view + 10))
+
+
+@triton.jit
+def _ellipse(mean, r0, r1, r2, s, view, fx, fy, limit_x, limit_y):
+    """Project a Gaussian; return all that its gradient needs.
+
+    The covariance is u u^T + dilation with rows u_x, u_y = (Jacobian x view rotation) x rotation x scales. Its
+    determinant is a sum of squares (Cauchy-Binet), det = |u_x x u_y|^2 + dilation (xx + yy - dilation), where
+    xx yy - xy^2 would cancel for needles; divided by yy before it is squared, so that it does not overflow.
+    """
+    right, down, forward = _view(view)
+    x, y = _dot(right, mean) + tl.load(view + 3), _dot(down, mean) + tl.load(view + 7)
+    z = _dot(forward, mean) + tl.load(view + 11)
+    slope_x, slope_y = x / z, y / z
+    clipped_x = tl.minimum(tl.maximum(slope_x, -limit_x), limit_x)
+    clipped_y = tl.minimum(tl.maximum(slope_y, -limit_y), limit_y)
+    row_x = _times(fx / z, _plus(right, -clipped_x, forward))
+    row_y = _times(fy / z, _plus(down, -clipped_y, forward))
+    ax, ay = _by_column(row_x, r0, r1, r2), _by_column(row_y, r0, r1, r2)
+    ux, uy = (s[0] * ax[0], s[1] * ax[1], s[2] * ax[2]), (s[0] * ay[0], s[1] * ay[1], s[2] * ay[2])
+    xx, xy, yy = _dot(ux, ux) + _DILATION, _dot(ux, uy), _dot(uy, uy) + _DILATION
+    l22 = 1 / tl.sqrt(yy)
+    cross, spread = _cross(ux, _times(l22, uy)), (xx + yy - _DILATION) * _DILATION
+    l11 = 1 / tl.sqrt(_dot(cross, cross) + spread * (l22 * l22))
+    return (slope_x, slope_y, z), (row_x, row_y), (ax, ay), (ux, uy), (cross, spread), (xx, xy, yy), (l11, l22)
+
+
+@triton.jit
+def _basis(x, y, z):
+    """Return the 16 real spherical harmonics up to degree 3; those that nobody reads are never computed.
+
+    Constants stand on the right: in the interpreter, a `tl.constexpr` times a tensor would be a `tl.constexpr`.
+    """
+    xx, yy, zz = x * x, y * y, z * z
+    return (
+        0 * x + _A, y * -_B, z * _B, x * -_B,
+        x * y * _C, y * z * -_C, (2 * zz - xx - yy) * _D, x * z * -_C, (xx - yy) * (0.5 * _C),
+        y * (3 * xx - yy) * -_E, x * y * z * _F, y * (4 * zz - xx - yy) * -_G, z * (2 * zz - 3 * xx - 3 * yy) * _H,
+        x * (4 * zz - xx - yy) * -_G, z * (xx - yy) * (0.5 * _F), x * (xx - 3 * yy) * -_E,
+    )  # fmt: skip
+
+
+@triton.jit
+def _basis_slopes(x, y, z):
+    """Return the derivatives of the harmonics in x, y and z."""
+    xx, yy, zz, no = x * x, y * y, z * z, 0 * x
+    in_x = (
+        no, no, no, no - _B, y * _C, no, x * (-2 * _D), z * -_C, x * _C, x * y * (-6 * _E), y * z * _F,
+        x * y * (2 * _G), x * z * (-6 * _H), (4 * zz - 3 * xx - yy) * -_G, x * z * _F, (xx - yy) * (-3 * _E),
+    )  # fmt: skip
+    in_y = (
+        no, no - _B, no, no, x * _C, z * -_C, y * (-2 * _D), no, y * -_C, (xx - yy) * (-3 * _E), x * z * _F,
+        (4 * zz - xx - 3 * yy) * -_G, y * z * (-6 * _H), x * y * (2 * _G), y * z * -_F, x * y * (6 * _E),
+    )  # fmt: skip
+    in_z = (
+        no, no, no + _B, no, no, y * -_C, z * (4 * _D), x * -_C, no, no, x * y * _F, y * z * (-8 * _G),
+        (2 * zz - xx - yy) * (3 * _H), x * z * (-8 * _G), (xx - yy) * (0.5 * _F), no,
+    )  # fmt: skip
+    return in_x, in_y, in_z
+
+
+@triton.jit
+def _towards(mean, view):
+    """Return the unit vector from the camera, at -R^T t, to a mean, and one over their distance."""
+    right, down, forward = _view(view)
+    at = _plus(_plus(_times(tl.load(view + 3), right), tl.load(view + 7), down), tl.load(view + 11), forward)
+    offset = _plus(mean, 1.0, at)
+    inverse = 1 / tl.maximum(tl.sqrt(_dot(offset, offset)), 1e-12)
+    return _times(inverse, offset), inverse
+
+
+@triton.jit(do_not_specialize=["count"])
+def project_forward(
+    indices, means, quaternions, scales, sh, view, centers,
+    factors, covariances, depths, colors, count, fx, fy, cx, cy,
+    limit_x, limit_y, BANDS: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Project and color; BANDS harmonics of the ROW given ones, or plain colors if it is 0."""
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    real = k < count
+    i = tl.load(indices + k, mask=real, other=0)
+    mean, s = _load3(means + 3 * i, real), _load3(scales + 3 * i, real)
+    r0, r1, r2, _unit, _scale = _rotation(quaternions + 4 * i, real)
+    slopes, _rows, _axes, _u, _det, covariance, factor = _ellipse(mean, r0, r1, r2, s, view, fx, fy, limit_x, limit_y)
+    l11, l22 = factor
+    tl.store(centers + 2 * k, fx * slopes[0] + cx, mask=real)
+    tl.store(centers + 2 * k + 1, fy * slopes[1] + cy, mask=real)
+    _store3(factors + 3 * k, (l11, -covariance[1] * (l22 * l22) * l11, l22), real)
+    _store3(covariances + 3 * k, covariance, real)
+    tl.store(depths + k, slopes[2], mask=real)
+    given = sh + i * (3 * ROW)
+    color = _load3(given, real)
+    if BANDS > 0:
+        direction, _inverse = _towards(mean, view)
+        values = _basis(direction[0], direction[1], direction[2])
+        color = 0.5 + values[0] * color[0], 0.5 + values[0] * color[1], 0.5 + values[0] * color[2]
+        for j in tl.static_range(1, BANDS):
+            color = _plus(color, values[j], _load3(given + 3 * j, real))
+        # Minus infinity gives nan, and is refused, where a plain maximum with 0 would hide it.
+        r, g, b = color
+        color = tl.where(r < 0, 0 * r, r), tl.where(g < 0, 0 * g, g), tl.where(b < 0, 0 * b, b)
+    _store3(colors + 3 * k, color, real)
+
+
+@triton.jit(do_not_specialize=["count"])
+def project_backward(
+    indices, means, quaternions, scales, sh, view, colors,
+    to_centers, to_factors, to_depths, to_colors, to_means, to_quaternions,
+    to_scales, to_sh, count, fx, fy, limit_x, limit_y, BANDS: tl.constexpr,
+    ROW: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Carry gradients back to the Gaussians; nothing is kept of the forward pass but the colors that were cut at 0."""
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    real = k < count
+    i = tl.load(indices + k, mask=real, other=0)
+    mean, s = _load3(means + 3 * i, real), _load3(scales + 3 * i, real)
+    r0, r1, r2, unit, scale = _rotation(quaternions + 4 * i, real)
+    slopes, rows, axes, u, det, covariance, factor = _ellipse(mean, r0, r1, r2, s, view, fx, fy, limit_x, limit_y)
+    slope_x, slope_y, z = slopes
+    row_x, row_y = rows
+    ux, uy = u
+    cross, spread = det
+    xy = covariance[1]
+    l11, l22 = factor
+    t11, t21, t22 = _load3(to_factors + 3 * k, real)
+    # l21 = -xy l22^2 l11; l11 = square^(-1/2) with square = |cross|^2 + spread l22^2, cross = u_x x (l22 u_y), and
+    # spread = dilation (xx + yy - dilation); l22 = yy^(-1/2).
+    to_xy = -t21 * l22 * l22 * l11
+    to_square = -0.5 * l11 * l11 * l11 * (t11 - t21 * xy * l22 * l22)
+    to_cross = _times(2 * to_square, cross)
+    w = _times(l22, uy)
+    to_w = _cross(to_cross, ux)
+    to_l22 = t22 - 2 * t21 * xy * l22 * l11 + 2 * spread * l22 * to_square + _dot(to_w, uy)
+    to_xx = l22 * l22 * to_square * _DILATION
+    to_yy = to_xx - 0.5 * l22 * l22 * l22 * to_l22
+    to_ux = _plus(_plus(_cross(w, to_cross), 2 * to_xx, ux), to_xy, uy)
+    to_uy = _plus(_plus(_times(l22, to_w), 2 * to_yy, uy), to_xy, ux)
+    # u_j = s_j (row R)_j in both rows, so a scale meets the axis (row R)_j, and the row and R meet v = s to_u.
+    ax, ay = axes
+    to_s = to_ux[0] * ax[0] + to_uy[0] * ay[0], to_ux[1] * ax[1] + to_uy[1] * ay[1], to_ux[2] * ax[2] + to_uy[2] * ay[2]
+    _store3(to_scales + 3 * i, to_s, real)
+    vx, vy = (to_ux[0] * s[0], to_ux[1] * s[1], to_ux[2] * s[2]), (to_uy[0] * s[0], to_uy[1] * s[1], to_uy[2] * s[2])
+    to_row_x, to_row_y = (_dot(r0, vx), _dot(r1, vx), _dot(r2, vx)), (_dot(r0, vy), _dot(r1, vy), _dot(r2, vy))
+    m0 = _plus(_times(row_x[0], vx), row_y[0], vy)  # the gradient of the rotation matrix, by rows
+    m1 = _plus(_times(row_x[1], vx), row_y[1], vy)
+    m2 = _plus(_times(row_x[2], vx), row_y[2], vy)
+    qw, qx, qy, qz = unit
+    a12, a20, a01 = m2[1] - m1[2], m0[2] - m2[0], m1[0] - m0[1]
+    b12, b20, b01 = m2[1] + m1[2], m0[2] + m2[0], m1[0] + m0[1]
+    to_w_ = 2 * (qx * a12 + qy * a20 + qz * a01)
+    to_x_ = 2 * (qy * b01 + qz * b20 + qw * a12 - 2 * qx * (m1[1] + m2[2]))
+    to_y_ = 2 * (qx * b01 + qz * b12 + qw * a20 - 2 * qy * (m0[0] + m2[2]))
+    to_z_ = 2 * (qx * b20 + qy * b12 + qw * a01 - 2 * qz * (m0[0] + m1[1]))
+    along = qw * to_w_ + qx * to_x_ + qy * to_y_ + qz * to_z_  # a quaternion's length does not matter
+    tl.store(to_quaternions + 4 * i, scale * (to_w_ - along * qw), mask=real)
+    _store3(
+        to_quaternions + 4 * i + 1,
+        (scale * (to_x_ - along * qx), scale * (to_y_ - along * qy), scale * (to_z_ - along * qz)), real,
+    )  # fmt: skip
+    # row = f / z (axis - clipped slope x forward), center = f slope + c, slope = x / z; the clip passes no gradient.
+    right, down, forward = _view(view)
+    to_slope_x = fx * tl.load(to_centers + 2 * k, mask=real, other=0.0)
+    to_slope_y = fy * tl.load(to_centers + 2 * k + 1, mask=real, other=0.0)
+    to_slope_x -= tl.where(tl.abs(slope_x) <= limit_x, fx / z * _dot(forward, to_row_x), 0.0)
+    to_slope_y -= tl.where(tl.abs(slope_y) <= limit_y, fy / z * _dot(forward, to_row_y), 0.0)
+    to_z = tl.load(to_depths + k, mask=real, other=0.0)
+    to_z -= (_dot(row_x, to_row_x) + _dot(row_y, to_row_y) + slope_x * to_slope_x + slope_y * to_slope_y) / z
+    to_mean = _plus(_plus(_times(to_slope_x / z, right), to_slope_y / z, down), to_z, forward)
+    shown, to_color = _load3(colors + 3 * k, real), _load3(to_colors + 3 * k, real)
+    if BANDS == 0:
+        _store3(to_sh + 3 * i, to_color, real)
+    else:
+        r, g, b = to_color
+        r, g, b = tl.where(shown[0] > 0, r, 0.0), tl.where(shown[1] > 0, g, 0.0), tl.where(shown[2] > 0, b, 0.0)
+        direction, inverse = _towards(mean, view)
+        values = _basis(direction[0], direction[1], direction[2])
+        in_x, in_y, in_z = _basis_slopes(direction[0], direction[1], direction[2])
+        at, to_at = sh + i * (3 * ROW), to_sh + i * (3 * ROW)
+        to_direction = 0 * r, 0 * r, 0 * r
+        for j in tl.static_range(BANDS):
+            _store3(to_at + 3 * j, (values[j] * r, values[j] * g, values[j] * b), real)
+            to_value = _dot(_load3(at + 3 * j, real), (r, g, b))
+            to_direction = _plus(to_direction, to_value, (in_x[j], in_y[j], in_z[j]))
+        # direction = offset / |offset|: only what is across the direction turns it.
+        across = _plus(to_direction, -_dot(direction, to_direction), direction)
+        to_mean = _plus(to_mean, inverse, across)
+    _store3(to_means + 3 * i, to_mean, real)
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, indices: Tensor, camera: Camera,
+        bands: int,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        limits = (
+            FRUSTUM_MARGIN * 0.5 * size / f for size, f in ((camera.width, camera.fx), (camera.height, camera.fy))
+        )
+        ctx.size = len(indices), camera.fx, camera.fy
+        ctx.limits = tuple(limits)
+        ctx.constants = {"warps": 4, "BANDS": bands, "ROW": sh.shape[1], "BLOCK": _BLOCK}
+        given = [x.detach().contiguous() for x in (indices, means, quaternions, scales, sh)]
+        given.append(camera.world_to_camera.contiguous())
+        outputs = tuple(means.new_empty(len(indices), *shape) for shape in ((2,), (3,), (3,), (), (3,)))
+        grid = (triton.cdiv(len(indices), _BLOCK),)
+        launch(project_forward, grid, *given, *outputs, *ctx.size, camera.cx, camera.cy, *ctx.limits, **ctx.constants)
+        ctx.save_for_backward(*given, outputs[-1])
+        ctx.mark_non_differentiable(outputs[2])
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
+        saved = ctx.saved_tensors
+        to_centers, to_factors, _, to_depths, to_colors = (x.contiguous() for x in gradients)
+        found = [torch.zeros_like(x) for x in saved[1:5]]
+        grid, upstream = (triton.cdiv(ctx.size[0], _BLOCK),), (to_centers, to_factors, to_depths, to_colors)
+        launch(project_backward, grid, *saved, *upstream, *found, *ctx.size, *ctx.limits, **ctx.constants)
+        return (*found, None, None, None)
+
+
+def project(
+    inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
+) -> tuple[Projection, Tensor]:
+    """Project and color Gaussians, see `Engine.project`.
+
+    Raises:
+        NotImplementedError: if the camera's pose requires a gradient, which this engine does not compute.
+    """
+    if camera.world_to_camera.requires_grad:
+        raise NotImplementedError("the engine triton has no gradient of the camera's pose: use_engine('torch') has.")
+    sh, bands = (inputs["colors"][:, None], 0) if degree is None else (inputs["sh"], (degree + 1) ** 2)
+    *projection, colors = _Project.apply(  # type: ignore[no-untyped-call]
+        inputs["means"], inputs["quaternions"], inputs["scales"], sh, indices, camera, bands
+    )
+    return Projection(*projection), colors

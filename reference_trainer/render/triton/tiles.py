@@ -1,0 +1,173 @@
+"""What the kernels of a tile share: its pixels, the alphas of its splats at them, and where gradients go.
+
+A program renders one tile, two of its 64 pixels per lane of one warp (one on AMD's wide wavefronts). A warp needs no
+shared memory and no barriers, its values fit into registers, and 32 of them share a multiprocessor, which hides the
+latency of the loads: all lanes read the same row of the table, one transaction for the whole tile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any, NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
+from reference_trainer.render.splats import Splats, TileLists
+
+__all__ = [
+    "FAINT", "LAUNCHED", "ROW", "Lists", "add_row", "alpha_at", "geometry_sums", "gradient_rows", "launch", "make_row",
+    "make_table", "over_tiles", "pixels", "sum_rows",
+]  # fmt: skip
+
+ROW = tl.constexpr(16)
+"""Columns of a row of gradients: 64 bytes, so that the sums of an entry leave in one atomic instruction."""
+
+FAINT = tl.constexpr(math.log2(MIN_ALPHA))
+"""Binary logarithm of the alpha below which a splat is skipped."""
+
+_HALF = tl.constexpr(0.5 * math.log2(math.e))  # exp(-x / 2) = 2^(-_HALF x)
+
+LAUNCHED: Counter[str] = Counter()
+"""How often each kernel has been launched in this process."""
+
+
+class Lists(NamedTuple):
+    """The splats of every tile, nearest first: the package's own lists, or another rasterizer's.
+
+    Args:
+        starts: where each tile's list starts, row by row, and where the last ends, int32, shape (tiles + 1,).
+        gaussians: rows of the table, tile after tile, int32, shape (P,).
+        width: image width, pixels.
+        height: image height, pixels.
+        tile: side of a tile, pixels, a power of two.
+        max_alpha: where alphas are clamped.
+    """
+
+    starts: Tensor
+    gaussians: Tensor
+    width: int
+    height: int
+    tile: int = TILE
+    max_alpha: float = MAX_ALPHA
+
+    @classmethod
+    def of(cls, lists: TileLists) -> Lists:
+        """Return the package's own lists; those of another engine have other integers."""
+        return cls(lists.starts.int(), lists.gaussians.int(), lists.width, lists.height)
+
+    @property
+    def tiles(self) -> int:
+        """The number of tiles."""
+        return -(-self.width // self.tile) * -(-self.height // self.tile)
+
+
+def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 1, **constants: Any) -> None:
+    """Start the programs of a grid on the device of the first argument; an empty grid is no launch."""
+    if min(grid) > 0:
+        LAUNCHED[kernel.fn.__name__] += 1
+        with torch.cuda.device_of(arguments[0]):  # type: ignore[no-untyped-call]
+            kernel[grid](*arguments, num_warps=warps, enable_fp_fusion=True, **constants)
+
+
+def over_tiles(kernel: Any, lists: Lists, table: Tensor, *arguments: Any, programs: int = 0, **constants: Any) -> None:
+    """Start a program for every tile, or as many as told; a warp has 64 pixels."""
+    size = lists.width, lists.height, -(-lists.width // lists.tile)
+    launch(
+        kernel, (programs or lists.tiles,), table, lists.starts, lists.gaussians, *arguments, *size,
+        warps=max(1, lists.tile**2 // 64), STRIDE=table.shape[1], TILE=lists.tile, **constants,
+    )  # fmt: skip
+
+
+def make_table(splats: Splats, *more: Tensor) -> Tensor:
+    """Return x, y, l11, l21, l22, log2 of the opacity, red, green, blue, and more of M splats, shape (M, 9 or more)."""
+    p, opacities = splats.projection, splats.opacities.detach()
+    return torch.cat([p.means, p.factors, opacities.log2()[:, None], splats.colors, *more], dim=1).detach()
+
+
+def gradient_rows(lists: Lists, table: Tensor) -> tuple[Tensor, bool]:
+    """Return zeros for the rows of gradients, and whether there is one per entry instead of one per splat.
+
+    Atomic additions come in any order. Where PyTorch is asked for deterministic algorithms, every entry of the lists
+    has a row of its own, 64 bytes, which `sum_rows` adds up in one order.
+    """
+    each = torch.are_deterministic_algorithms_enabled()
+    return table.new_zeros(len(lists.gaussians) if each else len(table), ROW.value), each
+
+
+def sum_rows(rows: Tensor, each: bool, lists: Lists, count: int) -> Tensor:
+    """Return the gradients of ``count`` splats, (count, 16)."""
+    if not each:
+        return rows
+    gaussians, order = torch.sort(lists.gaussians, stable=True)
+    ends = torch.arange(count + 1, dtype=gaussians.dtype, device=rows.device)
+    return torch.segment_reduce(rows[order], "sum", offsets=torch.searchsorted(gaussians, ends), axis=0)
+
+
+@triton.jit
+def pixels(tile, width, height, columns, TILE: tl.constexpr):
+    """Return x and y of a tile's pixel centers, their places in an image, and which are inside of it."""
+    p = tl.arange(0, TILE * TILE)
+    x = tile % columns * TILE + p % TILE
+    y = tile // columns * TILE + p // TILE
+    return x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5, y * width + x, (x < width) & (y < height)
+
+
+@triton.jit
+def alpha_at(row, log_opacity, x, y):
+    """Return a splat's alpha at the pixels before the clamp, 0 below `MIN_ALPHA`, and its geometry there.
+
+    ln alpha = ln o - (w1^2 + w2^2) / 2 with w1 = l11 dx + l21 dy, w2 = l22 dy: squares of what is small wherever alpha
+    is not, so nothing cancels.
+    """
+    l11, l21, l22 = tl.load(row + 2), tl.load(row + 3), tl.load(row + 4)
+    dx, dy = x - tl.load(row), y - tl.load(row + 1)
+    w1, w2 = l11 * dx + l21 * dy, l22 * dy
+    exponent = log_opacity - (w1 * w1 + w2 * w2) * _HALF
+    return tl.where(exponent > FAINT, tl.exp2(exponent), 0.0), (dx, dy, w1, w2, l11, l21, l22)
+
+
+@triton.jit
+def geometry_sums(slope, geometry, log_opacity):
+    """Carry the gradients of ln alpha at the pixels, ``slope``, to x, y, l11, l21, l22 and the opacity.
+
+    As the pixel's offset is dx = pixel - x, the derivatives of ln alpha are l11 w1 in x, l21 w1 + l22 w2 in y, -w1 dx,
+    -w1 dy, -w2 dy in the factor, and 1 / o in the opacity.
+    """
+    dx, dy, w1, w2, l11, l21, l22 = geometry
+    s1, s2 = slope * w1, slope * w2
+    along, across = tl.sum(s1), tl.sum(s2)
+    to_factor = -tl.sum(s1 * dx), -tl.sum(s1 * dy), -tl.sum(s2 * dy)
+    to_y = l21 * along + l22 * across
+    return l11 * along, to_y, to_factor[0], to_factor[1], to_factor[2], tl.sum(slope) * tl.exp2(-log_opacity)
+
+
+@triton.jit
+def make_row(a, b, c):
+    """Put three times four sums into the first columns of a row, in a tree of choices by the bits of the column.
+
+    A mask for every column would take two of AMD's scalar registers each.
+    """
+    column = tl.arange(0, ROW)
+    odd, second = (column & 1) != 0, (column & 2) != 0
+    first = tl.where(second, tl.where(odd, a[3], a[2]), tl.where(odd, a[1], a[0]))
+    middle = tl.where(second, tl.where(odd, b[3], b[2]), tl.where(odd, b[1], b[0]))
+    last = tl.where(second, tl.where(odd, c[3], c[2]), tl.where(odd, c[1], c[0]))
+    return tl.where(column >= 8, last, tl.where((column & 4) != 0, middle, first))
+
+
+@triton.jit
+def add_row(rows, row, e, i, COLUMNS: tl.constexpr, EACH: tl.constexpr):
+    """Add the gradients of entry e to those of splat i, or store them as the entry's own.
+
+    Relaxed: additions need no order among other memory accesses, and the fences of the default would wait for each.
+    """
+    column = tl.arange(0, ROW).to(tl.int64)
+    if EACH:
+        tl.store(rows + (0 * column + e) * ROW + column, row, mask=column < COLUMNS)
+    else:
+        tl.atomic_add(rows + (0 * column + i) * ROW + column, row, mask=column < COLUMNS, sem="relaxed")

@@ -1,0 +1,180 @@
+"""What a report says first: natural names for the runs, the table of their scores, and a verdict made from its rows."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from reference_trainer.evaluation.tables import format_mean_std, mean_std
+from reference_trainer.training.config import TrainConfig
+
+__all__ = ["Rows", "natural_name", "natural_order", "score_columns", "unique_names", "verdict"]
+
+_USUAL = TrainConfig()
+_COLUMNS = [  # split, key, title, decimals, unit, whether the highest is best; None where neither end is a merit
+    ("test", "psnr", "PSNR", 2, 1.0, True),
+    ("test", "ssim", "SSIM", 3, 1.0, True),
+    ("test", "lpips", "LPIPS", 3, 1.0, False),
+    ("test", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
+    ("between", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
+    ("around", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
+    ("train", "psnr", "PSNR", 2, 1.0, None),
+    ("train", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, None),
+    ("", "gaussians", "Gaussians", 0, 1.0, None),
+    ("", "seconds", "seconds", 0, 1.0, None),
+]
+
+
+def natural_name(config: TrainConfig) -> str:
+    """Return what people call a run: what it is regularized with, and a loss or density control of its own.
+
+    Example:
+        >>> natural_name(TrainConfig()), natural_name(TrainConfig(dropout=0.2, noise=0.8, analytic=True))
+        ('Baseline', 'Analytic dropout 0.2 + noise 0.8')
+    """
+    name = re.sub(r"\b(dropout|noise)\(([\d.e-]+)\)", r"\1 \2", config.regularizers) or "baseline"
+    parts = ["analytic " * config.analytic + name]
+    parts += [x for x, usual in ((config.loss, _USUAL.loss), (config.density, _USUAL.density)) if x != usual]
+    return (text := ", ".join(parts))[:1].upper() + text[1:]
+
+
+def natural_order(config: TrainConfig) -> tuple[int, bool]:
+    """Return a key that sorts runs: baseline, dropout, noise, both, anything else; the analytic ones after the drawn.
+
+    Example:
+        >>> natural_order(TrainConfig(noise=0.8)) < natural_order(TrainConfig(dropout=0.2, noise=0.8))
+        True
+    """
+    kinds = set(re.findall(r"[A-Za-z_]\w*(?=\()|[A-Za-z_]\w*$", config.regularizers))
+    order = [set(), {"dropout"}, {"noise"}, {"dropout", "noise"}, kinds]
+    other = (config.loss, config.density) != (_USUAL.loss, _USUAL.density)
+    return 4 if other else order.index(kinds), config.analytic
+
+
+def unique_names(configs: Sequence[TrainConfig], paths: Sequence[str]) -> list[str]:
+    """Return a name for each run: the natural one, with its path where several share it."""
+    names = [natural_name(config) for config in configs]
+    shared = Counter(names)
+    return [name if shared[name] == 1 else f"{name} ({path})" for name, path in zip(names, paths, strict=True)]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of a strategy that a verdict is made from.
+
+    Args:
+        name: of the strategy.
+        baseline: whether it is one without a regularizer.
+        results: content of ``results.json`` of each of its seeds.
+    """
+
+    name: str
+    baseline: bool
+    results: Sequence[Mapping[str, Any]]
+
+    def values(self, split: str, key: str) -> list[float]:
+        """Return a mean over the views of a split, of every seed that has it."""
+        found = [(of["mean"].get(split, {}) if split else of).get(key) for of in self.results]
+        return [float(x) for x in found if x is not None and math.isfinite(x)]
+
+
+def _difference(rows: Rows, reference: Rows, split: str, key: str) -> tuple[float, float] | None:
+    """Return the difference of two means and two standard errors of it, nan with a single seed; None without values."""
+    (mean, std), (other, spread) = (mean_std(of.values(split, key)) for of in (rows, reference))
+    if math.isnan(mean) or math.isnan(other):
+        return None
+    counts = [len(of.values(split, key)) for of in (rows, reference)]
+    return mean - other, 2 * math.sqrt(std**2 / counts[0] + spread**2 / counts[1])
+
+
+def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
+    """Return the columns of the scores: ``split``, ``title``, ``cells`` of ``text``, ``best``, ``delta``, ``better``.
+
+    ``delta`` is the difference to the first strategy as text, ``better`` whether that is an improvement (None where
+    neither direction is one). The best figure of a column that has a best is marked, all that share it.
+    """
+    columns = []
+    unseen = {split for of in strategies for run in of.results for split in run["mean"]}
+    for split, key, title, decimals, unit, highest in _COLUMNS:
+        means = [mean_std(of.values(split, key))[0] / unit for of in strategies]
+        if (split and split not in unseen) or all(map(math.isnan, means)):
+            continue
+        rounded = [round(mean, decimals) for mean in means]
+        known = [mean for mean in rounded if not math.isnan(mean)]
+        best = None if highest is None or len(known) < 2 else max(known) if highest else min(known)
+        cells: list[dict[str, Any]] = []
+        for i, (of, mean) in enumerate(zip(strategies, rounded, strict=True)):
+            cell = {"text": format_mean_std(of.values(split, key), unit=unit, decimals=decimals), "best": mean == best}
+            if i and highest is not None and math.isfinite(delta := mean - rounded[0]):
+                cell["delta"] = f"{delta:+.{decimals}f}".replace("-", "\N{MINUS SIGN}")
+                cell["better"] = None if not round(delta, decimals) else (delta > 0) == highest
+            cells.append(cell)
+        columns.append({"split": split, "title": title, "cells": cells})
+    return columns
+
+
+def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str, list[str]]:
+    """Return one sentence on what the rows show, and its evidence: the other strategies, the rule, what limits it.
+
+    Strategies are compared with the first. Two means are told apart if their difference exceeds two of its standard
+    errors, by the spread over seeds; with one seed no spread is known, and the evidence says so.
+
+    Args:
+        strategies: with scores, the reference first.
+        other: settings, next to the regularizers, that differ between the runs.
+    """
+    if not strategies:
+        return "No verdict: no run has been trained to its end.", []
+    reference, *rest = strategies
+    runs = [run for rows in strategies for run in rows.results]
+    tested = [sum(view["split"] == "test" for view in run["views"]) for run in runs]
+    split = "test" if all(tested) else "around"
+    where = f"on the {tested[0]} test view{'s' * (tested[0] != 1)}" if all(tested) else "around the training views"
+    limits = [] if all(tested) else ["Without test views, nothing is known about the quality at unseen views."]
+    if not rest:
+        psnr, ca = (mean_std(reference.values(split, key))[0] for key in ("psnr", "ca_exact_half"))
+        found = [f"PSNR {psnr:.2f} dB"] * math.isfinite(psnr) + [f"exact CA {ca * 1e3:.2f}e-3"] * math.isfinite(ca)
+        text = f"{reference.name}: {' and '.join(found) or 'nothing was measured'} {where}."
+        return text, [*limits, "Nothing stands beside it: add a second run to compare it with."]
+    said = {rows.name: _said(rows, reference, split) for rows in rest}
+    sign, key = (1, "psnr") if split == "test" else (-1, "ca_exact_half")
+    best = max(rest, key=lambda rows: sign * mean_std(rows.values(split, key))[0])
+    merit = "highest PSNR" if split == "test" else "least co-adaptation"
+    text = f"{best.name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: {said[best.name]} than "
+    text += f"{reference.name if not reference.baseline else 'the baseline'} {where}."
+    evidence = [f"{name}: {what}." for name, what in said.items() if name != best.name]
+    seeds = {len(rows.results) for rows in strategies}
+    if min(seeds) > 1:
+        evidence.append(
+            f"{min(seeds)} {'or more ' * (len(seeds) > 1)}seeds each. Two means are told apart if they differ by more "
+            "than two standard errors of the difference, by the spread over the seeds."
+        )
+    else:
+        evidence.append("One seed: no spread is known, and another seed may turn a small difference around.")
+    if other:
+        evidence.append(f"The runs differ in {', '.join(other)} too, so this is not the regularizer's effect alone.")
+    return text, evidence + limits
+
+
+def _said(rows: Rows, reference: Rows, split: str) -> str:
+    """Return how a strategy differs from the reference in PSNR and co-adaptation."""
+    parts = []
+    if split == "test" and (found := _difference(rows, reference, split, "psnr")):
+        delta, margin = found
+        text = (
+            f"{abs(delta):.2f} dB {'higher' if delta > 0 else 'lower'} PSNR"
+            if f"{abs(delta):.2f}" != "0.00"
+            else "the same PSNR"
+        )
+        parts.append(text if not abs(delta) <= margin else f"a PSNR that cannot be told apart ({delta:+.2f} dB)")
+    if found := _difference(rows, reference, split, "ca_exact_half"):
+        delta, margin = found
+        usual = mean_std(reference.values(split, "ca_exact_half"))[0]
+        part = f"{abs(delta) / usual:.0%}".replace("%", " %") if usual else f"{abs(delta) * 1e3:.2f}e-3"
+        text = f"{part} {'more' if delta > 0 else 'less'} co-adaptation"
+        parts.append(text if not abs(delta) <= margin else f"a co-adaptation that cannot be told apart ({text})")
+    return " and ".join(parts) or "nothing measured that is different"

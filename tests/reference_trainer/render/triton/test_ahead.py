@@ -1,0 +1,64 @@
+"""Every kernel compiled ahead of time for every card that the installed Triton knows, and nothing spilled.
+
+In processes of their own: a kernel that was made for Triton's interpreter cannot be compiled.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from subprocesses import subprocess_environment
+
+pytest.importorskip("triton")
+pytest.importorskip("scipy")
+ROOT = Path(__file__).parents[4]
+
+
+def run(*arguments):
+    environment = subprocess_environment(TRITON_INTERPRET="0", PYTHONPATH=str(ROOT))
+    return subprocess.run([sys.executable, *arguments], cwd=ROOT, env=environment, capture_output=True, text=True)
+
+
+def compiled(code):
+    """What a program that compiles with `benchmarks.ahead` prints, as JSON."""
+    done = run("-c", f"import dataclasses, json\nfrom benchmarks.ahead import *\nprint(json.dumps({code}))")
+    assert done.returncode == 0, done.stderr[-3000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120"])
+def test_nothing_spills_on_nvidia(target):
+    spills_nowhere(target, registers=128)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["gfx90a", "gfx942", "gfx1100", "gfx1201"])
+def test_nothing_spills_on_amd(target):
+    spills_nowhere(target, registers=256)
+
+
+def spills_nowhere(target, registers):
+    rows = compiled(f"[dataclasses.asdict(compile_ahead(k, {target!r})) for k in KERNELS]")
+    assert rows
+    assert [row["kernel"] for row in rows if row["spills"]] == []
+    assert max(row["registers"] for row in rows) <= registers
+    # A walk over a list is at least the exponential and the recursion, and no copy of the whole kernel.
+    assert all(15 < row["per_entry"] < row["instructions"] for row in rows if row["per_entry"] is not None)
+
+
+@pytest.mark.slow
+def test_a_spill_is_seen():
+    """With fewer registers than the kernel needs."""
+    kernel = "next(k for k in KERNELS if k.label == 'composite backward')"
+    assert compiled(f"compile_ahead({kernel}, 'sm_90', maxnreg=24).spills") > 0
+
+
+@pytest.mark.slow
+def test_the_command_says_what_it_cannot_compile():
+    done = run("-m", "benchmarks.gpu", "ahead", "sm_10")
+    assert done.returncode == 1
+    assert "sm_10" in done.stdout
+    assert run("-m", "benchmarks.gpu", "behind").returncode == 2

@@ -1,0 +1,32 @@
+"""How many launches and read-backs an exact score takes with the kernels, and bytes per entry of the lists."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from subprocesses import subprocess_environment
+
+pytest.importorskip("triton")
+ROOT = Path(__file__).parents[4]
+CODE = """
+import json
+from benchmarks.gpu import bytes_per_entry, count_exact_score
+rows = [count_exact_score(*size)._asdict() for size in ((16, 12, 0.05), (40, 30, 0.1))]
+print(json.dumps({"rows": rows, "bytes": bytes_per_entry()}))
+"""
+
+
+@pytest.mark.slow
+def test_an_exact_score_costs_the_same_at_any_size():
+    environment = subprocess_environment(TRITON_INTERPRET="1", PYTHONPATH=str(ROOT))
+    done = subprocess.run([sys.executable, "-c", CODE], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    small, large = found["rows"]
+    assert large["entries"] > 4 * small["entries"]
+    assert large["rendering"] == small["rendering"] <= 16
+    assert abs(large["operations"] - small["operations"]) <= 3  # whether some Gaussians are left out
+    assert large["read_backs"] - small["read_backs"] <= 1
+    assert found["bytes"] <= 32

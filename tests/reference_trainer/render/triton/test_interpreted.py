@@ -1,0 +1,41 @@
+"""Runs this file's neighbors in processes of their own: in Triton's interpreter and, where there is one, on a card."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from subprocesses import subprocess_environment
+
+pytest.importorskip("triton")
+FOLDER = Path(__file__).parent
+
+
+def passes(marked, interpret, name="interpreted.py"):
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-m", marked]
+    environment = subprocess_environment(TRITON_INTERPRET=interpret)
+    done = subprocess.run(
+        [*command, str(FOLDER / name)], cwd=FOLDER.parents[3], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+    assert " passed" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("marked", ["not slow", "slow"])
+def test_in_the_interpreter(marked):
+    passes(marked, "1")
+
+
+@pytest.mark.slow
+def test_over_gsplats_lists():
+    pytest.importorskip("gsplat")
+    passes("slow", "1", "gsplat_lists.py")
+
+
+@pytest.mark.gpu
+def test_on_a_card():
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    passes("slow or not slow", "0")

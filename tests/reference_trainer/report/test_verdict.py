@@ -1,0 +1,89 @@
+import math
+
+import pytest
+
+from reference_trainer.report.verdict import Rows, natural_name, natural_order, score_columns, unique_names, verdict
+from reference_trainer.training.config import TrainConfig
+
+
+def rows(name: str, psnr: list[float], ca: list[float], *, split: str = "test", baseline: bool = False) -> Rows:
+    """The rows of a strategy, one per seed, with two views."""
+    views = [{"split": split, "name": str(i)} for i in range(2)]
+    means = [{split: {"psnr": x, "ca_exact_half": y}} for x, y in zip(psnr, ca, strict=True)]
+    return Rows(name, baseline, [{"mean": mean, "views": views, "gaussians": 5, "seconds": 1.0} for mean in means])
+
+
+def test_runs_are_called_and_ordered_as_people_do():
+    configs = [
+        TrainConfig(),
+        TrainConfig(dropout=0.2),
+        TrainConfig(dropout=0.2, analytic=True),
+        TrainConfig(noise=0.8),
+        TrainConfig(dropout=0.2, noise=0.8),
+        TrainConfig(regularizer="d2gs"),
+        TrainConfig(density="absgrad"),
+    ]
+    names = ["Baseline", "Dropout 0.2", "Analytic dropout 0.2", "Noise 0.8", "Dropout 0.2 + noise 0.8", "D2gs"]
+    assert [natural_name(config) for config in configs] == [*names, "Baseline, absgrad"]
+    assert sorted(reversed(configs[:-1]), key=natural_order) == configs[:-1]
+    assert natural_order(configs[-1]) > natural_order(configs[4])
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ([{"seed": 1}, {"seed": 2}], ["Baseline (0)", "Baseline (1)"]),
+        ([{}, {}], ["Baseline (0)", "Baseline (1)"]),
+        ([{}, {"dropout": 0.5}], ["Baseline", "Dropout 0.5"]),
+    ],
+)
+def test_no_two_runs_share_a_name(changes, names):
+    assert unique_names([TrainConfig(**change) for change in changes], ["0", "1"]) == names
+
+
+def test_one_seed_is_said_to_have_no_spread():
+    found, evidence = verdict([rows("Baseline", [20.0], [0.004], baseline=True), rows("Mine", [20.55], [0.001])])
+    assert found == "Mine: 0.55 dB higher PSNR and 75 % less co-adaptation than the baseline on the 2 test views."
+    (rule,) = evidence
+    assert rule.startswith("One seed: no spread is known")
+
+
+def test_what_is_within_two_standard_errors_is_not_told_apart():
+    # The difference of the means is 1 and its standard error sqrt(s^2 / 2 + s^2 / 2) = s; s is half the range times
+    # the square root of 2.
+    for half, apart in ((0.3, True), (0.4, False)):
+        psnr = [[middle - half, middle + half] for middle in (20.0, 21.0)]
+        assert (2 * half * math.sqrt(2) < 1) == apart
+        found, evidence = verdict([rows("A", psnr[0], [0.004] * 2), rows("B", psnr[1], [0.001] * 2)])
+        assert ("1.00 dB higher PSNR" in found) == apart
+        assert ("a PSNR that cannot be told apart (+1.00 dB)" in found) != apart
+        assert "75 % less co-adaptation than A" in found
+        assert evidence[0].startswith("2 seeds each. Two means are told apart")
+
+
+def test_every_strategy_is_in_the_verdict_or_its_evidence():
+    strategies = [rows("Baseline", [20], [0.004], baseline=True), rows("A", [19], [0.003]), rows("B", [21], [0.005])]
+    found, evidence = verdict(strategies, ["iterations"])
+    assert found.startswith("B (the highest PSNR of 2): 1.00 dB higher PSNR and 25 % more co-adaptation than the base")
+    assert evidence[0] == "A: 1.00 dB lower PSNR and 25 % less co-adaptation."
+    assert "differ in iterations too" in evidence[-1]
+
+
+def test_without_test_views_nothing_is_said_about_quality():
+    pair = [rows(name, [30.0], [ca], split="around") for name, ca in (("A", 0.004), ("B", 0.002))]
+    found, evidence = verdict(pair)
+    assert found == "B: 50 % less co-adaptation than A around the training views."
+    assert "nothing is known about the quality" in evidence[-1]
+    assert verdict([]) == ("No verdict: no run has been trained to its end.", [])
+    assert "exact CA 4.00e-3 around the training views" in verdict(pair[:1])[0]
+
+
+def test_the_best_and_the_better_are_marked_where_that_is_a_merit():
+    columns = score_columns([rows("A", [20.0], [0.004]), rows("B", [20.5], [0.005]), rows("C", [20.5], [math.nan])])
+    psnr, ca, gaussians, _ = columns
+    assert [cell["best"] for cell in psnr["cells"]] == [False, True, True]
+    assert [cell["best"] for cell in ca["cells"]] == [True, False, False]
+    assert (psnr["cells"][1]["delta"], psnr["cells"][1]["better"]) == ("+0.50", True)
+    assert (ca["cells"][1]["delta"], ca["cells"][1]["better"]) == ("+1.00", False)
+    assert ca["cells"][2] == {"text": "n/a", "best": False}
+    assert not any(cell["best"] or "delta" in cell for cell in gaussians["cells"])
