@@ -302,5 +302,5 @@ def test_the_figure_can_be_drawn_without_an_error_of_the_exact_estimate(tmp_path
     module._draw({"a": known(5e-4), "b": known(0.0), "c": known(1e-6)}, figure)
     figure.savefig(tmp_path / "f.png")
     with Image.open(tmp_path / "f.png") as picture:
-        assert picture.width > 2.5 * picture.height
+        assert picture.width > picture.height
         assert len(picture.convert("RGB").getcolors(1 << 24)) > 10  # not an empty page
