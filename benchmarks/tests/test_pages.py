@@ -8,7 +8,7 @@ import shlex
 import pytest
 from pages import ROOT, fenced_blocks, linked_files
 
-from ca_reg.integrations.run import _parse
+from reference_trainer.cli import _parse
 
 PAGES = sorted((ROOT / "benchmarks").glob("*.md"))
 

@@ -10,7 +10,8 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,11 @@ __all__ = ["main"]
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``ca-reg``; errors that a user can fix exit with one line and code 2, an interruption with 130."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    _show_log()
+    with _log_shown():
+        _run(arguments)
+
+
+def _run(arguments: Sequence[str]) -> None:
     try:
         command = _parse(arguments)
         computing = command.what if isinstance(command, Study) else command
@@ -69,12 +74,18 @@ class _Shown(logging.Handler):
             print(text, flush=True)
 
 
-def _show_log() -> None:
-    """Show the messages of the trainer; of other packages only warnings."""
-    root = logging.getLogger()
-    if not any(isinstance(handler, _Shown) for handler in root.handlers):
-        root.addHandler(_Shown())
-    logging.getLogger("reference_trainer").setLevel(logging.INFO)
+@contextmanager
+def _log_shown() -> Iterator[None]:
+    """Show the messages of the trainer, and warnings of other packages, while a command runs."""
+    root, trainer, shown = logging.getLogger(), logging.getLogger("reference_trainer"), _Shown()
+    level = trainer.level
+    root.addHandler(shown)
+    trainer.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        root.removeHandler(shown)
+        trainer.setLevel(level)
 
 
 def _parse(arguments: Sequence[str]) -> Any:

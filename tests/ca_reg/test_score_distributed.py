@@ -26,7 +26,7 @@ def make_scores(not_finite_view=None):
     def render_fn(opacity, view):
         # View 1 shows nothing, so that one rank has an empty view.
         alpha = torch.full((4, 4), 0.0 if view == 1 else 1.0)
-        brightness = math.nan if view == not_finite_view else view + 1
+        brightness = math.nan if view == not_finite_view else (view + 1) / 100  # colors stay within [0, 1]
         return (colors @ opacity)[:, None, None].expand(3, 4, 4) * brightness, alpha
 
     def moments_fn(opacity, view, multiplier, background):

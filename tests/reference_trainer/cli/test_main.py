@@ -96,7 +96,7 @@ def test_help_and_mistakes_need_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-@pytest.mark.parametrize("command", ["train", "compare", "study error-runtime x"])
+@pytest.mark.parametrize("command", ["train", "compare"])
 def test_a_card_that_is_not_there(command, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)

@@ -15,8 +15,12 @@ def test_a_study_that_moved_is_refused_with_its_new_name(name, capsys):
     assert f"python -m benchmarks.{name}" in refused(["study", name, "--list"], capsys)
 
 
-def test_error_runtime(monkeypatch):
+def test_error_runtime(monkeypatch, tmp_path):
     declared, ran = [], []
+    monkeypatch.chdir(tmp_path)
+    for name in "rs":  # what a run is known by, before anything is loaded
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").touch()
     monkeypatch.setattr(
         error_runtime_module, "error_runtime_study", lambda runs, **keywords: declared.append((runs, keywords))
     )

@@ -262,14 +262,14 @@ def test_a_comparison_from_photographs_to_figures(tmp_path, options, said):
         assert "TrainingStoppedError: all Gaussians were pruned" in failure.error
         assert "in run_experiment" in failure.traceback
     assert sum("FAILED" in line for line in said) == 2
-    assert len(said) == 6
+    assert sum(", seed " in line and line.startswith("[") for line in said) == 6  # one line a run
 
     rows = {row["strategy"]: row for row in cells((tmp_path / TABLE).read_text())}
     for name, runs in comparison.runs.items():
         values = [run["mean"]["test"]["psnr"] for run in runs]
         mean, spread = (float(x) for x in rows[name]["test PSNR"].split(" ± "))
         assert mean == pytest.approx(statistics.mean(values), abs=0.05)
-        assert spread == pytest.approx(statistics.stdev(values), rel=0.06)
+        assert spread == pytest.approx(statistics.stdev(values), rel=0.06, abs=0.0051)  # half of the last digit shown
     stored = json.loads((tmp_path / COMPARISON).read_text())
     assert stored["runs"] == comparison.runs
     assert stored["failures"] == {name: dataclasses.asdict(why) for name, why in comparison.failures.items()}
@@ -311,12 +311,13 @@ def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_
     assert comparison.runs["dropout"][1]["views"] == whole["views"]
 
     before = files_of(out / "dropout")
+    said.clear()
     nobody = Here()
     again = compare({out: options}, {"dropout": config}, [0, 1], Running(nobody))[out]
     assert again == comparison
     assert nobody.tasks == []
     assert files_of(out / "dropout") == before
-    assert all(line.endswith("finished before") for line in said[-2:])
+    assert sum(line.endswith("finished before") for line in said) == 2
 
 
 @pytest.mark.parametrize("chosen", ["torch", "auto"])

@@ -147,11 +147,14 @@ def test_a_full_disk_keeps_the_last_checkpoint(finished, options, short, monkeyp
 
 
 @pytest.mark.slow
-def test_leftovers_of_a_killed_run_are_removed(options, short, tmp_path):
-    leftover = tmp_path / "views" / "train" / ".train_0.png.1234.part"
-    leftover.parent.mkdir(parents=True)
+def test_leftovers_of_a_killed_run_are_removed(finished, options, short, tmp_path):
+    """The run was killed while it measured: everything is there but its results, and half of a picture."""
+    out = tmp_path / "run"
+    shutil.copytree(finished[0], out)
+    (out / RESULTS).unlink()
+    leftover = out / "views" / "train" / ".train_0.png.1234.part"
     leftover.write_bytes(b"half")
-    run_experiment(options, short, tmp_path, **EVERY)
+    run_experiment(options, short, out, **EVERY)
     assert not leftover.exists()
 
 

@@ -123,7 +123,7 @@ def test_a_browser_shows_what_was_drawn(run, viewer):
         while time.monotonic() < last:
             viewer.update()
             page.run("new Promise(requestAnimationFrame)")
-            if viewer._windows and viewer._look.mode == mode:
+            if viewer._windows and viewer._options.mode == mode:
                 (only,) = viewer._windows.values()
                 expected, _ = viewer._model.render(DisplayOptions(mode), _camera(only.client.camera, MOST))
                 shown = page.picture()[:, 330:, :500]
