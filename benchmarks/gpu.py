@@ -167,7 +167,7 @@ def count_exact_score(count: int, width: int, scale: float, device: torch.device
     use_engine("triton")
     model = Model.of(count, width, scale, device)
     means, quaternions, scales, opacities, colors = model.tensors
-    score = partial(CAScore(exact=model.moments, drop_rate=0.5), opacities, model.camera)
+    score = partial(CAScore.exact(model.moments, drop_rate=0.5), opacities, model.camera)
     score()  # loads what is loaded once
     splats = splat(means, quaternions, scales, opacities, model.camera, colors=colors)
     inputs = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities, "colors": colors}
@@ -247,7 +247,7 @@ def _times() -> str:
     for name, size in _SIZES.items():
         model = Model.of(*size, device)
         keep = (torch.rand(5, size[0], device=device) > 0.5).float()
-        score = CAScore(exact=model.moments, drop_rate=0.5)
+        score = CAScore.exact(model.moments, drop_rate=0.5)
 
         def forward() -> Any:
             return rasterize(splat(*model.tensors[:4], model.camera, colors=model.tensors[4])).image  # noqa: B023
@@ -332,7 +332,7 @@ def _gsplat_times(name: str, model: Model) -> list[str]:
     works = {
         "render": torch.no_grad()(lambda: render(means, quats, scales, opacities, colors)),
         "render and gradients": backward,
-        "exact score over its lists": lambda: CAScore(exact=moments, drop_rate=0.5)(opacities, None),
+        "exact score over its lists": lambda: CAScore.exact(moments, drop_rate=0.5)(opacities, None),
     }
     label = f"gsplat {gsplat.__version__}"
     return [f"| {name} | {what} | {label} | {' | '.join(_measure(work))} |" for what, work in works.items()]

@@ -36,7 +36,7 @@ class GsplatMoments:
         >>> moments = GsplatMoments(
         ...     lambda opacities, view: (rgb, gsplat.rasterization(means, quats, scales, opacities, rgb, **view)[2])
         ... )  # doctest: +SKIP
-        >>> CAScore(exact=moments)(opacities, view).value  # doctest: +SKIP
+        >>> CAScore.exact(moments)(opacities, view).value  # doctest: +SKIP
     """
 
     def __init__(

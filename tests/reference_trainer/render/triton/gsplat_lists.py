@@ -79,7 +79,7 @@ def test_score_map_and_shares_are_those_of_listed_pixels(package, scene, packed)
             a, b = (x(scene.opacities, view, multiplier, None) for x in (ours, theirs))
         for mine, listed in zip(a, b, strict=True):
             assert (mine - listed).abs().max() < 1e-5
-    scores = [CAScore(exact=x, drop_rate=0.5, threshold=0.3) for x in (ours, theirs)]
+    scores = [CAScore.exact(x, drop_rate=0.5, threshold=0.3) for x in (ours, theirs)]
     mine, listed = (
         attribute(score, x.shares, scene.opacities, view).shares
         for score, x in zip(scores, (ours, theirs), strict=True)
