@@ -30,9 +30,8 @@ FLOORS = (
     "model",
     "scenes",
     "evaluation renderers",
-    "training.config training.errors training.field training.initial training.model_state training.randomness "
-    "training.step",
-    "losses density",
+    "training.config training.interruption training.model_state training.randomness training.step",
+    "training.losses training.density",
     "training compat",
     "runs",
     "report viewer studies",

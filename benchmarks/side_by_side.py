@@ -1,9 +1,9 @@
-"""One scene in several trainers, all scored by one evaluator: tables of docs/integrations.md and docs/recipes.md.
+"""One scene in several trainers, all scored by one evaluator: tables of benchmarks/integrations.md and recipes.md.
 
     python -m benchmarks.side_by_side benchmarks/data/forks.json --scene fern --images images_16 \
         --forks forks --iterations 300 --trainers AbsGS MVGS
 
-``forks`` has the repositories as folders of the names in `trainers.TRAINERS`; what they import, but for CUDA, is
+``forks`` has the repositories as folders of the names in `TRAINERS`; what they import, but for CUDA, is
 installed. Every run has a folder of its own below ``--out``; the file, of rows as of `benchmarks.paper`, is written
 after each, and none is repeated.
 """
