@@ -25,6 +25,7 @@ from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.colmap import read_colmap
 from reference_trainer.scenes.dense import dense_points
 from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.points import colmap_points
 from reference_trainer.scenes.scene import View
 
@@ -81,7 +82,7 @@ def judged(points: Tensor, views: tuple[View, ...], folder: Path) -> dict[str, f
 
 def measured(root: Path, name: str, options: dict[str, str], sift: str) -> list[dict[str, Any]]:
     """Measure all clouds of a scene."""
-    views = load_scene(root / name, **options).train
+    views = load_scene(SceneOptions(str(root / name), **options)).train
     guide = colmap_points(root / name / sift / "0")
     assert guide is not None
     begun = time.thread_time()
