@@ -214,7 +214,8 @@ def test_a_scene_folder_stays_as_it_is_and_the_points_are_kept_elsewhere(tmp_pat
     size = {"width": 96, "height": 72, "focal": 90.0}
     written(root, [plane_view(f"{i}", looking(x, **size), 0.2) for i, x in enumerate((-0.3, 0.0, 0.3))])
     before = sorted(root.rglob("*"))
-    scene = load_scene(SceneOptions(str(root), points="dense"))
+    options = SceneOptions(str(root), points="dense")
+    scene = load_scene(options)
     assert sorted(root.rglob("*")) == before
     assert scene.points.source == SOURCE
     assert scene.points.seen_by == {view.name for view in scene.train}
@@ -222,11 +223,9 @@ def test_a_scene_folder_stays_as_it_is_and_the_points_are_kept_elsewhere(tmp_pat
     (file,) = cache.rglob("*.npz")
     kept = dict(np.load(file))
     np.savez(file, **{name: array[:50] for name, array in kept.items()})
-    assert torch.equal(
-        load_scene(SceneOptions(str(root), points="dense")).points.positions, scene.points.positions[:50]
-    )
+    assert torch.equal(load_scene(options).points.positions, scene.points.positions[:50])
     file.write_bytes(b"damaged")
-    assert torch.equal(load_scene(SceneOptions(str(root), points="dense")).points.positions, scene.points.positions)
+    assert torch.equal(load_scene(options).points.positions, scene.points.positions)
 
 
 def test_a_cache_that_cannot_be_written_costs_only_time(cache):
