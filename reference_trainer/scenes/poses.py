@@ -169,6 +169,8 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
     match = partial(
         pycolmap.match_exhaustive, database, pairing_options=pycolmap.ExhaustivePairingOptions(block_size=5),
         verification_options=verification,
+        # One thread: with more, pairs enter the database in the order in which they end, which mapping follows.
+        matching_options=pycolmap.FeatureMatchingOptions(num_threads=1),
     )  # fmt: skip
     pairs = len(photos) * (len(photos) - 1) // 2
     _watched(extract, database, "keypoints", len(photos), desc="features", unit="photo", disable=not progress)
