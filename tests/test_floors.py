@@ -1,93 +1,15 @@
-"""Who imports whom, read from the sources: floors, no arrow upward, and no circle, by imports of any kind.
+"""No import of any kind points to a higher floor or closes a circle."""
 
-Imports within functions and under TYPE_CHECKING count like all others: the first are circles in waiting, the second
-circles of thought.
-"""
-
-import ast
-from collections.abc import Iterator, Mapping
-from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
-
-ROOT = Path(__file__).parents[1]
-
-FLOORS = (
-    {"ca_reg"},
-    {"integrations"},
-    {"camera", "rotations", "devices", "threads", "compiled"},
-    {"files", "json_files", "npy_files", "ply_files", "tensor_files"},
-    {"render"},  # which thereby knows neither scenes nor the model
-    {"renderers", "model"},
-    {"scenes"},  # which may begin with a model
-    {"training", "evaluation"},
-    {"runs"},
-    {"report", "viewer", "studies", "compat"},
-    {"cli"},
-)
-"""The rooms from the ground up: `ca_reg`, `integrations`, and the folders and modules of `reference_trainer`."""
-
-EXCEPTIONS = {("ca_reg.integrations.run", "reference_trainer.compat")}
-"""The launcher's stand-in for CUDA, loaded if the user asks for it."""
-
-
-def module_name(path: Path) -> str:
-    """The name by which a source is imported; the folder integrations is installed below ca_reg."""
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return ".".join(("ca_reg", *parts) if parts[0] == "integrations" else parts).removesuffix(".__init__")
-
-
-def imports(tree: ast.AST, package: str, modules: Mapping[str, object]) -> Iterator[str]:
-    """The modules among ``modules`` that a source imports."""
-    for node in ast.walk(tree):
-        names = []
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            above = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
-            origin = ".".join([*above, *([node.module] if node.module else [])])
-            names = [f"{origin}.{alias.name}" for alias in node.names]
-            names = [name if name in modules else origin for name in names]
-        yield from (name for name in names if name in modules)
+from floors import FLOORS, Graph, circle, import_graph, rooms, upward
 
 
 @pytest.fixture(scope="module")
-def graph() -> dict[str, set[str]]:
-    """What every module imports, but for the exceptions."""
-    folders = ("ca_reg", "integrations", "reference_trainer")
-    paths = {module_name(path): path for folder in folders for path in (ROOT / folder).rglob("*.py")}
-    found = {}
-    for name, path in paths.items():
-        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        targets = set(imports(ast.parse(path.read_text(encoding="utf-8")), package, paths)) - {name}
-        found[name] = {target for target in targets if (name, target) not in EXCEPTIONS}
-    return found
-
-
-def room(module: str) -> str:
-    """The room of a module."""
-    first, *rest = module.split(".")
-    if first == "reference_trainer":
-        return rest[0] if rest else ""
-    return "integrations" if rest[:1] == ["integrations"] else first
-
-
-def circle(graph: Mapping[str, set[str]]) -> list[str]:
-    """Some circle of a graph; empty if there is none."""
-    try:
-        TopologicalSorter(graph).prepare()
-    except CycleError as error:
-        return list(error.args[1])
-    return []
-
-
-def rooms(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
-    """Which rooms the modules of every room import."""
-    found: dict[str, set[str]] = {}
-    for module, targets in graph.items():
-        found.setdefault(room(module), set()).update({room(target) for target in targets} - {room(module)})
-    return found
+def graph() -> Graph:
+    """What every module of this checkout imports."""
+    return import_graph(Path(__file__).parents[1])
 
 
 def test_the_modules_are_read(graph):
@@ -99,14 +21,7 @@ def test_the_modules_are_read(graph):
 
 
 def test_no_arrow_points_upward(graph):
-    floor_of = {name: floor for floor, names in enumerate(FLOORS) for name in names}
-    upward = [
-        f"{module} -> {target}"
-        for module, targets in graph.items()
-        for target in targets
-        if room(module) and room(target) and floor_of[room(module)] < floor_of[room(target)]
-    ]
-    assert not upward
+    assert upward(graph) == []
 
 
 def test_integrations_need_ca_reg_alone_and_ca_reg_nothing(graph):
@@ -122,5 +37,27 @@ def test_there_is_no_circle_between_rooms(graph):
     assert circle(rooms(graph)) == []
 
 
-def test_a_circle_is_found():
-    assert set(circle({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}})) == {"a", "b", "c"}
+FILES = {
+    "ca_reg/__init__.py": "from ca_reg.a import f\n",
+    "ca_reg/a.py": "def f():\n    from ca_reg import b\n    return b\n",
+    "ca_reg/b.py": "import ca_reg.a\n",
+    "integrations/__init__.py": "",
+    "reference_trainer/__init__.py": "",
+    "reference_trainer/model/__init__.py": "",
+    "reference_trainer/model/ply.py": "from ..runs.run import main\nfrom . import other\n",
+    "reference_trainer/model/other.py": "",
+    "reference_trainer/runs/__init__.py": "",
+    "reference_trainer/runs/run.py": "from ca_reg import f\nmain = f\n",
+}
+
+
+def test_arrows_and_circles_are_found_wherever_imports_stand(tmp_path):
+    for name, text in FILES.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    found = import_graph(tmp_path)
+    assert found["ca_reg.a"] == {"ca_reg.b"}
+    assert found["reference_trainer.model.ply"] == {"reference_trainer.runs.run", "reference_trainer.model.other"}
+    assert found["reference_trainer.runs.run"] == {"ca_reg"}
+    assert upward(found) == ["reference_trainer.model.ply -> reference_trainer.runs.run"]
+    assert set(circle(found)) == {"ca_reg.a", "ca_reg.b"}
