@@ -8,6 +8,7 @@ results do not depend on the number of threads.
 
 from __future__ import annotations
 
+import atexit
 import collections
 import contextlib
 import os
@@ -23,7 +24,7 @@ __all__ = ["in_threads"]
 _RANGES = 32  # per thread, enough that none waits long for the others
 
 # A SimpleQueue is written in C: unlike futures, it cannot be left locked by a Ctrl-C that comes at the wrong moment.
-_Calls = queue.SimpleQueue[Callable[[], None]]
+_Calls = queue.SimpleQueue[Callable[[], None] | None]  # None ends a thread
 _calls: _Calls = queue.SimpleQueue()
 _threads: list[threading.Thread] = []
 
@@ -37,6 +38,19 @@ def _begin_forked_process() -> None:
     _calls = queue.SimpleQueue()
     _threads.clear()
     torch.set_num_threads(1)
+
+
+@atexit.register
+def _end_threads() -> None:
+    """End the threads before the interpreter takes itself apart.
+
+    A thread that then still wants the GIL is unwound wherever it stands, which has aborted processes at their very end.
+    The list stays full, so that none is started again; whoever calls later does the work alone.
+    """
+    for _ in _threads:
+        _calls.put(None)
+    for thread in _threads:
+        thread.join()
 
 
 if hasattr(os, "register_at_fork"):
@@ -99,9 +113,9 @@ def _hand_out(work: Callable[[], None], count: int) -> None:
 
 
 def _serve(calls: _Calls) -> None:
-    """Do what is asked for, for ever."""
-    while True:
-        calls.get()()
+    """Do what is asked for, until the end."""
+    while (call := calls.get()) is not None:
+        call()
 
 
 def _finish(ranges: Iterator[int], begun: Sized, ended: Sized, bell: queue.SimpleQueue[None]) -> None:

@@ -101,6 +101,23 @@ print("done")
     )
 
 
+def test_no_thread_is_left_when_the_interpreter_ends():
+    """One that still waits for the GIL by then is unwound wherever it stands, which once aborted a process."""
+    pytest.importorskip("numba")
+    script = (
+        """
+import atexit, threading
+atexit.register(lambda: print(*(thread.name for thread in threading.enumerate())))  # first in, last out
+"""
+        + DRAW
+        + """
+picture()
+assert threading.active_count() > 1
+"""
+    )
+    assert run(script) == "MainThread\n"
+
+
 def test_a_thread_that_outlives_the_main_one_still_draws():
     pytest.importorskip("numba")
     assert "drawn" in run(
