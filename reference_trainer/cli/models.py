@@ -85,7 +85,10 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Render a run's views as PNG, or a flight also as GIF."""
+    """Render a run's views as PNG, or a flight also as a film.
+
+    The film is an MP4 with ca_reg[photos], else an animated WebP.
+    """
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of a run of `ca-reg train`."""
@@ -203,16 +206,21 @@ class Bake:
     regularizer: str | None = None
     """What it was trained with, such as "dropout(0.2)"; PLYs of `ca-reg train` say so themselves."""
     out: Path | None = None
-    """The file to write; by default <ply>_for_viewers.ply."""
+    """The file to write; by default <ply>_for_viewers.ply. An .spz, a tenth of the size, or an .sog is for viewers in
+    the web, and needs ca_reg[web]."""
 
     def check(self) -> None:
         """Refuse what cannot work, before anything heavy is imported."""
         check_model(self.ply, OrbitOptions())
 
     def __call__(self) -> None:
-        from reference_trainer.runs.edit_ply import bake_ply
+        from reference_trainer.runs.edit_ply import SMALL, bake_ply, compress_ply
 
         out = self.out or self.ply.with_name(f"{self.ply.stem}_for_viewers.ply")
+        if out.suffix.lower() in SMALL:
+            compress_ply(self.ply, out, regularizer=self.regularizer)
+            print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, opacities those of the test")
+            return
         regularizer = bake_ply(self.ply, out, regularizer=self.regularizer)
         print(f"{out}: opacities are those of the test after {regularizer}, and marked so")
 

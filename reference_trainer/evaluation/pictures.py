@@ -30,7 +30,7 @@ __all__ = [
     "heat_colors",
     "heat_map",
     "is_own_png",
-    "save_gif",
+    "save_film",
     "save_png",
     "side_by_side",
 ]
@@ -39,6 +39,7 @@ PANEL = "_panel"
 """Suffix of a view's panel, after the name of its render."""
 
 _MADE_BY = "ca_reg"  # in the header of every PNG
+_RATE = 20  # pictures of a film per second
 _GAP = 4  # pixels between pictures
 _LABEL_HEIGHT = 16  # pixels; Pillow's built-in font is about 11 high
 _UNDEFINED = "0.5"  # gray for values that are not finite; not a color of the map
@@ -93,11 +94,28 @@ def is_own_png(path: Path) -> bool:
         return b"Software\0" + _MADE_BY.encode() in file.read(200)
 
 
-def save_gif(path: str | Path, images: Sequence[Tensor]) -> None:
-    """Write pictures, at least one, as a looping GIF of 20 per second; otherwise as `save_png`."""
+def save_film(folder: Path, name: str, images: Sequence[Tensor]) -> Path:
+    """Write pictures, at least one, of equal and even size or cut to it, as a film of 20 a second; return its file.
+
+    An MP4 (H.264), which everything plays, where PyAV is installed; else a looping animated WebP, for browsers. Errors
+    as for `save_png`.
+    """
     frames = [as_pillow(image) for image in images]
-    with replacing(path) as place:
-        frames[0].save(place, "GIF", save_all=True, append_images=frames[1:], duration=50, loop=0)
+    try:
+        import av
+    except ImportError:
+        with replacing(path := folder / f"{name}.webp") as place:
+            frames[0].save(
+                place, "WEBP", save_all=True, append_images=frames[1:], duration=1000 // _RATE, loop=0, quality=85
+            )
+        return path
+    width, height = (side // 2 * 2 for side in frames[0].size)  # H.264 has half the resolution in color
+    with replacing(path := folder / f"{name}.mp4") as place, av.open(str(place), "w", format="mp4") as file:
+        stream = file.add_stream("h264", rate=_RATE, options={"crf": "18"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for frame in [*(av.VideoFrame.from_image(each.crop((0, 0, width, height))) for each in frames), None]:
+            file.mux(stream.encode(frame))
+    return path
 
 
 def as_pillow(image: Tensor) -> Any:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import logging
+import tempfile
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from reference_trainer.evaluation.evaluate import Evaluation, evaluate
 from reference_trainer.evaluation.shares import Heat, all_but_highest
 from reference_trainer.evaluation.tables import EXACT, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.files import replacing
 from reference_trainer.model.ply import save_ply
-from reference_trainer.runs.ply import load_for_views, load_plain_ply_model, scaled
+from reference_trainer.runs.ply import load_for_views, load_plain_ply_model, load_ply_model, scaled
 from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.scenes.scene import Scene
@@ -22,7 +25,10 @@ from reference_trainer.threads import threads_for
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["bake_ply", "clean_ply", "refined"]
+__all__ = ["SMALL", "bake_ply", "clean_ply", "compress_ply", "refined"]
+
+SMALL = (".spz", ".sog")
+"""Formats of `compress_ply`, by the ends of file names."""
 
 _log = logging.getLogger(__name__)
 
@@ -71,6 +77,38 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> s
         raise ValueError(f"a model trained with {facts.regularizer} is rendered as it is: there is nothing to bake.")
     save_for_viewers(model, target)
     return facts.regularizer
+
+
+def compress_ply(source: Path, target: Path, *, regularizer: str | None = None) -> None:
+    """Write a model with its test-time opacities as one of the small files that viewers in the web read.
+
+    Args:
+        source: the PLY of a model, its opacities plain or of the test already.
+        target: the file to write, one of `SMALL` by its name; it must not exist. SPZ takes a tenth of a PLY.
+        regularizer: as for `bake_ply`.
+
+    Raises:
+        ImportError: if GaussForge is missing.
+        FileExistsError: if the target exists.
+        ValueError: if the PLY is damaged, or its test-time opacities depend on the camera.
+    """
+    try:
+        from gaussforge import GaussForge
+    except ImportError as error:
+        raise ImportError(f"{target.suffix} files need GaussForge: pip install 'ca_reg[web]'.") from error
+    if target.exists():
+        raise FileExistsError(f"{target} exists already: give another --out, or delete it.")
+    model, facts = load_ply_model(source, background=torch.zeros(3), regularizer=regularizer)
+    if model.depends_on_camera:
+        raise ValueError(f"what is rendered after {facts.regularizer} depends on the camera: no file can hold it.")
+    with tempfile.TemporaryDirectory() as work:
+        plain = Path(work, "plain.ply")
+        save_for_viewers(model, plain)
+        made = GaussForge().convert(plain.read_bytes(), "ply", target.suffix[1:].lower())
+    if "error" in made:
+        raise ValueError(f"GaussForge cannot write {target}: {made['error']}.")
+    with replacing(target) as place:
+        place.write_bytes(made["data"])
 
 
 def clean_ply(

@@ -1,12 +1,16 @@
+import gzip
 import math
 import struct
+import sys
 
+import numpy as np
 import pytest
 import torch
 
+from reference_trainer.cli import main
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
-from reference_trainer.runs.edit_ply import bake_ply
+from reference_trainer.runs.edit_ply import bake_ply, compress_ply
 
 
 @pytest.fixture
@@ -69,3 +73,37 @@ def test_a_file_says_what_it_was_trained_with_but_nothing_is_imported_for_it(pla
     save_ply(gaussians, tmp_path / "c.ply", regularizer="antigravity:Fly", step=7)
     with pytest.raises(ValueError, match=r"antigravity, which is not imported because a file says so"):
         bake_ply(tmp_path / "c.ply", tmp_path / "d.ply")
+
+
+@pytest.mark.parametrize("regularizer", ["dropout(0.3)", None])
+def test_a_small_file_for_the_web(plain, tmp_path, regularizer):
+    """Decoded by the layout that Niantic documents: a header of 16 bytes, positions of 3 x 24 bits, opacities of 8."""
+    pytest.importorskip("gaussforge", reason="needs ca_reg[web]")
+    compress_ply(plain, tmp_path / "a.spz", regularizer=regularizer)
+    content = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    magic, _, count, degree, fraction, _, _ = struct.unpack("<IIIBBBB", content[:16])
+    assert (magic, count, degree) == (0x5053474E, 6, 1)
+    body = np.frombuffer(content, np.uint8, offset=16)
+    parts = body[: 9 * count].reshape(count, 3, 3).astype(int)
+    fixed = parts[..., 0] + (parts[..., 1] << 8) + (parts[..., 2] << 16)
+    positions = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed) / 2**fraction
+    gaussians = load_ply(plain).gaussians
+    assert np.abs(positions - gaussians.means.numpy()).max() <= 1 / 2**fraction
+    opacity = 0.7 * (0.7 if regularizer else 1.0)
+    assert body[9 * count : 10 * count] / 255 == pytest.approx([opacity] * 6, abs=1 / 255)
+    with pytest.raises(FileExistsError, match="exists already"):
+        compress_ply(plain, tmp_path / "a.spz")
+
+
+def test_a_file_for_the_web_takes_a_baked_ply_as_it_is(plain, tmp_path):
+    pytest.importorskip("gaussforge", reason="needs ca_reg[web]")
+    bake_ply(plain, tmp_path / "b.ply", regularizer="dropout(0.3)")
+    main(["bake", str(tmp_path / "b.ply"), "--out", str(tmp_path / "b.spz")])
+    compress_ply(plain, tmp_path / "a.spz", regularizer="dropout(0.3)")
+    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
+
+
+def test_a_file_for_the_web_needs_an_extra(plain, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    with pytest.raises(ImportError, match=r"ca_reg\[web\]"):
+        compress_ply(plain, tmp_path / "a.sog")

@@ -1,11 +1,13 @@
 import dataclasses
 import json
 import math
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
 from reference_trainer.evaluation.results import PARTIAL
@@ -168,13 +170,32 @@ def test_views_of_the_same_name_in_two_folders_are_all_rendered(run, tmp_path, m
         assert (tmp_path / f"{name}.png").read_bytes() == (run[0] / "views" / "test" / f"{view}.png").read_bytes()
 
 
-def test_a_flight_begins_and_ends_at_training_cameras(run, tmp_path, said):
+@pytest.mark.parametrize("suffix", [".mp4", ".webp"])
+def test_a_flight_begins_and_ends_at_training_cameras(suffix, run, tmp_path, said, monkeypatch):
+    if suffix == ".mp4":
+        av = pytest.importorskip("av", reason="needs ca_reg[photos]")
+    else:
+        monkeypatch.setitem(sys.modules, "av", None)
     out, _ = run
     folder = render_run(out, "flight", tmp_path / "flight", frames=5)
-    assert sorted(path.name for path in folder.iterdir()) == [f"{i:04d}.png" for i in range(5)] + ["flight.gif"]
-    with Image.open(folder / "flight.gif") as animation:
-        assert (animation.n_frames, animation.size) == (5, (20, 15))
+    film = folder / f"flight{suffix}"
+    pictures = [folder / f"{i:04d}.png" for i in range(5)]
+    assert sorted(folder.iterdir()) == [*pictures, film]
+    if suffix == ".mp4":
+        with av.open(str(film)) as file:
+            assert file.streams.video[0].average_rate == 20
+            frames = [frame.to_image() for frame in file.decode(video=0)]
+        size = (20, 14)  # even
+    else:
+        with Image.open(film) as file:
+            frames = [frame.convert("RGB") for frame in ImageSequence.Iterator(file)]
+        size = (20, 15)
+    assert [frame.size for frame in frames] == [size] * 5
+    for frame, path in zip(frames, pictures, strict=True):  # of so few pixels little survives but the colors
+        with Image.open(path) as picture:
+            other = np.asarray(picture.crop((0, 0, *size))).astype(float)
+        assert np.abs(np.asarray(frame) - other).mean() < 12
     for frame, view in (("0000", "train_0"), ("0002", "train_1"), ("0004", "train_2")):
         one, other = (read_image(path)[0] for path in (folder / f"{frame}.png", out / f"views/train/{view}.png"))
         assert (one - other).abs().max() <= 1 / 255 + 1e-6
-    assert said == [f"5 pictures are in {folder}"]
+    assert said == [f"The film is {film}", f"5 pictures are in {folder}"]
