@@ -20,7 +20,7 @@ try:
 except ImportError as error:
     raise SystemExit("ca-reg: the command needs the trainer's packages: pip install 'ca_reg[trainer]'.") from error
 
-from reference_trainer.cli.models import Bake, Clean, Evaluate, Render, Report, View
+from reference_trainer.cli.models import Bake, Clean, Diff, Evaluate, Render, Report, View
 from reference_trainer.cli.options import refuse_old_options
 from reference_trainer.cli.setup import Names, Poses, Recipes, Version, Warmup
 from reference_trainer.cli.studies import MOVED, Study
@@ -108,6 +108,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "compare": Compare(out=Path("runs/compare"), config=config, recipe=recipe),
         "evaluate": Evaluate(run=tyro.MISSING),
         "report": Report(runs=tyro.MISSING),
+        "diff": Diff(tyro.MISSING, tyro.MISSING),
         "view": View(run=tyro.MISSING),
         "render": Render(run=Path("runs/train")),
         "study": Study(tyro.MISSING),

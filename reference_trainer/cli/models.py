@@ -23,7 +23,7 @@ from reference_trainer.cli.training import PORT, Lpips
 from reference_trainer.runs.folder import check_run, folder_name, modules_named, report_file, runs_of
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 
-__all__ = ["Bake", "Clean", "Evaluate", "Render", "Report", "View"]
+__all__ = ["Bake", "Clean", "Diff", "Evaluate", "Render", "Report", "View"]
 
 ModelScene = Annotated[PlyScene, tyro.conf.arg(name="scene")]
 
@@ -147,6 +147,27 @@ class Report:
 
         self.rendering.begin(self.device)
         write_report(self.runs, self.out, views=self.views, device=self.device, trust=self.trust)
+
+
+@dataclass(frozen=True)
+class Diff:
+    """Compare two trainings, score by score, in the terminal.
+
+    With differences, the settings that differ, and whether the seeds tell the two apart, for which each needs three.
+    """
+
+    first: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run, or one with seed_0, seed_1 and so on, such as <out>/baseline of `ca-reg compare`."""
+    second: Annotated[Path, tyro.conf.Positional]
+    """The other one, trained on the same scene."""
+
+    def __call__(self) -> None:
+        from reference_trainer.evaluation.tables import markdown_table, print_table
+        from reference_trainer.report.page import compare_two
+
+        rows, notes = compare_two(self.first, self.second)
+        print_table(markdown_table(rows, list(rows[0])))
+        print("\n".join(notes))
 
 
 @dataclass(frozen=True)

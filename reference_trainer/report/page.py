@@ -27,7 +27,9 @@ from reference_trainer.files import write_text
 from reference_trainer.report.findings import Findings, find
 from reference_trainer.report.packing import data_uri, jpeg
 from reference_trainer.report.verdict import (
+    FEWEST_SEEDS,
     Rows,
+    differences,
     natural_name,
     natural_order,
     score_columns,
@@ -48,7 +50,7 @@ from reference_trainer.scenes.scene import View
 from reference_trainer.scenes.virtual_cameras import interpolate_cameras
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["labels", "view_name", "write_report"]
+__all__ = ["compare_two", "labels", "view_name", "write_report"]
 
 _log = logging.getLogger(__name__)
 
@@ -116,6 +118,54 @@ def write_report(
     write_text(out, page)
     _log.info("The report is %s (%.1f MB): open it in a browser", out, out.stat().st_size / 1e6)
     return out
+
+
+def compare_two(first: Path, second: Path) -> tuple[list[dict[str, object]], list[str]]:
+    """Return the rows of `differences` between two trainings on one scene, and notes on what they rest on.
+
+    Args:
+        first: a run, or the folder of its seeds.
+        second: the other one.
+
+    Raises:
+        FileNotFoundError: if a folder holds no run.
+        ValueError: if one has not been trained to its end, its seeds differ in more than the seed, or the two were not
+            measured at the same views of one scene.
+    """
+    both, configs = [], {}
+    for folder in (first, second):
+        seeds = [] if (folder / CONFIG).is_file() else sorted(path.parent for path in folder.glob(f"seed_*/{CONFIG}"))
+        if not seeds:
+            check_run(folder)
+        runs = [run for run in seeds or [folder] if (run / RESULTS).exists()]
+        if not runs:
+            raise ValueError(f"{folder} has not been trained to its end: there are no scores yet.")
+        settings = [read_run_settings(run / CONFIG) for run in runs]
+        if len({(scene, dataclasses.replace(config, seed=0)) for scene, config in settings}) > 1:
+            raise ValueError(f"the runs of {folder} differ in more than the seed: give one of them.")
+        configs[str(folder)] = settings[0]
+        both.append([read_results(run) for run in runs])
+    if len(configs) < 2:
+        raise ValueError(f"expected two different runs, got {first} twice.")
+    viewed = [{(runs[0]["scene"], view["split"], view["name"]) for view in runs[0]["views"]} for runs in both]
+    other = {split for _, split, _ in viewed[0] ^ viewed[1]}
+    shared = {split for _, split, _ in viewed[0] & viewed[1]} - other
+    if not shared:
+        raise ValueError(f"{first} and {second} were not measured at the same views of one scene.")
+    names = unique_names([config for _, config in configs.values()], list(configs))
+    rows = [
+        Rows(name, False, [run | {"mean": {split: run["mean"][split] for split in shared}} for run in runs])
+        for name, runs in zip(names, both, strict=True)
+    ]
+    counts = [len(of.results) for of in rows]
+    rule = f"too few to tell anything apart: it takes {FEWEST_SEEDS} of each"
+    if min(counts) >= FEWEST_SEEDS:
+        rule = "told apart is what differs by more than two standard errors of the difference, which ± stands for"
+    notes = [f"Seeds: {counts[0]} and {counts[1]}; {rule}."]
+    notes += [f"Not compared, because the views differ: {', '.join(sorted(other))}."] * bool(other)
+    differing = _settings(dict(zip(names, configs.values(), strict=True)))[1]
+    notes += [f"Next to the regularizers, the runs differ in {', '.join(differing)}."] * bool(differing)
+    return differences(*rows), notes
 
 
 def labels(runs: Sequence[Path]) -> list[str]:

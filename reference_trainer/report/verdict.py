@@ -12,7 +12,16 @@ from typing import Any
 from reference_trainer.evaluation.tables import format_mean_std, mean_std
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["Rows", "natural_name", "natural_order", "score_columns", "unique_names", "verdict"]
+__all__ = [
+    "FEWEST_SEEDS",
+    "Rows",
+    "differences",
+    "natural_name",
+    "natural_order",
+    "score_columns",
+    "unique_names",
+    "verdict",
+]
 
 _USUAL = TrainConfig()
 _COLUMNS = [  # split, key, title, decimals, unit, whether the highest is best; None where neither end is a merit
@@ -27,6 +36,9 @@ _COLUMNS = [  # split, key, title, decimals, unit, whether the highest is best; 
     ("", "gaussians", "Gaussians", 0, 1.0, None),
     ("", "seconds", "seconds", 0, 1.0, None),
 ]
+
+FEWEST_SEEDS = 3
+"""Of each of two runs, to say whether they can be told apart."""
 
 
 def natural_name(config: TrainConfig) -> str:
@@ -89,6 +101,31 @@ def _difference(rows: Rows, reference: Rows, split: str, key: str) -> tuple[floa
         return None
     counts = [len(of.values(split, key)) for of in (rows, reference)]
     return mean - other, 2 * math.sqrt(std**2 / counts[0] + spread**2 / counts[1])
+
+
+def differences(first: Rows, second: Rows) -> list[dict[str, object]]:
+    """Return a row for every score that both have: of each, the difference, and whether seeds tell them apart.
+
+    The difference is that of the means, with two of its standard errors. Below `FEWEST_SEEDS` of either, the spread is
+    not known well enough to tell anything apart.
+    """
+    rows: list[dict[str, object]] = []
+    for split, key, title, decimals, unit, highest in _COLUMNS:
+        if (found := _difference(second, first, split, key)) is None:
+            continue
+        delta, margin = (x / unit for x in found)
+        known = min(len(of.values(split, key)) for of in (first, second)) >= FEWEST_SEEDS
+        said = "no" if known else "unknown"
+        if known and abs(delta) > margin:
+            said = "yes" if highest is None else "yes, better" if (delta > 0) == highest else "yes, worse"
+        rows.append({
+            "score": f"{split} {title}".strip(),
+            first.name: format_mean_std(first.values(split, key), unit=unit, decimals=decimals),
+            second.name: format_mean_std(second.values(split, key), unit=unit, decimals=decimals),
+            "difference": f"{delta:+.{decimals}f}" + f" ± {margin:.{decimals}f}" * known,
+            "told apart": said,
+        })  # fmt: skip
+    return rows
 
 
 def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:

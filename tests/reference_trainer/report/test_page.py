@@ -16,12 +16,13 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ca_reg.monitor import LOG_NAME
+from reference_trainer.cli import main
 from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.shares import blend_weights, colored_by, mean_shares, share_per_weight
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.report import page as page_module
 from reference_trainer.report.findings import find
-from reference_trainer.report.page import write_report
+from reference_trainer.report.page import compare_two, write_report
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG, run_settings
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes import load_scene
@@ -460,3 +461,50 @@ def test_the_scores_of_a_comparison_are_those_of_all_its_seeds(run, tmp_path):
     assert (cells[1]["delta"], cells[1]["better"], cells[1]["best"], cells[0]["best"]) == ("+1.50", True, True, False)
     # Two standard errors are 2 sqrt(0.5 / 2 + 2 / 2) = 2.24.
     assert data["verdict"].startswith("Dropout 0.2: a PSNR that cannot be told apart (+1.50 dB) and ")
+
+
+def trained(folder: Path, seed: int, psnr: float, *, test=("test_0",), **settings) -> Path:
+    """The folder of a run with these scores."""
+    config = TrainConfig(seed=seed, **settings)
+    views = [{"name": name, "split": "test"} for name in test] + [{"name": "train_0", "split": "train"}]
+    mean = {"test": {"psnr": psnr}, "train": {"psnr": psnr + 9}}
+    results = {"scene": "fern", "config": dataclasses.asdict(config), "seconds": 1.0, "gaussians": 7, "mean": mean}
+    write_json(folder / CONFIG, run_settings(SceneOptions(), config))
+    write_json(folder / "results.json", results | {"views": views})
+    return folder
+
+
+def test_two_trainings_side_by_side(tmp_path, capsys):
+    for seed, psnr in enumerate((20.0, 20.1, 20.2)):
+        trained(tmp_path / f"plain/seed_{seed}", seed, psnr)
+        trained(tmp_path / f"dropout/seed_{seed}", seed, psnr + 1, dropout=0.2, iterations=99)
+    (tmp_path / "plain/seed_2/results.json").rename(tmp_path / "later")  # not finished yet
+    main(["diff", str(tmp_path / "plain"), str(tmp_path / "dropout")])
+    said = capsys.readouterr().out
+    assert "| test PSNR | 20.05 ± 0.07 | 21.10 ± 0.10 | +1.05 | unknown |" in said
+    assert "Seeds: 2 and 3; too few" in said
+    assert "differ in iterations" in said
+    (tmp_path / "later").rename(tmp_path / "plain/seed_2/results.json")
+    main(["diff", str(tmp_path / "plain"), str(tmp_path / "dropout")])
+    assert "| test PSNR | 20.10 ± 0.10 | 21.10 ± 0.10 | +1.00 ± 0.16 | yes, better |" in capsys.readouterr().out
+
+    other = trained(tmp_path / "other", 0, 25.0, test=("test_1",))
+    rows, notes = compare_two(tmp_path / "plain/seed_0", other)
+    assert not any(str(row["score"]).startswith("test") for row in rows)
+    assert any("not compared" in note.lower() and "test" in note for note in notes)
+
+
+def test_what_cannot_be_compared_is_refused(tmp_path):
+    run, seeds = trained(tmp_path / "run", 0, 20.0), tmp_path / "seeds"
+    with pytest.raises(ValueError, match="two different runs"):
+        compare_two(run, run)
+    with pytest.raises(FileNotFoundError, match="holds no run"):
+        compare_two(run, tmp_path)
+    trained(seeds / "seed_0", 0, 20.0)
+    trained(seeds / "seed_1", 1, 20.0, dropout=0.1)
+    with pytest.raises(ValueError, match="more than the seed"):
+        compare_two(run, seeds)
+    (seeds / "seed_0/results.json").unlink()
+    (seeds / "seed_1/results.json").unlink()
+    with pytest.raises(ValueError, match="no scores yet"):
+        compare_two(run, seeds)

@@ -2,7 +2,15 @@ import math
 
 import pytest
 
-from reference_trainer.report.verdict import Rows, natural_name, natural_order, score_columns, unique_names, verdict
+from reference_trainer.report.verdict import (
+    Rows,
+    differences,
+    natural_name,
+    natural_order,
+    score_columns,
+    unique_names,
+    verdict,
+)
 from reference_trainer.training.config import TrainConfig
 
 
@@ -87,3 +95,23 @@ def test_the_best_and_the_better_are_marked_where_that_is_a_merit():
     assert (ca["cells"][1]["delta"], ca["cells"][1]["better"]) == ("+1.00", False)
     assert ca["cells"][2] == {"text": "n/a", "best": False}
     assert not any(cell["best"] or "delta" in cell for cell in gaussians["cells"])
+
+
+def test_two_trainings_are_told_apart_by_three_seeds_and_not_by_fewer():
+    one = rows("One", [20.0, 20.1, 20.2], [0.005, 0.0049, 0.0051])
+    two = rows("Two", [20.5, 20.7, 20.6], [0.0051, 0.005, 0.0049])
+    psnr, ca, *_ = differences(one, two)
+    error = 2 * math.sqrt(2 * 0.1**2 / 3)
+    assert psnr["score"] == "test PSNR"
+    assert psnr["difference"] == f"+0.50 ± {error:.2f}"
+    assert (psnr["told apart"], ca["told apart"]) == ("yes, better", "no")
+    assert (psnr["One"], psnr["Two"]) == ("20.10 ± 0.10", "20.60 ± 0.10")
+    assert differences(two, one)[0]["told apart"] == "yes, worse"
+
+    single = Rows("Two", False, two.results[:2])
+    assert {row["told apart"] for row in differences(one, single)} == {"unknown"}
+    assert "±" not in differences(one, single)[0]["difference"]
+    assert [row["score"] for row in differences(one, rows("B", [1.0] * 3, [1.0] * 3, split="train"))] == [
+        "Gaussians",
+        "seconds",
+    ]
