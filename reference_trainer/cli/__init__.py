@@ -22,6 +22,7 @@ except ImportError as error:
 
 from reference_trainer.cli.models import Bake, Clean, Diff, Evaluate, Render, Report, View
 from reference_trainer.cli.options import refuse_old_options
+from reference_trainer.cli.photos import Run
 from reference_trainer.cli.setup import Names, Poses, Recipes, Version, Warmup
 from reference_trainer.cli.studies import MOVED, Study
 from reference_trainer.cli.training import Compare, Demo, Plan, Train, given_fields
@@ -102,6 +103,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     config = with_recipe(recipe, **peeked) if recipe else TrainConfig()
     defaults: dict[str, Any] = {
         "demo": Demo(),
+        "run": Run(tyro.MISSING),
         "poses": Poses(tyro.MISSING),
         "plan": Plan(config=config, recipe=recipe, given=given),
         "train": Train(config=config, recipe=recipe, given=given),

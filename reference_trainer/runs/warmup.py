@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import functools
 import logging
+import time
 from dataclasses import replace
 
 import torch
 
 from reference_trainer.render import describe_engine, render_moments, variance_shares
+from reference_trainer.scenes.scene import View
 
-__all__ = ["warm_up"]
+__all__ = ["step_seconds", "warm_up"]
 
 _log = logging.getLogger(__name__)
+_UNTIMED, _TIMED = 3, 9  # steps
 
 
 @functools.cache
@@ -45,6 +48,31 @@ def warm_up() -> tuple[str, ...]:
         with reported_to(note):
             _use_everything()
     return tuple(names)
+
+
+def step_seconds(width: int, height: int, device: str = "cpu") -> float:
+    """Time a training step on this machine as it is now: photographs of this size, one Gaussian for ten pixels.
+
+    After `warm_up`, else what is compiled counts.
+    """
+    from reference_trainer.scenes import synthetic_scene
+    from reference_trainer.scenes.images import resize_image
+    from reference_trainer.threads import threads_for
+    from reference_trainer.training.config import TrainConfig
+    from reference_trainer.training.trainer import Trainer
+
+    scene = synthetic_scene(width=40, height=30, points=max(10, width * height // 10))
+    views = tuple(
+        View(view.name, view.camera.resized(width, height), resize_image(view.image, width, height))
+        for view in scene.train
+    )
+    trainer = Trainer(replace(scene, train=views), TrainConfig(dropout=0.2), device)
+    with threads_for(width * height):
+        for number in range(_UNTIMED + _TIMED):
+            if number == _UNTIMED:
+                begun = time.perf_counter()
+            trainer.train_step()
+    return (time.perf_counter() - begun) / _TIMED
 
 
 def _use_everything() -> None:

@@ -1,0 +1,256 @@
+"""`ca-reg run`: from photographs to a model and its page, in steps that each resume."""
+
+from __future__ import annotations
+
+import math
+import os
+import shlex
+import shutil
+import sys
+import webbrowser
+from contextlib import suppress
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from reference_trainer.cli.options import Device, Rendering, RenderOptions
+from reference_trainer.json_files import read_json
+from reference_trainer.runs.folder import (
+    BAKED_PLY,
+    CHECKPOINT,
+    CONFIG,
+    PLAN,
+    PLY,
+    RESULTS,
+    VIEWS,
+    check_output,
+    report_file,
+    run_lock,
+    settings_of_run,
+)
+from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.recipes import with_recipe
+
+__all__ = ["Run"]
+
+RECIPE = "3dgs"
+"""The schedule under the setting that is best known for few photographs, `plan_rules.RECOMMENDED`."""
+PRESETS = {"quick": (1_000, 100_000), "default": (2_000, 200_000), "quality": (5_000, 500_000)}
+"""Training steps, and pixels to which photographs are reduced."""
+MARK = "photographs.json"
+SCENE = "scene"
+Step = Literal["photographs", "poses", "train", "evaluate", "report"]
+_WRITTEN: dict[Step, tuple[str, ...]] = {
+    "photographs": (MARK, SCENE),
+    "poses": (f"{SCENE}/*/sparse",),
+    "train": (CHECKPOINT, CONFIG, PLAN, PLY, BAKED_PLY, "ca.jsonl", "events.out.*"),
+    "evaluate": (RESULTS, "evaluation.partial.json", VIEWS),
+    "report": ("report.html",),
+}
+"""What each step writes. `--from` deletes that of a step and of those after it."""
+
+_TRAINING, _SHOWN, _REFERENCE = 1.7, 30.0, 2.9e-7
+"""Of `_forecast`: a training step, and measuring and showing a view, in timed steps; seconds of such a step per pixel
+on the machine on which the seconds of the poses were measured."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Make a model, and a page about it, from photographs.
+
+    Finds the cameras, trains at the setting that is best known for few photographs, measures, and writes the page; says
+    first how long it will take. The same command goes on where it stopped. Needs ca_reg[colmap] where there are no
+    cameras, ca_reg[photos] for HEIC and videos.
+    """
+
+    photos: Annotated[Path, tyro.conf.Positional]
+    """Folder of the photographs, with cameras or without; or a video."""
+    out: Path | None = None
+    """Folder for everything that is written; by default runs/<name of the photographs>."""
+    quick: bool = False
+    """1,000 steps at a tenth of a megapixel, for a first look; by default 2,000 at a fifth."""
+    quality: bool = False
+    """5,000 steps at half a megapixel."""
+    again: Annotated[Step | None, tyro.conf.arg(name="from")] = None
+    """Do this step and those after it again: what they wrote is deleted."""
+    frames: int = 16
+    """Pictures to take from a video: the sharpest of as many equal parts."""
+    points: str = "auto"
+    """Initial points, as for `ca-reg train`, such as "dense"."""
+    test: Literal["none", "auto"] = "none"
+    """"auto" holds photographs out to measure the quality at, as `ca-reg train` does; by default all of them train."""
+    open: bool = True
+    """Open the page in a browser, where there is one."""
+    device: Device = "cpu"
+    rendering: Rendering = field(default_factory=RenderOptions)
+
+    @property
+    def folder(self) -> Path:
+        """Where everything is written."""
+        return self.out or Path("runs", self.photos.resolve().stem)
+
+    def check(self) -> None:
+        """Refuse what cannot work, before anything heavy is imported."""
+        if not self.photos.exists():
+            raise FileNotFoundError(f"there is no {self.photos}: give the folder of the photographs, or a video.")
+        if self.quick and self.quality:
+            raise ValueError("--quick and --quality exclude each other: give one.")
+        if self.frames < 2:
+            raise ValueError(f"expected at least 2 --frames of a video, got {self.frames}.")
+        if self.folder.resolve() in self.photos.resolve().parents:
+            raise ValueError(f"the photographs are in {self.folder}, to which nothing is written: give another --out.")
+        ours = (self.folder / MARK).exists()
+        check_output(self.folder, self.photos, () if ours else (SCENE, CONFIG, CHECKPOINT, PLY, RESULTS, VIEWS))
+        report_file([self.folder])
+
+    def __call__(self) -> None:
+        from reference_trainer.runs.run import Monitoring, run_experiment
+
+        scene = self._photographs()
+        self.rendering.begin(self.device, trains=True)
+        options, config = self._settings(scene)
+        print(self._forecast(scene, options, config), flush=True)
+        self._poses(scene)
+        self._plan(options, config)
+        run_experiment(
+            options, config, self.folder, auto=True, device=self.device, monitoring=Monitoring(), progress=True
+        )
+        self._report()
+
+    def _photographs(self) -> Path:
+        """Name what cannot be read, and return the folder of the scene: that of the photographs if it has cameras."""
+        from reference_trainer.evaluation.results import write_json
+        from reference_trainer.scenes.formats import find_format
+        from reference_trainer.scenes.photographs import collect_photographs, is_video, sort_photographs
+
+        sources, wrong = sort_photographs(self.photos)
+        for name, why in wrong.items():
+            print(f"not read, and left out: {name}: {why}", file=sys.stderr)
+        scene, mark = self.folder / SCENE / self.photos.resolve().stem, self.folder / MARK
+        with suppress(ValueError, FileNotFoundError):
+            find_format(self.photos, "auto")
+            scene = self.photos
+        if scene != self.photos and find_spec("pycolmap") is None:
+            raise ImportError("these photographs have no cameras, and finding them needs pip install 'ca_reg[colmap]'.")
+        if scene != self.photos and len(sources) < 2 and not is_video(self.photos):
+            raise ValueError(f"{self.photos} holds {len(sources)} photographs that can be read; it takes at least 2.")
+        about: dict[str, Any] = {"frames": self.frames, "files": {path.name: path.stat().st_size for path in sources}}
+        with run_lock(self.folder):
+            for step in list(_WRITTEN)[list(_WRITTEN).index(self.again) :] if self.again else ():
+                for path in [path for name in _WRITTEN[step] for path in self.folder.glob(name)]:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+            if not mark.exists():
+                names = [] if scene == self.photos else collect_photographs(sources, scene / "images", self.frames)
+                write_json(mark, about)
+                print(f"photographs: {len(names)}, in {scene}" if names else f"photographs with cameras: {scene}")
+            elif (before := read_json(mark)) != about:
+                changed = {name for name, _ in about["files"].items() ^ before["files"].items()} or {"--frames"}
+                raise ValueError(
+                    f"{self.folder} was made from other photographs, see {', '.join(sorted(changed))}: give another "
+                    "--out, or begin again with --from photographs."
+                )
+        return scene
+
+    def _settings(self, scene: Path) -> tuple[SceneOptions, TrainConfig]:
+        """Return what is trained; refuses to go on with a run that was begun with other settings, which are named."""
+        from reference_trainer.training.plan_rules import RECOMMENDED
+
+        steps, pixels = PRESETS["quick" if self.quick else "quality" if self.quality else "default"]
+        factor = max(1.0, math.sqrt(math.prod(_sizes(scene)[0]) / pixels))
+        options = SceneOptions(str(scene), test=self.test, points=self.points, downscale=round(factor, 3))
+        config = with_recipe(RECIPE, iterations=steps, **RECOMMENDED)
+        if (self.folder / CONFIG).exists():
+            try:
+                settings_of_run(self.folder, options, config, auto=True, given=())
+            except ValueError as error:
+                raise ValueError(f"{error} Or train again with --from train.") from error
+        return options, config
+
+    def _forecast(self, scene: Path, options: SceneOptions, config: TrainConfig) -> str:
+        """Return how long what is still to be done will take, from a few training steps on this machine.
+
+        A real training step takes `_TRAINING` times as long as a timed one in the mean, because Gaussians grow in
+        number; all else is counted in timed steps too, so that it scales with the machine.
+        """
+        from reference_trainer.runs.warmup import step_seconds
+        from reference_trainer.scenes.colmap import colmap_folders
+        from reference_trainer.training.checkpoint import load_checkpoint
+
+        if (self.folder / RESULTS).exists():
+            return "Trained and measured before."
+        (width, height), count = _sizes(scene)
+        factor, done = options.downscale or 1.0, 0
+        if (self.folder / CHECKPOINT).exists():
+            done = load_checkpoint(self.folder / CHECKPOINT)["step"]
+        step = step_seconds(round(width / factor), round(height / factor), self.device)
+        times = {"training": _TRAINING * (config.iterations - done), "scores and page": _SHOWN * 3 * min(count, 8)}
+        if scene != self.photos and not colmap_folders(scene):
+            megapixels = min(width * height, 1_920_000) / 1e6  # COLMAP looks at no more
+            work = count * megapixels * (6.0 if count < 8 else 2.0) + 0.025 * count * (count - 1) / 2
+            times = {"poses": work / (_REFERENCE * width * height / factor**2), **times}
+        parts = ", ".join(f"{name} {_duration(step * number)}" for name, number in times.items())
+        return f"This will take about {_duration(step * sum(times.values()))} on this machine as it is now: {parts}."
+
+    def _poses(self, scene: Path) -> None:
+        """Find the cameras of photographs that have none."""
+        from reference_trainer.scenes.colmap import colmap_folders
+        from reference_trainer.scenes.poses import find_poses
+
+        if scene == self.photos:
+            return
+        if found := colmap_folders(scene):
+            print(f"poses: in {found[0]}, as before")
+            return
+        with run_lock(self.folder):
+            print(find_poses(scene, progress=True))
+
+    def _plan(self, options: SceneOptions, config: TrainConfig) -> None:
+        """Say what training will use, unless it has begun."""
+        from reference_trainer.scenes import load_scene
+        from reference_trainer.training.plan import make_plan
+
+        if not (self.folder / CHECKPOINT).exists():
+            scene = load_scene(options, seed=config.seed)
+            print(f"{scene}\n{make_plan(scene, config).summary()}")
+
+    def _report(self) -> None:
+        """Write the page and open it."""
+        from reference_trainer.evaluation.tables import print_table, summary
+        from reference_trainer.report.page import write_report
+        from reference_trainer.runs.folder import read_results
+
+        page, results = self.folder / "report.html", self.folder / RESULTS
+        if not page.exists() or page.stat().st_mtime < results.stat().st_mtime:
+            write_report([self.folder], device=self.device)
+        print_table(summary(read_results(self.folder)))
+        out = shlex.quote(str(self.folder))
+        print(f"The page is {page}. Live: ca-reg view {out}; a film: ca-reg render {out} --what flight")
+        screen = not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+        if self.open and screen:
+            with suppress(webbrowser.Error):
+                webbrowser.open(page.resolve().as_uri())
+
+
+def _sizes(scene: Path) -> tuple[tuple[int, int], int]:
+    """Return width and height of the largest photograph of a scene, and how many there are."""
+    from reference_trainer.scenes.images import image_size, list_images, picture_folder
+
+    sizes = [image_size(path) for path in list_images(picture_folder(scene, None))]
+    return max(sizes, key=math.prod), len(sizes)
+
+
+def _duration(seconds: float) -> str:
+    """Return a time as people say it.
+
+    Example:
+        >>> _duration(42), _duration(200), _duration(5000)
+        ('40 s', '3 min', '1 h 23 min')
+    """
+    if seconds < 90:
+        return f"{max(5, 5 * round(seconds / 5))} s"
+    hours, minutes = divmod(round(seconds / 60), 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"

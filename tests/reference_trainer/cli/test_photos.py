@@ -1,0 +1,183 @@
+"""From photographs to a page with one command, and again from where it stopped."""
+
+import json
+import re
+import shutil
+import webbrowser
+
+import numpy as np
+import pytest
+from commands import refused
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from reference_trainer.cli import main, photos
+from reference_trainer.evaluation.pictures import save_png
+from reference_trainer.report import page as page_module
+from reference_trainer.runs import warmup
+from reference_trainer.scenes import poses, synthetic_scene
+from reference_trainer.scenes.images import read_image
+
+SCENE = synthetic_scene(width=40, height=30, points=150)
+
+
+def write_cameras(scene, folder):
+    """COLMAP's text files of the built-in scene, as COLMAP documents them."""
+    folder.mkdir(parents=True)
+    camera = SCENE.train[0].camera
+    lens = f"{camera.fx} {camera.fy} {camera.cx} {camera.cy}"
+    (folder / "cameras.txt").write_text(f"1 PINHOLE {camera.width} {camera.height} {lens}\n")
+    lines = []
+    for number, view in enumerate(SCENE.train, 1):
+        pose = view.camera.world_to_camera.double().numpy()
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        lines += [" ".join(map(str, [number, w, x, y, z, *pose[:3, 3], 1, f"{view.name}.png"])), ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    points = [" ".join(map(str, [i, *p, 9, 9, 9, 0.5, 1, 0])) for i, p in enumerate(SCENE.points.positions.tolist(), 1)]
+    (folder / "points3D.txt").write_text("\n".join(points) + "\n")
+
+
+@pytest.fixture
+def garden(tmp_path, monkeypatch):
+    """Three photographs without cameras, which a stand-in for COLMAP finds; two or three steps; no calibration."""
+
+    def find(scene, **rest):
+        assert sorted(path.name for path in (scene / "images").iterdir()) == [f"train_{i}.png" for i in range(3)]
+        write_cameras(scene, scene / "sparse" / "0")
+        return "3 of 3 photographs registered"
+
+    for view in SCENE.train:
+        save_png(tmp_path / "garden" / f"{view.name}.png", view.image)
+    monkeypatch.setattr(poses, "find_poses", find)
+    monkeypatch.setattr(warmup, "step_seconds", lambda *size: 0.5)
+    monkeypatch.setattr(photos, "PRESETS", {"quick": (2, 600), "default": (3, 1200), "quality": (4, 1200)})
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "garden"
+
+
+def seen(folder):
+    """What is there, and when it was written."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.slow
+def test_three_photographs_become_a_page(garden, tmp_path, capsys, monkeypatch):
+    opened = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setenv("DISPLAY", ":0")
+    before = seen(garden)
+    (garden / "IMG_4.CR2").write_bytes(b"raw")
+    main(["run", "garden"])
+    said, warned = capsys.readouterr()
+    out = tmp_path / "runs" / "garden"
+    assert "IMG_4.CR2" in warned
+    assert "3 of 3 photographs registered" in said
+    assert (
+        said.index("will take about") < said.index("registered") < said.index("| train |") < said.index("The page is")
+    )
+    assert {path: at for path, at in seen(garden).items() if path.suffix == ".png"} == before
+    page = (out / "report.html").read_text()
+    assert opened == [(out / "report.html").as_uri()]
+    assert "garden" in re.search("<title>(.*)</title>", page)[1]
+    verdict = re.search(r'"verdict": "([^"]*)"', page)[1]
+    assert "CA" in verdict
+    assert "test view" not in verdict
+    settings = json.loads((out / "config.json").read_text())["config"]
+    assert (settings["dropout"], settings["opacity_decay"], settings["iterations"]) == (0.2, 0.995, 3)
+    assert read_image(out / "views/train/train_0.png")[0].shape == (3, 30, 40)
+
+    # What is finished stays, and nothing is written again.
+    finished = seen(out)
+    main(["run", "garden", "--no-open"])
+    assert len(opened) == 1
+    assert seen(out) == finished
+
+    # One step and those after it again.
+    main(["run", "garden", "--from", "evaluate"])
+    changed = {path.relative_to(out).parts[0] for path, at in seen(out).items() if finished.get(path) != at}
+    assert {"results.json", "views", "report.html"} <= changed
+    assert not changed & {"scene", "photographs.json"}
+
+    # Other settings or photographs are named, unless they are asked for.
+    assert "iterations: 3 -> 2" in (text := refused(["run", "garden", "--quick"], capsys))
+    assert "--from train" in text
+    (garden / "train_2.png").unlink()
+    assert "other photographs, see train_2.png" in refused(["run", "garden"], capsys)
+    shutil.copy(out / "scene/garden/images/train_2.png", garden)
+    main(["run", "garden", "--quick", "--from", "train", "--no-open"])
+    assert json.loads((out / "config.json").read_text())["config"]["iterations"] == 2
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_goes_on(garden, tmp_path, monkeypatch, capsys):
+    def stop(*arguments, **named):
+        raise KeyboardInterrupt
+
+    out = tmp_path / "out"
+    with monkeypatch.context() as patched:
+        patched.setattr(page_module, "write_report", stop)
+        with pytest.raises(SystemExit) as ended:
+            main(["run", "garden", "--out", "out", "--no-open"])
+    assert ended.value.code == 130
+    trained = seen(out)
+    main(["run", "garden", "--out", "out", "--no-open"])
+    new = {path.name for path, at in seen(out).items() if trained.get(path) != at}
+    assert new == {"report.html"}
+
+
+@pytest.mark.slow
+def test_photographs_with_cameras_stay_where_they_are(garden, tmp_path, monkeypatch):
+    monkeypatch.setattr(poses, "find_poses", None)  # nobody calls it
+    write_cameras(SCENE, garden / "sparse" / "0")
+    before = seen(garden)
+    main(["run", "garden", "--out", "out", "--quick", "--no-open"])
+    assert seen(garden) == before
+    assert not (tmp_path / "out" / "scene").exists()
+    with Image.open(tmp_path / "out/views/train/train_0.png") as view:  # 600 pixels of 40 x 30
+        assert view.size == (28, 21)
+    assert np.isfinite(json.loads((tmp_path / "out" / "results.json").read_text())["mean"]["train"]["psnr"])
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("point_cloud.ply", "ply"), ("report.html", "<p>mine"), ("scene", None), ("views", None)]
+)
+def test_nothing_of_somebody_else_is_overwritten(garden, tmp_path, capsys, name, content):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).mkdir() if content is None else (tmp_path / "out" / name).write_text(content)
+    before = seen(tmp_path)
+    assert name in refused(["run", "garden", "--out", "out"], capsys)
+    assert name in refused(["run", "garden", "--out", "out", "--from", "photographs"], capsys)
+    for out in ("garden", "."):
+        assert "another --out" in refused(["run", "garden", "--out", out], capsys)
+    assert seen(tmp_path) == before
+
+
+def test_what_cannot_work_is_refused_at_once(garden, capsys, monkeypatch):
+    (garden.parent / "one").mkdir()
+    shutil.copy(garden / "train_0.png", garden.parent / "one")
+    assert "1 photographs that can be read" in refused(["run", "one"], capsys)
+    with monkeypatch.context() as patched:
+        patched.setattr(photos, "find_spec", lambda name: None)
+        assert "ca_reg[colmap]" in refused(["run", "garden"], capsys)
+    assert "no nowhere" in refused(["run", "nowhere"], capsys)
+    assert "--quality" in refused(["run", "garden", "--quick", "--quality"], capsys)
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_three_real_photographs_from_nothing_to_the_page(data_root, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
+    monkeypatch.setattr(photos, "PRESETS", {"quick": (30, 20_000)})
+    names = json.loads((data_root / "fern/split.json").read_text())["train"]
+    (tmp_path / "fern").mkdir()
+    for name in names:
+        with Image.open(data_root / "fern/images_8" / name) as picture:
+            picture.convert("RGB").save(tmp_path / "fern" / f"{name[:-4]}.jpg", quality=95)
+    main(["run", str(tmp_path / "fern"), "--out", str(tmp_path / "out"), "--quick", "--no-open"])
+    said = capsys.readouterr().out
+    assert "3 of 3 photographs registered" in said
+    assert re.search(r"will take about \d+ (s|min) on this machine as it is now: poses \d+ s, training \d+ s", said)
+    assert (tmp_path / "out/report.html").stat().st_size > 1e6
+    results = json.loads((tmp_path / "out/results.json").read_text())
+    assert set(results["mean"]) == {"train", "between", "around"}
+    assert results["mean"]["train"]["psnr"] > 12
