@@ -17,7 +17,7 @@ import tyro
 
 from reference_trainer.camera import Camera
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
-from reference_trainer.evaluation.pictures import as_pillow, heat_map
+from reference_trainer.evaluation.pictures import as_pillow, heat_map, label_font
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing
 from reference_trainer.runs.measure import load_run_model
@@ -49,11 +49,10 @@ def there_and_back(cameras: Sequence[Camera], frames: int, past: float) -> list[
 @torch.no_grad()
 def sheets(models: Sequence[TrainedModel], labels: Sequence[str], path: Sequence[Camera]) -> list[Image]:
     """Return a picture for each camera: a column for each model, its render above the exact variance of the pixels."""
-    import matplotlib
-    from PIL import Image, ImageDraw, ImageFont
+    from PIL import Image, ImageDraw
 
     width, height = path[0].width, path[0].height
-    font = ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), 15)
+    font = label_font()
     drawn, scores = list[list[tuple[Image.Image, Image.Image]]](), list[str]()
     for model in models:
         score = model.exact_ca_score(drop_rate=0.5)

@@ -111,7 +111,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         "evaluate": Evaluate(run=tyro.MISSING),
         "report": Report(runs=tyro.MISSING),
         "diff": Diff(tyro.MISSING, tyro.MISSING),
-        "view": View(run=tyro.MISSING),
+        "view": View(runs=tyro.MISSING),
         "render": Render(run=Path("runs/train")),
         "study": Study(tyro.MISSING),
         "bake": Bake(ply=tyro.MISSING),

@@ -85,9 +85,9 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Render a run's views as PNG, or a flight also as a film.
+    """Render a run's views as PNG, or a flight also as a movie.
 
-    The film is an MP4 with ca_reg[photos], else an animated WebP.
+    The movie is an MP4 with ca_reg[photos], else an animated WebP.
     """
 
     run: Annotated[Path, tyro.conf.Positional]
@@ -172,13 +172,14 @@ class Diff:
 
 @dataclass(frozen=True)
 class View:
-    """Explore a run, or any 3DGS PLY, live in a browser.
+    """Explore a run, or any 3DGS PLY, live in a browser; or two with one camera.
 
     Shows render, co-adaptation, depth or heat, as this package renders them. Needs ca_reg[viewer]; Ctrl-C ends it.
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Folder of a run of `ca-reg train`, finished or not, or a standard 3DGS PLY."""
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folder of a run of `ca-reg train`, finished or not, or a standard 3DGS PLY; of two, one stands beside the other,
+    seen from the cameras of the first."""
     scene: ModelScene = field(default_factory=PlyScene)
     orbit: Orbit = field(default_factory=OrbitOptions)
     regularizer: str | None = None
@@ -191,7 +192,10 @@ class View:
 
     def check(self) -> None:
         """Refuse what cannot work, before anything heavy is imported."""
-        check_model(self.run, place_of(self.run, self.scene, self.orbit))
+        if not 1 <= len(self.runs) <= 2 or len(set(self.runs)) < len(self.runs):
+            raise ValueError(f"expected 1 model to show, or 2 that differ, got {[str(run) for run in self.runs]}.")
+        for run in self.runs:
+            check_model(run, place_of(run, self.scene, self.orbit))
 
     def __call__(self) -> None:
         from reference_trainer.runs.measure import load_run_model
@@ -199,17 +203,18 @@ class View:
         from reference_trainer.scenes.virtual_cameras import measured_views
         from reference_trainer.viewer.window import Viewer
 
-        where = place_of(self.run, self.scene, self.orbit)
         trust = {*self.trust, *modules_named(self.regularizer or "")}
         shared: dict[str, Any] = {"regularizer": self.regularizer, "device": self.device, "trust": trust}
         with Viewer(self.port) as viewer:
             self.rendering.begin(self.device, trains=True)  # so that no later picture waits for the compiler
-            if where is None:
-                model, scene = load_run_model(self.run, **shared)
-                viewer.show(model, measured_views(scene))
-            else:
-                loaded = load_for_views(self.run, where, background=self.scene.background, **shared)
-                viewer.show(loaded.model, loaded.views)
+            for run in self.runs:
+                where = place_of(run, self.scene, self.orbit)
+                if where is None:
+                    model, scene = load_run_model(run, **shared)
+                    viewer.show(model, measured_views(scene), str(run))
+                else:
+                    loaded = load_for_views(run, where, background=self.scene.background, **shared)
+                    viewer.show(loaded.model, loaded.views, str(run))
             print(f"{viewer}; Ctrl-C ends it.", flush=True)
             viewer.serve()
 

@@ -209,16 +209,18 @@ def _measure(
         ca_reason=ca.reason.name,
     )
     if files:
-        render = {"render" if photograph is None else f"render {measured.psnr:.2f} dB": image}
+        title = "render" if photograph is None else f"render {measured.psnr:.2f} dB"
+        panels: dict[str, tuple[Tensor, tuple[str, str] | None]] = {title: (image, None)}
         if photograph is None:
             own = {} if scores[2].settings == scores[3].settings else {f"exact CA{_at(exact)}": exact}
             sampled = f"CA, {ca.samples} renders{_at(ca)}"
-            panels = render | _maps({"exact CA": exact_half, **own, sampled: ca, f"neutral CA{_at(neutral)}": neutral})
+            panels |= _maps({"exact CA": exact_half, **own, sampled: ca, f"neutral CA{_at(neutral)}": neutral})
         else:
-            error = error_picture(image, photograph)
-            panels = {"photograph": photograph} | render | {"error": error} | _maps({"exact CA": exact_half})
+            error = error_picture(image, photograph), ("0", f"{ERROR_PICTURE_RANGE:g}")
+            panels = {"photograph": (photograph, None)} | panels | {"error": error} | _maps({"exact CA": exact_half})
         save_png(files[0], image)
-        save_png(files[1], side_by_side([*panels.values()], [*panels]))
+        pictures, scales = zip(*panels.values(), strict=True)
+        save_png(files[1], side_by_side(pictures, [*panels], scales=scales))
     return measured
 
 
@@ -242,9 +244,10 @@ def _at(result: CAResult) -> str:
     return "" if result.drop_rate == 0.5 or result.drop_rate is None else f" at drop rate {result.drop_rate:g}"
 
 
-def _maps(results: Mapping[str, CAResult]) -> dict[str, Tensor]:
-    """Return the maps of scores, titled with name and value."""
-    return {f"{name} {result.value * 1e3:.2f}e-3": ca_picture(result) for name, result in results.items()}
+def _maps(results: Mapping[str, CAResult]) -> dict[str, tuple[Tensor, tuple[str, str] | None]]:
+    """Return the maps of scores with the ends of their color bars, titled with name and value."""
+    ends = "0", f"{CA_PICTURE_RANGE:g}"
+    return {f"{name} {result.value * 1e3:.2f}e-3": (ca_picture(result), ends) for name, result in results.items()}
 
 
 def ca_picture(result: CAResult) -> Tensor:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from fractions import Fraction
+from functools import cache
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -24,24 +26,25 @@ from reference_trainer.scenes.images import IMAGE_SUFFIXES, read_image
 __all__ = [
     "PANEL",
     "as_pillow",
+    "color_bar",
     "comparison_figure",
     "dynamics_figure",
     "file_names",
     "heat_colors",
     "heat_map",
     "is_own_png",
-    "save_film",
+    "label_font",
     "save_png",
     "side_by_side",
+    "write_movie",
 ]
 
 PANEL = "_panel"
 """Suffix of a view's panel, after the name of its render."""
 
 _MADE_BY = "ca_reg"  # in the header of every PNG
-_RATE = 20  # pictures of a film per second
 _GAP = 4  # pixels between pictures
-_LABEL_HEIGHT = 16  # pixels; Pillow's built-in font is about 11 high
+_TEXT, _LINE, _BAR = 15, 20, 8  # pixels: size of letters, height of a line of them, height of a color bar
 _UNDEFINED = "0.5"  # gray for values that are not finite; not a color of the map
 
 
@@ -94,30 +97,6 @@ def is_own_png(path: Path) -> bool:
         return b"Software\0" + _MADE_BY.encode() in file.read(200)
 
 
-def save_film(folder: Path, name: str, images: Sequence[Tensor]) -> Path:
-    """Write pictures, at least one, of equal and even size or cut to it, as a film of 20 a second; return its file.
-
-    An MP4 (H.264), which everything plays, where PyAV is installed; else a looping animated WebP, for browsers. Errors
-    as for `save_png`.
-    """
-    frames = [as_pillow(image) for image in images]
-    try:
-        import av
-    except ImportError:
-        with replacing(path := folder / f"{name}.webp") as place:
-            frames[0].save(
-                place, "WEBP", save_all=True, append_images=frames[1:], duration=1000 // _RATE, loop=0, quality=85
-            )
-        return path
-    width, height = (side // 2 * 2 for side in frames[0].size)  # H.264 has half the resolution in color
-    with replacing(path := folder / f"{name}.mp4") as place, av.open(str(place), "w", format="mp4") as file:
-        stream = file.add_stream("h264", rate=_RATE, options={"crf": "18"})
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for frame in [*(av.VideoFrame.from_image(each.crop((0, 0, width, height))) for each in frames), None]:
-            file.mux(stream.encode(frame))
-    return path
-
-
 def as_pillow(image: Tensor) -> Any:
     """Return an image (3, H, W) as a Pillow image; errors as for `save_png`."""
     from PIL import Image
@@ -166,11 +145,38 @@ def heat_colors(values: Tensor, low: float, high: float) -> Tensor:
     return heat_map(along[None], 1.0)[:, 0].T
 
 
-def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: int | None = None) -> Tensor:
+@cache
+def label_font(size: int = _TEXT) -> Any:
+    """Return the font of labels in pictures for Pillow: matplotlib's DejaVu Sans, ``size`` pixels high."""
+    import matplotlib
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")), size)
+
+
+def color_bar(low: str, high: str, *, width: int) -> Tensor:
+    """Return the colors of `heat_map` from left to right, with what they mean at the ends below: (3, 28, width)."""
+    from PIL import Image, ImageDraw
+
+    sheet = Image.new("RGB", (width, _BAR + _LINE), "white")
+    sheet.paste(as_pillow(heat_map(torch.linspace(0, 1, width).expand(_BAR, -1), 1.0)))
+    pen = ImageDraw.Draw(sheet)
+    for at, anchor, text in ((2, "la", low), (width - 2, "ra", high)):
+        pen.text((at, _BAR + 1), text, fill="black", font=label_font(), anchor=anchor)
+    return torch.from_numpy(np.array(sheet)).permute(2, 0, 1) / 255
+
+
+def side_by_side(
+    images: Sequence[Tensor],
+    labels: Sequence[str],
+    *,
+    columns: int | None = None,
+    scales: Sequence[tuple[str, str] | None] = (),
+) -> Tensor:
     """Arrange pictures (3, H, W) in [0, 1] of one size in a grid, each with a label above, with thin white gaps.
 
-    Labels should be Latin letters (the built-in font has few others); a column is at least as wide as its labels.
-    Without ``columns`` all pictures form one row.
+    A column is at least as wide as its labels. Without ``columns`` all pictures form one row. ``scales`` are the ends
+    of each picture's color bar, which is drawn below it; None for a picture without.
 
     Returns:
         Colors in [0, 1], shape (3, H', W'), on the CPU, rounded to bytes.
@@ -180,11 +186,12 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
 
     Example:
         >>> side_by_side([torch.zeros(3, 30, 40)] * 3, ["a", "b", "c"], columns=2).shape
-        torch.Size([3, 96, 84])
+        torch.Size([3, 104, 84])
     """
     from PIL import Image, ImageDraw
 
-    if not images or len(images) != len(labels):
+    scales = scales or [None] * len(images)
+    if not images or not len(images) == len(labels) == len(scales):
         raise ValueError(f"expected one label for each of at least one image, got {len(images)} and {len(labels)}.")
     pictures = [as_pillow(image) for image in images]
     if len({picture.size for picture in pictures}) != 1:
@@ -192,19 +199,50 @@ def side_by_side(images: Sequence[Tensor], labels: Sequence[str], *, columns: in
     columns = min(len(images), len(images) if columns is None else columns)
     if columns < 1:
         raise ValueError(f"columns must be positive, got {columns}.")
-    width, cell = pictures[0].width, pictures[0].height + _LABEL_HEIGHT + _GAP
-    measure = ImageDraw.Draw(pictures[0]).textlength
-    needed = [max(width, math.ceil(measure(label)) + 4) for label in labels]
+    width, height = pictures[0].size
+    cell = _LINE + height + (_BAR + _LINE + 2 if any(scales) else 0) + _GAP
+    needed = [max(width, math.ceil(label_font().getlength(label)) + 4) for label in labels]
     widths = [max(needed[column::columns]) for column in range(columns)]
     size = (sum(widths) + (columns - 1) * _GAP, -(-len(images) // columns) * cell - _GAP)
     sheet = Image.new("RGB", size, "white")
     pen = ImageDraw.Draw(sheet)
-    for index, (picture, label) in enumerate(zip(pictures, labels, strict=True)):
+    for index, (picture, label, scale) in enumerate(zip(pictures, labels, scales, strict=True)):
         row, column = divmod(index, columns)
-        left = sum(widths[:column]) + column * _GAP
-        pen.text((left + 2, row * cell + 2), label, fill="black")
-        sheet.paste(picture, (left, row * cell + _LABEL_HEIGHT))
+        left, top = sum(widths[:column]) + column * _GAP, row * cell
+        pen.text((left + 2, top + 1), label, fill="black", font=label_font())
+        sheet.paste(picture, (left, top + _LINE))
+        if scale:
+            sheet.paste(as_pillow(color_bar(*scale, width=width)), (left, top + _LINE + height + 2))
     return torch.from_numpy(np.array(sheet)).permute(2, 0, 1) / 255
+
+
+def write_movie(frames: Iterable[Tensor], path: Path, fps: float = 24) -> Path:
+    """Write pictures (3, H, W) of one size as a movie, and return the file.
+
+    That is an MP4 (H.264) where PyAV is installed, which `pip install av` does, else a WebP that plays in a loop; the
+    file's extension says which. A last row or column beyond an even number is cut from an MP4.
+    """
+    try:
+        import av
+    except ImportError:
+        pictures = [as_pillow(frame) for frame in frames]
+        with replacing(path := path.with_suffix(".webp")) as place:
+            pictures[0].save(
+                place, "WEBP", save_all=True, append_images=pictures[1:], duration=round(1000 / fps), loop=0, quality=85
+            )
+        return path
+    with replacing(path := path.with_suffix(".mp4")) as place, av.open(str(place), "w", format="mp4") as file:
+        stream = None
+        for frame in frames:
+            picture = np.asarray(as_pillow(frame))
+            picture = np.ascontiguousarray(picture[: len(picture) // 2 * 2, : picture.shape[1] // 2 * 2])
+            if stream is None:
+                stream = file.add_stream("h264", rate=Fraction(fps).limit_denominator(1000), options={"crf": "18"})
+                stream.height, stream.width, stream.pix_fmt = *picture.shape[:2], "yuv420p"
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        if stream is not None:
+            file.mux(stream.encode())
+    return path
 
 
 def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
@@ -249,4 +287,4 @@ def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split:
     panels = [read_image(folder / "views" / split / f"{view}{PANEL}.png")[0] for folder in runs.values()]
     widest = max(panel.shape[2] for panel in panels)  # long labels widen the panels of narrow pictures
     panels = [pad(panel, (0, widest - panel.shape[2]), value=1.0) for panel in panels]
-    save_png(path, side_by_side(panels, list(runs), columns=1))
+    save_png(path, side_by_side(panels, [*map(readable, runs)], columns=1))

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise, Reason
 from reference_trainer.camera import Camera
@@ -16,9 +17,9 @@ from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ca_picture
 from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE, Heat, colored_by
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.scenes.scene import Viewpoint
+from reference_trainer.scenes.scene import View, Viewpoint
 
-__all__ = ["DisplayOptions", "Mode", "ViewerModel"]
+__all__ = ["DisplayOptions", "Mode", "Picture", "ViewerModel", "with_photograph"]
 
 Mode = Literal["render", "co-adaptation", "depth", "heat"]
 
@@ -43,36 +44,46 @@ class DisplayOptions:
     hidden: float = 0.0
 
 
+class Picture(NamedTuple):
+    """A picture (3, H, W) in [0, 1], a note on it, and what its color bar means: low end, high end, quantity."""
+
+    image: Tensor
+    note: str
+    scale: tuple[str, str, str] | None = None
+
+
 class ViewerModel:
     """A model to show; what successive pictures share is computed once.
 
     Args:
         model: what to draw.
         views: that its heat is measured at, on the model's device.
+        beside: whose mean heat is the unit of the colors, so that two models can be compared; by default its own.
 
     Example:
         >>> from reference_trainer.model.gaussians import Gaussians
         >>> gaussians = Gaussians.from_points(torch.rand(9, 3), torch.rand(9, 3), torch.full((9,), 0.1), sh_degree=1)
         >>> camera = Camera(torch.eye(4), 20.0, 20.0, 8.0, 8.0, 16, 16)
         >>> shown = ViewerModel(TrainedModel(gaussians, torch.zeros(3)), [])
-        >>> image, note = shown.render(DisplayOptions("co-adaptation"), camera)
-        >>> image.shape
-        torch.Size([3, 16, 16])
+        >>> picture = shown.render(DisplayOptions("co-adaptation"), camera)
+        >>> picture.image.shape, picture.scale
+        (torch.Size([3, 16, 16]), ('0', '0.02', 'variance of the color'))
     """
 
-    def __init__(self, model: TrainedModel, views: Sequence[Viewpoint]) -> None:
+    def __init__(self, model: TrainedModel, views: Sequence[Viewpoint], beside: ViewerModel | None = None) -> None:
         self.model = model
-        self._views = views
+        self.views = views
+        self._beside = beside or self
         self._chosen_last: tuple[DisplayOptions | None, TrainedModel] = None, model
 
     @cached_property
     def heat(self) -> Heat:
         """The heat at drop rate 1/2; ValueError if no view has a score, or all scores are 0."""
-        return Heat.of(self.model, self._views)
+        return Heat.of(self.model, self.views)
 
     @torch.no_grad()
-    def render(self, options: DisplayOptions, camera: Camera) -> tuple[Tensor, str]:
-        """Return a picture (3, H, W) in [0, 1] and a note on it.
+    def render(self, options: DisplayOptions, camera: Camera) -> Picture:
+        """Draw the model.
 
         Raises:
             ValueError: if heat is needed (for its colors or to hide Gaussians) and cannot be measured, see `heat`.
@@ -80,36 +91,44 @@ class ViewerModel:
         if options != self._chosen_last[0]:
             self._chosen_last = options, self._chosen(options)
         model, view = self._chosen_last[1], Viewpoint("", camera.to(self.model.gaussians.means.device))
-        if options.mode == "co-adaptation":
-            score = CAScore.exact(model.moments, regularizer=_draws(options))
-            result = score(model.gaussians.opacities, view)
-            rate, noise = options.drop_rate, options.noise
-            of = f" at drop rate {rate:g}" * (rate != 0.5) + f" with noise {noise:g}" * (noise > 0)
-            said = f"exact CA{of} {result.value * 1e3:.2f}e-3" if result.reason is Reason.OK else str(result.reason)
-            return ca_picture(result), f"{said}; variance 0 (black) to {CA_PICTURE_RANGE:g}, gray: not covered"
-        out = model.test_rendering(view, depth=options.mode == "depth")
-        if out.depth is None:
-            return out.image.clamp(0, 1), self._note_on_heat(options)
-        nearness = torch.where(out.alpha > 0.5, out.alpha / out.depth, torch.nan)
-        if not (seen := nearness[nearness.isfinite()]).numel():
-            return torch.full_like(out.image, 0.5), "nothing covers half of a pixel"
-        low, high = seen[:: 1 + len(seen) // 10_000].quantile(seen.new_tensor([0.02, 0.98])).tolist()
-        colors = heat_colors(nearness.flatten(), low, max(high, low * 1.001))
-        return colors.T.view_as(out.image), f"depth {1 / high:.3g} (bright) to {1 / low:.3g}"
+        draw = {"co-adaptation": self._co_adaptation, "depth": self._depth}.get(options.mode, self._render)
+        return draw(options, model, view)
 
-    def _note_on_heat(self, options: DisplayOptions) -> str:
-        """Return a note on what the colors mean and how much co-adaptation is hidden."""
-        said = []
+    def _render(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
+        """Draw the colors of a model, which those of its heat may have replaced."""
+        image, note, scale = model.test_rendering(view).image.clamp(0, 1), "", None
         if options.mode == "heat":
-            said.append(
-                "share of the exact CA per blend weight, {:g} (dark) to {:g} times the mean".format(*PER_WEIGHT_SCALE)
-            )
+            low, high = PER_WEIGHT_SCALE
+            scale = f"{low:g}", f"{high:g}", "share of the exact CA per blend weight, over the mean"
         if options.hidden:
             shares = self.heat.shares
-            said.append(
-                f"{shares[self.heat.ranks >= 1 - options.hidden].sum() / shares.sum():.0%} of the exact CA are hidden"
-            )
-        return "; ".join(said)
+            hidden = shares[self.heat.ranks >= 1 - options.hidden].sum() / shares.sum()
+            note = f"{hidden:.0%} of the exact CA are hidden"
+        return Picture(image, note, scale)
+
+    def _co_adaptation(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
+        """Draw the exact variance of every pixel."""
+        result = CAScore.exact(model.moments, regularizer=_draws(options))(model.gaussians.opacities, view)
+        rate, noise = options.drop_rate, options.noise
+        of = f" at drop rate {rate:g}" * (rate != 0.5) + f" with noise {noise:g}" * (noise > 0)
+        note = f"exact CA{of} {result.value * 1e3:.2f}e-3" if result.reason is Reason.OK else str(result.reason)
+        scale = "variance of the color"
+        if not bool(result.visible.all()):
+            note += f", {1 - result.visible.double().mean().item():.0%} of the picture not covered"
+            scale += "; gray, not covered: when Gaussians are left out, more than a fifth is background on average"
+        return Picture(ca_picture(result), note, ("0", f"{CA_PICTURE_RANGE:g}", scale))
+
+    def _depth(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
+        """Draw the nearness of what covers half of a pixel at least."""
+        out = model.test_rendering(view, depth=True)
+        assert out.depth is not None
+        nearness = torch.where(out.alpha > 0.5, out.alpha / out.depth, torch.nan)
+        if not (seen := nearness[nearness.isfinite()]).numel():
+            return Picture(torch.full_like(out.image, 0.5), "nothing covers half of a pixel")
+        low, high = seen[:: 1 + len(seen) // 10_000].quantile(seen.new_tensor([0.02, 0.98])).tolist()
+        colors = heat_colors(nearness.flatten(), low, max(high, low * 1.001))
+        scale = f"{1 / low:.3g}", f"{1 / high:.3g}", "depth; gray: nothing covers half of the pixel"
+        return Picture(colors.T.view_as(out.image), "", scale)
 
     def _chosen(self, options: DisplayOptions) -> TrainedModel:
         """Return the model with the Gaussians, colors and opacities of some options."""
@@ -120,7 +139,7 @@ class ViewerModel:
             )
             gaussians, regularizer = replace(gaussians, opacity_logits=drawn.opacities.logit()), ""
         if options.mode == "heat":
-            low, high = (end * self.heat.mean for end in PER_WEIGHT_SCALE)
+            low, high = (end * self._beside.heat.mean for end in PER_WEIGHT_SCALE)
             gaussians = colored_by(gaussians, self.heat.values, low, high)
         if options.hidden:
             gaussians = gaussians[self.heat.ranks < 1 - options.hidden]
@@ -131,3 +150,23 @@ def _draws(options: DisplayOptions) -> Chain:
     """Return the regularizers whose draw or whose exact variance is shown."""
     dropped = options.mask or options.mode == "co-adaptation"
     return Chain(GaussianDropout(options.drop_rate if dropped else 0.0), OpacityNoise(options.noise))
+
+
+def with_photograph(image: Tensor, camera: Camera, view: View, share: float) -> Tensor:
+    """Return an image (3, H, W) with a photograph over it, as a camera at the same place sees it.
+
+    Args:
+        image: that ``camera`` sees.
+        camera: where the camera of the photograph stands; it may be turned, or have another field of view.
+        view: the photograph.
+        share: of the photograph in the mixture, in [0, 1].
+    """
+    x, y = torch.meshgrid(torch.arange(camera.width) + 0.5, torch.arange(camera.height) + 0.5, indexing="xy")
+    points = camera.to("cpu").lift(torch.stack([x, y], -1), torch.ones(x.shape))
+    pixels, depth = view.camera.to("cpu").project(points)
+    inside = view.camera.inside(pixels, depth)
+    size = pixels.new_tensor([view.camera.width, view.camera.height])
+    seen = grid_sample(
+        view.image.cpu()[None], (2 * pixels / size - 1)[None], padding_mode="border", align_corners=False
+    )
+    return torch.lerp(image.cpu(), seen[0], share * inside)

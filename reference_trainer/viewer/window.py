@@ -7,10 +7,12 @@ import io
 import math
 import os
 import socket
+import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -18,17 +20,17 @@ import torch
 
 from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.pictures import as_pillow
+from reference_trainer.evaluation.pictures import as_pillow, color_bar, side_by_side, write_movie
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import NotFiniteError
 from reference_trainer.rotations import rotation_matrices
 from reference_trainer.runs.run import model_of
-from reference_trainer.scenes.scene import Viewpoint
-from reference_trainer.scenes.virtual_cameras import measured_views
+from reference_trainer.scenes.scene import View, Viewpoint
+from reference_trainer.scenes.virtual_cameras import interpolate_cameras, measured_views
 from reference_trainer.threads import threads_for
 from reference_trainer.training.trainer import Trainer
-from reference_trainer.viewer.picture import DisplayOptions, Mode, ViewerModel
+from reference_trainer.viewer.picture import DisplayOptions, Mode, Picture, ViewerModel, with_photograph
 
 __all__ = ["Viewer"]
 
@@ -41,20 +43,34 @@ FEWEST, MOST = 10_000, 1_000_000
 """Limits on the pixels of a picture."""
 TRAINING_SHARE = 0.1
 """Fraction of a training's time that showing its new states may take; moving the camera takes more."""
+MOVIE_PIXELS, MOVIE_FPS, MOVIE_SECONDS = 400_000, 24, 2
+"""Of a recorded flight: most pixels of a picture of a model, pictures a second, seconds from one camera to the next."""
+BOTH = "side by side"
 
 
 @dataclass
 class _Window:
-    """One page: when it last moved, whether a picture is due, and whether the last one was at reduced resolution."""
+    """One page.
+
+    Args:
+        client: viser's handle.
+        moved: when it last moved.
+        due: whether a picture is.
+        rough: whether the last one was at reduced resolution.
+        wish: the file that it asked for: ``"screenshot"``, ``"flight"`` or none.
+        path: cameras of the flight.
+    """
 
     client: Any
     moved: float
     due: bool = True
     rough: bool = True
+    wish: str = ""
+    path: list[Camera] = field(default_factory=list)
 
 
 class Viewer(contextlib.AbstractContextManager["Viewer", None]):
-    """A context manager that serves pages on this machine which show a model.
+    """A context manager that serves pages on this machine which show a model, or two with one camera.
 
     Everything is drawn in the thread that calls `serve` or `follow`: a training is drawn between its steps.
 
@@ -81,7 +97,10 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             raise OSError(f"port {port} cannot be used for the viewer ({reason}): give another one.") from error
         with contextlib.redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(HOST, port, label="ca_reg", verbose=False)
-        self._model: ViewerModel | None = None
+        self._models: dict[str, ViewerModel] = {}
+        self._chosen: Any = None  # of several models
+        self._photographs: list[View] = []
+        self._frusta: list[tuple[Any, Any]] = []  # position, and what viser draws there
         self._windows: dict[int, _Window] = {}
         self._changed = threading.Event()
         self._rough_pixels, self._next_model = 40_000, 0.0
@@ -102,15 +121,17 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def show(self, model: TrainedModel, views: Mapping[str, Sequence[Viewpoint]]) -> None:
-        """Show a model from now on. The first call's views, by split, become the cameras to jump to."""
+    def show(self, model: TrainedModel, views: Mapping[str, Sequence[Viewpoint]], name: str = "") -> None:
+        """Show a model from now on; one of another name beside the first, whose views are the cameras to jump to."""
         flat = [view.to(model.gaussians.means.device) for group in views.values() for view in group]
-        if self._model is None:
+        if not self._models:
             self._add_cameras(views, model.gaussians)
-        self._model = ViewerModel(model, flat)
-        for window in list(self._windows.values()):
-            window.due = True
-        self._changed.set()
+        elif name not in self._models:
+            self._chosen = self._server.gui.add_dropdown("Model", [BOTH, *self._models, name], order=-1)
+            self._chosen.on_update(lambda event: self._moved())
+        first = next(iter(self._models), name)
+        self._models[name] = ViewerModel(model, flat, self._models[first] if name != first else None)
+        self._moved(still=True)
 
     def serve(self) -> None:
         """Draw whatever pages need until Ctrl-C."""
@@ -143,32 +164,99 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             if window.due or (window.rough and still >= STILL):
                 window.due, window.rough = False, still < STILL
                 self._send(window)
+            if window.wish:
+                wish, window.wish = window.wish, ""
+                self._save(window, wish)
             if window.rough:
                 waits.append(max(0.0, STILL - still))
         return min(waits, default=None)
 
     def _send(self, window: _Window) -> None:
         """Draw one picture and send it to a page."""
-        shown, view = self._model, window.client.camera
-        if shown is None:
+        view = window.client.camera
+        if not self._models:
             return
         start = time.perf_counter()
         camera = _camera(view, self._rough_pixels if window.rough else MOST)
-        with threads_for(camera.width * camera.height):
-            try:
-                image, note = shown.render(self._options, camera)
-            except ValueError as error:
-                (image, _), note = shown.render(DisplayOptions(), camera), str(error)
+        pictures = self._draw(camera)
         if window.client.client_id not in self._windows:  # closed in the meantime
             return
+        image = torch.cat([picture.image.cpu() for picture in pictures.values()], 2)
         window.client.scene.set_background_image(np.asarray(as_pillow(image)), format="jpeg", jpeg_quality=90)
-        took, model = max(1e-3, time.perf_counter() - start), shown.model
+        self._hide_nearest_frustum(view.position, beside=len(pictures) > 1)
+        took = max(1e-3, time.perf_counter() - start)
         if window.rough:
             pixels = self._rough_pixels * min(2.0, max(0.5, ROUGH_SECONDS / took))
             self._rough_pixels = int(min(MOST, max(FEWEST, pixels)))
         else:
-            drawn = f"{len(model.gaussians):,} Gaussians, {camera.width}x{camera.height} in {took * 1e3:.0f} ms"
-            self._status.content = f"step {model.step:,}: {drawn}\n\n{note}"
+            notes = []
+            for name, picture in pictures.items():
+                model = self._models[name].model
+                notes.append(
+                    f"**{name}** " * (len(self._models) > 1)
+                    + f"step {model.step:,}: {len(model.gaussians):,} Gaussians"
+                )
+                notes += [picture.note] * bool(picture.note)
+            self._status.content = "\n\n".join([*notes, f"{camera.width}x{camera.height} in {took * 1e3:.0f} ms"])
+            if self._bar.visible != (picture.scale is not None):
+                self._bar.visible = picture.scale is not None
+            if picture.scale is not None:
+                self._bar.image = np.asarray(as_pillow(color_bar(*picture.scale[:2], width=320)))
+                self._bar.label = picture.scale[2]
+
+    def _draw(self, camera: Camera) -> dict[str, Picture]:
+        """Return the picture of every model that is chosen, by name; two share the width of the camera."""
+        one = None if self._chosen is None or self._chosen.value == BOTH else self._chosen.value
+        names = list(self._models) if one is None else [one]
+        width, pictures = max(1, camera.width // len(names)), dict[str, Picture]()
+        camera = replace(camera, width=width, cx=camera.cx - (camera.width - width) / 2)
+        with threads_for(len(names) * width * camera.height):
+            for name in names:
+                shown = self._models[name]
+                try:
+                    picture = shown.render(self._options, camera)
+                except ValueError as error:
+                    picture = shown.render(DisplayOptions(), camera)._replace(note=str(error))
+                if share := self._photograph.value / 100:
+                    if (view := self._photograph_at(camera)) is None:
+                        picture = picture._replace(note=f"{picture.note}\n\nNo photograph from here: go to a camera.")
+                    else:
+                        picture = picture._replace(image=with_photograph(picture.image, camera, view, share))
+                pictures[name] = picture
+        return pictures
+
+    def _photograph_at(self, camera: Camera) -> View | None:
+        """Return the photograph that was taken where a camera stands, None if there is none."""
+        near = [v for v in self._photographs if (v.camera.position - camera.position).norm() < 1e-3 * self._distance]
+        return next(iter(near), None)
+
+    def _save(self, window: _Window, wish: str) -> None:
+        """Draw what a page asked for at full resolution, with titles and color bars, and let it download the file."""
+        if wish == "screenshot":
+            file = io.BytesIO()
+            as_pillow(self._sheet(_camera(window.client.camera, MOST))).save(file, "PNG")
+            window.client.send_file_download("view.png", file.getvalue(), save_immediately=True)
+            return
+        cameras = interpolate_cameras(window.path, MOVIE_FPS * MOVIE_SECONDS * (len(window.path) - 1) + 1)
+
+        def frames() -> Iterator[torch.Tensor]:
+            for number, camera in enumerate(cameras):
+                self._status.content = f"flight: picture {number + 1} of {len(cameras)}"
+                yield self._sheet(camera)
+
+        with tempfile.TemporaryDirectory() as folder:
+            file_ = write_movie(frames(), Path(folder, "flight.mp4"), MOVIE_FPS)
+            window.client.send_file_download(file_.name, file_.read_bytes(), save_immediately=True)
+        self._status.content = f"flight: {len(cameras)} pictures in {file_.name}"
+
+    def _sheet(self, camera: Camera) -> torch.Tensor:
+        """Return what a page shows, (3, H, W), with the names of the models and color bars."""
+        pictures = self._draw(camera)
+        return side_by_side(
+            [picture.image for picture in pictures.values()],
+            [", ".join(filter(None, (name, self._options.mode, picture.note))) for name, picture in pictures.items()],
+            scales=[picture.scale and picture.scale[:2] for picture in pictures.values()],
+        )
 
     @property
     def _options(self) -> DisplayOptions:
@@ -180,31 +268,72 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         gui = self._server.gui
         gui.configure_theme(show_share_button=False, show_logo=False)
         self._controls = [
-            gui.add_dropdown("Show", get_args(Mode)),
+            gui.add_dropdown("Show", get_args(Mode), hint="Hidden or masked Gaussians are missing in every mode."),
             gui.add_slider("Drop rate", 0.0, 0.95, 0.05, 0.5, hint="Of the co-adaptation, and of the mask."),
             gui.add_slider("Noise", 0.0, 2.0, 0.1, 0.0, hint="Opacity noise: a draw of it, or in the co-adaptation."),
-            gui.add_checkbox("Draw a mask", False, hint="Leave Gaussians out at random, at the drop rate."),
-            gui.add_slider("Hide %", 0.0, 50.0, 0.5, 0.0, hint="Leave out those that co-adapt most."),
-        ]
-        for control in self._controls:
+            gui.add_checkbox("Draw a mask", False, hint="Leave Gaussians out at random, as many as the drop rate says, "
+                "and turn: colors that need the missing ones change, and groups that co-adapt fall apart."),
+            gui.add_slider("Hide %", 0.0, 50.0, 0.5, 0.0, hint="Leave out the Gaussians that co-adapt most for what "
+                "they contribute to the pictures, and see what stands without them."),
+        ]  # fmt: skip
+        self._photograph = gui.add_slider(
+            "Photograph %",
+            0,
+            100,
+            1,
+            0,
+            hint="Lay the photograph over the picture, where a camera stands that took one.",
+        )
+        for control in (*self._controls, self._photograph):
             control.on_update(lambda event: self._moved())
+        self._bar = gui.add_image(np.zeros((1, 320, 3), np.uint8), label=" ", visible=False)
         self._status = gui.add_markdown("")
+        self._buttons = gui.add_button_group(
+            "Save", ("screenshot", "add to path", "flight"),
+            hint="A picture; or a flight: move, add the camera to its path, move, add the next, then save the flight.",
+        )  # fmt: skip
+        self._buttons.on_click(lambda event: self._ask(event.client, self._buttons.value))
+
+    def _ask(self, client: Any, wish: str) -> None:
+        """Note what a page asks for; it is drawn by the thread that draws everything."""
+        window = self._windows.get(client.client_id) if client is not None else None
+        if window is None:
+            return
+        if wish == "add to path":
+            window.path.append(_camera(client.camera, MOVIE_PIXELS))
+        if wish == "screenshot" or (wish == "flight" and len(window.path) > 1):
+            window.wish = wish
+            self._changed.set()
+        else:
+            cameras = f"{len(window.path)} camera{'s' * (len(window.path) != 1)}"
+            self._status.content = f"path: {cameras}; a flight needs 2 or more, {MOVIE_SECONDS} s from each to the next"
+
+    def _hide_nearest_frustum(self, position: Any, *, beside: bool) -> None:
+        """Hide the frustum that a page looks out of, which would lie across its picture, and all beside each other."""
+        for place, frustum in self._frusta:
+            visible = not beside and float(np.linalg.norm(place - np.asarray(position))) > 2 * frustum.scale
+            if frustum.visible != visible:
+                frustum.visible = visible
 
     def _add_cameras(self, views: Mapping[str, Sequence[Viewpoint]], gaussians: Gaussians) -> None:
-        """Add the cameras to the page, to jump to, and start at the first one."""
+        """Add the cameras to the page, to jump to, and start at the first one, with a level horizon."""
         from kornia.geometry.quaternion import Quaternion
 
         gui, scene = self._server.gui, self._server.scene
         cameras = {f"{split} {view.name}": view.camera.to("cpu") for split, of in views.items() for view in of}
-        distance = _distance(gaussians, next(iter(cameras.values())))
+        self._distance = distance = _distance(gaussians, next(iter(cameras.values())))
+        self._photographs = [view.to("cpu") for of in views.values() for view in of if isinstance(view, View)]
         size = 0.04 * distance  # of a frustum
         if len(cameras) > 1:
             places = torch.stack([camera.position for camera in cameras.values()])
             size = min(size, 0.25 * nearest_neighbors(places, 1)[0].sqrt().median().item())
-        poses = {name: _pose(camera, distance) for name, camera in cameras.items()}
-        scene.set_up_direction(sum(pose["up_direction"] for pose in poses.values()))
+        up = _level([*cameras.values()])
+        poses = {name: _pose(camera, distance, up) for name, camera in cameras.items()}
+        scene.set_up_direction(up.numpy())
         start, at = self._server.initial_camera, poses[next(iter(poses))]
-        start.position, start.look_at, start.fov = at["position"], at["look_at"], at["fov"]
+        start.position, start.look_at, start.fov, start.up = (
+            at[name] for name in ("position", "look_at", "fov", "up_direction")
+        )
         folder = scene.add_frame("/cameras", show_axes=False)
         chooser = gui.add_dropdown("Go to", list(cameras))
         chooser.on_update(lambda event: self._jump(event.client, poses[chooser.value]))
@@ -219,6 +348,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
                 wxyz=turned.data.numpy(), position=pose["position"],
             )  # fmt: skip
             frustum.on_click(lambda event, pose=pose: self._jump(event.client, pose))
+            self._frusta.append((pose["position"], frustum))
 
     def _jump(self, client: Any, pose: Mapping[str, Any]) -> None:
         """Move a page to a camera."""
@@ -233,11 +363,11 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         client.camera.on_update(lambda camera: self._moved(client.client_id))
         self._changed.set()
 
-    def _moved(self, *clients: int) -> None:
-        """Mark these pages, or all, as due for a new picture."""
+    def _moved(self, *clients: int, still: bool = False) -> None:
+        """Mark these pages, or all, as due for a new picture; as moving unless they are ``still``."""
         for client in clients or list(self._windows):
             if window := self._windows.get(client):
-                window.moved, window.due = time.monotonic(), True
+                window.moved, window.due = window.moved if still else time.monotonic(), True
         self._changed.set()
 
 
@@ -252,15 +382,31 @@ def _camera(view: Any, most: int) -> Camera:
     return Camera(from_camera.inverse().float(), focal, focal, width / 2, height / 2, width, height)
 
 
-def _pose(camera: Camera, distance: float) -> dict[str, Any]:
-    """Convert a camera on the CPU to properties of viser's, which orbits around a point ``distance`` in front of it."""
+def _pose(camera: Camera, distance: float, level: torch.Tensor | None = None) -> dict[str, Any]:
+    """Convert a camera on the CPU to properties of viser's, which orbits around a point ``distance`` in front of it.
+
+    ``level`` is the direction that is up in the scene: it replaces that of a camera that is rolled by less than 20
+    degrees, unless the camera looks nearly along it.
+    """
     position, axes = camera.position, camera.world_to_camera[:3, :3]
+    up = -axes[1]
+    if level is not None:
+        across = level - (level @ axes[2]) * axes[2]
+        up = level if across.norm() > 0.2 and across @ up > 0.94 * across.norm() else up
     return {
         "position": position.numpy(),
         "look_at": (position + distance * axes[2]).numpy(),
-        "up_direction": (-axes[1]).numpy(),
+        "up_direction": up.numpy(),
         "fov": 2 * math.atan(0.5 * camera.height / camera.fy),
     }
+
+
+def _level(cameras: Sequence[Camera]) -> torch.Tensor:
+    """Return the direction (3,) that is up if cameras were held level: across their x axes, near their mean."""
+    axes = torch.stack([camera.world_to_camera[:3, :3] for camera in cameras])
+    right, up = axes[:, 0], -axes[:, 1].mean(0)
+    weak = 0.01 * len(cameras)  # of the mean, which decides what parallel axes leave open
+    return torch.nn.functional.normalize(torch.linalg.solve(right.T @ right + weak * torch.eye(3), weak * up), dim=0)
 
 
 def _distance(gaussians: Gaussians, camera: Camera) -> float:

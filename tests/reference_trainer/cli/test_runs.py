@@ -28,19 +28,21 @@ def trained(tmp_path_factory):
     return out
 
 
-@pytest.mark.parametrize("what", ["", "point_cloud.ply"])
+@pytest.mark.parametrize("what", [[""], ["point_cloud.ply"], ["", "point_cloud_for_viewers.ply"]])
 def test_a_run_or_a_ply_is_shown_until_ctrl_c(what, trained, capsys, monkeypatch):
     pytest.importorskip("viser")
     shown = []
 
     def draw(viewer):
-        shown.append(viewer._model.render(viewer._options, viewer._model._views[0].camera)[0])
+        for model in viewer._models.values():
+            shown.append(model.render(viewer._options, model.views[0].camera).image)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Viewer, "update", draw)
-    main(["view", str(trained / what), "--port", "0"])
+    main(["view", *(str(trained / name) for name in what), "--port", "0"])
     assert re.search(r"The viewer is at http://127\.0\.0\.1:\d+, .*; Ctrl-C ends it\.", capsys.readouterr().out)
-    assert shown[0].std() > 0
+    assert [bool(image.std() > 0) for image in shown] == [True] * len(what)
+    assert "1 model to show, or 2" in refused(["view", str(trained), str(trained)], capsys)
 
 
 @pytest.mark.parametrize("arguments", [["garden"], ["--path", "garden"], ["garden", "--path", "garden"]])

@@ -343,4 +343,4 @@ def test_the_pictures_of_a_viewpoint(tiny_scene, gaussians, tmp_path):
     with Image.open(tmp_path / "orbit/000_panel.png") as panel, Image.open(tmp_path / "orbit/000.png") as picture:
         assert picture.size == (32, 24)
         assert panel.width > 4 * 32 + 3 * 4  # as wide as the labels
-        assert panel.height == 24 + 16
+        assert panel.height == 24 + 20 + 30  # a line of text above, a color bar with its numbers below

@@ -1,18 +1,22 @@
 from __future__ import annotations
 
+import sys
+
 import matplotlib
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from reference_trainer.evaluation.pictures import (
     PANEL,
+    color_bar,
     dynamics_figure,
     file_names,
     heat_map,
     save_png,
     side_by_side,
+    write_movie,
 )
 from reference_trainer.evaluation.style import STRATEGIES
 from reference_trainer.scenes.images import read_image
@@ -76,23 +80,56 @@ def test_heat_map_is_monotone_in_brightness_and_leaves_gray_for_the_undefined():
 
 
 def test_side_by_side_places_every_picture():
-    pictures = [torch.full((3, 20, 50), level) for level in (0.1, 0.4, 0.7)]
+    pictures = [torch.full((3, 20, 60), level) for level in (0.1, 0.4, 0.7)]
     grid = side_by_side(pictures, ["one", "two", "three"], columns=2)
-    assert grid.shape == (3, 2 * 36 + 4, 2 * 50 + 4)
-    for k, (top, left) in enumerate([(16, 0), (16, 54), (56, 0)]):
-        assert torch.allclose(grid[:, top : top + 20, left : left + 50], pictures[k], rtol=0, atol=0.5 / 255 + 1e-7)
-    assert (grid[:, :, 50:54] == 1).all()
-    assert (grid[:, 36:40] == 1).all()
-    assert (grid[:, 40:, 54:] == 1).all()
-    for top, left in [(0, 0), (0, 54), (40, 0)]:
-        assert grid[:, top : top + 16, left : left + 50].min() < 0.5, "the label has ink"
-    assert not torch.equal(grid[:, :16, :50], grid[:, :16, 54:104])
+    assert grid.shape == (3, 2 * 40 + 4, 2 * 60 + 4)
+    for k, (top, left) in enumerate([(20, 0), (20, 64), (64, 0)]):
+        assert torch.allclose(grid[:, top : top + 20, left : left + 60], pictures[k], rtol=0, atol=0.5 / 255 + 1e-7)
+    assert (grid[:, :, 60:64] == 1).all()
+    assert (grid[:, 40:44] == 1).all()
+    assert (grid[:, 44:, 64:] == 1).all()
+    for top, left in [(0, 0), (0, 64), (44, 0)]:
+        assert grid[:, top : top + 20, left : left + 60].min() < 0.5, "the label has ink"
+    assert not torch.equal(grid[:, :20, :60], grid[:, :20, 64:124])
 
 
 def test_one_row_by_default_and_no_room_for_absent_columns():
-    pictures = [torch.zeros(3, 8, 9)] * 3
-    assert side_by_side(pictures, ["a"] * 3).shape == (3, 24, 3 * 9 + 2 * 4)
-    assert side_by_side(pictures[:1], ["a"], columns=5).shape == (3, 24, 9)
+    pictures = [torch.zeros(3, 8, 19)] * 3
+    assert side_by_side(pictures, ["a"] * 3).shape == (3, 28, 3 * 19 + 2 * 4)
+    assert side_by_side(pictures[:1], ["a"], columns=5).shape == (3, 28, 19)
+
+
+def test_a_map_has_its_colors_below_it_and_what_they_mean_at_the_ends():
+    bar = color_bar("0", "0.02", width=200)
+    torch.testing.assert_close(bar[:, 3], heat_map(torch.linspace(0, 1, 200)[None], 1.0)[:, 0], rtol=0, atol=0.003)
+    ink = (bar[:, 8:] < 0.5).any(0).any(0).nonzero()[:, 0]
+    assert ink.min() < 15
+    assert ink.max() > 185
+    assert not ((ink > 20) & (ink < 150)).any()  # the numbers stand at the ends
+    sheet = side_by_side([torch.zeros(3, 30, 200)] * 2, ["a", "b"], scales=[None, ("0", "0.02")])
+    torch.testing.assert_close(sheet[:, 52:80, 204:], bar)
+    assert (sheet[:, 52:, :204] == 1).all()
+
+
+@pytest.mark.parametrize("with_av", [False, True])
+def test_a_movie_shows_its_frames_in_order(tmp_path, monkeypatch, with_av):
+    if with_av:
+        av = pytest.importorskip("av")
+    else:
+        monkeypatch.setitem(sys.modules, "av", None)
+    levels = [0.1, 0.5, 0.9]
+    frames = (torch.full((3, 21, 32), level) for level in levels)
+    path = write_movie(frames, tmp_path / "flight.mp4", fps=10)
+    if with_av:
+        with av.open(str(path)) as file:
+            shown = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+            assert file.streams.video[0].average_rate == 10
+    else:
+        with Image.open(path) as movie:
+            shown = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(movie)]
+            assert movie.info["duration"] == 100
+    assert [path.name] == [place.name for place in tmp_path.iterdir()] == ["flight.mp4" if with_av else "flight.webp"]
+    assert [frame.mean() / 255 for frame in shown] == pytest.approx(levels, abs=0.02)
 
 
 @pytest.mark.parametrize(
@@ -114,10 +151,10 @@ def test_wrong_arguments(call, message):
 
 
 def test_a_label_wider_than_its_picture_is_not_cut():
-    wide, narrow = (side_by_side([torch.zeros(3, 4, w)] * 2, ["render 20.51 dB", "error"]) for w in (120, 20))
-    black = [int(picture[0, :16].lt(0.5).sum()) for picture in (wide, narrow)]
+    wide, narrow = (side_by_side([torch.zeros(3, 4, w)] * 2, ["render 20.51 dB", "error"]) for w in (150, 20))
+    black = [int(picture[0, :20].lt(0.5).sum()) for picture in (wide, narrow)]
     assert black[0] == black[1] > 50
-    assert narrow.shape[2] < 150
+    assert narrow.shape[2] < 200
 
 
 def test_a_strategy_has_one_color_in_every_figure(tmp_path):
