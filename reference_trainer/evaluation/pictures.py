@@ -34,6 +34,7 @@ __all__ = [
     "heat_map",
     "is_own_png",
     "label_font",
+    "logs_exact",
     "save_png",
     "side_by_side",
     "write_movie",
@@ -256,7 +257,7 @@ def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
         figure.set_size_inches(WIDTH, 4.4)
         colors = {label: color(label, number) for number, label in enumerate(runs)}
         ca_axes, psnr_axes = plot_dynamics(dict(runs), axes=figure.subplots(1, 2), colors=colors)
-        exact = [_logs_exact(folder) for folder in runs.values()]
+        exact = [logs_exact(folder) for folder in runs.values()]
         old = "CA; exact, or of 5 renders" if any(exact) else "CA"  # logs of older versions hold the sampled score
         in_thousandths(ca_axes.yaxis, "exact CA" if all(exact) else old)
         ca_axes.set_title("Co-adaptation")
@@ -267,7 +268,7 @@ def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
         figure.legend(ca_axes.lines, names, loc="outside lower center", ncols=max(1, min(4, len(runs))))
 
 
-def _logs_exact(folder: Path) -> bool:
+def logs_exact(folder: Path) -> bool:
     """Whether the log of a run holds the exact score at drop rate 1/2, by its last line."""
     with suppress(OSError, ValueError, IndexError, AttributeError):
         last = json.loads((folder / LOG_NAME).read_text("utf-8").splitlines()[-1])

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ca_reg import CAResult, Reason
 from reference_trainer.evaluation.evaluate import ca_picture, error_picture
@@ -17,8 +18,7 @@ from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.shares import Heat, concentration
 from reference_trainer.evaluation.tables import EXACT
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.report.packing import jpeg, numbers
-from reference_trainer.rotations import rotation_matrices
+from reference_trainer.report.packing import heat_uri, image_uri, quantized
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.load import evenly_spaced
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
@@ -52,36 +52,47 @@ class Findings:
     notes: list[str]
 
     def packed(self, low: float, high: float) -> dict[str, Any]:
-        """Return the model as the page draws it, with arrays as little-endian numbers in base64.
+        """Return the model as the page draws it: its Gaussians in the order of their heat, those of least heat first.
 
-        ``geometry`` holds 16 float32 per Gaussian: position (3), opacity, covariance (xx, xy, xz, yy, yz, zz), rank by
-        share per weight in [0, 1), 0, color of the heat (3), 0. ``colors`` holds the spherical harmonics coefficients,
-        (N, (degree + 1)^2, 3) in float16. ``held`` is the fraction of the score held by the 0, 1, ... 100 % of the
-        Gaussians of highest rank.
+        ``values`` are `quantized` columns: the position (3) less ``center``, in units of ``scale`` and as
+        sign(x) log(1 + |x|), the logarithm of the scales (3), the quaternion (4, wxyz), opacity, color of the heat (3),
+        and the coefficients of the spherical harmonics, ((degree + 1)^2, 3). ``held`` is the fraction of the score held
+        by the 0, 1, ... 100 % of the Gaussians of most heat.
 
         Args:
             low: share per weight of the darkest color.
             high: share per weight of the brightest color.
         """
-        gaussians, n = self.model.gaussians, len(self.model.gaussians)
-        axes = rotation_matrices(gaussians.quaternions) * gaussians.scales[:, None]
-        covariances = (axes @ axes.transpose(1, 2)).flatten(1)[:, [0, 1, 2, 4, 5, 8]]
-        rank, heat, held = torch.zeros(n), torch.full((n, 3), 0.5), []
+        order, n = torch.arange(len(self.model.gaussians)), len(self.model.gaussians)
+        heat, held = torch.full((n, 3), 0.5), list[float]()
         if self.heat is not None:
-            rank, heat = self.heat.ranks.cpu(), heat_colors(self.heat.values, low, high)
-            along = self.heat.shares[self.heat.ranks.argsort(descending=True)].cumsum(0)
+            order = self.heat.ranks.cpu().argsort()
+            heat = heat_colors(self.heat.values, low, high)[order]
+            along = self.heat.shares.cpu()[order.flip(0)].cumsum(0)
             along = torch.cat([along.new_zeros(1), along / along[-1]])
             held = [round(along[percent * n // 100].item(), 4) for percent in range(101)]
-        columns = [gaussians.means, self.opacities[:, None], covariances, rank[:, None], torch.zeros(n, 1)]
-        columns += [heat, torch.zeros(n, 1)]
+        gaussians = self.model.gaussians.map(lambda x: x.detach().cpu()[order])
         degree = gaussians.sh_degree if self.model.sh_degree is None else self.model.sh_degree
+        center = gaussians.means.median(0).values
+        means = gaussians.means - center
+        scale = means.norm(dim=1).median().clamp_min(1e-9)
+        columns = [
+            (means.sign() * (means / scale).abs().log1p(), 2e-4),
+            (gaussians.log_scales, 0.02),
+            (normalize(gaussians.quaternions, dim=1), 1 / 256),
+            (self.opacities.cpu()[order][:, None], 1 / 512),
+            (heat, 1 / 255),
+            (gaussians.sh[:, 0], 1 / 256),
+            (gaussians.sh[:, 1 : (degree + 1) ** 2].flatten(1), 1 / 40),  # an error of 2 gray levels
+        ]
         return {
             "label": self.label,
             "background": self.model.background.tolist(),
             "count": n,
             "degree": degree,
-            "geometry": numbers(torch.cat([column.float().cpu() for column in columns], 1), "<f4"),
-            "colors": numbers(gaussians.sh[:, : (degree + 1) ** 2], "<f2"),
+            "center": center.tolist(),
+            "scale": scale.item(),
+            "values": quantized(columns),
             "held": held,
         }
 
@@ -131,11 +142,11 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
 def _pictures(model: TrainedModel, view: Viewpoint, result: CAResult | None) -> dict[str, str]:
     """Return the pictures of a view and their caption."""
     image = model.test_rendering(view).image.clamp(0, 1)
-    found, said = {"render": jpeg(image)}, []
+    found, said = {"render": image_uri(image)}, []
     if isinstance(view, View):
-        found["error"] = jpeg(error_picture(image, view.image))
+        found["error"] = heat_uri(error_picture(image, view.image))
         said.append(f"PSNR {psnr(image, view.image, view.mask):.2f} dB")
     if result is not None and result.reason is Reason.OK:
-        found["co-adaptation"] = jpeg(ca_picture(result))
+        found["co-adaptation"] = heat_uri(ca_picture(result))
         said.append(f"exact CA {result.value * 1e3:.2f}e-3")
     return found | {"caption": ", ".join(said)}

@@ -1,3 +1,13 @@
+const data = JSON.parse(document.getElementById("data").textContent);
+const $ = id => document.getElementById(id);
+const make = (tag, properties, ...children) => {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+};
+const swatch = color => make("i", { className: "swatch", style: `background: ${color}` });
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
 // A model in WebGL 2: its Gaussians projected to ellipses, sorted by depth and blended back to front, with the formulas
 // and constants of the reference renderer. Lengths are pixels of the training pictures, whatever the canvas has.
 const ROW = 64; // Gaussians per row of a texture
@@ -64,10 +74,43 @@ void main() {
   color = vec4(shade.rgb * alpha, alpha);
 }`;
 
-const bytes = text => Uint8Array.from(atob(text), letter => letter.charCodeAt(0)).buffer;
+// The numbers of a model, row by row: multiples of a step in 16 bits, stored as planes of bytes and compressed.
+async function unpack({ text, steps }, count) {
+  if (!self.DecompressionStream) throw new Error("This browser is too old for the models, which are compressed.");
+  const packed = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const planes = new Uint8Array(await new Response(stream).arrayBuffer()), width = steps.length;
+  const values = new Float32Array(count * width);
+  steps.forEach((step, j) => {
+    for (let i = 0; i < count; i++) {
+      const at = 2 * j * count + i, coded = planes[at] | planes[at + count] << 8;
+      values[i * width + j] = step * (coded >> 1 ^ -(coded & 1));
+    }
+  });
+  return values;
+}
+
+// Per Gaussian: position, opacity, covariance (xx, xy, xz, yy, yz, zz), rank by heat in [0, 1), 0, color of the heat, 0.
+function geometryOf(values, width, { count, center, scale }) {
+  const geometry = new Float32Array(16 * count);
+  for (let i = 0; i < count; i++) {
+    const v = values.subarray(width * i, width * i + 14), at = 16 * i, m = [];
+    for (let k = 0; k < 3; k++) geometry[at + k] = center[k] + scale * Math.sign(v[k]) * Math.expm1(Math.abs(v[k]));
+    const [sx, sy, sz] = [v[3], v[4], v[5]].map(Math.exp), norm = Math.hypot(v[6], v[7], v[8], v[9]);
+    const [w, x, y, z] = [v[6], v[7], v[8], v[9]].map(part => part / norm);
+    m.push([sx * (1 - 2 * (y * y + z * z)), sy * 2 * (x * y - w * z), sz * 2 * (x * z + w * y)],
+      [sx * 2 * (x * y + w * z), sy * (1 - 2 * (x * x + z * z)), sz * 2 * (y * z - w * x)],
+      [sx * 2 * (x * z - w * y), sy * 2 * (y * z + w * x), sz * (1 - 2 * (x * x + y * y))]);
+    geometry[at + 3] = v[10];
+    [[0, 0], [0, 1], [0, 2], [1, 1], [1, 2], [2, 2]].forEach(([r, c], k) => { geometry[at + 4 + k] = dot(m[r], m[c]); });
+    geometry[at + 10] = i / count;
+    for (let k = 0; k < 3; k++) geometry[at + 12 + k] = v[11 + k];
+  }
+  return geometry;
+}
 
 class Model {
-  constructor(canvas, run) {
+  constructor(canvas, run, values) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("This browser has no WebGL 2, which the models need.");
     const program = gl.createProgram();
@@ -81,8 +124,10 @@ class Model {
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
     gl.useProgram(program);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    this.geometry = new Float32Array(bytes(run.geometry));
-    const height = Math.ceil(run.count / ROW), bands = (run.degree + 1) ** 2;
+    const height = Math.ceil(run.count / ROW), bands = (run.degree + 1) ** 2, width = run.values.steps.length;
+    this.geometry = geometryOf(values, width, run);
+    const colors = new Float32Array(3 * bands * run.count);
+    for (let i = 0; i < run.count; i++) colors.set(values.subarray(width * i + 14, width * (i + 1)), 3 * bands * i);
     const most = ROW * gl.getParameter(gl.MAX_TEXTURE_SIZE);
     if (run.count > most) throw new Error(`${run.label} has ${run.count} Gaussians; this browser draws up to ${most}.`);
     const texture = (unit, name, kind, format, type, width, values) => {
@@ -96,7 +141,7 @@ class Model {
       gl.uniform1i(gl.getUniformLocation(program, name), unit);
     };
     texture(0, "geometry", gl.RGBA32F, gl.RGBA, gl.FLOAT, 4 * ROW, this.geometry);
-    texture(1, "colors", gl.RGB16F, gl.RGB, gl.HALF_FLOAT, bands * ROW, new Uint16Array(bytes(run.colors)));
+    texture(1, "colors", gl.RGB16F, gl.RGB, gl.FLOAT, bands * ROW, colors);
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
     const index = gl.getAttribLocation(program, "index");
     gl.enableVertexAttribArray(index);

@@ -1,10 +1,3 @@
-const data = JSON.parse(document.getElementById("data").textContent);
-const $ = id => document.getElementById(id);
-const make = (tag, properties, ...children) => {
-  const made = Object.assign(document.createElement(tag), properties);
-  made.append(...children);
-  return made;
-};
 
 // Definitions: a hint wherever a title has the word, the first that fits; a list at the end.
 const TERMS = {
@@ -62,8 +55,8 @@ function table(markdown, missing, label) {
 function scores() {
   if (!data.scores.length) return make("p", { className: "quiet" }, "No run has been trained to its end.");
   const head = [[""], ...data.scores.map(({ split, title }) => [split, make("br"), ...hinted(title, title)])];
-  const rows = data.strategies.map(({ name, seeds }, i) => [
-    make("td", {}, name, ...(seeds > 1 ? [make("small", {}, `${seeds} seeds`)] : [])),
+  const rows = data.strategies.map(({ name, seeds, color }, i) => [
+    make("td", {}, swatch(color), name, ...(seeds > 1 ? [make("small", {}, `${seeds} seeds`)] : [])),
     ...data.scores.map(({ cells }) => {
       const { text, best, delta, better } = cells[i], word = better == null ? "" : better ? "better" : "worse";
       const arrow = word && (delta[0] === "+" ? "▲△" : "▼▽")[better ? 0 : 1];
@@ -89,9 +82,8 @@ $("settings").append(table(data.settings, "All settings are the defaults.", "set
 $("attribution").append(table(data.attribution, "No run has a score to attribute.", "concentration"));
 for (const [label, markdown] of Object.entries(data.perView))
   $("each").append(make("h3", {}, label), table(markdown, "", `views of ${label}`));
-$("dynamics").append(data.dynamics
-  ? make("img", { src: data.dynamics, alt: "Co-adaptation and PSNR against the iteration" })
-  : make("p", { className: "quiet" }, "Nothing was measured while the runs were trained."));
+if (data.curves.length) addCharts();
+else $("dynamics").append(make("p", { className: "quiet" }, "Nothing was measured while the runs were trained."));
 addEventListener("beforeprint", () => document.querySelectorAll("details").forEach(part => { part.open = true; }));
 
 // The views: two pictures upon each other, the right one shown to the right of the wipe, or both in turn.
@@ -107,24 +99,24 @@ for (const [id, usual] of [["left", "photograph"], ["right", "render"]]) {
 function stack(view, run) {
   const part = { view, run, box: make("button", { className: "stack", type: "button" }), turn: false };
   part.images = [0, 1].map(() => make("img", {}));
-  part.names = [0, 1].map(() => make("span", {}));
+  part.names = [0, 1].map(() => make("span", { ariaHidden: "true" }));
   part.box.append(...part.images, ...part.names);
   return part;
 }
 function refresh(part) {
-  const { view, run, images, names, box, turn } = part, wipe = $("flicker").checked ? (turn ? 0 : 100) : $("wipe").value;
+  const { view, run, images, names, turn } = part, wipe = $("flicker").checked ? (turn ? 0 : 100) : $("wipe").value;
   const found = ["left", "right"].map((id, side) => {
     const [kind, of] = $(id).value.split("/"), picture = { photograph: view.photograph, ...view.pictures[of ?? run] }[kind];
     const name = (of ? `${KINDS[kind]} of ${data.runs[of].label}` : KINDS[kind]) + (picture ? "" : ": none");
     if (picture && images[side].src !== picture) images[side].src = picture;
     images[side].hidden = !picture;
-    images[side].alt = names[side].textContent = name;
+    names[side].textContent = name;
+    images[side].alt = `${name}, ${view.name}, ${data.runs[run].label}`;
     return Boolean(picture);
   });
   const at = found[0] && found[1] ? wipe : 0;
   images[1].style.clipPath = `inset(0 0 0 ${at}%)`;
   names.forEach((name, side) => { name.hidden = $("flicker").checked && side !== Number(turn); });
-  box.ariaLabel = `${names[0].textContent} and ${names[1].textContent}, ${view.name}, ${data.runs[run].label}: enlarge`;
 }
 const refreshAll = () => {
   $("wide").value = $("wipe").value;
@@ -137,7 +129,7 @@ for (const view of data.views) {
     const part = stack(view, run), number = stacks.push(part) - 1;
     part.caption = [data.runs[run].label, view.name, pictures.caption ?? "not among the views of this run"];
     part.box.onclick = () => enlarge(number);
-    return make("figure", {}, part.box, make("figcaption", {}, part.caption.filter(Boolean).join(" · ")));
+    return make("figure", {}, part.box, make("figcaption", {}, swatch(data.runs[run].color), part.caption.filter(Boolean).join(" · ")));
   });
   $("views").append(make("div", { className: "side" }, ...figures));
 }
@@ -177,7 +169,6 @@ if (data.attribution) $("ranges").append(bar("CA map (variance, half left out); 
 // The models, and one camera for all of them.
 const camera = {}, models = [];
 let depth = 1, up = [0, 1, 0]; // of the point that is turned around; of the world
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const row = i => camera.rotation.slice(3 * i, 3 * i + 3);
 
 const place = pose => Object.assign(camera, { rotation: [0, 4, 8].flatMap(i => pose.slice(i, i + 3)),
@@ -233,19 +224,19 @@ function draw() {
   $("hidden").value = hide;
   for (const model of models) {
     model.draw(camera, heat, 1 - hide / 100);
-    const { label, count, held } = model.run, gone = Math.floor(count * hide / 100);
-    model.caption.textContent = `${label} · ${count - gone} of ${count} Gaussians`
-      + (hide && held.length ? `; those hidden hold ${(100 * held[hide]).toFixed(1)} % of the co-adaptation` : "");
+    const { label, count, held, color } = model.run, gone = Math.floor(count * hide / 100);
+    model.caption.replaceChildren(swatch(color), `${label} · ${count - gone} of ${count} Gaussians`
+      + (hide && held.length ? `; those hidden hold ${(100 * held[hide]).toFixed(1)} % of the co-adaptation` : ""));
   }
 }
 let asked = 0;
 const redraw = () => { asked ||= requestAnimationFrame(() => { asked = 0; draw(); }); };
 
-try {
+async function showModels() {
   for (const run of data.runs) {
     const canvas = make("canvas", { tabIndex: 0, role: "img", ariaLabel: `the model ${run.label} in 3D` }), caption = make("figcaption", {});
     $("models").append(make("figure", {}, canvas, caption));
-    models.push(Object.assign(new Model(canvas, run), { caption }));
+    models.push(Object.assign(new Model(canvas, run, await unpack(run.values, run.count)), { caption }));
     canvas.onpointerdown = event => canvas.setPointerCapture(event.pointerId);
     canvas.oncontextmenu = event => event.preventDefault();
     canvas.onpointermove = event => {
@@ -309,6 +300,5 @@ try {
   draw();
   if (data.attribution) $("legend").append(bar("heat: share of the co-adaptation per contribution, logarithmic around the mean of the first run",
     data.ends.heat[0], `${data.ends.heat[1]} or more`));
-} catch (error) {
-  $("models").append(make("p", { className: "quiet" }, error.message));
 }
+const ready = showModels().catch(error => $("models").append(make("p", { className: "quiet" }, error.message)));

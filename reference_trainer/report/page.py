@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import shlex
-import tempfile
 from collections.abc import Collection, Sequence
 from datetime import datetime
 from importlib.resources import files
@@ -15,23 +14,25 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
 import torch
 
 import ca_reg
 from ca_reg.monitor import read_dynamics
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ERROR_PICTURE_RANGE
-from reference_trainer.evaluation.pictures import dynamics_figure, heat_map
+from reference_trainer.evaluation.pictures import heat_map, logs_exact
 from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE
 from reference_trainer.evaluation.tables import evaluation_table, markdown_table
 from reference_trainer.files import write_text
 from reference_trainer.report.findings import Findings, find
-from reference_trainer.report.packing import data_uri, jpeg
+from reference_trainer.report.packing import image_uri
 from reference_trainer.report.verdict import (
     FEWEST_SEEDS,
     Rows,
     differences,
     natural_name,
     natural_order,
+    run_colors,
     score_columns,
     unique_names,
     verdict,
@@ -113,7 +114,7 @@ def write_report(
         title=f"{found[0].scene.name}: {', '.join(names)}".replace("&", "&amp;").replace("<", "&lt;"),
         style=_part("page.css"),
         data=json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c"),  # nothing ends the script
-        script=_part("models.js") + _part("page.js"),
+        script=_part("models.js") + _part("curves.js") + _part("page.js"),
     )
     write_text(out, page)
     _log.info("The report is %s (%.1f MB): open it in a browser", out, out.stat().st_size / 1e6)
@@ -194,12 +195,13 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
     """Return all that the page shows, as plain data; runs in ``whole`` stand for all seeds of their strategy."""
     configs = {label: read_run_settings(run / CONFIG) for label, run in runs.items()}
     results = {label: read_results(run) for label, run in runs.items() if (run / RESULTS).exists()}
-    strategies = _strategies(runs, results, configs, whole)
+    colors = dict(zip(runs, run_colors([config for _, config in configs.values()]), strict=True))
+    strategies = _strategies(runs, results, configs, whole, colors)
     table, differing = _settings(configs)
     said, evidence = verdict(strategies, differing)
     notes = [note for each in found for note in each.notes]
     notes += [f"{label}: no scores, it has not been trained to its end." for label in runs.keys() - results.keys()]
-    dynamics, missing = _dynamics(runs)
+    curves, missing = _curves(runs)
     middle = next((each.heat.mean for each in found if each.heat is not None), 1.0)
     low, high = (end * middle for end in PER_WEIGHT_SCALE)
     attribution = [row for each in found if (row := each.attribution())]
@@ -209,17 +211,18 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
         "scene": found[0].scene.name,
         "verdict": said,
         "evidence": evidence,
-        "strategies": [{"name": of.name, "seeds": len(of.results)} for of in strategies],
+        "strategies": [{"name": of.name, "seeds": len(of.results), "color": of.color} for of in strategies],
         "scores": score_columns(strategies),
         "settings": table,
-        "dynamics": dynamics,
+        "curves": curves,
+        "exact": all(logs_exact(runs[curve["run"]]) for curve in curves),
         "perView": {label: evaluation_table(_renamed(of)) for label, of in results.items()},
         "attribution": markdown_table(attribution, list(attribution[0])) if attribution else "",
-        "legend": jpeg(heat_map(torch.linspace(0, 1, 256)[None].expand(8, -1), 1.0)),
+        "legend": image_uri(heat_map(torch.linspace(0, 1, 256)[None].expand(8, -1), 1.0)),
         "ends": {"heat": [f"{low:.2g}", f"{high:.2g}"], "error": ERROR_PICTURE_RANGE, "ca": CA_PICTURE_RANGE},
         "views": _views(found),
         "flight": _flight(found[0]),
-        "runs": [each.packed(low, high) for each in found],
+        "runs": [each.packed(low, high) | {"color": colors[each.label]} for each in found],
     }
 
 
@@ -243,6 +246,7 @@ def _strategies(
     results: dict[str, dict[str, Any]],
     configs: dict[str, tuple[SceneOptions, TrainConfig]],
     whole: Collection[Path],
+    colors: dict[str, str],
 ) -> list[Rows]:
     """Return the rows of every strategy: runs that differ in nothing but the seed are one, as in a comparison."""
     found: dict[object, tuple[str, list[str], dict[int, dict[str, Any]]]] = {}
@@ -259,7 +263,12 @@ def _strategies(
                 other = read_results(seed.parent)
                 rows.setdefault(other["config"]["seed"], other)
     return [
-        Rows(name if len(names) == 1 else natural_name(config), not natural_order(config)[0], list(rows.values()))
+        Rows(
+            name if len(names) == 1 else natural_name(config),
+            not natural_order(config)[0],
+            list(rows.values()),
+            colors[name],
+        )
         for name, names, rows in found.values()
         for config in [configs[name][1]]
     ]
@@ -278,23 +287,24 @@ def _settings(configs: dict[str, tuple[SceneOptions, TrainConfig]]) -> tuple[str
     return markdown_table(rows, ["setting", *configs]) if rows else "", [x for x in differing if x not in named]
 
 
-def _dynamics(runs: dict[str, Path]) -> tuple[str, list[str]]:
-    """Return the figure of CA and PSNR against the step as a data URI, empty without data, and notes on gaps."""
-    logged, missing = {}, []
+def _curves(runs: dict[str, Path]) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return CA in 1e-3 and PSNR against the step of every run and group of views, and notes on what is missing."""
+    curves, missing = list[dict[str, Any]](), []
     for label, run in runs.items():
         try:
-            read_dynamics(run)
-            logged[label] = run
+            columns = read_dynamics(run)
         except FileNotFoundError:
             missing.append(f"{label}: no CA and PSNR against the step, because nothing was measured while it trained.")
         except ValueError as error:
             missing.append(f"{label}: no CA and PSNR against the step: {error}")
-    if not logged:
-        return "", missing
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "dynamics.svg")
-        dynamics_figure(logged, path)
-        return data_uri(path.read_bytes(), "image/svg+xml"), missing
+        else:
+            for group in (key[3:] for key in columns if key.startswith("ca/")):
+                curve: dict[str, Any] = {"run": label, "group": group, "step": columns["step"].tolist()}
+                for name, unit in (("ca", 1e-3), ("psnr", 1.0)):
+                    values = columns.get(f"{name}/{group}", np.full(len(columns["step"]), np.nan)) / unit
+                    curve[name] = [round(x, 4) if np.isfinite(x) else None for x in values.tolist()]
+                curves.append(curve)
+    return curves, missing
 
 
 def view_name(split: str, name: str) -> str:
@@ -325,7 +335,7 @@ def _views(found: Sequence[Findings]) -> list[dict[str, Any]]:
                 pose = camera.world_to_camera[:3].flatten().tolist()
                 entry = views.setdefault((split, view.name, str(pose)), {
                     "name": view_name(split, view.name),
-                    "photograph": jpeg(view.image) if isinstance(view, View) else "",
+                    "photograph": image_uri(view.image) if isinstance(view, View) else "",
                     "pose": pose,
                     "focal": [camera.fx, camera.fy],
                     "center": [camera.cx, camera.cy],

@@ -7,8 +7,10 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Any
 
+from reference_trainer.evaluation.style import COLORS, STRATEGIES
 from reference_trainer.evaluation.tables import format_mean_std, mean_std
 from reference_trainer.training.config import TrainConfig
 
@@ -18,6 +20,7 @@ __all__ = [
     "differences",
     "natural_name",
     "natural_order",
+    "run_colors",
     "score_columns",
     "unique_names",
     "verdict",
@@ -74,6 +77,21 @@ def unique_names(configs: Sequence[TrainConfig], paths: Sequence[str]) -> list[s
     return [name if shared[name] == 1 else f"{name} ({path})" for name, path in zip(names, paths, strict=True)]
 
 
+def run_colors(configs: Sequence[TrainConfig]) -> list[str]:
+    """Return a color for each run: that of its strategy for the first of each, one of its own for all others.
+
+    Example:
+        >>> run_colors([TrainConfig(), TrainConfig(dropout=0.2), TrainConfig(dropout=0.4)])
+        ['#0072B2', '#E69F00', '#56B4E9']
+    """
+    of_strategies, others = [*STRATEGIES.values(), ""], cycle(COLORS)
+    found: list[str] = []
+    for config in configs:
+        of = of_strategies[natural_order(config)[0]]
+        found.append(of if of and of not in found else next(others))
+    return found
+
+
 @dataclass(frozen=True)
 class Rows:
     """The rows of a strategy that a verdict is made from.
@@ -82,11 +100,13 @@ class Rows:
         name: of the strategy.
         baseline: whether it is one without a regularizer.
         results: content of ``results.json`` of each of its seeds.
+        color: that the page shows it in.
     """
 
     name: str
     baseline: bool
     results: Sequence[Mapping[str, Any]]
+    color: str = ""
 
     def values(self, split: str, key: str) -> list[float]:
         """Return a mean over the views of a split, of every seed that has it."""

@@ -1,7 +1,9 @@
 import dataclasses
 import json
+import os
 import re
 import shutil
+import zlib
 from base64 import b64decode
 from html.parser import HTMLParser
 from io import BytesIO
@@ -13,15 +15,16 @@ import torch
 from browser import CHROMIUM, Page
 from heard import hearing
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
-from ca_reg.monitor import LOG_NAME
+from ca_reg.monitor import LOG_NAME, read_dynamics
 from reference_trainer.cli import main
 from reference_trainer.evaluation.results import write_json
-from reference_trainer.evaluation.shares import blend_weights, colored_by, mean_shares, share_per_weight
+from reference_trainer.evaluation.shares import Heat, blend_weights, colored_by, mean_shares, share_per_weight
+from reference_trainer.evaluation.style import STRATEGIES
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.report import page as page_module
 from reference_trainer.report.findings import find
+from reference_trainer.report.packing import quantized
 from reference_trainer.report.page import compare_two, write_report
 from reference_trainer.runs.folder import CHECKPOINT, CONFIG, run_settings
 from reference_trainer.runs.measure import load_run_model
@@ -51,8 +54,17 @@ class Parsed(HTMLParser):
         self.texts[self._open] = self.texts.get(self._open, "") + text
 
 
-def array(text: str, kind: str, *shape: int) -> np.ndarray:
-    return np.frombuffer(b64decode(text), kind).reshape(shape)
+def unpacked(run: dict) -> dict[str, np.ndarray]:
+    """The numbers of a model of the page, read as their docstrings say."""
+    planes = np.frombuffer(zlib.decompress(b64decode(run["values"]["text"])), np.uint8)
+    low, high = planes.reshape(-1, 2, run["count"]).astype(int).transpose(1, 0, 2)
+    coded = (low + 256 * high).T
+    table = np.where(coded % 2, -(coded + 1) // 2, coded // 2) * np.array(run["values"]["steps"])
+    ends = np.cumsum([3, 3, 4, 1, 3])
+    names = "means", "log_scales", "quaternions", "opacities", "heat", "sh"
+    found = dict(zip(names, np.split(table, ends, axis=1), strict=True))
+    found["means"] = run["center"] + run["scale"] * np.sign(found["means"]) * np.expm1(np.abs(found["means"]))
+    return found
 
 
 def two_of_each(scene: Scene) -> list[View]:
@@ -107,12 +119,15 @@ def test_the_tables_are_those_of_the_runs(pair):
 
 
 def test_the_curves_are_those_that_were_measured(pair):
-    _, page = pair
+    runs, page = pair
     without, with_ = (each["label"] for each in page.data["runs"])
-    assert page.data["dynamics"].startswith("data:image/svg+xml;base64,")
-    figure = b64decode(page.data["dynamics"].partition(",")[2])
-    assert f"{with_} test".encode() in figure  # the legend
-    assert without.encode() + b" test" not in figure
+    logged = read_dynamics(runs[1])
+    assert [(curve["run"], curve["group"]) for curve in page.data["curves"]] == [(with_, "train"), (with_, "test")]
+    for curve in page.data["curves"]:
+        np.testing.assert_array_equal(curve["step"], logged["step"])
+        np.testing.assert_allclose(curve["ca"], 1e3 * logged[f"ca/{curve['group']}"], atol=1e-4)
+        np.testing.assert_allclose(curve["psnr"], logged[f"psnr/{curve['group']}"], atol=1e-4)
+    assert page.data["exact"]
     assert [note for note in page.data["notes"] if "against the step" in note] == [
         f"{without}: no CA and PSNR against the step, because nothing was measured while it trained."
     ]
@@ -143,28 +158,35 @@ def test_the_models_are_those_of_the_runs(pair):
     runs, page = pair
     for run, packed in zip(runs, page.data["runs"], strict=True):
         model, scene = load_run_model(run)
-        gaussians, n = model.gaussians, len(model.gaussians)
-        table = array(packed["geometry"], "<f4", n, 16)
-        np.testing.assert_array_equal(table[:, :3], gaussians.means)
-        np.testing.assert_allclose(table[:, 3], model.test_opacities, rtol=1e-6)
-        rotations = Rotation.from_quat(gaussians.quaternions.double().numpy(), scalar_first=True).as_matrix()
-        squares = gaussians.scales.double().numpy()[:, None] ** 2
-        covariances = (rotations * squares) @ rotations.transpose(0, 2, 1)
-        upper = covariances[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-        np.testing.assert_allclose(table[:, 4:10], upper, rtol=1e-4, atol=1e-6 * upper.max())
-        bands = (packed["degree"] + 1) ** 2
-        assert packed["degree"] == 2
-        colors = array(packed["colors"], "<f2", n, bands, 3)
-        np.testing.assert_allclose(colors, gaussians.sh[:, :bands], rtol=1e-3, atol=1e-4)
-
         views = two_of_each(scene)
         shares = mean_shares(model, views)[0]
         values = share_per_weight(shares, blend_weights(model, views)).numpy()
-        ordered = values[table[:, 10].argsort()]
-        assert (ordered[1:] >= ordered[:-1]).all()
-        held, tenth = packed["held"], table[:, 10] >= 1 - (n // 10) / n - 1e-6
+        n, table = len(model.gaussians), unpacked(packed)
+        order = Heat.of(model, views).ranks.argsort()
+        assert (np.diff(values[order]) >= 0).all()
+        gaussians = model.gaussians[order]
+        np.testing.assert_allclose(table["means"], gaussians.means, rtol=1e-3, atol=2e-4 * packed["scale"])
+        np.testing.assert_allclose(table["log_scales"], gaussians.log_scales, atol=0.011)
+        expected = torch.nn.functional.normalize(gaussians.quaternions, dim=1)
+        np.testing.assert_allclose(table["quaternions"], expected, atol=0.6 / 256)
+        np.testing.assert_allclose(table["opacities"][:, 0], model.test_opacities[order], atol=0.6 / 512)
+        bands = (packed["degree"] + 1) ** 2
+        assert packed["degree"] == 2
+        colors = table["sh"].reshape(n, bands, 3)
+        np.testing.assert_allclose(colors[:, 0], gaussians.sh[:, 0], atol=0.6 / 256)
+        np.testing.assert_allclose(colors[:, 1:], gaussians.sh[:, 1:bands], atol=0.6 / 40)
+        held, tenth = packed["held"], order[-(n // 10) :]
         assert (held[0], held[100]) == (0, 1)
         assert held[10] == pytest.approx(shares.numpy()[tenth].sum() / shares.sum().item(), abs=1e-3)
+
+
+def test_numbers_that_do_not_fit_their_step_get_a_larger_one():
+    values = torch.tensor([[1e6, 0.25], [-1e6, -0.5], [3.0, 0.0]])
+    packed = quantized([(values, 0.25)])
+    assert packed["steps"] == [pytest.approx(1e6 / 32767)] * 2
+    planes = zlib.decompress(b64decode(packed["text"]))
+    assert list(planes[:3]) == [65534 % 256, 65533 % 256, 0]  # 32767 and -32767
+    assert list(planes[3:6]) == [255, 255, 0]
 
 
 def unfinished(folder: Path, options: SceneOptions, config: TrainConfig) -> Trainer:
@@ -184,7 +206,7 @@ def test_what_a_run_lacks_is_left_out_with_a_word(tmp_path, options, short, opac
     assert out == tmp_path / "mine" / "report.html"
     page = Parsed(out)
     assert page.data["scores"] == []
-    assert page.data["dynamics"] == ""
+    assert page.data["curves"] == []
     assert page.data["verdict"] == "No verdict: no run has been trained to its end."
     name = "Dropout 0.2 + noise 0.3"
     assert page.data["perView"] == {}
@@ -207,8 +229,8 @@ def test_a_damaged_log_is_told_from_none(tmp_path):
         (tmp_path / name).mkdir()
         if content:
             (tmp_path / name / LOG_NAME).write_text(content)
-    figure, notes = page_module._dynamics({name: tmp_path / name for name in ("damaged", "none")})
-    assert figure == ""
+    curves, notes = page_module._curves({name: tmp_path / name for name in ("damaged", "none")})
+    assert curves == []
     assert re.match(r"damaged: no CA and PSNR against the step: .*ca\.jsonl, line 1, is no measurement ", notes[0])
     assert notes[1] == "none: no CA and PSNR against the step, because nothing was measured while it trained."
 
@@ -219,8 +241,8 @@ def test_opacities_that_depend_on_the_camera_are_drawn_plain(tmp_path, options, 
     page = Parsed(write_report([tmp_path], views=1))
     assert "opacities depend on the camera" in page.data["notes"][0]
     (packed,) = page.data["runs"]
-    drawn = array(packed["geometry"], "<f4", packed["count"], 16)[:, 3]
-    np.testing.assert_allclose(drawn, trainer.gaussians.opacities.detach(), rtol=1e-6)
+    drawn = np.sort(unpacked(packed)["opacities"][:, 0])
+    np.testing.assert_allclose(drawn, trainer.gaussians.opacities.detach().sort().values, atol=0.6 / 512)
 
 
 def test_what_is_no_run_or_no_pair_is_refused(run, found, tmp_path, monkeypatch):
@@ -259,6 +281,7 @@ def turned(tmp_path_factory, short):
     folder = tmp_path_factory.mktemp("turned")
     options, runs = SceneOptions("synthetic", downscale=2), [folder / "baseline", folder / "dropout"]
     spreads = {"sh_rest": 0.2, "log_scales": 0.7, "quaternions": 1.0, "opacity_logits": 2.0}
+    units, groups = (("ca", 5e-3), ("psnr", 30.0)), ("train", "test")
     for run, rate in zip(runs, (0.0, 0.2), strict=True):
         trainer = unfinished(run, options, dataclasses.replace(short, dropout=rate, sh_every=1, initial_opacity=0.9))
         generator = torch.Generator().manual_seed(0)
@@ -268,6 +291,16 @@ def turned(tmp_path_factory, short):
                 part += spread * torch.randn(part.shape, generator=generator)
             trainer.gaussians.log_scales[::2] -= 2.0  # some are as thin as a pixel
         trainer.save(run / CHECKPOINT)
+        lines = [
+            {"step": step, "method": "exact", "drop_rate": 0.5}
+            | {
+                f"{key}/{group}": torch.rand((), generator=generator).item() * unit
+                for key, unit in units
+                for group in groups
+            }
+            for step in (100, 200, 300, 400)
+        ]
+        (run / LOG_NAME).write_text("".join(json.dumps(line) + "\n" for line in lines))
     return runs, write_report(runs, views=2)
 
 
@@ -275,6 +308,7 @@ def turned(tmp_path_factory, short):
 def opened(turned):
     """The page in a browser."""
     with Page(turned[1]) as page:
+        page.run("ready.then(() => 0)")
         page.run("for (const { canvas } of models) canvas.style.width = '80px'")  # as the photographs
         yield page
 
@@ -402,6 +436,7 @@ def test_the_models_move_by_keys_and_along_the_flight_and_are_reset(turned, open
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_page_fits_its_window_in_light_and_dark(turned, width, scheme):
     with Page(turned[1], width=width) as page:
+        page.run("ready.then(() => 0)")
         page("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
         page.run("document.querySelectorAll('details').forEach(part => { part.open = true; })")
         assert page.run("document.documentElement.scrollWidth") == width
@@ -413,6 +448,65 @@ def test_the_page_fits_its_window_in_light_and_dark(turned, width, scheme):
         tip = page.run("[$('tip').hidden, $('tip').textContent, $('tip').getBoundingClientRect().right]")
         assert tip[:2] == [False, hint]
         assert tip[2] <= width
+
+
+@pytest.mark.slow
+@needs_browser
+def test_curves_are_read_zoomed_and_toggled(turned, opened):
+    curves = Parsed(turned[1]).data["curves"]
+    steps, [first, *_] = curves[0]["step"], sorted({(curve["run"], curve["group"]) for curve in curves})
+    opened.run("charts[0].box.scrollIntoView()")
+    box = opened.run("charts[0].box.getBoundingClientRect().toJSON()")
+    left, right = 42, 10  # of the axes
+    places = [
+        box["x"] + left + (step - steps[0]) / (steps[-1] - steps[0]) * (box["width"] - left - right) for step in steps
+    ]
+
+    def mouse(kind, x, **rest):
+        opened("Input.dispatchMouseEvent", type=kind, x=x, y=box["y"] + 50, button="left", **rest)
+
+    mouse("mouseMoved", places[1] + 3)  # near the second step
+    text = opened.run("$('readout').textContent")
+    for curve in curves:
+        ca, psnr = curve["ca"][1], curve["psnr"][1]
+        assert f"{curve['run']}, {curve['group']}: CA {ca:.2f}, PSNR {psnr:.2f}" in text
+    mouse("mousePressed", places[1])
+    mouse("mouseMoved", places[-1], buttons=1)
+    mouse("mouseReleased", places[-1])
+    assert opened.run("range") == [steps[1], steps[-1]]
+    assert opened.run("$('zoomed').click(), range") == [steps[0], steps[-1]]
+    paths = "charts.map(({ box }) => box.querySelectorAll('.curve').length)"
+    assert opened.run(paths) == [len(curves)] * 2
+    for toggle, left_over in (
+        (first[0], [curve for curve in curves if curve["run"] != first[0]]),
+        ("test", [curve for curve in curves if curve["group"] != "test"]),
+    ):
+        button = f"[...document.querySelectorAll('.toggle')].find(x => x.textContent === {json.dumps(toggle)})"
+        assert opened.run(f"{button}.click(), {paths}") == [len(left_over)] * 2
+        assert opened.run(f"{button}.ariaPressed") == "false"
+        assert opened.run(f"{button}.click(), {paths}") == [len(curves)] * 2
+    colors = {run["label"]: run["color"] for run in Parsed(turned[1]).data["runs"]}
+    assert [*colors.values()] == [STRATEGIES["noise"], STRATEGIES["both"]]
+    drawn = opened.run("[...charts[0].box.querySelectorAll('.curve')].map(path => path.getAttribute('stroke'))")
+    assert drawn == [colors[curve["run"]] for curve in curves]
+
+
+@pytest.mark.slow
+@needs_browser
+@pytest.mark.skipif("CA_REG_AXE" not in os.environ, reason="needs the axe.min.js of npm pack axe-core in $CA_REG_AXE")
+@pytest.mark.parametrize("width", [360, 1200, 2560])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_people_of_all_abilities_can_use_the_page(turned, width, scheme):
+    with Page(turned[1], width=width) as page:
+        page("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        page.run("ready.then(() => 0)")
+        page.run("document.querySelectorAll('details').forEach(part => { part.open = true; })")
+        page.run(Path(os.environ["CA_REG_AXE"]).read_text("utf-8") + "; 0")
+        found = page.run("axe.run({ resultTypes: ['violations'] })")
+        assert len(found["passes"]) > 20
+        assert not [
+            f"{of['id']}: {of['nodes'][0]['html']} {of['nodes'][0]['failureSummary']}" for of in found["violations"]
+        ]
 
 
 @pytest.mark.slow
@@ -455,7 +549,7 @@ def test_the_scores_of_a_comparison_are_those_of_all_its_seeds(run, tmp_path):
             write_json(folder / "results.json", results | {"config": results["config"] | changed, "mean": means})
     data = Parsed(write_report([tmp_path], views=1)).data
     assert [each["label"] for each in data["runs"]] == ["Baseline", "Dropout 0.2"]
-    assert data["strategies"] == [{"name": "Baseline", "seeds": 2}, {"name": "Dropout 0.2", "seeds": 2}]
+    assert [(of["name"], of["seeds"]) for of in data["strategies"]] == [("Baseline", 2), ("Dropout 0.2", 2)]
     cells = data["scores"][0]["cells"]
     assert [cell["text"] for cell in cells] == ["19.50 ± 0.71", "21.00 ± 1.41"]
     assert (cells[1]["delta"], cells[1]["better"], cells[1]["best"], cells[0]["best"]) == ("+1.50", True, True, False)
