@@ -31,6 +31,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier
+from ca_reg.lists import ListMoments, PixelLists
 from reference_trainer.camera import Camera
 from reference_trainer.render import describe_engine, rasterize, render_masks, render_moments, splat, use_engine
 
@@ -89,7 +90,7 @@ class _Operations(TorchDispatchMode):
         super().__init__()
         self.names: Counter[str] = Counter()
         self.alive: dict[int, tuple[int, int]] = {}  # bytes and tensors of a storage, by its address
-        self.now = self.peak = 0
+        self.now = self.peak = self.elements = 0
         self.paused = False
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -102,6 +103,7 @@ class _Operations(TorchDispatchMode):
             self.names[schema.name.removeprefix("aten::")] += 1
         for x in pytree.tree_leaves(out):
             if isinstance(x, Tensor):
+                self.elements += 0 if view else x.numel()
                 self._hold(x)
         return out
 
@@ -198,6 +200,50 @@ def bytes_per_entry(device: torch.device | str = "cpu") -> float:
         peaks.append(mode.peak)
         entries.append(len(lists.gaussians))
     return (peaks[1] - peaks[0]) / (entries[1] - entries[0])
+
+
+class ListCounts(NamedTuple):
+    """What the exact moments of per-pixel lists cost: operations, elements that these write, and bytes at the peak."""
+
+    entries: int
+    longest: int
+    operations: int
+    elements: int
+    peak: int
+
+    def __sub__(self, other: ListCounts) -> ListCounts:
+        return ListCounts(*(a - b for a, b in zip(self, other, strict=True)))
+
+
+def count_lists(length: int, width: int = 64, *, gradient: bool = False) -> ListCounts:
+    """Count what the exact moments of a picture cost whose pixels have lists of up to twice a length."""
+    g = torch.Generator().manual_seed(0)
+    count = width**2
+    lengths = torch.randint(0, 2 * length, (count,), generator=g)
+    pixels = torch.arange(count, dtype=torch.int32).repeat_interleave(lengths)
+    gaussians = torch.randint(0, count, pixels.shape, generator=g, dtype=torch.int32)
+    alphas = torch.rand(len(pixels), generator=g).requires_grad_(gradient)
+    lists = PixelLists(gaussians, pixels, alphas, torch.rand(count, 3, generator=g), width, width)
+    with _Operations() as mode, torch.set_grad_enabled(gradient):
+        out = ListMoments(lambda opacity, view: lists)(torch.ones(count), None, Multiplier.dropout(0.5), None)
+        if gradient:
+            out.variance.sum().backward()
+    return ListCounts(len(pixels), int(lengths.max()), mode.launches, mode.elements, mode.peak)
+
+
+def _lists() -> str:
+    """Return the table of what longer lists cost."""
+    out = ["| exact moments of lists | entries | longest | operations | elements per entry | bytes per further entry |"]
+    out += ["|:--|---:|---:|---:|---:|---:|"]
+    for label, gradient in (("without gradients", False), ("with gradients", True)):
+        rows = [count_lists(length, gradient=gradient) for length in (512, 1024, 2048)]
+        for row, before in zip(rows[1:], rows[:-1], strict=True):
+            further = row - before
+            out.append(
+                f"| {label} | {row.entries} | {row.longest} | {row.operations} | {row.elements / row.entries:.1f} | "
+                f"{further.peak / further.entries:.1f} |"
+            )
+    return "\n".join(out)
 
 
 def _count() -> str:

@@ -7,14 +7,19 @@ its :meth:`~ListMoments.shares` attribute the score to the Gaussians.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from ca_reg._check import check_callable, check_count, check_opacity
-from ca_reg.functional import Multiplier, contributions, pixel_moments
+from ca_reg.functional import Multiplier
+from ca_reg.functional.moments import check_all_finite, check_alphas, check_types
 from ca_reg.types import ExactMoments
 
 __all__ = ["ListMoments", "PixelLists"]
@@ -52,13 +57,12 @@ class ListMoments:
     The lists must be complete. Renderers stop at an opaque surface, but what lies behind it shows when splats of the
     surface are dropped, so a list that ends there misses part of the variance.
 
-    Pixels are processed in blocks, of about 40 floats per padded entry; a backward pass retains all. Differentiable in
-    everything that ``lists_fn`` is differentiable in, and in the multiplier.
+    Time and memory are proportional to the number of entries: of each at most 28 bytes besides the lists themselves.
+    Differentiable in everything that ``lists_fn`` is differentiable in, and in the multiplier.
 
     Args:
         lists_fn: ``lists_fn(opacity, view)`` returns the :class:`PixelLists` of the view for these activated
             opacities, (N,) or (N, 1) as the caller gave them.
-        elements: largest number of padded entries in a block; a longer list is a block of its own.
 
     Example:
         Two Gaussians and two pixels; the second pixel sees the first Gaussian only.
@@ -80,11 +84,9 @@ class ListMoments:
         tensor([0.0704, 0.0181], dtype=torch.float64)
     """
 
-    def __init__(self, lists_fn: Callable[[Tensor, Any], PixelLists], *, elements: int = 1 << 20) -> None:
+    def __init__(self, lists_fn: Callable[[Tensor, Any], PixelLists]) -> None:
         check_callable(lists_fn, "lists_fn")
-        check_count(elements, "elements", minimum=1)
         self.lists_fn = lists_fn
-        self.elements = int(elements)
 
     def __call__(self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None) -> ExactMoments:
         """Return the exact moments of a view: mean and variance (3, H, W) and the expected alpha (H, W).
@@ -96,18 +98,11 @@ class ListMoments:
             TypeError: if ``lists_fn`` returns no :class:`PixelLists`, or a dtype does not fit.
             ValueError: if a shape does not fit, an index is out of range, or an alpha outside [0, 1].
         """
-        lists = self._lists(opacity, view)
-        pixels, means, variances = [], [], []
-        for block in _blocks(lists, multiplier, background, self.elements):
-            mean, variance = pixel_moments(block.alphas, block.values, block.multiplier, background=block.background)
-            pixels.append(block.pixels)
-            means.append(mean)
-            variances.append(variance)
-        place = torch.cat(pixels).argsort()
-        size = (4, lists.height, lists.width)
-        mean, variance = (torch.cat(x)[place].T.reshape(size) for x in (means, variances))
+        walk = _Walk.over(*self._lists(opacity, view, background), multiplier)
+        mean, variance = walk.moments()
         return ExactMoments(mean[:3], variance[:3], mean[3])
 
+    @torch.no_grad()
     def shares(
         self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None, weights: Tensor
     ) -> Tensor:
@@ -123,21 +118,15 @@ class ListMoments:
             >>> ListMoments(lists_fn).shares(torch.tensor([0.5, 0.5]), None, Multiplier.dropout(0.5), None, ones)
             tensor([0.0625, 0.0000], dtype=torch.float64)
         """
-        lists = self._lists(opacity, view)
+        lists, behind = self._lists(opacity, view, background)
         if weights.shape != (lists.height, lists.width):
             raise ValueError(
                 f"weights must have the shape of the image, {(lists.height, lists.width)}, got {tuple(weights.shape)}."
             )
-        flat = weights.to(lists.alphas.device, torch.float64).flatten()
-        out = flat.new_zeros(lists.colors.shape[0] + 1)  # the last one gathers the padding
-        for block in _blocks(lists, multiplier, background, self.elements):
-            parts = contributions(block.alphas, block.values, block.multiplier, background=block.background)
-            parts = parts[..., :3].mean(-1, dtype=torch.float64) * flat[block.pixels, None]
-            out = out.index_add(0, block.gaussians.flatten(), parts.flatten())
-        return out[:-1]
+        return _Walk.over(lists, behind, multiplier).shares(weights)
 
-    def _lists(self, opacity: Tensor, view: Any) -> PixelLists:
-        """Ask for the lists and check them."""
+    def _lists(self, opacity: Tensor, view: Any, background: Tensor | None) -> tuple[PixelLists, Tensor]:
+        """Ask for the lists and check them; return them and the color behind every pixel, shape (H * W, 3)."""
         check_opacity(opacity)
         lists = self.lists_fn(opacity, view)
         if not isinstance(lists, PixelLists):
@@ -152,58 +141,182 @@ class ListMoments:
             )
         if lists.alphas.ndim != 1:
             raise ValueError(f"alphas of the lists must have shape (P,), got {tuple(lists.alphas.shape)}.")
-        _check_indices(lists.gaussians, "gaussians", lists, n)
-        _check_indices(lists.pixels, "pixels", lists, lists.height * lists.width)
-        return lists
+        check_types(lists.alphas, lists.colors)
+        for name, indices in (("gaussians", lists.gaussians), ("pixels", lists.pixels)):
+            if indices.dtype not in (torch.int32, torch.int64):
+                raise TypeError(f"{name} of the lists must be int64 or int32 indices, got {indices.dtype}.")
+            if indices.shape != lists.alphas.shape:
+                raise ValueError(
+                    f"{name} of the lists must have the shape of alphas, {tuple(lists.alphas.shape)}, got "
+                    f"{tuple(indices.shape)}."
+                )
+        behind = _background_of(lists, background)
+        _check_values(lists, behind)
+        return lists, behind
 
 
-class _Block(NamedTuple):
-    """B pixels with lists padded to L entries; in the padding alpha is 0 and the Gaussian index is N."""
+_CHUNK = 1 << 20
+"""Entries between two states that are kept for the backward pass, which computes again what is between them."""
 
-    pixels: Tensor
+
+class _Walk(NamedTuple):
+    """The entries of all lists, by their place in a list: the last of the longest first, the nearest of all last.
+
+    Pixels are sorted by the length of their lists, the longest first. So the entries of one place belong to the first
+    pixels, as many as there are entries: a step of the recursion from back to front takes slices, without padding.
+
+    Args:
+        counts: number of entries of each place.
+        gaussians: of the entries, shape (P,).
+        alphas: of the entries, shape (P,).
+        values: red, green, blue and 1 of all Gaussians, shape (N, 4); the 1 gives the alpha.
+        behind: the colors behind the sorted pixels, and 0, shape (H * W, 4).
+        factors: mean and variance of every Gaussian's factor, () or (N,).
+        ranks: the place of every pixel among the sorted ones, shape (H * W,).
+        shape: of the image, (H, W).
+    """
+
+    counts: list[int]
     gaussians: Tensor
     alphas: Tensor
     values: Tensor
-    multiplier: Multiplier
-    background: Tensor
+    behind: Tensor
+    factors: tuple[Tensor, Tensor]
+    ranks: Tensor
+    shape: tuple[int, int]
 
-
-def _blocks(lists: PixelLists, multiplier: Multiplier, background: Tensor | None, elements: int) -> Iterator[_Block]:
-    """Yield all pixels in blocks, longest lists first; the fourth channel, 1 for every splat, gives the alpha."""
-    n, size = lists.colors.shape[0], lists.height * lists.width
-    pixels = lists.pixels.long()
-    order = pixels.argsort(stable=True)
-    # Entry P, one behind the last, is the padding: Gaussian n, of alpha 0.
-    gaussians = torch.nn.functional.pad(lists.gaussians.long()[order], (0, 1), value=n)
-    alphas = torch.nn.functional.pad(lists.alphas[order], (0, 1))
-    values = torch.cat([lists.colors, torch.ones_like(lists.colors[:, :1])], dim=1)
-    values = torch.nn.functional.pad(values, (0, 0, 0, 1))
-    background = torch.nn.functional.pad(_background_of(lists, background), (0, 1))
-    mean, variance = (_per_gaussian(getattr(multiplier, name), name, lists) for name in ("mean", "variance"))
-
-    counts = pixels.bincount(minlength=size)
-    first = counts.cumsum(0) - counts
-    by_length = counts.argsort(descending=True)
-    lengths = counts[by_length].clamp(min=1)
-    start = 0
-    while start < size:
-        longest = int(lengths[start])
-        # Lists up to half the longest wait for a later block, so at most half of a block is padding.
-        similar = int((lengths > longest // 2).sum())
-        stop = min(start + max(1, elements // longest), similar)
-        which = by_length[start:stop]
-        column = torch.arange(longest, device=which.device)
-        entry = torch.where(column < counts[which, None], first[which, None] + column, pixels.shape[0])
-        listed = gaussians[entry]
-        yield _Block(
-            pixels=which,
-            gaussians=listed,
-            alphas=alphas.index_select(0, entry.flatten()).view(entry.shape),
-            values=values.index_select(0, listed.flatten()).view(*entry.shape, 4),
-            multiplier=Multiplier(_gather(mean, listed), _gather(variance, listed)),
-            background=background[which],
+    @classmethod
+    def over(cls, lists: PixelLists, behind: Tensor, multiplier: Multiplier) -> _Walk:
+        """Sort the entries of the lists."""
+        size, entries, device = len(behind), len(lists.alphas), behind.device
+        dtype = torch.int32 if max(size, entries) < 2**31 else torch.int64
+        mean, variance = (_per_gaussian(getattr(multiplier, name), name, lists) for name in ("mean", "variance"))
+        pixels, order = torch.sort(lists.pixels.to(dtype), stable=True)
+        starts = torch.searchsorted(pixels, torch.arange(size + 1, dtype=dtype, device=device)).to(dtype)
+        lengths, by_length = torch.sort(starts.diff(), stable=True, descending=True)
+        ranks = torch.empty_like(starts[1:]).scatter_(0, by_length, torch.arange(size, dtype=dtype, device=device))
+        lengths = lengths.flip(0).cpu()  # the one wait for a GPU
+        counts = size - torch.searchsorted(lengths, torch.arange(int(lengths[-1]), dtype=dtype), right=True)
+        offsets = counts.sum() - counts.cumsum(0)
+        places = torch.arange(entries, dtype=dtype, device=device).sub_(starts.index_select(0, pixels))
+        target = offsets.to(device, dtype).index_select(0, places).add_(ranks.index_select(0, pixels))
+        del pixels, places  # memory
+        order = torch.empty_like(order).scatter_(0, target.long(), order)
+        return cls(
+            counts.flip(0).tolist(),
+            lists.gaussians.index_select(0, order),
+            lists.alphas.index_select(0, order),
+            torch.cat([lists.colors, torch.ones_like(lists.colors[:, :1])], dim=1),
+            torch.nn.functional.pad(behind, (0, 1)).index_select(0, by_length),
+            (mean, variance),
+            ranks,
+            (lists.height, lists.width),
         )
-        start = stop
+
+    def moments(self, terms: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        """Return mean and variance of the values, (4, H, W); ``terms`` collects what `_advance` does, by chunk."""
+        advance = _Chunk.apply if terms is None else partial(_advance, terms=terms)
+        mean = variance = self.behind[:0]
+        chunks = self._chunks()
+        ends = [0, *(counts[-1] for counts, _, _ in chunks), len(self.ranks)]
+        *behind, rest = torch.split(self.behind, [b - a for a, b in pairwise(ends)])
+        for chunk, begins in zip(chunks, behind, strict=True):
+            mean, variance = advance(*chunk, mean, variance, begins, self.values, *self.factors)
+        moments = torch.cat([mean, rest]), torch.cat([variance, torch.zeros_like(rest)])
+        mean, variance = (x.index_select(0, self.ranks).T.reshape(4, *self.shape) for x in moments)
+        return mean, variance
+
+    def shares(self, weights: Tensor) -> Tensor:
+        """Return what each Gaussian adds to the variance, mean over RGB, weighted by pixels (H, W); (N,), float64."""
+        terms: list[Tensor] = []
+        self.moments(terms)
+        front = torch.empty_like(self.behind[:, 0], dtype=torch.float64)
+        front.scatter_(0, self.ranks.long(), weights.to(front).flatten())
+        out = front.new_zeros(len(self.values))
+        for (counts, gaussians, alphas), term in zip(reversed(self._chunks()), reversed(terms), strict=True):
+            # From the front: a splat scales the variance of all that is behind it.
+            shrink, parts = _spread(alphas, gaussians, *self.factors)[2], list[Tensor]()
+            for t, factor in zip(
+                reversed(torch.split(term, counts)), reversed(torch.split(shrink, counts)), strict=True
+            ):
+                front = front[: len(t)]
+                parts.append(front * t)
+                front = front * factor
+            out.index_add_(0, gaussians, torch.cat(parts[::-1]))
+        return out
+
+    def _chunks(self) -> list[tuple[list[int], Tensor, Tensor]]:
+        """Return counts, Gaussians and alphas of all entries, whole places and about `_CHUNK` entries at a time.
+
+        Whatever belongs to the Gaussians or pixels costs as much for a chunk as for all entries: no chunk is shorter
+        than these are many.
+        """
+        least = max(_CHUNK, 4 * len(self.ranks), 4 * len(self.values))
+        counts: list[list[int]] = []
+        room = 0
+        for count in self.counts:
+            if room <= 0:
+                counts.append([])
+                room = least
+            counts[-1].append(count)
+            room -= count
+        sizes = [sum(x) for x in counts]
+        return list(zip(counts, torch.split(self.gaussians, sizes), torch.split(self.alphas, sizes), strict=True))
+
+
+def _spread(alphas: Tensor, gaussians: Tensor, *factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the expected alphas, their variances, and the factors on the variance of what is behind them."""
+    m, v = (x.index_select(0, gaussians) if x.ndim else x for x in factors)
+    expected, spread = m * alphas, v * alphas.square()
+    return expected, spread, (1.0 - expected).square() + spread
+
+
+def _advance(
+    counts: list[int], gaussians: Tensor, alphas: Tensor, mean: Tensor, variance: Tensor, behind: Tensor,
+    values: Tensor, *factors: Tensor, terms: list[Tensor] | None = None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Carry mean and variance of what is behind, (B, 4), over a chunk of entries, see `ca_reg.functional.moments`.
+
+    ``behind`` is that of the pixels whose lists begin here. ``terms`` collects the summands of the variance, mean over
+    RGB, of all entries.
+    """
+    columns = (*(x[:, None] for x in _spread(alphas, gaussians, *factors)), values.index_select(0, gaussians))
+    begins = torch.split(behind, [b - a for a, b in pairwise([len(mean), *counts])])
+    found = []
+    for expected, spread, shrink, value, new in zip(*(torch.split(x, counts) for x in columns), begins, strict=True):
+        if len(new):
+            mean, variance = torch.cat([mean, new]), torch.cat([variance, torch.zeros_like(new)])
+        term = spread * (value - mean).square()
+        variance = torch.addcmul(term, shrink, variance)
+        # lerp, not a sum of products: equal colors then have exactly zero contrast, without rounding errors.
+        mean = torch.lerp(mean, value, expected)
+        if terms is not None:
+            found.append(term[:, :3].mean(1))
+    if terms is not None:
+        terms.append(torch.cat(found))
+    return mean, variance
+
+
+class _Chunk(torch.autograd.Function):
+    """`_advance`, computed again in the backward pass: nothing is kept but the states between chunks."""
+
+    @staticmethod
+    def forward(ctx: Any, counts: list[int], gaussians: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.counts = counts
+        ctx.save_for_backward(gaussians, *inputs)
+        return _advance(counts, gaussians, *inputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        gaussians, *saved = ctx.saved_tensors
+        inputs = [x.detach().requires_grad_(needed) for x, needed in zip(saved, ctx.needs_input_grad[2:], strict=True)]
+        with torch.enable_grad():
+            pairs = zip(_advance(ctx.counts, gaussians, *inputs), gradients, strict=True)
+            out, upstream = zip(*((x, g) for x, g in pairs if x.requires_grad), strict=True)
+            leaves = [x for x in inputs if x.requires_grad]
+            found = iter(torch.autograd.grad(list(out), leaves, list(upstream), allow_unused=True))
+        return None, None, *(next(found) if x.requires_grad else None for x in inputs)
 
 
 def _background_of(lists: PixelLists, background: Tensor | None) -> Tensor:
@@ -220,37 +333,35 @@ def _background_of(lists: PixelLists, background: Tensor | None) -> Tensor:
     return (background if background.ndim == 3 else background[:, None, None]).expand(shape).flatten(1).T
 
 
-def _per_gaussian(moment: float | Tensor, name: str, lists: PixelLists) -> float | Tensor:
-    """Return a moment of the multiplier as it is if a number, else one value per Gaussian and one for the padding."""
+def _per_gaussian(moment: float | Tensor, name: str, lists: PixelLists) -> Tensor:
+    """Return a moment of the multiplier, () if it is a number, else one value per Gaussian, (N,)."""
     if not isinstance(moment, Tensor):
-        return moment
+        return lists.alphas.new_full((), moment)
     n = lists.colors.shape[0]
     if moment.shape not in ((n,), (n, 1)):
         raise ValueError(
             f"the {name} of the multiplier must be a number or have shape ({n},) or ({n}, 1), one value per Gaussian, "
             f"got {tuple(moment.shape)}."
         )
-    return torch.nn.functional.pad(moment.to(lists.alphas).flatten(), (0, 1))
+    return moment.to(lists.alphas).flatten()
 
 
-def _gather(moment: float | Tensor, listed: Tensor) -> float | Tensor:
-    """Return a moment for every entry of a block."""
-    if not isinstance(moment, Tensor):
-        return moment
-    return moment.index_select(0, listed.flatten()).view(listed.shape)
-
-
-def _check_indices(indices: Tensor, name: str, lists: PixelLists, end: int) -> None:
-    """Raise unless there is one index in [0, end) for every alpha."""
-    if indices.dtype not in (torch.int32, torch.int64):
-        raise TypeError(f"{name} of the lists must be int64 or int32 indices, got {indices.dtype}.")
-    if indices.shape != lists.alphas.shape:
-        raise ValueError(
-            f"{name} of the lists must have the shape of alphas, {tuple(lists.alphas.shape)}, got "
-            f"{tuple(indices.shape)}."
-        )
-    if indices.numel() == 0:
-        return
-    low, high = (int(x) for x in torch.aminmax(indices))
-    if low < 0 or high >= end:
-        raise ValueError(f"{name} of the lists must be in [0, {end}), got values from {low} to {high}.")
+def _check_values(lists: PixelLists, behind: Tensor) -> None:
+    """Raise unless indices and alphas are in their ranges and colors finite; one wait for a GPU."""
+    found = [lists.colors.sum(), behind.sum()]
+    if len(lists.alphas):
+        found += [x for given in (lists.gaussians, lists.pixels, lists.alphas) for x in torch.aminmax(given)]
+    colors, background, *ends = torch.stack([x.detach().double() for x in found]).tolist()
+    if ends:
+        indices, (least, most) = (("gaussians", len(lists.colors)), ("pixels", len(behind))), ends[4:]
+        for (name, end), low, high in zip(indices, ends[:4:2], ends[1:4:2], strict=True):
+            if low < 0 or high >= end:
+                raise ValueError(f"{name} of the lists must be in [0, {end}), got values from {low:.0f} to {high:.0f}.")
+        if not (least >= 0 and most <= 1):
+            check_alphas(lists.alphas)
+    if not math.isfinite(colors):  # those of Gaussians that are not listed may be anything
+        listed = torch.zeros_like(lists.colors[:, 0], dtype=torch.bool)
+        listed[lists.gaussians.long()] = True
+        check_all_finite(lists.colors[listed], "colors")
+    if not math.isfinite(background):
+        check_all_finite(behind, "background")

@@ -191,33 +191,31 @@ def _background(background: Tensor | None, alphas: Tensor, colors: Tensor) -> Te
         raise TypeError(f"background must be a tensor of the dtype of colors, {colors.dtype}, or None.")
     if background.shape not in (shape, shape[-1:]):
         raise ValueError(f"background must have shape {shape[-1:]} or {shape}, got {tuple(background.shape)}.")
-    _check_finite(background, "background")
+    check_all_finite(background, "background")
     return background.expand(shape)
 
 
 def _check_lists(alphas: Tensor, colors: Tensor) -> None:
     """Raise unless alphas and colors are what :func:`pixel_moments` asks for."""
-    _check_alphas(alphas)
-    check_tensor(colors, "colors", "of shape (..., n, C)")
+    check_types(alphas, colors)
+    check_alphas(alphas)
     if colors.shape[:-1] != alphas.shape:
         raise ValueError(
             f"colors must have the shape of alphas and a last axis of channels, {(*alphas.shape, 'C')}, "
             f"got {tuple(colors.shape)}; expand the colors if the pixels share them."
         )
-    if colors.dtype != alphas.dtype:
-        raise TypeError(f"colors and alphas must have the same dtype, got {colors.dtype} and {alphas.dtype}.")
-    _check_finite(colors, "colors")
+    check_all_finite(colors, "colors")
 
 
-def _check_finite(x: Tensor, name: str) -> None:
+def check_all_finite(x: Tensor, name: str) -> None:
     """Raise unless all values are finite, also in the padding: an alpha of 0 does not keep a nan out."""
     # The sum first: it is several times cheaper than checking every value, but may overflow though all are finite.
     if not bool(x.detach().sum().isfinite()) and not bool(x.isfinite().all()):
         raise ValueError(f"{name} must be finite, got nan or infinity.")
 
 
-def _check_alphas(alphas: Tensor) -> None:
-    """Raise unless alphas is a float32 or float64 tensor (..., n) of values in [0, 1]."""
+def check_types(alphas: Tensor, colors: Tensor) -> None:
+    """Raise unless alphas (..., n) and colors are float32 or float64 tensors, both of one."""
     check_tensor(alphas, "alphas", "of shape (..., n)")
     # The 8 or 11 significant bits of the 16-bit dtypes do not survive the products over long lists.
     if alphas.dtype not in (torch.float32, torch.float64):
@@ -226,5 +224,12 @@ def _check_alphas(alphas: Tensor) -> None:
         )
     if alphas.ndim == 0:
         raise ValueError("alphas must have shape (..., n), got a scalar.")
+    check_tensor(colors, "colors", "of shape (..., n, C)")
+    if colors.dtype != alphas.dtype:
+        raise TypeError(f"colors and alphas must have the same dtype, got {colors.dtype} and {alphas.dtype}.")
+
+
+def check_alphas(alphas: Tensor) -> None:
+    """Raise unless all alphas are in [0, 1]."""
     if not bool(((alphas >= 0) & (alphas <= 1)).all()):
         raise ValueError("alphas must be in [0, 1], got a value outside; pass min(0.99, opacity * falloff).")

@@ -1,5 +1,6 @@
 """Moments from per-pixel lists, against padded lists, the renderer, and closed forms."""
 
+import itertools
 from typing import NamedTuple
 
 import pytest
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier, alpha_moments, contributions, pixel_moments
-from ca_reg.lists import ListMoments, PixelLists, _blocks
+from ca_reg.lists import ListMoments, PixelLists
 from reference_trainer.render import splat
 from reference_trainer.render.renderer import render_moments
 
@@ -109,28 +110,48 @@ def test_the_background_is_the_one_asked_for_else_that_of_the_lists_else_black(s
     torch.testing.assert_close(out.variance, image(expected.variance), **CLOSE)
 
 
-@pytest.mark.parametrize("elements", [1, 7, 25])
-def test_blocks_of_any_size_give_the_same(elements):
-    scene = padded()
-    whole, parts = ListMoments(scene.lists), ListMoments(scene.lists, elements=elements)
-    per_gaussian, weights = MULTIPLIERS["(N,)"], uniform(3, HEIGHT, WIDTH)
-    for a, b in zip(*(x(scene.opacity, None, per_gaussian, None) for x in (whole, parts)), strict=True):
+def dense(seed=0):
+    """Twelve entries for every pixel: several chunks, which hold at least four."""
+    return padded(seed)._replace(falloff=uniform(4, SIZE, N))
+
+
+def test_chunks_of_any_size_give_the_same(monkeypatch):
+    scene, per_gaussian, weights = dense(), MULTIPLIERS["(N,)"], uniform(3, HEIGHT, WIDTH)
+    moments, found = ListMoments(scene.lists), []
+    for least in (1, 1000):
+        monkeypatch.setattr("ca_reg.lists._CHUNK", least)
+        shares = moments.shares(scene.opacity, None, per_gaussian, None, weights)
+        found.append((*moments(scene.opacity, None, per_gaussian, None), shares))
+    for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b, **CLOSE)
-    a, b = (x.shares(scene.opacity, None, per_gaussian, None, weights) for x in (whole, parts))
-    torch.testing.assert_close(a, b, **CLOSE)
 
 
-@pytest.mark.parametrize("elements", [1, 40, 300])
-def test_no_block_exceeds_the_bound_and_at_most_half_of_it_is_padding(elements):
-    scene = padded()
-    blocks = list(_blocks(scene.lists(scene.opacity, None), DROPOUT, None, elements))
-    assert torch.cat([block.pixels for block in blocks]).sort()[0].tolist() == list(range(SIZE))
-    assert sum((block.alphas > 0).sum() for block in blocks) == (scene.falloff > 0).sum()
-    for block in blocks:
-        pixels, longest = block.alphas.shape
-        assert pixels * longest <= elements or pixels == 1
-        # Pixels without an entry get one of padding, in a block of lists of one entry.
-        assert 2 * (block.alphas > 0).sum() >= block.alphas.numel() or longest == 1
+def test_all_masks_of_short_lists():
+    """Every subset of up to five Gaussians, dropped at rates of their own, composited one by one."""
+    rates = uniform(6, 5)
+    falloff = uniform(7, SIZE, 5) * (uniform(8, SIZE, 5) < 0.7)
+    colors, behind = uniform(9, 5, 3), uniform(10, 3)
+    order = torch.stack([torch.randperm(5, generator=torch.Generator().manual_seed(i)) for i in range(SIZE)])
+
+    def lists_fn(opacity, view):
+        pixels, places = (falloff > 0).nonzero().unbind(1)
+        return PixelLists(order[pixels, places], pixels, falloff[pixels, places], colors, HEIGHT, WIDTH, behind)
+
+    means = torch.zeros(2, SIZE, 4, dtype=torch.float64)
+    for keep in itertools.product((0.0, 1.0), repeat=5):
+        keep = torch.tensor(keep, dtype=torch.float64)
+        over = torch.cat([behind, behind.new_zeros(1)]).expand(SIZE, 4)
+        for place in range(4, -1, -1):
+            alpha = (falloff[:, place] * keep[order[:, place]])[:, None]
+            shown = torch.nn.functional.pad(colors[order[:, place]], (0, 1), value=1.0)
+            over = alpha * shown + (1 - alpha) * over
+        probability = torch.where(keep > 0, 1 - rates, rates).prod()
+        means += probability * torch.stack([over, over.square()])
+    multiplier = Multiplier(1 - rates, rates * (1 - rates))
+    found = ListMoments(lists_fn)(torch.ones(5, dtype=torch.float64), None, multiplier, None)
+    torch.testing.assert_close(found.mean, image(means[0, :, :3]), **CLOSE)
+    torch.testing.assert_close(found.variance, image((means[1] - means[0].square())[:, :3]), rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(found.alpha_mean, means[0, :, 3].view(HEIGHT, WIDTH), **CLOSE)
 
 
 def test_pixels_without_entries_show_the_background_for_certain():
@@ -210,25 +231,22 @@ def test_lists_by_brute_force_agree_with_the_renderer():
         assert a.value == pytest.approx(b.value, rel=1e-9)
 
 
-def test_gradients():
-    scene = padded(seed=1)
+def test_gradients(monkeypatch):
+    monkeypatch.setattr("ca_reg.lists._CHUNK", 1)
+    scene = dense(seed=1)
 
     def f(opacity, colors, background, mean, variance):
         return tuple(
-            ListMoments(scene._replace(colors=colors).lists, elements=30)(
-                opacity, None, Multiplier(mean, variance), background
-            )
+            ListMoments(scene._replace(colors=colors).lists)(opacity, None, Multiplier(mean, variance), background)
         )
 
     inputs = (scene.opacity, scene.colors, uniform(4, 3, HEIGHT, WIDTH), uniform(1, N) + 0.1, uniform(2, N) + 0.1)
-    assert torch.autograd.gradcheck(f, tuple(x.clone().requires_grad_() for x in inputs))
+    assert torch.autograd.gradcheck(f, tuple(x.clone().requires_grad_() for x in inputs), fast_mode=True)
 
 
 def test_the_callable_itself_is_checked():
     with pytest.raises(TypeError, match="must be callable"):
         ListMoments(None)
-    with pytest.raises(ValueError, match="elements must be at least 1"):
-        ListMoments(padded().lists, elements=0)
 
 
 @pytest.mark.parametrize(
@@ -244,6 +262,8 @@ def test_the_callable_itself_is_checked():
         ({"alphas": torch.ones(2).double()}, TypeError, "same dtype"),
         ({"colors": torch.ones(3, 3)}, ValueError, r"colors of the lists must have shape \(2, 3\)"),
         ({"height": 0}, ValueError, "height must be at least 1"),
+        ({"background": torch.tensor([0.0, torch.nan, 0.0])}, ValueError, "background must be finite"),
+        ({"colors": torch.tensor([[0.5] * 3, [torch.inf] * 3])}, ValueError, "colors must be finite"),
         ({"background": torch.ones(4)}, ValueError, r"background must have shape \(3,\) or \(3, 2, 3\)"),
     ],
 )
