@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -84,7 +85,18 @@ class Counts(NamedTuple):
 class _Operations(TorchDispatchMode):
     """Counts operations that would launch something on a card, waits for a card, and the bytes of what lives."""
 
-    _FREE = ("empty", "detach", "alias", "lift_fresh", "_unsafe_view", "_local_scalar_dense", "set_", "new_empty")
+    _FREE = (
+        "empty",
+        "empty_like",
+        "detach",
+        "alias",
+        "lift_fresh",
+        "_unsafe_view",
+        "_local_scalar_dense",
+        "set_",
+        "new_empty",
+        "tolist",
+    )
 
     def __init__(self) -> None:
         super().__init__()
@@ -129,7 +141,19 @@ class _Operations(TorchDispatchMode):
 
     @property
     def read_backs(self) -> int:
-        return self.names["_local_scalar_dense"] + self.names["nonzero"]
+        return self.names["_local_scalar_dense"] + self.names["nonzero"] + self.names["tolist"]
+
+
+class _Lists(TorchFunctionMode):
+    """Counts `tolist`, which PyTorch's dispatcher does not see on a processor."""
+
+    def __init__(self, names: Counter[str]) -> None:
+        super().__init__()
+        self.names = names
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.names["tolist"] += func is Tensor.tolist
+        return func(*args, **(kwargs or {}))
 
 
 @contextmanager
@@ -158,7 +182,7 @@ def _counted(work: Callable[[], Any]) -> tuple[int, _Operations, Any]:
     from reference_trainer.render.triton import tiles
 
     mode, before = _Operations(), sum(tiles.LAUNCHED.values())
-    with _outside_of_kernels(mode), mode:
+    with _outside_of_kernels(mode), _Lists(mode.names), mode:
         out = work()
     return mode.launches + sum(tiles.LAUNCHED.values()) - before, mode, out
 

@@ -44,7 +44,7 @@ def check_opacity_range(opacity: Tensor, upper: float = 1.0) -> None:
     """Raise unless all opacities are finite and in [0, upper]. Reads the values, which synchronizes a GPU."""
     if opacity.numel() == 0:
         return
-    low, high = (float(x) for x in torch.aminmax(opacity.detach()))
+    low, high = torch.stack(torch.aminmax(opacity.detach())).tolist()  # together: one wait for a GPU
     if not (low >= 0.0 and high <= upper and math.isfinite(high)):
         allowed = "at least 0" if math.isinf(upper) else f"in [0, {upper:g}]"
         remedy = "pass torch.sigmoid(logits), what the rasterizer receives, not the raw parameter."

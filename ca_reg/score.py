@@ -12,7 +12,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from ca_reg._accumulate import Deviations, RenderMoments, effect_of, finite_colors, visible_mean
+from ca_reg._accumulate import Deviations, RenderMoments, effect_of, exact_mean, finite_colors, visible_mean
 from ca_reg._check import check_callable, check_count, check_finite, check_opacity, check_opacity_range, check_rate
 from ca_reg._random import seeded
 from ca_reg.functional import Multiplier
@@ -443,12 +443,14 @@ class ExactScore(CAScore):
         self.settings = self._settings("exact_neutral" if neutral else "exact", threshold)
 
     def _measure(self, x: Params, view: Any, index: int) -> CAResult:
-        return self.measure(x, view).result
+        return self._exact(x, view).result
 
     @torch.no_grad()
     def measure(self, given: Tensor | Params, view: Any) -> ExactView:
         """Measure one view, and return the inputs of its moments as well, with which they can be rendered again."""
-        x = self._params(given)
+        return self._exact(self._params(given), view)
+
+    def _exact(self, x: Params, view: Any) -> ExactView:
         settings = self.settings
         rendered, multiplier = self._alpha_factor(x)
         opacity = rendered.opacities.view_as(x.opacities)
@@ -468,12 +470,7 @@ class ExactScore(CAScore):
             neutral = (black / torch.where(total > 0, total, 1.0)).nan_to_num(0.0, 0.0, 0.0)
             background = neutral if self.layout == "CHW" else neutral.permute(1, 2, 0)
         image, alpha = moments(background)
-        visible = alpha > settings.threshold
-        for colors in image[:2]:
-            colors, odd = finite_colors(colors, alpha, alpha, settings.threshold)
-            broken |= odd
-        variance = colors.mean(0).to(torch.float64)
-        value, reason = visible_mean(variance, visible, broken, 1.0)
+        variance, visible, value, reason = exact_mean(image, alpha, settings.threshold, broken)
         std_error = 0.0 if reason is Reason.OK else math.nan
         result = self._result(value, std_error, variance, visible, reason, None)
         return ExactView(result, opacity, multiplier, background)

@@ -25,29 +25,38 @@ class NotFiniteError(ValueError):
 
 @torch.no_grad()
 def check_projection(
-    total: Tensor, projection: Projection, colors: Tensor, inputs: Mapping[str, Tensor], camera: Camera
+    depths: Tensor,
+    opacities: Tensor,
+    projection: Projection,
+    colors: Tensor,
+    inputs: Mapping[str, Tensor],
+    camera: Camera,
 ) -> None:
     """Raise unless all numbers are finite and the world's coordinates not too large.
 
-    ``total`` sums what decides which Gaussians are rendered: all depths and opacities. Only if it and
-    the projected values add up to nan or infinity are the inputs (of all Gaussians, by name)
-    examined one by one.
+    ``depths`` and ``opacities``, those of all Gaussians, decide which of them are rendered. Only if
+    they and the projected values add up to nan or infinity are the inputs (of all Gaussians, by
+    name) examined one by one.
 
     Raises:
         NotFiniteError: if an input, which the message names, or a projection is nan or infinite.
         ValueError: if the rounding of the coordinates moves Gaussians by more than `MAX_ROUNDING`.
     """
     results = (projection.means, projection.covariances, colors)
-    # The camera's distance from the world's origin, in mean depths.
-    distance = camera.position.abs().amax() / projection.depths.mean()
-    # Both numbers at once: one wait for a GPU.
-    total, share = torch.stack([sum((x.sum() for x in results), total), distance]).tolist()
+    # Everything at once: one wait for a GPU, and one kernel for all norms.
+    norms = torch._foreach_norm([depths, opacities, *results])
+    sums = [x.reshape(1) for x in (projection.depths.sum(), *norms)]
+    numbers = torch.cat([*sums, camera.world_to_camera.reshape(16)]).tolist()
+    depth, total, view = numbers[0], sum(numbers[: len(sums)]), numbers[len(sums) :]
+    # How far the camera is from the world's origin along each axis: -R^T t.
+    far = max(abs(sum(view[4 * row + axis] * view[4 * row + 3] for row in range(3))) for axis in range(3))
     if not math.isfinite(total):
         _refuse(results, inputs, camera)
+    share = far * len(colors) / depth if depth else 0.0  # in mean depths
     rounding = 0.5 * torch.finfo(colors.dtype).eps * share * max(camera.fx, camera.fy)
     if rounding > MAX_ROUNDING:
         raise ValueError(
-            f"the camera is {camera.position.abs().max().item():.3g} from the world's origin, where {colors.dtype} "
+            f"the camera is {far:.3g} from the world's origin, where {colors.dtype} "
             f"rounds by {rounding:.2g} pixels of this view, and loses small training steps: subtract a common offset, "
             "such as the mean camera position, from the means and from all cameras, or use float64."
         )

@@ -58,7 +58,7 @@ def splat(
             depths = inputs["means"] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
             indices = torch.nonzero((depths > NEAR_PLANE) & (opacities >= MIN_ALPHA)).squeeze(1)
         projection, shown = engine.project(inputs, indices, camera, degree)
-        check_projection(depths.sum() + opacities.detach().sum(), projection, shown, inputs, camera)
+        check_projection(depths, opacities, projection, shown, inputs, camera)
         if indices.shape[0] < n:
             opacities = opacities.index_select(0, indices)
         # Which tile a splat touches is a decision, not a quantity: nothing flows through the lists.
@@ -222,14 +222,15 @@ def variance_shares(
 def _background_image(background: Tensor | None, splats: Splats) -> Tensor:
     """Return the background of every pixel, (3, H, W)."""
     shape = (3, splats.lists.height, splats.lists.width)
+    if background is None:
+        return splats.colors.new_zeros(shape)
     found = checked_background(background, splats, (3,), shape)
     return (found if found.ndim == 3 else found[:, None, None]).expand(shape)
 
 
 def _factors(multiplier: Multiplier, splats: Splats) -> Tensor:
     """Return mean and variance of every projected Gaussian's factor, (M, 2)."""
-    columns = [
-        x[splats.indices].to(splats.opacities) if isinstance(x, Tensor) else torch.full_like(splats.opacities, x)
-        for x in (multiplier.mean, multiplier.variance)
-    ]
-    return torch.stack(columns, dim=1)
+    found = splats.opacities.new_empty(len(splats.opacities), 2)
+    for i, x in enumerate((multiplier.mean, multiplier.variance)):
+        found[:, i] = x[splats.indices] if isinstance(x, Tensor) else x
+    return found

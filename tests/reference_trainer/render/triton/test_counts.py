@@ -28,5 +28,6 @@ def test_an_exact_score_costs_the_same_at_any_size():
     assert large["entries"] > 4 * small["entries"]
     assert large["rendering"] == small["rendering"] <= 16
     assert abs(large["operations"] - small["operations"]) <= 3  # whether some Gaussians are left out
-    assert large["read_backs"] - small["read_backs"] <= 1
+    assert large["operations"] <= 40
+    assert large["read_backs"] == small["read_backs"] <= 5
     assert found["bytes"] <= 32
