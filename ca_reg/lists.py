@@ -125,6 +125,19 @@ class ListMoments:
             )
         return _Walk.over(lists, behind, multiplier).shares(weights)
 
+    @torch.no_grad()
+    def color_variance(self, opacity: Tensor, view: Any) -> Tensor:
+        """Return the variance of the colors blended at each pixel, :func:`ca_reg.functional.color_variance`, (H, W)."""
+        walk = _Walk.over(*self._lists(opacity, view, None), Multiplier(1.0, 0.0))
+        weights, pixels = walk.blend_weights()
+        colors = walk.values[:, :3].index_select(0, walk.gaussians)
+        nothing = torch.zeros_like(walk.behind[:, :3])
+        total = nothing[:, 0].index_add(0, pixels, weights).clamp_min(torch.finfo(weights.dtype).tiny)[:, None]
+        mean = nothing.index_add(0, pixels, weights[:, None] * colors) / total
+        spread = weights[:, None] * (colors - mean.index_select(0, pixels)).square()
+        variance = (nothing.index_add(0, pixels, spread) / total).mean(1)
+        return variance.index_select(0, walk.ranks).reshape(walk.shape)
+
     def _lists(self, opacity: Tensor, view: Any, background: Tensor | None) -> tuple[PixelLists, Tensor]:
         """Ask for the lists and check them; return them and the color behind every pixel, shape (H * W, 3)."""
         check_opacity(opacity)
@@ -244,6 +257,16 @@ class _Walk(NamedTuple):
                 front = front * factor
             out.index_add_(0, gaussians, torch.cat(parts[::-1]))
         return out
+
+    def blend_weights(self) -> tuple[Tensor, Tensor]:
+        """Return alpha times transmittance of every entry, and the place of its pixel among the sorted ones."""
+        light, parts = torch.ones_like(self.behind[:, 0]), list[Tensor]()
+        for alphas in reversed(torch.split(self.alphas, self.counts)):  # from the front
+            parts.append(alphas * (light := light[: len(alphas)]))
+            light = light * (1.0 - alphas)
+        places = [torch.arange(count, dtype=self.ranks.dtype, device=self.ranks.device) for count in self.counts]
+        none = self.ranks[:0]
+        return torch.cat([self.alphas[:0], *reversed(parts)]), torch.cat([none, *places])
 
     def _chunks(self) -> list[tuple[list[int], Tensor, Tensor]]:
         """Return counts, Gaussians and alphas of all entries, whole places and about `_CHUNK` entries at a time.

@@ -1,0 +1,303 @@
+"""How well an error map knows the error: leave one scene out, against its rivals, on the same models.
+
+    python -m benchmarks.error_map SCENE-SETTING-SEED=RUN ... [--keep FOLDER] [--rivals] [--weights]
+
+RUN is the folder of a finished training. Prints the tables of ``benchmarks/error_map.md``, which has the protocol;
+``--weights`` prints those of `ca_reg.error_map.FORMS`, fitted on all scenes. What is measured of a model is kept in the
+folder, and not measured again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+from scipy.stats import spearmanr
+from torch import Tensor
+
+from ca_reg import error_map as form_of
+from ca_reg.functional import Multiplier
+from reference_trainer.evaluation.error_map import ErrorMaps
+from reference_trainer.evaluation.metrics import ssim
+from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
+from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.render.renderer import render_moments
+from reference_trainer.runs.measure import load_run_model
+from reference_trainer.scenes.scene import Scene, View
+
+VIEWS = 8
+STEPS = 100
+PIXELS = 4000
+"""Of each view that a fit sees, drawn at random."""
+FLOOR = 0.3
+"""Of the mean error: keeps pixels that are expected to be right from ruling the fit."""
+RATES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+
+
+class Seen(NamedTuple):
+    """One view of a model: the terms of the forms, the rivals, and the error, (P,) each, of the pixels that count."""
+
+    terms: dict[str, np.ndarray]
+    rivals: dict[str, np.ndarray]
+    error: np.ndarray
+    squared: np.ndarray
+
+
+def left(order: np.ndarray, error: np.ndarray, *, root: bool = False) -> np.ndarray:
+    """Return the mean error, or its root mean square, of what is left when 0, 1, ... 99 % of the pixels are removed.
+
+    The first of an order are removed first. Relative to all.
+    """
+    e = (error[order] ** 2 if root else error[order])[::-1]
+    rest = (np.cumsum(e) / np.arange(1, len(e) + 1))[::-1]
+    curve = rest[np.arange(STEPS) * len(e) // STEPS]
+    return np.asarray(np.sqrt(curve / curve[0]) if root else curve / curve[0])
+
+
+def ause(predicted: np.ndarray, error: np.ndarray, *, root: bool = False) -> float:
+    """Return the area between the sparsification curves of a prediction and of the error itself; ties at random."""
+    ties = np.random.default_rng(0).random(len(error))
+    found = left(np.lexsort((ties, -predicted)), error, root=root) - left(np.argsort(-error), error, root=root)
+    return float(found.mean())
+
+
+def rate_of_ph_dropout(model: TrainedModel, train: Sequence[View]) -> float:
+    """Return the largest rate at which the mean SSIM on the training views falls by at most 5 %, of five masks each."""
+    def quality(rate: float) -> float:
+        generator, n = torch.Generator().manual_seed(0), len(model.gaussians)
+        renders = MaskedRenders(model)
+        values = []
+        for view in train:
+            keep = (torch.rand(5, n, generator=generator) >= rate).float() if rate else torch.ones(1, n)
+            images, _ = renders.render_batch(model.gaussians.opacities * keep, view)
+            values += [ssim(image.clamp(0, 1), view.image) for image in images]
+        return float(np.mean(values))
+    best = quality(0.0)
+    return max((rate for rate in RATES if quality(rate) >= 0.95 * best), default=RATES[0])
+
+
+def sampled(model: TrainedModel, view: View, samples: int, rate: float) -> Tensor:
+    """Return the standard deviation of K masked renders, root of the mean over RGB, (H, W)."""
+    generator, renders = torch.Generator().manual_seed(1), MaskedRenders(model)
+    images = []
+    for _ in range(0, samples, 5):
+        keep = (torch.rand(5, len(model.gaussians), generator=generator) >= rate).float()
+        images.append(renders.render_batch(model.gaussians.opacities * keep, view)[0])
+    return torch.cat(images).double().var(0).mean(0).sqrt()
+
+
+class Fisher:
+    """A diagonal Fisher information of all parameters from the training views, and the pixels' deviation by it.
+
+    The diagonal is estimated with random signs, four a photograph, damped by a thousandth of its mean over each kind of
+    parameter; the pixels' variance by 16 central differences along random directions of the inverse's root.
+    """
+
+    def __init__(self, model: TrainedModel, train: Sequence[View]) -> None:
+        self.model = model
+        fields = {f.name: getattr(model.gaussians, f.name) for f in dataclasses.fields(model.gaussians)}
+        self.raw = {name: x.detach() for name, x in fields.items() if isinstance(x, Tensor) and x.is_floating_point()}
+        total = {name: torch.zeros_like(x) for name, x in self.raw.items()}
+        generator = torch.Generator().manual_seed(2)
+        for view in train:
+            for _ in range(4):
+                leaves = {name: x.clone().requires_grad_() for name, x in self.raw.items()}
+                image = self._render(leaves, view)
+                signs = torch.randint(0, 2, image.shape, generator=generator) * 2.0 - 1
+                found = torch.autograd.grad((image * signs).sum(), [*leaves.values()], allow_unused=True)
+                for name, g in zip(leaves, found, strict=True):
+                    total[name] += 0.0 if g is None else g.square() / 4
+        self.root = {name: (h + 1e-3 * h.mean() + 1e-12).rsqrt() for name, h in total.items()}
+
+    def _render(self, raw: Mapping[str, Tensor], view: View) -> Tensor:
+        gaussians = dataclasses.replace(self.model.gaussians, **raw)
+        return render_gaussians(gaussians, view.camera, self.model.background, sh_degree=self.model.sh_degree).image
+
+    @torch.no_grad()
+    def __call__(self, view: View) -> Tensor:
+        generator, step, total = torch.Generator().manual_seed(3), 0.01, torch.zeros(())
+        for _ in range(16):
+            along = {n: step * r * torch.randn(r.shape, generator=generator) for n, r in self.root.items()}
+            ends = [self._render({n: self.raw[n] + sign * d for n, d in along.items()}, view) for sign in (1, -1)]
+            total = total + ((ends[0] - ends[1]) / (2 * step)).square().mean(0) / 16
+        return total.sqrt()
+
+
+def look(model: TrainedModel, scene: Scene, *, rivals: bool) -> tuple[list[Seen], dict[str, float]]:
+    """Measure a model at its test views; return also seconds of the processor, per view where a view is measured."""
+    views = scene.test[:: max(1, -(-len(scene.test) // VIEWS))]
+    spent: dict[str, float] = {}
+
+    def timed(name: str, call: Callable[[], Any]) -> Any:
+        start = time.process_time()
+        found = call()
+        spent[name] = spent.get(name, 0.0) + (time.process_time() - start) / len(views)
+        return found
+
+    maps = timed("once a model", lambda: ErrorMaps(model, scene.train))
+    fisher = Fisher(model, scene.train) if rivals else None
+    rate = model.dropout or form_of.PLAIN_RATE
+    rule = rate_of_ph_dropout(model, scene.train) if rivals else rate
+    spent["PH-Dropout's rate"] = rule * 1.0
+    seen = []
+    for number, view in enumerate(views):
+        out = timed("a render", lambda view=view: model.test_rendering(view))
+        features = timed("error map", lambda view=view: maps.features(view))
+        terms = {"constant": torch.ones_like(out.alpha)} | features
+        terms["hidden*colors"] = features["hidden"] * features["colors"]
+        keep = torch.ones_like(out.alpha, dtype=torch.bool)
+        if view.mask is not None:
+            keep = view.mask > 254.5 / 255
+        elif view.alpha is not None:
+            keep = (view.alpha > 0.5) | (out.alpha > 0.5)
+        others = {"deviation": features["deviation"], "colors": features["colors"], "gradient": features["contrast"],
+                  "1 - alpha": features["empty"], "random": torch.rand(out.alpha.shape, generator=torch.Generator().manual_seed(number))}  # fmt: skip
+        if fisher is not None:
+            with torch.no_grad():
+                splats = model.splats(model.gaussians.opacities, view)
+                moments = render_moments(splats, Multiplier.dropout(rule), background=model.background)
+                others["PH-Dropout's rate"] = moments.variance.mean(0).sqrt()
+                for count in (5, 100):
+                    others[f"{count} masks"] = timed(f"{count} masks", lambda c=count, v=view: sampled(model, v, c, rate))
+            others["Fisher"] = timed("Fisher", lambda view=view: fisher(view))
+        off = out.image.clamp(0, 1) - view.image
+        smooth = {name: form_of._smooth(x)[keep].numpy().astype(np.float32) for name, x in terms.items()}
+        flat = {name: x[keep].double().numpy().astype(np.float32) for name, x in others.items()}
+        seen.append(Seen(smooth, flat, off.abs().mean(0)[keep].double().numpy(), off.square().mean(0)[keep].double().numpy()))
+    return seen, spent
+
+
+def fitted(views: Sequence[Seen], terms: Sequence[str]) -> tuple[dict[str, float], float, float]:
+    """Fit the shape to errors relative to their view's mean, every view counting alike; then the units.
+
+    Returns the weights; the squared error over the square of the expectation; and the spread of the PSNR, dB.
+    """
+    rng = np.random.default_rng(0)
+    picks = [rng.permutation(len(v.error))[:PIXELS] for v in views]
+    x = np.concatenate([np.stack([v.terms[t][p] for t in terms], 1) for v, p in zip(views, picks, strict=True)]).astype(float)
+    y = np.concatenate([v.error[p] / v.error.mean() for v, p in zip(views, picks, strict=True)])
+    each = np.concatenate([np.full(len(p), 1 / len(p)) for p in picks])
+    expected = np.ones(len(y))
+    for _ in range(6):  # the error of a pixel grows with its expectation
+        w = each / (expected + FLOOR) ** 2
+        gram, right = (x * w[:, None]).T @ x, (x * w[:, None]).T @ y
+        root = np.linalg.cholesky(gram + 1e-12 * np.trace(gram) * np.eye(len(terms)))
+        weights = nnls(root.T, np.linalg.solve(root, right))[0]
+        expected = x @ weights
+    means = [(predict(v, dict(zip(terms, weights, strict=True))), v) for v in views]
+    unit = math.exp(np.mean([math.log(v.error.mean() / p.mean()) for p, v in means]))
+    ratios = [math.log10(v.squared.mean() / ((unit * p) ** 2).mean()) for p, v in means]
+    return dict(zip(terms, (unit * weights).tolist(), strict=True)), 10 ** float(np.mean(ratios)), 10 * float(np.std(ratios, ddof=1))
+
+
+def predict(view: Seen, weights: Mapping[str, float]) -> np.ndarray:
+    """Return the expected error of a view's pixels."""
+    return np.asarray(sum(w * view.terms[t] for t, w in weights.items() if w)) + 0.0 * view.error
+
+
+def scene_of(name: str) -> str:
+    """Return the scene of SCENE-SETTING-SEED."""
+    return name.rsplit("-", 2)[0]
+
+
+def held_out(models: Mapping[str, list[Seen]], terms: Sequence[str], *, kinds: bool = False) -> dict[str, Any]:
+    """Fit for every scene on the others; with ``kinds``, models with and without dropout apart."""
+    plain = {name: name.rsplit("-", 2)[1] == "plain" for name in models}
+    known: dict[Any, Any] = {}
+    for name in models:
+        key = scene_of(name), plain[name] if kinds else None
+        if key not in known:
+            others = {m: v for m, v in models.items() if scene_of(m) != key[0] and key[1] in (None, plain[m])}
+            scenes = {scene_of(m) for m in others}
+            # A scene counts once, however many models it has.
+            picked = [v for s in sorted(scenes) for v in [w for m, of in others.items() if scene_of(m) == s for w in of]]
+            known[key] = fitted(picked, terms)
+    return {name: known[scene_of(name), plain[name] if kinds else None] for name in models}
+
+
+def row(label: str, models: Mapping[str, list[Seen]], of: Callable[[str, Seen], np.ndarray], score: Callable[..., float]) -> list[float]:
+    """Print and return a figure of every model, mean over its views, and their mean over models."""
+    found = [float(np.mean([score(of(name, v), v.error) for v in views])) for name, views in models.items()]
+    print(f"| {label} | " + " | ".join(f"{x:.3f}" for x in found) + f" | {np.mean(found):.3f} |", flush=True)
+    return found
+
+
+def main() -> None:
+    """Measure, fit, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", nargs="+")
+    parser.add_argument("--keep", type=Path, default=Path("error_map"))
+    parser.add_argument("--rivals", action="store_true")
+    parser.add_argument("--weights", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    options.keep.mkdir(parents=True, exist_ok=True)
+    models: dict[str, list[Seen]] = {}
+    times: dict[str, dict[str, float]] = {}
+    for name, run in (each.split("=") for each in sorted(options.runs)):
+        file = options.keep / f"{name}{'-rivals' if options.rivals else ''}.pt"
+        if not file.exists():
+            model, scene = load_run_model(Path(run))
+            found, spent = look(model, scene, rivals=options.rivals)
+            torch.save(([tuple(v) for v in found], spent), file)
+            print("measured", name, flush=True)
+        found, times[name] = torch.load(file, weights_only=False)
+        models[name] = [Seen(*v) for v in found]
+    forms = [[*form] for form in form_of.FORMS]
+    if options.weights:
+        for terms in forms:
+            weights, peaked, spread = fitted([v for views in models.values() for v in views], terms)
+            print({t: round(w, 4) for t, w in weights.items()}, f"PEAKED {peaked:.2f} spread in sample {spread:.2f} dB")
+        return
+    print("| AUSE-MAE | " + " | ".join(models) + " | mean |\n|:---" + "|---:" * (len(models) + 1) + "|")
+    names = [*next(iter(models.values()))[0].rivals]
+    for rival in names:
+        row(rival, models, lambda _, v, r=rival: v.rivals[r], ause)
+    best = {}
+    for label, terms, kinds in [("all features", forms[0], False), ("all features, kinds apart", forms[0], True),
+                                ("model alone", forms[1], False), ("moments", forms[2], False), ("image and alpha", forms[3], False)]:  # fmt: skip
+        best[label] = held_out(models, terms, kinds=kinds)
+        row(label, models, lambda n, v, b=best[label]: predict(v, b[n][0]), ause)
+    chosen = best["all features"]
+    of = lambda n, v: predict(v, chosen[n][0])  # noqa: E731
+    for term in forms[0]:
+        less = held_out(models, [t for t in forms[0] if t != term])
+        row(f"without {term}", models, lambda n, v, b=less: predict(v, b[n][0]), ause)
+    print("\nothers:")
+    row("AUSE-RMSE", models, of, lambda u, e: ause(u, e, root=True))
+    row("AUSE-RMSE, deviation", models, lambda _, v: v.rivals["deviation"], lambda u, e: ause(u, e, root=True))
+    row("Spearman", models, of, lambda u, e: float(spearmanr(u, e).statistic))
+    row("Spearman, deviation", models, lambda _, v: v.rivals["deviation"], lambda u, e: float(spearmanr(u, e).statistic))
+    row("expected over measured mean error", models, of, lambda u, e: float(u.mean() / e.mean()))
+    row("share of errors below 2.303 expected (0.9 if exponential)", models, of, lambda u, e: float((e < math.log(10) * u).mean()))
+    row("negative log likelihood, exponential", models, of, lambda u, e: float((np.log(u) + e / u).mean()))
+    row("the same, of one number, the view's true mean", models, lambda _, v: np.full_like(v.error, v.error.mean()), lambda u, e: float((np.log(u) + e / u).mean()))
+    deciles = np.zeros((2, 10))
+    errors, off = [], []
+    for name, views in models.items():
+        for v in views:
+            u = of(name, v)
+            for i, part in enumerate(np.array_split(np.argsort(u), 10)):
+                deciles[:, i] += u[part].mean(), v.error[part].mean()
+            errors.append(u.mean() / v.error.mean())
+            _, peaked, _ = chosen[name]
+            off.append(-10 * math.log10(peaked * (u**2).mean()) + 10 * math.log10(v.squared.mean()))
+    count = sum(map(len, models.values()))
+    print("deciles, expected:", *(f"{x:.3f}" for x in deciles[0] / count), "\ndeciles, measured:", *(f"{x:.3f}" for x in deciles[1] / count))
+    ratio, shift = np.array(errors), np.array(off)
+    print(f"{count} views: within 20 % {np.mean((ratio > 0.8) & (ratio < 1.25)):.0%}; PSNR off by {shift.mean():+.2f} ± {shift.std(ddof=1):.2f} dB (rms {np.sqrt((shift**2).mean()):.2f})")
+    print("rank correlation of expected and measured mean error over views:", f"{spearmanr([of(n, v).mean() for n, vs in models.items() for v in vs], [v.error.mean() for vs in models.values() for v in vs]).statistic:.2f}")
+    for name, spent in times.items():
+        print(name, {k: round(v, 3) for k, v in spent.items()})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+"""Where a picture is wrong: the expected error of every pixel of a view that has no photograph, in units of color.
+
+What a model knows of its own mistakes is cheap to read off: how much a pixel varies when Gaussians are missing, how
+much the colors along its ray disagree, what covers it, how many training photographs saw that, and what these
+photographs show there. :func:`expected_error` adds such maps up with fixed weights. A renderer that offers less gets a
+coarser map from what it has.
+
+The weights were fitted on nine scenes, by models with and without dropout; what they are worth on a scene that had no
+part in the fit is in ``benchmarks/error_map.md``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ca_reg._check import check_callable, check_opacity, check_rate, check_tensor
+from ca_reg.functional import Multiplier
+from ca_reg.lists import ListMoments
+from ca_reg.types import Layout, MomentsFn, RenderFn, read_moments, read_rendering
+
+__all__ = ["ErrorMap", "error_map", "expected_error"]
+
+PLAIN_RATE = 0.1
+"""Drop rate of the deviation for models trained without dropout: there, the ranking of pixels is best at low rates."""
+
+SMOOTHING = 1.0
+"""Standard deviation, pixels, of the blur of the map: errors are wider than a pixel, and the features noisy."""
+
+FORMS: tuple[Mapping[str, float], ...] = tuple(
+    MappingProxyType(form)
+    for form in (
+        {"constant": 0.01, "deviation": 0.3, "colors": 0.03, "single": 0.05, "warp": 0.4, "hidden": 0.02, "hidden*colors": 0.2},
+        {"constant": 0.01, "deviation": 0.6, "colors": 0.1, "empty": 0.05},
+        {"constant": 0.01, "deviation": 0.6, "empty": 0.05},
+        {"constant": 0.01, "contrast": 0.3, "empty": 0.05},
+    )
+)  # fmt: skip
+"""Weights of the features, from the form that needs most to the one that needs an image and its alpha alone. A product
+means that one feature counts where the other is 1."""
+
+PEAKED = 3.0
+"""Mean squared error of a view over the mean square of its expected absolute errors."""
+
+SPREAD = 2.0
+"""Standard deviation, dB, of the measured PSNR about the expected one, over scenes that had no part in the fit."""
+
+_NORMAL_80 = 1.2816  # 80 % of a normal distribution lie within so many standard deviations
+
+
+class ErrorMap(NamedTuple):
+    """What :func:`error_map` expects.
+
+    Attributes:
+        error: expected absolute error of the color, mean over RGB, colors in [0, 1], shape (H, W).
+        psnr: expected of the view, dB, over the pixels that count; infinite if no error is expected, nan if none counts.
+        interval: in which the PSNR should lie in 80 % of the cases, dB.
+    """
+
+    error: Tensor
+    psnr: float
+    interval: tuple[float, float]
+
+
+def expected_error(features: Mapping[str, Tensor], mask: Tensor | None = None) -> ErrorMap:
+    """Return the error that the features of a view let expect: a sum of them, smoothed.
+
+    The most demanding of `FORMS` whose features are all there is used. The features, of shape (H, W):
+
+    - ``empty``: 1 - alpha;
+    - ``contrast``: length of the gradient of the image's mean over RGB, per pixel;
+    - ``deviation``: root of the exact variance of the color, mean over RGB, under dropout at the training rate;
+    - ``colors``: root of :func:`ca_reg.functional.color_variance`: surfaces along the ray that disagree;
+    - ``single``: blend weight of the Gaussians that fewer than two training photographs see;
+    - ``hidden``: 1 where no training photograph can be brought by the model's depth, else 0;
+    - ``warp``: least absolute difference, mean over RGB, to the photographs that can be, 0 where none can.
+
+    Args:
+        features: by name.
+        mask: which pixels count for the PSNR, (H, W) bool; None for all.
+
+    Raises:
+        TypeError: if a feature is no tensor.
+        ValueError: if no form has its features, or the shapes differ.
+
+    Example:
+        >>> flat, step = torch.zeros(8, 8), torch.zeros(8, 8)
+        >>> step[:, 4:] = 1.0
+        >>> found = expected_error({"empty": step, "contrast": flat})
+        >>> bool(found.error[4, 7] > found.error[4, 0] > 0), found.error.shape
+        (True, torch.Size([8, 8]))
+    """
+    for name, feature in features.items():
+        check_tensor(feature, name, "give maps of shape (H, W)")
+    form = next((form for form in FORMS if all(_factors(term) <= {*features} for term in form)), None)
+    if form is None:
+        raise ValueError(
+            f"an error map needs at least {' and '.join(sorted(_needs(FORMS[-1])))}, got {', '.join(features) or 'nothing'}."
+        )
+    shapes = {features[name].shape for name in _needs(form)}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2:
+        raise ValueError(f"features must share one shape (H, W), got {', '.join(str(tuple(x)) for x in shapes)}.")
+    total = torch.zeros_like(features["hidden" if "hidden" in _needs(form) else "empty"])
+    for term, weight in form.items():
+        total = total + weight * math.prod((features[name] for name in _factors(term)), start=torch.ones_like(total))
+    error = _smooth(total)
+    squared = error.square() if mask is None else error[mask].square()
+    psnr = float(-10 * (PEAKED * squared.double().mean()).log10())
+    return ErrorMap(error, psnr, (psnr - _NORMAL_80 * SPREAD, psnr + _NORMAL_80 * SPREAD))
+
+
+def error_map(
+    render_fn: RenderFn,
+    opacity: Tensor,
+    view: Any,
+    *,
+    moments_fn: MomentsFn | None = None,
+    p: float = 0.0,
+    layout: Layout = "CHW",
+    known: Mapping[str, Tensor] = MappingProxyType({}),
+) -> ErrorMap:
+    """Expect the error of a view without a photograph, from what a renderer offers.
+
+    An image and its alpha are enough for a map, moments make it better (one more render in cost), and lists of the
+    Gaussians of each pixel, :class:`~ca_reg.lists.ListMoments`, better still. The reference trainer's own,
+    ``reference_trainer.evaluation.error_map``, also asks the training photographs.
+
+    Args:
+        render_fn: the renderer of the model; it must return an alpha.
+        opacity: activated, neither scaled nor dropped, (N,) or (N, 1).
+        view: what ``render_fn`` takes.
+        moments_fn: the renderer's exact moments.
+        p: dropout rate that the model was trained with; the image is rendered with opacities of ``1 - p``.
+        layout: order of the axes of the images.
+        known: further features, see :func:`expected_error`, such as ``single``, ``warp`` and ``hidden``.
+
+    Raises:
+        TypeError: if an argument is of the wrong type.
+        ValueError: if one is out of range, or ``render_fn`` returns no alpha.
+
+    Example:
+        A wall with a hole: what is not covered is expected to be wrong.
+
+        >>> def render_fn(opacity: Tensor, view: None) -> tuple[Tensor, Tensor]:
+        ...     alpha = opacity.expand(6, 6).clone()
+        ...     alpha[:, 3:] = 0
+        ...     return 0.5 * alpha.expand(3, 6, 6), alpha
+        >>> error = error_map(render_fn, torch.tensor([0.9]), None).error
+        >>> bool(error[3, 5] > error[3, 0])
+        True
+    """
+    check_callable(render_fn, "render_fn")
+    check_opacity(opacity)
+    check_rate(p)
+    image, alpha = read_rendering(render_fn(opacity * (1 - p) if p else opacity, view), layout=layout)
+    if alpha is None:
+        raise ValueError("render_fn must return an alpha beside the image, got the image alone: return (image, alpha).")
+    features = {"empty": (1 - alpha).clamp_min(0), "contrast": contrast(image)}
+    if moments_fn is not None:
+        moments = moments_fn(opacity, view, Multiplier.dropout(p or PLAIN_RATE), None)
+        features["deviation"] = read_moments(moments, layout=layout).variance.mean(0).clamp_min(0).sqrt()
+    if isinstance(moments_fn, ListMoments):
+        features["colors"] = moments_fn.color_variance(opacity * (1 - p) if p else opacity, view).sqrt()
+    return expected_error({**features, **known})
+
+
+def contrast(image: Tensor) -> Tensor:
+    """Return the length of the gradient of an image's (3, H, W) mean over RGB, per pixel, (H, W)."""
+    from kornia.filters import spatial_gradient
+
+    found: Tensor = spatial_gradient(image.clamp(0, 1).mean(0)[None, None])[0, 0].square().sum(0).sqrt()
+    return found
+
+
+def _smooth(x: Tensor) -> Tensor:
+    from kornia.filters import gaussian_blur2d
+
+    size = 2 * math.ceil(3 * SMOOTHING) + 1
+    border = "replicate" if min(x.shape) <= size // 2 else "reflect"  # a reflection needs that many pixels
+    found: Tensor = gaussian_blur2d(x[None, None], (size, size), (SMOOTHING, SMOOTHING), border_type=border)[0, 0]
+    return found
+
+
+def _factors(term: str) -> set[str]:
+    return {*term.split("*")} - {"constant"}
+
+
+def _needs(form: Mapping[str, float]) -> set[str]:
+    return {name for term in form for name in _factors(term)}
