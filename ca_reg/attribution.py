@@ -1,4 +1,4 @@
-"""Which Gaussians co-adapt: two per-Gaussian attributions of the exact score.
+"""Which Gaussians co-adapt, by two attributions of the exact score, and which hang where no photograph was taken.
 
 *Shares* (:func:`attribute`) add up to the score, as :func:`ca_reg.functional.contributions` add up to the variance of a
 pixel; the interaction of two Gaussians counts entirely for the one behind.
@@ -10,6 +10,8 @@ the share.
 
 Both refer to the visible pixels of the score, and both remove only the randomness of a Gaussian: deleting it would also
 change the mean.
+
+Shares at cameras that nobody took tell which Gaussians *hang* there (:func:`hanging`).
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from ca_reg.result import CAResult, Reason
 from ca_reg.score import CAScore, ExactScore, ExactView
 from ca_reg.types import read_moments
 
-__all__ = ["CAAttribution", "CATotalEffects", "SharesFn", "attribute", "total_effects"]
+__all__ = ["CAAttribution", "CATotalEffects", "SharesFn", "attribute", "hanging", "total_effects"]
 
 
 class SharesFn(Protocol):
@@ -109,6 +111,45 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
             "put zeros where the view does not see a Gaussian."
         )
     return CAAttribution(shares.to(torch.float64), result)
+
+
+def hanging(shares: Tensor, there: Tensor, here: Tensor, *, ratio: float = 2.0, least: float = 0.01) -> Tensor:
+    """Find the Gaussians that hang where no photograph was taken: veils and blobs before and beside the cameras.
+
+    Training with dropout can leave opaque Gaussians where no training camera looks, and no photograph tells. A Gaussian
+    hangs if its weight at cameras that nobody took is more than ``ratio`` times that at the training cameras, and if it
+    alone holds more than ``least`` of the score there. Remove those, measure again, and stop when none is found. It is
+    for models that were trained with dropout or noise: the Gaussians of others need each other. Which cameras, which
+    numbers and what it gained: benchmarks/guard.md.
+
+    Args:
+        shares: from :func:`attribute`, averaged over cameras that nobody took, at least 0, shape (N,).
+        there: blend weights (alpha times transmittance, summed over the pixels) at these cameras, averaged over them,
+            shape (N,). A picture is linear in the colors, so they are the gradient of its sum in a color channel.
+        here: the same at the training cameras, shape (N,).
+        ratio: at least 0.
+        least: share of the score that a single Gaussian must hold, in [0, 1).
+
+    Returns:
+        Which Gaussians hang, bool, shape (N,).
+
+    Raises:
+        ValueError: if the shapes differ, or a number is out of range.
+
+    Example:
+        The second Gaussian is seen beside the training cameras only; the third too, but hardly matters.
+
+        >>> hanging(torch.tensor([0.5, 0.4, 0.001]), torch.tensor([9.0, 5.0, 1.0]), torch.tensor([9.0, 1.0, 0.0]))
+        tensor([False,  True, False])
+    """
+    if not shares.ndim == 1 or not shares.shape == there.shape == here.shape:
+        raise ValueError(
+            "shares and weights must have one value per Gaussian each, shape (N,), got "
+            f"{tuple(shares.shape)}, {tuple(there.shape)} and {tuple(here.shape)}."
+        )
+    if not ratio >= 0 or not 0 <= least < 1:
+        raise ValueError(f"ratio must be at least 0 and least in [0, 1), got {ratio} and {least}.")
+    return (there > ratio * here) & (shares > least * shares.sum())
 
 
 @torch.inference_mode(False)  # it would record no gradient

@@ -64,6 +64,7 @@ class Evaluate:
 
     def __call__(self) -> None:
         from reference_trainer.evaluation.lpips import load_lpips
+        from reference_trainer.evaluation.shares import guard
         from reference_trainer.runs.measure import load_run_model, measure
         from reference_trainer.runs.ply import score_ply
         from reference_trainer.scenes.virtual_cameras import measured_views
@@ -78,6 +79,8 @@ class Evaluate:
             model, scene = load_run_model(self.run, self.device, regularizer=self.regularizer, trust=trust)
             name = "evaluation" if self.regularizer is None else f"evaluation_{folder_name(self.regularizer)}"
             measure(model, measured_views(scene), self.out or self.run / name, about={"scene": scene.name}, **shared)
+            if len(model.chain) and len(scene.train) > 1:
+                print(guard(model, scene))
         else:
             shared |= {"regularizer": self.regularizer, "device": self.device, "background": self.scene.background}
             score_ply(self.run, place, self.out, trust=trust, **shared)
@@ -258,7 +261,7 @@ class Clean:
     Removes those with the most co-adaptation per contribution, and prints a table of before and after. A few training
     steps on the photographs of the scene close the holes; without a scene, on an orbit, they stay. For models that were
     trained without a regularizer: after dropout there is little to remove, and such a model is refused unless you say
-    --anyway.
+    --anyway. Those can be freed of what hangs before and beside the cameras (--hanging), without a photograph.
     """
 
     ply: Annotated[Path, tyro.conf.Positional]
@@ -267,8 +270,10 @@ class Clean:
     orbit: Orbit = field(default_factory=OrbitOptions)
     fraction: float = 0.1
     """Fraction of the Gaussians to remove."""
-    refine: int = 100
-    """Training steps afterwards; 0 for none."""
+    hanging: bool = False
+    """Remove instead what hangs where nobody took a photograph; for models trained with dropout or noise."""
+    refine: int | None = None
+    """Training steps afterwards; by default 100, with --hanging none."""
     regularizer: str | None = None
     """What it was trained with, such as "dropout(0.2)"; PLYs of `ca-reg train` say so themselves."""
     anyway: bool = False
@@ -298,6 +303,7 @@ class Clean:
             self.out or self.ply.with_name(f"{self.ply.stem}_clean.ply"),
             fraction=self.fraction,
             refine=self.refine,
+            hanging=self.hanging,
             background=self.scene.background,
             regularizer=self.regularizer,
             anyway=self.anyway,

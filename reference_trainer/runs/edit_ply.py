@@ -1,4 +1,4 @@
-"""Write a finished model anew: with its test-time opacities, or without the Gaussians that co-adapt most."""
+"""Write a finished model anew: with its test-time opacities, or without the Gaussians that co-adapt most or hang."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.evaluation.evaluate import Evaluation, evaluate
-from reference_trainer.evaluation.shares import Heat, all_but_highest
+from reference_trainer.evaluation.shares import Heat, all_but_highest, guard
 from reference_trainer.evaluation.tables import EXACT, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing
@@ -117,25 +117,29 @@ def clean_ply(
     out: Path,
     *,
     fraction: float = 0.1,
-    refine: int = 100,
+    refine: int | None = None,
+    hanging: bool = False,
     background: str = "auto",
     regularizer: str | None = None,
     anyway: bool = False,
     device: str = "cpu",
     trust: Collection[str] = (),
 ) -> dict[str, Evaluation]:
-    """Write a model without the Gaussians of highest share of the exact score per blend weight, and refined.
+    """Write a model without the Gaussians of highest share of the exact score per blend weight, or without what hangs.
 
-    Shares (at drop rate 1/2) and weights are measured at the training views, or at those of the orbit. The removal
-    leaves holes, which a few training steps on the photographs close; without a scene or with ``refine=0`` they stay.
-    Logs a table of quality and co-adaptation before and after, and says so if the photographs are fitted worse.
+    With ``hanging`` those go that `guard` finds, which is for models trained with dropout or noise. Otherwise, shares
+    (at drop rate 1/2) and weights are measured at the training views, or at those of the orbit. The removal leaves
+    holes, which a few training steps on the photographs close; without a scene or with ``refine=0`` they stay. Logs a
+    table of quality and co-adaptation before and after, and says so if the photographs are fitted worse.
 
     Args:
         ply: a standard 3DGS PLY.
         where: its scene, or an orbit around it.
         out: the file to write, opacities plain; it must not exist.
         fraction: of the Gaussians to remove, in (0, 1); those without a share stay.
-        refine: training steps afterwards, without densification, with the regularizers of the model.
+        refine: training steps afterwards, without densification, with the regularizers of the model; by default 100,
+            or none with ``hanging``, which leaves no holes.
+        hanging: remove what hangs where nobody took a photograph instead.
         background: as in `score_ply`.
         regularizer: as in `score_ply`.
         anyway: clean a model that was trained with dropout, too, which made all measured ones worse.
@@ -147,10 +151,12 @@ def clean_ply(
 
     Raises:
         ValueError: as `score_ply`, if ``fraction`` or ``refine`` is out of range, no view has a score, the PLY has
-            only test-time opacities, which cannot be trained, or the model was trained with dropout.
+            only test-time opacities, which cannot be trained, the model was trained with dropout, or with ``hanging``
+            without a regularizer, or there is no scene.
         FileExistsError: if ``out`` exists.
         FileNotFoundError: if the PLY or the scene is missing.
     """
+    refine = (0 if hanging else 100) if refine is None else refine
     if not 0 < fraction < 1 or refine < 0:
         raise ValueError(f"fraction must be in (0, 1) and refine at least 0, got {fraction} and {refine}.")
     if out.exists():
@@ -159,13 +165,21 @@ def clean_ply(
     model, scene = loaded.model, loaded.scene
     if model.for_rendering:
         raise ValueError(f"the opacities of {ply} are those of the test: give the PLY with plain ones.")
-    if model.chain.drops and not anyway:
+    if hanging and scene is None:
+        raise ValueError("what hangs is found between and beyond the cameras of a scene: give --scene FOLDER.")
+    if model.chain.drops and not (anyway or hanging):
         raise ValueError(
             f"{ply} was trained with {model.regularizer}, which leaves little to remove: cleaning such a model made it "
-            "worse (fern, 24.21 to 23.80 dB at the test views). Keep it as it is, or say --anyway."
+            "worse (fern, 24.21 to 23.80 dB at the test views). Keep it as it is, remove what hangs where nobody was "
+            "(--hanging), or say --anyway."
         )
-    views = [view.to(device) for view in loaded.views["orbit" if scene is None else "train"]]
-    stays = all_but_highest(Heat.of(model, views).values, fraction)
+    if hanging and scene is not None:
+        found_hanging = guard(model, scene)
+        _log.info("%s", found_hanging)
+        stays = found_hanging.keep
+    else:
+        views = [view.to(device) for view in loaded.views["orbit" if scene is None else "train"]]
+        stays = all_but_highest(Heat.of(model, views).values, fraction)
     models = {"as it was": model, "taken out": replace(model, gaussians=model.gaussians[stays])}
     if scene is None:
         _log.info("Without photographs nothing can close the holes: for that give the scene (--scene FOLDER).")

@@ -20,7 +20,7 @@ from reference_trainer.scenes.scene import Scene, Viewpoint
 
 __all__ = [
     "VIRTUAL_VIEWS", "BoundingSphere", "CameraPath", "bounding_sphere", "camera_between", "cameras_between",
-    "depth_bounds", "interpolate_cameras", "look_at", "measured_views", "orbit_views", "pseudo_cameras",
+    "depth_bounds", "interpolate_cameras", "look_at", "measured_views", "orbit_views", "pseudo_cameras", "unseen_views",
 ]  # fmt: skip
 
 _log = logging.getLogger(__name__)
@@ -352,3 +352,33 @@ def measured_views(scene: Scene) -> dict[str, Sequence[Viewpoint]]:
     }
     numbered = {split: [Viewpoint(f"{i:03d}", camera) for i, camera in enumerate(of)] for split, of in new.items()}
     return {"train": scene.train, **numbered}
+
+
+def unseen_views(scene: Scene) -> list[Viewpoint]:
+    """Return cameras that nobody took: between every two training cameras, and beyond each, away from the other.
+
+    They stand at a quarter, a half and three quarters of the way, and as far beyond as a third, two thirds and all of
+    it, on the arc of the screw motion: around what the cameras look at, or along a line if they look the same way. Each
+    training camera is paired with its two nearest.
+
+    Raises:
+        ValueError: if there are fewer than two training cameras.
+
+    Example:
+        >>> from reference_trainer.scenes import synthetic_scene
+        >>> views = unseen_views(synthetic_scene(width=32, height=24, points=50))
+        >>> len(views), views[0].name, views[-1].name
+        (27, 'between train_0 and train_1', 'beyond train_2, away from train_1')
+    """
+    if len(scene.train) < 2:
+        raise ValueError(f"there is no camera between or beyond {len(scene.train)} training views: it takes two.")
+    cameras, names = [view.camera for view in scene.train], [view.name for view in scene.train]
+    near = nearest_neighbors(torch.stack([camera.position for camera in cameras]), min(2, len(cameras) - 1))[1].tolist()
+    pairs = sorted({pair for i, of in enumerate(near) for j in of for pair in ((i, j), (j, i))})
+    ways = [
+        (f"between {names[i]} and {names[j]}", i, j, along) for i, j in pairs if i < j for along in (0.25, 0.5, 0.75)
+    ]
+    ways += [
+        (f"beyond {names[i]}, away from {names[j]}", i, j, -along) for i, j in pairs for along in (1 / 3, 2 / 3, 1.0)
+    ]
+    return [Viewpoint(name, camera_between(cameras[i], cameras[j], along, "arc")) for name, i, j, along in ways]

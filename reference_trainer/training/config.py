@@ -43,6 +43,9 @@ class TrainConfig:
     density: str = "adaptive"
     """Density control, such as "absgrad" or "share_pruning(every=500)", or "my_module:MyStrategy"; `ca-reg names` lists
     them."""
+    guard: int = 0
+    """Steps between removals of Gaussians that hang where nobody took a photograph, the last one after the last step;
+    as many as ``iterations``: that alone; 0 never. Only models with a regularizer are guarded."""
     models: int = 1
     """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
     random_background: bool = False
@@ -177,7 +180,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("iterations", "models"), lambda x: x >= 1, "at least 1", ""),
     (("dropout",), lambda x: 0 <= x < 1, "in [0, 1)", ": 0 turns it off"),
     (("noise",), lambda x: x >= 0, "at least 0", ": 0 turns it off"),
-    (("seed", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_from",
+    (("seed", "guard", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_from",
       "opacity_reset_every", "prune_size_from", "densify_gradient", "dense_fraction", "prune_opacity", "scales_rate",
       "quaternions_rate", "opacity_rate", "color_rate"), lambda x: x >= 0, "at least 0", ""),
     (("max_gaussians", "densify_until"), lambda x: x is None or x >= 0, "None or at least 0", ""),

@@ -151,6 +151,16 @@ def dropped(scene: Scene, config: TrainConfig) -> PlanItem:
     return PlanItem("dropped Gaussians", "left out", f"by construction: {reason}")
 
 
+def guarding(scene: Scene, config: TrainConfig) -> PlanItem:
+    """The guard against what hangs where nobody took a photograph."""
+    if not config.regularizers:
+        reason = "by construction: without dropout or noise the Gaussians of a model need each other"
+        return PlanItem("guard", "left out", reason)
+    if not config.guard:
+        return PlanItem("guard", "left out", "not asked for: --guard 500 removes what hangs where no camera was")
+    return PlanItem("guard", "used", f"asked for (guard={config.guard})")
+
+
 def regularizer_inputs(scene: Scene, config: TrainConfig) -> PlanItem:
     """What the regularizers need besides the opacities."""
     needed = ", ".join(make_regularizer(config).needs)
@@ -255,7 +265,7 @@ FAR_APART_GAINS = {("DTU scan24", 0.2): 0.4, ("DTU scan65", 0.2): -0.1, ("lego",
 
 RULES: tuple[Callable[[Scene, TrainConfig], PlanItem], ...] = (
     sh_bands, alpha_masks, background, depth_output, distortion, densification, opacity_reset, dropout, dropped,
-    regularizer_inputs, unseen, saturated, ssim_windows, moments, initial_size, dense_start,
+    guarding, regularizer_inputs, unseen, saturated, ssim_windows, moments, initial_size, dense_start,
 )  # fmt: skip
 """All rules, in the order of the table."""
 

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import math
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from ca_reg import Chain
+from reference_trainer.evaluation.shares import guard
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import NotFiniteError
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.virtual_cameras import unseen_views
 from reference_trainer.training.assembly import check, make_density, make_losses, make_regularizer, make_renderer
 from reference_trainer.training.checkpoint import load_checkpoint, read_state, save_checkpoint
 from reference_trainer.training.config import TrainConfig
@@ -24,6 +29,8 @@ from reference_trainer.training.randomness import stream, view_order
 from reference_trainer.training.step import Step
 
 __all__ = ["Trainer"]
+
+_log = logging.getLogger(__name__)
 
 
 class Trainer:
@@ -86,6 +93,10 @@ class Trainer:
             raise ValueError(f"the photographs of {scene.name!r} lie on a background already: leave random_background.")
         if config.analytic:
             self._refuse_draws_without_multiplier()
+        if config.guard and not config.regularizers:
+            _log.info("no guard: without dropout or noise the Gaussians of a model need each other.")
+        elif config.guard:
+            unseen_views(scene)  # raises where there can be none
 
     @property
     def gaussians(self) -> Gaussians:
@@ -176,6 +187,8 @@ class Trainer:
                 model.optimizer.step()
         self.step += 1
         self.loss = value
+        if self._guards:
+            self._guard()
         steps.clear()  # each step refers to all: a cycle would keep their graphs until garbage collection
         return value, squared_error
 
@@ -251,6 +264,24 @@ class Trainer:
                 f"analytic training needs draws that are independent factors of the opacities, which those of "
                 f"{', '.join(names)} are not: leave out analytic."
             )
+
+    @property
+    def _guards(self) -> bool:
+        """Whether it is time to remove what hangs where nobody took a photograph."""
+        config, step = self.config, self.step
+        if not (config.guard and config.regularizers and self.regularized):
+            return False
+        return step == config.iterations or (step > config.densify_from and step % config.guard == 0)
+
+    def _guard(self) -> None:
+        """Remove from all models what hangs where nobody took a photograph."""
+        for model in self.models:
+            gaussians = model.gaussians.map(Tensor.detach)
+            rendered = TrainedModel(gaussians, self.background, self.config.regularizers, self.step, self.sh_degree)
+            found = guard(rendered, self.scene)
+            if found.where:
+                _log.info("step %d: %s", self.step, found)
+                model.density.select(model.optimizer, found.keep)
 
     def _begin_steps(self) -> list[Step]:
         """Choose the view of the step and what regularizes it; return a `Step` for every model."""

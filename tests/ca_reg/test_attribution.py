@@ -9,7 +9,7 @@ import torch
 from oracles import random_scene
 
 from ca_reg import CAScore, OpacityNoise, Reason, attribute
-from ca_reg.attribution import total_effects
+from ca_reg.attribution import hanging, total_effects
 from ca_reg.lists import ListMoments, PixelLists
 from ca_reg.types import ExactMoments
 from reference_trainer.render import splat
@@ -265,3 +265,31 @@ def test_bad_input():
             call(torch.ones(3, dtype=torch.int64))
     with pytest.raises(ValueError, match=r"one share per Gaussian, shape \(3,\), got \(2,\)"):
         attribute(score, lambda *args: scene.moments.shares(*args)[:2], scene.opacity, None)
+
+
+def test_what_hangs_is_seen_there_more_than_here_and_holds_much_of_the_score():
+    """Against a loop over the Gaussians, each asked by itself."""
+    g = torch.Generator().manual_seed(0)
+    shares, there, here = (torch.rand(200, generator=g, dtype=torch.float64) ** 4 for _ in range(3))
+    found = hanging(shares, there, here, ratio=1.5, least=0.01)
+    total = sum(shares.tolist())
+    one_by_one = [
+        share / total > 0.01 and seen > 1.5 * trained
+        for share, seen, trained in zip(shares.tolist(), there.tolist(), here.tolist(), strict=True)
+    ]
+    assert 0 < sum(one_by_one) < 200
+    assert found.tolist() == one_by_one
+    assert not hanging(torch.zeros(3), torch.ones(3), torch.zeros(3), least=0.0).any()  # no score, nothing to hang
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"there": torch.ones(2)}, r"shape \(N,\), got \(3,\), \(2,\) and \(3,\)"),
+        ({"ratio": -1.0}, "ratio must be at least 0"),
+        ({"least": 1.0}, r"least in \[0, 1\)"),
+    ],
+)
+def test_hanging_refuses_what_cannot_be(change, message):
+    with pytest.raises(ValueError, match=message):
+        hanging(**{"shares": torch.ones(3), "there": torch.ones(3), "here": torch.ones(3)} | change)

@@ -86,7 +86,7 @@ class AdaptiveDensity(DensityStrategy):
 
     def select(self, optimizer: GaussianOptimizer, keep: Tensor) -> None:
         """Keep some Gaussians, (N,) bool, with their statistics."""
-        optimizer.select(keep)
+        super().select(optimizer, keep)
         self.statistics = self.statistics[keep]
 
     def split_generator(self, step: int) -> torch.Generator:

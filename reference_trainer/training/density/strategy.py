@@ -81,6 +81,10 @@ class DensityStrategy(abc.ABC):
             TrainingStoppedError: if the Gaussians are not finite, or none is left.
         """
 
+    def select(self, optimizer: GaussianOptimizer, keep: Tensor) -> None:
+        """Keep some Gaussians, (N,) bool, with all that is counted of them."""
+        optimizer.select(keep)
+
     def together(self, models: Sequence[ModelState[DensityStrategy]], step: int) -> None:  # noqa: B027
         """Change models by comparing them with each other: pruning what another one lacks, for example.
 

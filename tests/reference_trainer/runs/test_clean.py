@@ -3,12 +3,14 @@ import dataclasses
 import pytest
 import torch
 
-from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
+from reference_trainer.evaluation.shares import blend_weights, guard, mean_shares, share_per_weight
+from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.runs.edit_ply import clean_ply
 from reference_trainer.runs.folder import BAKED_PLY, PLY
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.options import OrbitOptions
+from reference_trainer.scenes.virtual_cameras import unseen_views
 
 
 def rows(means: torch.Tensor) -> list[tuple[float, ...]]:
@@ -71,6 +73,36 @@ def test_a_model_that_was_trained_with_dropout_is_refused(run, options, tmp_path
     with pytest.raises(ValueError, match=r"was trained with dropout\(0\.2\).* made it worse .*--anyway"):
         clean_ply(run[0] / PLY, options, tmp_path / "c.ply")
     assert not (tmp_path / "c.ply").exists()
+
+
+def test_what_hangs_goes_and_nothing_else(run, options, tmp_path, said):
+    """A model that the guard finds something in: one opaque Gaussian stands close before a camera that nobody took."""
+    model, scene = load_run_model(run[0])
+    beyond = next(view.camera for view in unseen_views(scene) if view.name.startswith("beyond train_2"))
+    veil = model.gaussians[:1]
+    center = beyond.position + 0.5 * beyond.forward - 0.2 * beyond.world_to_camera[0, :3]
+    veil = dataclasses.replace(veil, means=center[None], log_scales=torch.full((1, 3), -3.0))
+    veil = dataclasses.replace(veil, opacity_logits=torch.full((1,), 5.0))
+    both = {name: torch.cat([x, dict(veil.named())[name]]) for name, x in model.gaussians.named()}
+    opaque = dataclasses.replace(Gaussians.from_named(both), opacity_logits=both["opacity_logits"] + 4)
+    save_ply(opaque, tmp_path / "veiled.ply", regularizer="dropout(0.2)")
+    found = clean_ply(tmp_path / "veiled.ply", options, tmp_path / "c.ply", hanging=True)
+    assert list(found) == ["as it was", "taken out"]  # it leaves no holes to be closed
+    left = load_ply(tmp_path / "c.ply").gaussians.means
+    expected = guard(dataclasses.replace(model, gaussians=opaque), scene).keep
+    assert not expected[-1]
+    assert rows(left) == rows(opaque.means[expected])
+    assert any("hang where nobody took a photograph: " in text for text in said)
+
+
+def test_what_hangs_is_sought_only_where_it_can_be_found(run, options, tmp_path):
+    out = tmp_path / "c.ply"
+    with pytest.raises(ValueError, match="give --scene"):
+        clean_ply(run[0] / PLY, OrbitOptions(cameras=2, size=32), out, hanging=True)
+    save_ply(load_ply(run[0] / PLY).gaussians, tmp_path / "plain.ply")
+    with pytest.raises(ValueError, match="its Gaussians need each other"):
+        clean_ply(tmp_path / "plain.ply", options, out, hanging=True)
+    assert not out.exists()
 
 
 def test_a_worse_fit_is_said(run, options, tmp_path, said):

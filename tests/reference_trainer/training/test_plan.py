@@ -110,6 +110,8 @@ def test_points_behind_all_cameras_are_left_out(tiny_scene):
         ("opacity reset", TrainConfig(opacity_reset_every=0), r"asked for"),
         ("dropped Gaussians", TrainConfig(dropout=0.2), r"neither projected nor sorted"),
         ("dropped Gaussians", TrainConfig(), r"draws no masks"),
+        ("guard", TrainConfig(guard=500), r"Gaussians of a model need each other"),
+        ("guard", TrainConfig(dropout=0.2), r"not asked for: --guard"),
         ("moments", TrainConfig(), r"a step needs none"),
         ("SSIM windows without change", TrainConfig(loss="photometric(0.0)"), r"the loss has no SSIM"),
     ],

@@ -1,0 +1,173 @@
+"""Rules of the guard on finished trainings, under the protocol of benchmarks/guard.md.
+
+    python -m benchmarks.guard measure RUN... --out rules.json    # folders of runs; what is measured is kept
+    python -m benchmarks.guard table rules.json
+
+A row is a model under a rule: PSNR at the test views, at the training views and at held-out views of training kind,
+which alone choose; how many Gaussians went, and the exact score where nobody was, before and after.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+import tyro
+from torch import Tensor
+
+from benchmarks.remedy import held_out
+from ca_reg.attribution import hanging
+from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.results import write_json
+from reference_trainer.evaluation.shares import blend_weights, unseen_shares
+from reference_trainer.evaluation.tables import markdown_table
+from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.runs.folder import read_run_settings
+from reference_trainer.runs.measure import load_run_model
+from reference_trainer.scenes.scene import Scene, View, Viewpoint
+from reference_trainer.scenes.virtual_cameras import unseen_views
+
+__all__ = ["RULES", "keeps", "main"]
+
+RULES: dict[str, dict[str, Any]] = {
+    "ratio 2, 0.3 %": {"ratio": 2.0, "least": 0.003},
+    "ratio 2, 1 %": {"ratio": 2.0, "least": 0.01},
+    "ratio 2, 3 %": {"ratio": 2.0, "least": 0.03},
+    "ratio 4, 0.3 %": {"ratio": 4.0, "least": 0.003},
+    "ratio 4, 1 %": {"ratio": 4.0, "least": 0.01},
+    "ratio 4, 3 %": {"ratio": 4.0, "least": 0.03},
+    "ratio 2, 1 %, fewer cameras": {"ratio": 2.0, "least": 0.01, "fewer": True},
+    "pilot: 15 twice": {"ratio": 2.0, "least": 0.0, "most": 15, "rounds": 2},
+}
+"""The rules of the protocol."""
+
+OTHER_EXPOSURE = {"sceaux": ("7107.jpg",)}
+"""Held-out photographs that are no measure."""
+
+_SPLITS = ("held-out", "test", "train")
+
+
+def main(
+    what: Annotated[Literal["measure", "table"], tyro.conf.Positional],
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path = Path("runs/guard.json"),
+    rules: tuple[str, ...] = tuple(RULES),
+) -> None:
+    """Measure runs under every rule, or print tables of what was measured.
+
+    Args:
+        what: "measure", or "table".
+        paths: folders of runs, or files of rows.
+        out: the file of rows, which is continued.
+        rules: those to measure.
+    """
+    torch.set_num_threads(1)
+    if what == "table":
+        print("\n\n".join(table(json.loads(path.read_text("utf-8"))) for path in paths))
+        return
+    rows = json.loads(out.read_text("utf-8")) if out.exists() else []
+    for run in paths:
+        missing = [name for name in ("none", *rules) if (run.name, name) not in {(r["run"], r["rule"]) for r in rows}]
+        if missing:
+            rows += measure(run, missing)
+            write_json(out, rows)
+    print(table(rows))
+
+
+def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the rows of a run, "none" being the model as it is."""
+    model, scene = load_run_model(run)
+    options, config = read_run_settings(run / "config.json")
+    others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(scene.name, ())]
+    splits: dict[str, Sequence[View]] = dict(zip(_SPLITS, (others, scene.test, scene.train), strict=True))
+    known: dict[bytes, tuple[Tensor, Tensor, Tensor, float]] = {}
+    rows = []
+    for name in rules:
+        start = time.process_time()
+        keep, scores, where = keeps(model, scene, known, **RULES.get(name, {"rounds": 0}))
+        rest = replace(model, gaussians=model.gaussians[keep])
+        found = {split: {v.name: quality(rest, v) for v in views} for split, views in splits.items()}
+        rows.append(
+            {"run": run.name, "rule": name, "gaussians": len(keep), "removed": int((~keep).sum()), "scores": scores,
+             "where": where, "seconds": time.process_time() - start}
+            | {split: sum(of.values()) / max(1, len(of)) for split, of in found.items()} | {"views": found}
+        )  # fmt: skip
+        shown = {split: round(rows[-1][split], 2) for split in _SPLITS}
+        print(run.name, name, rows[-1]["removed"], shown, *(f"{1e3 * x:.2f}" for x in scores), flush=True)
+    return rows
+
+
+@torch.no_grad()
+def quality(model: TrainedModel, view: View) -> float:
+    """Return the PSNR of a view."""
+    return psnr(model.test_rendering(view).image.clamp(0, 1), view.image, view.mask)
+
+
+@torch.no_grad()
+def keeps(
+    model: TrainedModel,
+    scene: Scene,
+    known: dict[bytes, tuple[Tensor, Tensor, Tensor, float]],
+    *,
+    ratio: float = 2.0,
+    least: float = 0.0,
+    most: int | None = None,
+    rounds: int = 3,
+    fewer: bool = False,
+) -> tuple[Tensor, list[float], dict[str, int]]:
+    """Return what a rule keeps, the score after each round, and where what went had its highest share.
+
+    As `reference_trainer.evaluation.shares.guard`, with the alternatives of the protocol; ``known`` keeps what rules
+    with equal beginnings share.
+    """
+    views: list[Viewpoint] = unseen_views(scene)
+    if fewer:  # of 1/4, 1/2, 3/4 between the middle one, of 1/3, 2/3 and 1 beyond the last two
+        views = [v for i, v in enumerate(views) if (i % 3 == 1 if v.name.startswith("between") else i % 3 > 0)]
+    keep, scores, where = torch.ones(len(model.gaussians), dtype=torch.bool), list[float](), Counter[str]()
+    for number in range(rounds + 1):
+        key = bytes(keep.tolist()) + bytes([fewer])
+        if key not in known:
+            rest = replace(model, gaussians=model.gaussians[keep])
+            shares, score = unseen_shares(rest, views)
+            plain = rest.without_camera
+            weights = [blend_weights(plain, of) / len(of) for of in (views, scene.train)]
+            known[key] = shares, weights[0], weights[1], score
+        shares, there, here, score = known[key]
+        scores.append(score)
+        hang = hanging(shares.mean(0), there, here, ratio=ratio, least=least)
+        if most is not None:
+            held = torch.where(hang, shares.mean(0), 0.0)
+            hang &= held >= held.sort(descending=True).values[min(most, len(held)) - 1]
+        if number == rounds or not bool(hang.any()):
+            break
+        where.update(views[i].name for i in shares[:, hang].argmax(0).tolist())
+        keep[keep.clone()] = ~hang
+    return keep, scores, dict(where)
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return a table: what every rule changes on every run, against the model as it is."""
+    runs, rules = dict.fromkeys(r["run"] for r in rows), dict.fromkeys(r["rule"] for r in rows if r["rule"] != "none")
+    of = {(r["run"], r["rule"]): r for r in rows}
+    lines = []
+    for run in runs:
+        plain = of[run, "none"]
+        line = {"model": run, "score": f"{1e3 * plain['scores'][0]:.2f}"}
+        line |= {f"{split} PSNR": f"{plain[split]:.2f}" for split in _SPLITS[:2]}
+        for rule in rules:
+            if row := of.get((run, rule)):
+                changes = "/".join(f"{row[split] - plain[split]:+.2f}" for split in _SPLITS[:2])
+                line[rule] = f"{changes} ({row['removed']})"
+        lines.append(line)
+    titles = ["model", "score", *(f"{split} PSNR" for split in _SPLITS[:2]), *rules]
+    return markdown_table([dict.fromkeys(titles, "-") | line for line in lines], titles)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

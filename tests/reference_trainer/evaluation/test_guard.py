@@ -1,0 +1,172 @@
+"""The guard, on the built-in scene with a veil planted where no training camera looks."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.shares import guard, unseen_shares
+from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.runs.run import model_of
+from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.virtual_cameras import unseen_views
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.model_state import initial_gaussians, seen_by_any
+from reference_trainer.training.trainer import Trainer
+
+OUTSIDE = -1  # the built-in scene's last test view stands beyond its training cameras
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return synthetic_scene(width=64, height=48, points=1_500)
+
+
+def veil(scene: Scene, count: int = 12) -> Gaussians:
+    """Opaque Gaussians close before the view outside, in no picture of the training, in the colors of nothing there."""
+    camera = scene.test[OUTSIDE].camera
+    size = 0.03
+    pixels = torch.cartesian_prod(torch.arange(4.0, camera.width, 2), torch.arange(4.0, camera.height, 2))
+    for depth in (0.8, 1.0, 1.3, 1.6):
+        places = camera.lift(pixels, torch.full((len(pixels),), depth))
+        colors = torch.tensor([[0.0, 1.0, 0.0]]).expand(len(places), 3)
+        made = Gaussians.from_points(places, colors, torch.full((len(places),), size), sh_degree=3)
+        made = replace(made, opacity_logits=torch.full_like(made.opacity_logits, 4.0))
+        chosen = (~seen_by_any(made, scene.train)).nonzero()[:, 0]
+        if len(chosen) >= count:
+            return made[chosen[torch.linspace(0, len(chosen) - 1, count).long()]]
+    raise AssertionError("no place outside the training cones")
+
+
+def together(one: Gaussians, other: Gaussians) -> Gaussians:
+    named = dict(other.named())
+    return Gaussians.from_named({name: torch.cat([x, named[name]]) for name, x in one.named()})
+
+
+@torch.no_grad()
+def quality(model: TrainedModel, scene: Scene) -> list[float]:
+    return [psnr(model.test_rendering(v).image.clamp(0, 1), v.image) for v in scene.test]
+
+
+def trained(scene: Scene, start: Gaussians, **settings) -> Trainer:
+    """A training without densification: the number of a Gaussian stays what it was."""
+    quiet = {"iterations": 120, "densify_every": 0, "opacity_reset_every": 0}
+    trainer = Trainer(replace(scene, start=start), TrainConfig(**quiet | settings))
+    trainer.train()
+    return trainer
+
+
+@pytest.mark.parametrize("analytic", [False, True], ids=["drawn", "expectation"])
+@pytest.mark.slow
+def test_a_planted_veil_is_found_and_what_it_hides_is_seen_again(scene, analytic):
+    start, planted = initial_gaussians(scene, TrainConfig()), veil(scene)
+    assert not seen_by_any(planted, scene.train).any()  # no photograph ever tells
+    settings = {"dropout": 0.2, "analytic": analytic}
+    clean = model_of(trained(scene, start, **settings))
+    model = model_of(trained(scene, together(start, planted), **settings))
+    before, never = quality(model, scene), quality(clean, scene)
+    assert before[OUTSIDE] < never[OUTSIDE] - 3  # dB: the failure is there
+    found = guard(model, scene)
+    gone = (~found.keep).nonzero()[:, 0]
+    assert len(gone) >= len(planted) // 2
+    assert gone.min() >= len(start)  # nothing but the veil
+    assert found.scores[-1] < found.scores[0]
+    assert all(name.startswith("beyond train_2") for name in found.where)
+    after = quality(replace(model, gaussians=model.gaussians[found.keep]), scene)
+    assert after[OUTSIDE] > before[OUTSIDE] + 3
+    assert after[:OUTSIDE] == pytest.approx(before[:OUTSIDE], abs=1e-4)  # where the veil never was
+
+    # A clean model keeps what it has.
+    kept = guard(clean, scene).keep
+    assert (~kept).sum() <= 0.001 * len(kept)
+    left = quality(replace(clean, gaussians=clean.gaussians[kept]), scene)
+    assert all(after > before - 0.05 for after, before in zip(left, never, strict=True))
+
+
+def planted_model(scene: Scene) -> TrainedModel:
+    """An untrained model with a veil, opaque enough to have a score."""
+    start = initial_gaussians(scene, TrainConfig())
+    opaque = replace(start, opacity_logits=torch.full_like(start.opacity_logits, 2.0))
+    return TrainedModel(together(opaque, veil(scene)), scene.background, "dropout(0.2)")
+
+
+def test_a_model_without_a_regularizer_is_refused(scene):
+    plain = replace(planted_model(scene), regularizer="")
+    with pytest.raises(ValueError, match="its Gaussians need each other"):
+        guard(plain, scene)
+
+
+def test_one_camera_has_nothing_between(scene):
+    with pytest.raises(ValueError, match="it takes two"):
+        guard(planted_model(scene), replace(scene, train=scene.train[:1]))
+
+
+def test_shares_at_unseen_views_add_up_to_their_scores(scene):
+    model, views = planted_model(scene), unseen_views(scene)[::9]
+    shares, score = unseen_shares(model, views)
+    exact = model.exact_ca_score(drop_rate=0.2)
+    scores = [exact(model.gaussians.opacities, view).value for view in views]
+    assert shares.shape == (3, len(model.gaussians))
+    torch.testing.assert_close(shares.sum(1), torch.tensor(scores, dtype=torch.float64), rtol=1e-3, atol=1e-9)
+    assert score == pytest.approx(sum(scores) / 3)
+
+
+@pytest.mark.slow
+def test_a_guarded_training_ends_without_what_hangs_and_resumes_identically(scene, tmp_path):
+    """The veil goes at a removal on the way, with all that is counted of it; nothing goes of an unguarded model."""
+    start = together(initial_gaussians(scene, TrainConfig()), veil(scene))
+    start = replace(start, opacity_logits=start.opacity_logits.clamp(min=2.0))
+    settings = {"dropout": 0.2, "iterations": 6, "densify_from": 1, "densify_every": 0}
+    whole = trained(scene, start, guard=4, **settings)
+    unguarded = trained(scene, start, **settings)
+    assert len(unguarded.gaussians) == len(start) > len(whole.gaussians)
+    assert len(whole.density.statistics.steps) == len(whole.gaussians)
+    part = Trainer(replace(scene, start=start), whole.config)
+    part.train(until=5)
+    assert len(part.gaussians) < len(start)  # the removal of step 4
+    part.save(tmp_path / "checkpoint.pt")
+    again = Trainer.load(tmp_path / "checkpoint.pt", replace(scene, start=start))
+    again.train()
+    for name, x in whole.gaussians.named():
+        assert torch.equal(x, dict(again.gaussians.named())[name])
+
+
+def test_the_guard_of_a_plain_training_is_left_out_and_says_why(scene, said):
+    start = initial_gaussians(scene, TrainConfig())
+    trainer = trained(scene, start, guard=1, iterations=2)
+    assert len(trainer.gaussians) == len(start)
+    assert any("no guard" in text and "need each other" in text for text in said)
+
+
+def test_cameras_nobody_took_go_around_what_the_training_cameras_look_at():
+    """Of cameras on a circle, those between and beyond stand on it too, and look at its center."""
+    scene = synthetic_scene(width=32, height=24, points=50)
+    around = []
+    for i, view in enumerate(scene.train):
+        angle = math.radians(40 * i)
+        pose = torch.eye(4)
+        pose[:3, :3] = torch.tensor(
+            [[math.cos(angle), 0, -math.sin(angle)], [0, 1, 0], [math.sin(angle), 0, math.cos(angle)]]
+        )
+        pose[2, 3] = 5.0
+        around.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    views = unseen_views(replace(scene, train=tuple(around)))
+    assert len(views) == 3 * 3 + 3 * 6
+    for view in views:
+        torch.testing.assert_close(view.camera.position.norm(), torch.tensor(5.0), rtol=1e-4, atol=0)
+        torch.testing.assert_close(view.camera.forward, -view.camera.position / 5, rtol=0, atol=1e-4)
+
+
+def test_nothing_but_the_veil_goes(scene):
+    """Without a training: the points of the built-in scene lie on its surfaces."""
+    model = planted_model(scene)
+    found = guard(model, scene, rounds=1)
+    gone = (~found.keep).nonzero()[:, 0]
+    assert len(gone) >= 6
+    assert gone.min() >= len(model.gaussians) - 12
+    assert found.where.total() == len(gone)
+    assert f"{len(gone)} of {len(model.gaussians)} Gaussians hang" in str(found)
