@@ -138,6 +138,23 @@ class ListMoments:
         variance = (nothing.index_add(0, pixels, spread) / total).mean(1)
         return variance.index_select(0, walk.ranks).reshape(walk.shape)
 
+    @torch.no_grad()
+    def weights(self, opacity: Tensor, view: Any) -> Tensor:
+        """Return every Gaussian's blend weight: alpha times transmittance, summed over the pixels, (N,), float64.
+
+        With shares at cameras that nobody took, these tell what hangs there: :func:`ca_reg.attribution.hanging`.
+
+        Example:
+            >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
+            ...     both, one = torch.tensor([0, 1]), torch.zeros(2, dtype=torch.int64)
+            ...     return PixelLists(both, one, opacity, torch.ones(2, 3), height=1, width=1)
+            >>> ListMoments(lists_fn).weights(torch.tensor([0.75, 0.5]), None)  # a quarter of the light passes on
+            tensor([0.7500, 0.1250], dtype=torch.float64)
+        """
+        walk = _Walk.over(*self._lists(opacity, view, None), Multiplier(1.0, 0.0))
+        out = torch.zeros(len(walk.values), dtype=torch.float64, device=walk.values.device)
+        return out.index_add_(0, walk.gaussians, walk.blend_weights()[0].double())
+
     def _lists(self, opacity: Tensor, view: Any, background: Tensor | None) -> tuple[PixelLists, Tensor]:
         """Ask for the lists and check them; return them and the color behind every pixel, shape (H * W, 3)."""
         check_opacity(opacity)

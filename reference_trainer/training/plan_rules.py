@@ -15,6 +15,7 @@ from reference_trainer.training.assembly import make_density, make_losses, make_
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import Photometric
 from reference_trainer.training.model_state import initial_gaussians, seen_by_any
+from reference_trainer.training.recipes import with_recipe
 
 __all__ = ["DROPOUT_GAINS", "FAR_APART_GAINS", "RECOMMENDED", "RULES", "PlanItem"]
 
@@ -98,7 +99,11 @@ def densification(scene: Scene, config: TrainConfig) -> PlanItem:
         return PlanItem(name, "left out", f"by construction: it would begin at step {config.densify_from} of {until}")
     pixels = sum(view.camera.width * view.camera.height for view in scene.train) / len(scene.train)
     reason = f"{len(points.positions)} initial points are {len(points.positions) / pixels:.2f} per pixel of a view"
-    return PlanItem(name, "used", f"{reason}; detail comes from clones and splits")
+    reason += f"; detail comes from clones and splits, from step {config.densify_from} of {config.iterations} on"
+    scaled = with_recipe("3dgs", iterations=config.iterations).densify_from
+    if config.densify_from == TrainConfig().densify_from != scaled:
+        reason += f" (without a recipe nothing scales with the iterations: --recipe 3dgs would begin at {scaled})"
+    return PlanItem(name, "used", reason)
 
 
 def opacity_reset(scene: Scene, config: TrainConfig) -> PlanItem:

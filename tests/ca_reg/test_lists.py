@@ -189,6 +189,18 @@ def test_shares_are_the_contributions_added_up_by_gaussian():
     torch.testing.assert_close(shares.sum(), (variance.mean(0) * weights).sum(), **CLOSE)
 
 
+def test_weights_are_the_gradient_of_a_picture_in_its_colors():
+    """The mean picture of a factor of 1 is the picture itself, linear in the colors."""
+    case = padded(seed=4)
+    colors = torch.zeros_like(case.colors).requires_grad_()
+    picture = ListMoments(case._replace(colors=colors).lists)(case.opacity, None, Multiplier(1.0, 0.0), None).mean
+    (gradient,) = torch.autograd.grad(picture.sum(), colors)
+    assert (gradient > 0).any()
+    for elements in (7, 1 << 20):  # in many blocks, and in one
+        weights = ListMoments(case.lists, elements=elements).weights(case.opacity, None)
+        torch.testing.assert_close(weights, gradient[:, 0], **CLOSE)
+
+
 def test_float32_lists_give_float32_moments_and_float64_shares():
     scene, exact = padded(dtype=torch.float32), padded()
     moments = ListMoments(scene.lists)

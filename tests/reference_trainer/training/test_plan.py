@@ -53,6 +53,16 @@ def test_a_stored_plan_yields_to_what_is_given_later(tiny_scene):
     assert plan.applied(SHORT, given=["sh_degree"]) == SHORT
 
 
+def test_the_schedule_is_told_from_that_of_the_recipe(tiny_scene):
+    """Without a recipe steps do not scale with the iterations."""
+    of = {name: items(tiny_scene, config)["densification"].reason for name, config in
+          (("listed", TrainConfig()), ("recipe", with_recipe("3dgs", iterations=3_000)))}  # fmt: skip
+    assert "from step 500 of 3000 on" in of["listed"]
+    assert "--recipe 3dgs would begin at 150" in of["listed"]
+    assert "from step 150 of 3000 on" in of["recipe"]
+    assert "would begin" not in of["recipe"]
+
+
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_what_a_recipe_sets_stays(tiny_scene, recipe):
     config = with_recipe(recipe, iterations=400)
