@@ -64,8 +64,7 @@ class Evaluate:
 
     def __call__(self) -> None:
         from reference_trainer.evaluation.lpips import load_lpips
-        from reference_trainer.evaluation.shares import guard
-        from reference_trainer.runs.measure import load_run_model, measure
+        from reference_trainer.runs.measure import load_run_model, log_what_hangs, measure
         from reference_trainer.runs.ply import score_ply
         from reference_trainer.scenes.virtual_cameras import measured_views
 
@@ -79,8 +78,7 @@ class Evaluate:
             model, scene = load_run_model(self.run, self.device, regularizer=self.regularizer, trust=trust)
             name = "evaluation" if self.regularizer is None else f"evaluation_{folder_name(self.regularizer)}"
             measure(model, measured_views(scene), self.out or self.run / name, about={"scene": scene.name}, **shared)
-            if len(model.chain) and len(scene.train) > 1:
-                print(guard(model, scene))
+            log_what_hangs(model, scene)
         else:
             shared |= {"regularizer": self.regularizer, "device": self.device, "background": self.scene.background}
             score_ply(self.run, place, self.out, trust=trust, **shared)

@@ -15,6 +15,7 @@ from reference_trainer.evaluation.evaluate import Evaluation, evaluate
 from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.pictures import file_names, is_own_png, save_png, write_movie
 from reference_trainer.evaluation.results import PARTIAL, machine, write_json
+from reference_trainer.evaluation.shares import guard
 from reference_trainer.evaluation.tables import evaluation_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import remove_leftovers, write_text
@@ -24,7 +25,7 @@ from reference_trainer.scenes.scene import Scene, Viewpoint
 from reference_trainer.scenes.virtual_cameras import interpolate_cameras
 from reference_trainer.threads import threads_for
 
-__all__ = ["load_run_model", "measure", "render_run"]
+__all__ = ["load_run_model", "log_what_hangs", "measure", "render_run"]
 
 EVALUATION = "evaluation.json"
 _log = logging.getLogger(__name__)
@@ -103,6 +104,14 @@ def measure(
     _log.info(table)
     _log.info("Scores and pictures are in %s", out)
     return result
+
+
+def log_what_hangs(model: TrainedModel, scene: Scene | None) -> None:
+    """Log what hangs where nobody took a photograph, if the model is one that can be guarded and there are cameras."""
+    if scene is not None and len(scene.train) > 1 and len(model.chain):
+        with threads_for(scene.pixels):
+            found = guard(model, scene)
+        _log.info("%s%s", found, " To remove them: ca-reg clean PLY --hanging." if found.where else "")
 
 
 @torch.no_grad()

@@ -21,7 +21,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.runs.folder import check_trusted
-from reference_trainer.runs.measure import measure
+from reference_trainer.runs.measure import log_what_hangs, measure
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import BACKGROUNDS, OrbitOptions, SceneOptions
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
@@ -216,6 +216,7 @@ def score_ply(
     folder, scene = out or ply.with_name(ply.stem + "_evaluation"), loaded.scene
     shared: dict[str, Any] = {"samples": samples, "seed": seed, "perceptual": perceptual}
     result = measure(loaded.model, loaded.views, folder, about=loaded.about, **shared)
+    log_what_hangs(loaded.model, scene)
     if scene is None:
         _log.info(
             "An orbit sees the model from where no photograph may have been taken: compare these scores with others "

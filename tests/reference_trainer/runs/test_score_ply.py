@@ -233,7 +233,8 @@ def test_a_ply_on_its_scene(run, options, tmp_path, said):
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]
     assert found["ply"]["regularizer"] == "dropout(0.2)"
-    assert said[-1] == f"Scores and pictures are in {tmp_path}"
+    assert f"Scores and pictures are in {tmp_path}" in said
+    assert "where nobody took a photograph" in said[-1]
 
 
 @pytest.mark.parametrize("photographs", ["options", "masked"])  # where the noise beside the masks is no measure
