@@ -87,12 +87,15 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
     others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(scene.name, ())]
     splits: dict[str, Sequence[View]] = dict(zip(_SPLITS, (others, scene.test, scene.train), strict=True))
     known: dict[bytes, tuple[Tensor, Tensor, Tensor, float]] = {}
-    rows = []
+    rows, of_kept = [], dict[bytes, dict[str, dict[str, float]]]()
     for name in rules:
         start = time.process_time()
         keep, scores, where = keeps(model, scene, known, **RULES.get(name, {"rounds": 0}))
-        rest = replace(model, gaussians=model.gaussians[keep])
-        found = {split: {v.name: quality(rest, v) for v in views} for split, views in splits.items()}
+        found = of_kept.get(bytes(keep.tolist()))
+        if found is None:
+            rest = replace(model, gaussians=model.gaussians[keep])
+            found = {split: {v.name: quality(rest, v) for v in views} for split, views in splits.items()}
+            of_kept[bytes(keep.tolist())] = found
         rows.append(
             {"run": run.name, "rule": name, "gaussians": len(keep), "removed": int((~keep).sum()), "scores": scores,
              "where": where, "seconds": time.process_time() - start}
