@@ -113,14 +113,17 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
     return CAAttribution(shares.to(torch.float64), result)
 
 
-def hanging(shares: Tensor, there: Tensor, here: Tensor, *, ratio: float = 2.0, least: float = 0.01) -> Tensor:
+def hanging(
+    shares: Tensor, there: Tensor, here: Tensor, *, ratio: float = 16.0, together: float = 0.05, alone: float = 0.003
+) -> Tensor:
     """Find the Gaussians that hang where no photograph was taken: veils and blobs before and beside the cameras.
 
     Training with dropout can leave opaque Gaussians where no training camera looks, and no photograph tells. A Gaussian
-    hangs if its weight at cameras that nobody took is more than ``ratio`` times that at the training cameras, and if it
-    alone holds more than ``least`` of the score there. Remove those, measure again, and stop when none is found. It is
-    for models that were trained with dropout or noise: the Gaussians of others need each other. Which cameras, which
-    numbers and what it gained: benchmarks/guard.md.
+    is suspect if its weight at cameras that nobody took is more than ``ratio`` times that at the training cameras. If
+    all suspects hold less than ``together`` of the score there, nothing hangs: that is what a training leaves beside
+    its pictures. Else those hang that hold more than ``alone``. Remove them, measure again, and stop when none is
+    found. It is for models that were trained with dropout or noise: the Gaussians of others need each other. Which
+    cameras, which numbers and what it gained: benchmarks/guard.md.
 
     Args:
         shares: from :func:`attribute`, averaged over cameras that nobody took, at least 0, shape (N,).
@@ -128,7 +131,8 @@ def hanging(shares: Tensor, there: Tensor, here: Tensor, *, ratio: float = 2.0, 
             shape (N,). A picture is linear in the colors, so they are the gradient of its sum in a color channel.
         here: the same at the training cameras, shape (N,).
         ratio: at least 0.
-        least: share of the score that a single Gaussian must hold, in [0, 1).
+        together: share of the score that all suspects must hold, in [0, 1).
+        alone: share of the score that each of them must hold, in [0, 1).
 
     Returns:
         Which Gaussians hang, bool, shape (N,).
@@ -139,7 +143,7 @@ def hanging(shares: Tensor, there: Tensor, here: Tensor, *, ratio: float = 2.0, 
     Example:
         The second Gaussian is seen beside the training cameras only; the third too, but hardly matters.
 
-        >>> hanging(torch.tensor([0.5, 0.4, 0.001]), torch.tensor([9.0, 5.0, 1.0]), torch.tensor([9.0, 1.0, 0.0]))
+        >>> hanging(torch.tensor([0.5, 0.4, 0.001]), torch.tensor([9.0, 5.0, 1.0]), torch.tensor([9.0, 0.2, 0.0]))
         tensor([False,  True, False])
     """
     if not shares.ndim == 1 or not shares.shape == there.shape == here.shape:
@@ -147,9 +151,12 @@ def hanging(shares: Tensor, there: Tensor, here: Tensor, *, ratio: float = 2.0, 
             "shares and weights must have one value per Gaussian each, shape (N,), got "
             f"{tuple(shares.shape)}, {tuple(there.shape)} and {tuple(here.shape)}."
         )
-    if not ratio >= 0 or not 0 <= least < 1:
-        raise ValueError(f"ratio must be at least 0 and least in [0, 1), got {ratio} and {least}.")
-    return (there > ratio * here) & (shares > least * shares.sum())
+    if not ratio >= 0 or not 0 <= together < 1 or not 0 <= alone < 1:
+        raise ValueError(
+            f"ratio must be at least 0, together and alone in [0, 1), got {ratio}, {together} and {alone}."
+        )
+    suspect, total = there > ratio * here, shares.sum()
+    return suspect & (shares > alone * total) & (shares[suspect].sum() > together * total)
 
 
 @torch.inference_mode(False)  # it would record no gradient

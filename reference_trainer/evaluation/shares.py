@@ -94,7 +94,7 @@ class Guard:
 
 
 @torch.no_grad()
-def guard(model: TrainedModel, scene: Scene, *, ratio: float = 2.0, least: float = 0.01, rounds: int = 3) -> Guard:
+def guard(model: TrainedModel, scene: Scene, *, rounds: int = 3) -> Guard:
     """Find the Gaussians that hang where nobody took a photograph, see `ca_reg.attribution.hanging`.
 
     What hangs is left out and the rest measured again, because it may have hidden more, until nothing hangs or
@@ -122,7 +122,7 @@ def guard(model: TrainedModel, scene: Scene, *, ratio: float = 2.0, least: float
             break
         plain = rest.without_camera
         weights = (blend_weights(plain, of) / len(of) for of in (views, here))
-        hang = hanging(shares.mean(0), *weights, ratio=ratio, least=least)
+        hang = hanging(shares.mean(0), *weights)
         if not bool(hang.any()):
             break
         where.update(views[i].name for i in shares[:, hang].argmax(0).tolist())

@@ -271,15 +271,15 @@ def test_what_hangs_is_seen_there_more_than_here_and_holds_much_of_the_score():
     """Against a loop over the Gaussians, each asked by itself."""
     g = torch.Generator().manual_seed(0)
     shares, there, here = (torch.rand(200, generator=g, dtype=torch.float64) ** 4 for _ in range(3))
-    found = hanging(shares, there, here, ratio=1.5, least=0.01)
     total = sum(shares.tolist())
-    one_by_one = [
-        share / total > 0.01 and seen > 1.5 * trained
-        for share, seen, trained in zip(shares.tolist(), there.tolist(), here.tolist(), strict=True)
-    ]
-    assert 0 < sum(one_by_one) < 200
+    suspect = [seen > 1.5 * trained for seen, trained in zip(there.tolist(), here.tolist(), strict=True)]
+    held = sum(share for share, one in zip(shares.tolist(), suspect, strict=True) if one) / total
+    found = hanging(shares, there, here, ratio=1.5, together=0.99 * held, alone=0.01)
+    one_by_one = [one and share / total > 0.01 for share, one in zip(shares.tolist(), suspect, strict=True)]
+    assert 0 < sum(one_by_one) < sum(suspect) < 200
     assert found.tolist() == one_by_one
-    assert not hanging(torch.zeros(3), torch.ones(3), torch.zeros(3), least=0.0).any()  # no score, nothing to hang
+    assert not hanging(shares, there, here, ratio=1.5, together=1.01 * held, alone=0.01).any()
+    assert not hanging(torch.zeros(3), torch.ones(3), torch.zeros(3), together=0.0, alone=0.0).any()  # no score
 
 
 @pytest.mark.parametrize(
@@ -287,7 +287,8 @@ def test_what_hangs_is_seen_there_more_than_here_and_holds_much_of_the_score():
     [
         ({"there": torch.ones(2)}, r"shape \(N,\), got \(3,\), \(2,\) and \(3,\)"),
         ({"ratio": -1.0}, "ratio must be at least 0"),
-        ({"least": 1.0}, r"least in \[0, 1\)"),
+        ({"together": 1.0}, r"together and alone in \[0, 1\)"),
+        ({"alone": -0.1}, r"together and alone in \[0, 1\)"),
     ],
 )
 def test_hanging_refuses_what_cannot_be(change, message):
