@@ -124,7 +124,7 @@ class Run:
     def _photographs(self) -> Path:
         """Name what cannot be read, and return the folder of the scene: that of the photographs if it has cameras."""
         from reference_trainer.evaluation.results import write_json
-        from reference_trainer.scenes.formats import find_format
+        from reference_trainer.scenes.load import find_format  # from where all formats are known
         from reference_trainer.scenes.photographs import collect_photographs, is_video, sort_photographs
 
         sources, wrong = sort_photographs(self.photos)
@@ -155,12 +155,23 @@ class Run:
                 )
         return scene
 
+    def _sizes(self, scene: Path) -> tuple[tuple[int, int], int]:
+        """Return width and height of the largest photograph, and how many there are, placed or not."""
+        from reference_trainer.scenes.images import image_size, list_images
+        from reference_trainer.scenes.load import find_format
+
+        if scene == self.photos:
+            paths = [frame.path for frame in find_format(scene, "auto")[1](scene, SceneOptions(str(scene))).frames]
+        else:
+            paths = list_images(scene / "images")
+        return max(map(image_size, paths), key=math.prod), len(paths)
+
     def _settings(self, scene: Path) -> tuple[SceneOptions, TrainConfig]:
         """Return what is trained; refuses to go on with a run that was begun with other settings, which are named."""
         from reference_trainer.training.plan_rules import RECOMMENDED
 
         steps, pixels = PRESETS["quick" if self.quick else "quality" if self.quality else "default"]
-        factor = max(1.0, math.sqrt(math.prod(_sizes(scene)[0]) / pixels))
+        factor = max(1.0, math.sqrt(math.prod(self._sizes(scene)[0]) / pixels))
         options = SceneOptions(str(scene), test=self.test, points=self.points, downscale=round(factor, 3))
         config = with_recipe(RECIPE, iterations=steps, **RECOMMENDED)
         if (self.folder / CONFIG).exists():
@@ -182,7 +193,7 @@ class Run:
 
         if (self.folder / RESULTS).exists():
             return "Trained and measured before."
-        (width, height), count = _sizes(scene)
+        (width, height), count = self._sizes(scene)
         factor, done = options.downscale or 1.0, 0
         if (self.folder / CHECKPOINT).exists():
             done = load_checkpoint(self.folder / CHECKPOINT)["step"]
@@ -233,14 +244,6 @@ class Run:
         if self.open and screen:
             with suppress(webbrowser.Error):
                 webbrowser.open(page.resolve().as_uri())
-
-
-def _sizes(scene: Path) -> tuple[tuple[int, int], int]:
-    """Return width and height of the largest photograph of a scene, and how many there are."""
-    from reference_trainer.scenes.images import image_size, list_images, picture_folder
-
-    sizes = [image_size(path) for path in list_images(picture_folder(scene, None))]
-    return max(sizes, key=math.prod), len(sizes)
 
 
 def _duration(seconds: float) -> str:

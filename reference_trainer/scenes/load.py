@@ -26,7 +26,7 @@ from reference_trainer.scenes.scene import Scene
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.scenes.transforms import BLENDER, TRANSFORMS
 
-__all__ = ["blender_split", "dtu_split", "evenly_spaced", "file_split", "llff_split", "load_scene"]
+__all__ = ["blender_split", "dtu_split", "evenly_spaced", "file_split", "find_format", "llff_split", "load_scene"]
 
 # The order matters: of several formats that fit a folder, the first counts.
 for _format in (BLENDER, IDR, COLMAP, TRANSFORMS, LLFF, ARRAYS):

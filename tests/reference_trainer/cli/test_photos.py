@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+import subprocess
+import sys
 import webbrowser
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from commands import refused
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from subprocesses import subprocess_environment
 
 from reference_trainer.cli import main, photos
 from reference_trainer.evaluation.pictures import save_png
@@ -136,6 +139,18 @@ def test_photographs_with_cameras_stay_where_they_are(garden, tmp_path, monkeypa
     with Image.open(tmp_path / "out/views/train/train_0.png") as view:  # 600 pixels of 40 x 30
         assert view.size == (28, 21)
     assert np.isfinite(json.loads((tmp_path / "out" / "results.json").read_text())["mean"]["train"]["psnr"])
+
+
+@pytest.mark.slow
+def test_cameras_are_found_by_a_new_process(garden):
+    """Which has imported nothing that knows the formats."""
+    write_cameras(SCENE, garden / "sparse" / "0")
+    done = subprocess.run(
+        [sys.executable, "-m", "reference_trainer.cli", "run", "garden", "--out", "out", "--points", "nowhere"],
+        env=subprocess_environment(), capture_output=True, text=True,
+    )  # fmt: skip
+    assert (done.returncode, "nowhere" in done.stderr) == (2, True)
+    assert "photographs with cameras: garden" in done.stdout
 
 
 @pytest.mark.parametrize(
