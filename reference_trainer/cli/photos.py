@@ -53,7 +53,7 @@ _WRITTEN: dict[Step, tuple[str, ...]] = {
 }
 """What each step writes. `--from` deletes that of a step and of those after it."""
 
-_TRAINING, _SHOWN, _REFERENCE = 1.7, 30.0, 2.9e-7
+_TRAINING, _SHOWN, _REFERENCE = 1.9, 30.0, 2.9e-7
 """Of `_forecast`: a training step, and measuring and showing a view, in timed steps; seconds of such a step per pixel
 on the machine on which the seconds of the poses were measured."""
 
@@ -108,7 +108,7 @@ class Run:
         report_file([self.folder])
 
     def __call__(self) -> None:
-        from reference_trainer.runs.run import Monitoring, run_experiment
+        from reference_trainer.runs.run import run_experiment
 
         scene = self._photographs()
         self.rendering.begin(self.device, trains=True)
@@ -116,9 +116,7 @@ class Run:
         print(self._forecast(scene, options, config), flush=True)
         self._poses(scene)
         self._plan(options, config)
-        run_experiment(
-            options, config, self.folder, auto=True, device=self.device, monitoring=Monitoring(), progress=True
-        )
+        run_experiment(options, config, self.folder, auto=True, device=self.device, progress=True)
         self._report()
 
     def _photographs(self) -> Path:
@@ -143,11 +141,13 @@ class Run:
             for step in list(_WRITTEN)[list(_WRITTEN).index(self.again) :] if self.again else ():
                 for path in [path for name in _WRITTEN[step] for path in self.folder.glob(name)]:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
-            if not mark.exists():
+            before = read_json(mark) if mark.exists() else {}
+            if not before:
+                write_json(mark, before)  # the folder is ours from now on, should this be interrupted
                 names = [] if scene == self.photos else collect_photographs(sources, scene / "images", self.frames)
                 write_json(mark, about)
                 print(f"photographs: {len(names)}, in {scene}" if names else f"photographs with cameras: {scene}")
-            elif (before := read_json(mark)) != about:
+            elif before != about:
                 changed = {name for name, _ in about["files"].items() ^ before["files"].items()} or {"--frames"}
                 raise ValueError(
                     f"{self.folder} was made from other photographs, see {', '.join(sorted(changed))}: give another "

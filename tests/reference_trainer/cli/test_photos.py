@@ -18,7 +18,7 @@ from reference_trainer.cli import main, photos
 from reference_trainer.evaluation.pictures import save_png
 from reference_trainer.report import page as page_module
 from reference_trainer.runs import warmup
-from reference_trainer.scenes import poses, synthetic_scene
+from reference_trainer.scenes import photographs, poses, synthetic_scene
 from reference_trainer.scenes.images import read_image
 
 SCENE = synthetic_scene(width=40, height=30, points=150)
@@ -45,7 +45,7 @@ def garden(tmp_path, monkeypatch):
     """Three photographs without cameras, which a stand-in for COLMAP finds; two or three steps; no calibration."""
 
     def find(scene, **rest):
-        assert sorted(path.name for path in (scene / "images").iterdir()) == [f"train_{i}.png" for i in range(3)]
+        assert sorted(path.stem for path in (scene / "images").iterdir()) == [f"train_{i}" for i in range(3)]
         write_cameras(scene, scene / "sparse" / "0")
         return "3 of 3 photographs registered"
 
@@ -113,15 +113,20 @@ def test_three_photographs_become_a_page(garden, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on(garden, tmp_path, monkeypatch, capsys):
+    with Image.open(garden / "train_2.png") as last:
+        last.save(garden / "train_2.webp", lossless=True)  # which has to be made anew
+    (garden / "train_2.png").unlink()
+
     def stop(*arguments, **named):
         raise KeyboardInterrupt
 
     out = tmp_path / "out"
-    with monkeypatch.context() as patched:
-        patched.setattr(page_module, "write_report", stop)
-        with pytest.raises(SystemExit) as ended:
-            main(["run", "garden", "--out", "out", "--no-open"])
-    assert ended.value.code == 130
+    for module, function in ((photographs, "_save"), (poses, "find_poses"), (page_module, "write_report")):
+        with monkeypatch.context() as patched:
+            patched.setattr(module, function, stop)
+            with pytest.raises(SystemExit) as ended:
+                main(["run", "garden", "--out", "out", "--no-open"])
+        assert ended.value.code == 130
     trained = seen(out)
     main(["run", "garden", "--out", "out", "--no-open"])
     new = {path.name for path, at in seen(out).items() if trained.get(path) != at}
