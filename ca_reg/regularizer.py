@@ -145,25 +145,31 @@ class Regularizer(Scheduled):
     drops: ClassVar[bool] = True
     renders_mean: bool = False
     _latest: Draw | None = None
-    _by_thread: weakref.WeakKeyDictionary[threading.Thread, Draw | None] | None = None
+    _by_thread: tuple[tuple[weakref.ref[threading.Thread], Draw | None], ...] = ()
 
     @property
     def last(self) -> Draw | None:
         """The last draw of the calling thread; that of any thread if this one has not called the module."""
-        by_thread = self._by_thread
-        return self._latest if by_thread is None else by_thread.get(threading.current_thread(), self._latest)
+        thread = weakref.ref(threading.current_thread())  # the same object for a thread
+        for caller, draw in self._by_thread:
+            if caller is thread:
+                return draw
+        return self._latest
 
     @last.setter
     def last(self, draw: Draw | None) -> None:
-        self._latest = draw
+        self._remember(draw)
+
+    def _remember(self, draw: Draw | None) -> None:
+        """Set :attr:`last`; an assignment to an attribute of a module takes longer than all of this."""
         if torch.compiler.is_compiling():
-            self._by_thread = None  # a graph knows no threads
-        else:
-            with _LOCK:
-                # A new dictionary, because a shallow copy of the module shares the old one.
-                by_thread = weakref.WeakKeyDictionary(self._by_thread or {})
-                by_thread[threading.current_thread()] = draw
-                self._by_thread = by_thread
+            self._latest, self._by_thread = draw, ()  # a graph knows no threads
+            return
+        thread = weakref.ref(threading.current_thread())
+        with _LOCK:
+            # A new tuple, because a shallow copy of the module shares the old one.
+            others = [x for x in self._by_thread if x[0] is not thread and x[0]() is not None]
+            vars(self).update(_latest=draw, _by_thread=(*others, (thread, draw)))
 
     def __getstate__(self) -> dict[str, Any]:
         # Without the draws, which may be part of the graph of a step and then cannot be copied.
@@ -204,7 +210,8 @@ class Regularizer(Scheduled):
             ValueError: if ``x`` lacks a field that the regularizer needs.
         """
         self.check_needs(x)
-        self.last = draw = self.draw(x, generator)
+        draw = self.draw(x, generator)
+        self._remember(draw)
         return self.replay(x, draw)
 
     def forward(self, x: Given, *, drawn: Draw | None = None, generator: torch.Generator | None = None) -> Given:

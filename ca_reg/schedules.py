@@ -195,7 +195,7 @@ class Scheduled(nn.Module):
         Raises a TypeError if it is no integer, a ValueError if it is negative or the schedule leaves its range there.
         """
         check_count(step, "step", minimum=0)
-        self.step = int(step)
+        vars(self)["step"] = int(step)  # an assignment to an attribute of a module takes ten times as long
         if not isinstance(self._schedule, Constant):
             # A graph reads the rate from a tensor; a number would be baked in, with a recompilation at each step.
             # A new tensor, because one created in inference mode cannot be overwritten outside it.

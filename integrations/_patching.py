@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ._calls import RasterizerCall, class_in, forward_signature
+from ._calls import RasterizerCall, Signature, class_in, forward_signature
 
 __all__ = ["AfterImport", "ClassPatch", "PatchedClasses", "is_overridden", "override"]
 
@@ -202,10 +202,12 @@ class PatchedClasses:
                 )
             function = getattr(function, "__wrapped__", None)
 
+        binder = Signature(signature)
+
         def make(forward: Callable[..., Any]) -> Callable[..., Any]:
             @functools.wraps(forward)
             def regularized_forward(*args: Any, **kwargs: Any) -> Any:
-                return self._rasterize(RasterizerCall(forward, signature.bind(*args, **kwargs)))
+                return self._rasterize(RasterizerCall(forward, binder, args, kwargs))
 
             # Graph break in a compiled render: what follows reads the local variables of the caller.
             eager: Callable[..., Any] = torch.compiler.disable(regularized_forward)  # type: ignore[no-untyped-call]
@@ -304,7 +306,7 @@ def _release(rasterizer: type) -> None:
 
 def _make(rasterizer: type) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return the function that wraps the forward of a class."""
-    signature = forward_signature(rasterizer)
+    signature = Signature(forward_signature(rasterizer))
 
     def make(forward: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(forward)
@@ -312,7 +314,7 @@ def _make(rasterizer: type) -> Callable[[Callable[..., Any]], Callable[..., Any]
             mine = _current.get()
             if mine is None or rasterizer not in mine.rasterizers:
                 return forward(*args, **kwargs)
-            call = RasterizerCall(forward, signature.bind(*args, **kwargs))
+            call = RasterizerCall(forward, signature, args, kwargs)
             given = call.arguments["opacities"]
             if given.numel() != mine.opacity.numel():
                 raise ValueError(

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from ca_reg._random import seeded
 
-from ._calls import Call, chain_of
+from ._calls import Call, Signature, chain_of
 from ._report import Hook, Tally
 
 __all__ = ["Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized"]
@@ -121,10 +121,11 @@ class Regularized:
                 "with Chain, or take its .rasterization."
             )
         self.chain = chain_of(regularizer)
-        self._signature = inspect.signature(rasterization)
-        if "opacities" not in self._signature.parameters:
+        signature = inspect.signature(rasterization)
+        if "opacities" not in signature.parameters:
             raise TypeError(f"expected gsplat.rasterization, got {rasterization!r}, which has no argument opacities.")
-        _GsplatCall.check(self.chain, self._signature)
+        _GsplatCall.check(self.chain, signature)
+        self._signature = Signature(signature)
         self.rasterization = rasterization
         self.regularizer = regularizer
         self.tally = Tally() if hook is None else hook.tally
@@ -148,7 +149,7 @@ class Regularized:
 
     def _rasterize(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, trains: bool) -> tuple[Any, ...]:
         """Rasterize in training mode if ``trains`` and gradients reach the opacities, else in evaluation mode."""
-        call = _GsplatCall(self.rasterization, self._signature.bind(*args, **kwargs))
+        call = _GsplatCall(self.rasterization, self._signature, args, kwargs)
         opacities: Tensor = call.arguments["opacities"]
         trains = trains and torch.is_grad_enabled() and opacities.requires_grad
         keep = None

@@ -28,6 +28,7 @@ from ._calls import (
     check_installed,
     hide_dropped,
     rasterizer_classes,
+    second_regularizers,
     white_alpha,
 )
 from ._patching import PatchedClasses, is_overridden, override
@@ -41,8 +42,9 @@ Scope = Literal["main", "all"]
 in the script (a batch), or all; always with the same mask."""
 
 DEFAULT_MODEL = "scene.gaussian_model:GaussianModel"
+_WORD = 2**64 - 1
 _MANY_ZEROS = 1e-3  # share of zero opacities beyond what rounding explains
-_ZEROS_EVERY = 128  # renders on a GPU after which that share is read
+_ZEROS_EVERY = 127  # renders after which they are counted; odd, as a script may drop in every second one
 
 
 class RasterizerHook(Hook):
@@ -126,6 +128,9 @@ class RasterizerHook(Hook):
             if isinstance(member, WrappedModule):
                 member.check_generator()
         check_count(seed, "seed", minimum=0)
+        self._parts = tuple(self._chain.modules())
+        self._names = second_regularizers(self._chain)
+        self._counts_zeros = self._chain.drops and not allow_zeros
         self._scope = scope
         self._seed = int(seed)
         self._rasterizer = rasterizer
@@ -133,12 +138,13 @@ class RasterizerHook(Hook):
         self._candidates = tuple(candidates) if rasterizer is None else ()
         self._models = tuple(models)
         self._viewer = viewer
-        self._allow_zeros = allow_zeros
         self._iterations = Iterations(steps, self.note_lost)
         self._patched: PatchedClasses | None = None
         self._hooked: list[str] = []  # names of the classes, for messages
-        self._zeros: Tensor | None = None  # largest share of zero opacities since it was last read
-        self._counted = 0  # renders whose zeros were counted
+        self._zeros: tuple[Tensor, torch.cuda.Event | None] | None = None  # share of zero opacities, on its way
+        self._generators: dict[tuple[int, torch.device], tuple[torch.Generator, int]] = {}
+        self._latest: Tensor | None = None  # opacities of the last regularized render
+        self._counted = 0  # renders so far that may have been counted
 
     def install(self) -> Self:
         """Wrap the rasterizers, now or once they are imported; return the hook.
@@ -189,7 +195,7 @@ class RasterizerHook(Hook):
 
     def problem(self) -> str | None:
         """Describe a failure to regularize and its remedy, as every hook does, or a second dropout; else None."""
-        return self._double_dropout() or super().problem()
+        return self._double_dropout(wait=True) or super().problem()
 
     def _explain(self) -> str:
         names = self._hooked if self._patched is None else self._patched.names
@@ -209,7 +215,7 @@ class RasterizerHook(Hook):
         site = CallSite.find()
         model = None if self._patched is None else site.find_instance(self._patched.models)
         if not torch.is_grad_enabled() or site.is_viewer(self._viewer):
-            site.refuse_a_second_regularizer(self._chain)
+            site.refuse_a_second_regularizer(self._names)
             return self._evaluate(call, self._iterations.evaluation_step(means if model is None else model))
         if not opacities.requires_grad:
             return self._leave(call, Skip.CONSTANT_OPACITY)
@@ -220,9 +226,9 @@ class RasterizerHook(Hook):
         steps = self._iterations.steps_of(model if model is not None else parameters[0] if parameters else self)
         if not steps.count_render(parameters, site.place) and self._scope == "main":
             return self._leave(call, Skip.FURTHER_VIEW)
-        site.refuse_a_second_regularizer(self._chain)
+        site.refuse_a_second_regularizer(self._names)
         del site  # holds the variables of the caller
-        if self._chain.drops and not self._allow_zeros:
+        if self._counts_zeros:
             self._count_zeros(opacities)
         return self._train(call, steps)
 
@@ -244,27 +250,54 @@ class RasterizerHook(Hook):
         """Make a call with regularized Gaussians, and hide the dropped ones from densification."""
         step = steps.training_step
         # The same seed for every render of an iteration, so that all drop the same Gaussians.
-        generator = seeded(self._seed, steps.index, step, device=call.arguments["opacities"].device)
-        self._chain.train().set_step(step)
+        generator = self._generator(steps.index, step, call.arguments["opacities"].device)
+        if False in [part.training for part in self._parts]:
+            self._chain.train()
+        self._chain.set_step(step)
         keep = call.train(self._chain, step, self.tally, generator)
         self.note_regularized()
         returned = call()
         return returned if keep is None else hide_dropped(returned, keep)
 
+    def _generator(self, model: int, step: int, device: torch.device) -> torch.Generator:
+        """Return the source of the draws of a model's step."""
+        key = model, device
+        if key not in self._generators:
+            self._generators[key] = torch.Generator(device), seeded(self._seed, model).initial_seed()
+        generator, seed = self._generators[key]
+        # The finalizer of splitmix64 (Steele, Lea and Flood 2014): numpy's seed sequences take twenty times as long.
+        x = (seed + step * 0x9E3779B97F4A7C15) & _WORD
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+            x = ((x ^ x >> shift) * factor) & _WORD
+        return generator.manual_seed((x ^ x >> 31) >> 1)
+
     def _count_zeros(self, opacities: Tensor) -> None:
-        """Note the share of Gaussians that arrive dropped; activated opacities are above 0."""
-        zeros = (opacities.detach() == 0).float().mean()
-        self._zeros = zeros if self._zeros is None else torch.maximum(self._zeros, zeros.to(self._zeros.device))
+        """Count Gaussians that arrive dropped, in the renders 1, 2, 4, 8, ..., every 127th, and the last one.
+
+        Activated opacities are above 0. A dropout of the code base's own may begin late and with a small rate
+        (DropGaussian), so the first renders are not enough. No step waits for a card: the next count reads this one.
+        """
+        self._latest = opacities.detach()
         self._counted += 1
-        # Reading it waits for the device. A dropout of the code base's own may begin late and with a small rate
-        # (DropGaussian), so the first renders are not enough.
-        due = self._counted.bit_count() == 1 or self._counted % _ZEROS_EVERY == 0
-        if (due or zeros.device.type == "cpu") and (problem := self._double_dropout()):
+        if self._counted & (self._counted - 1) and self._counted % _ZEROS_EVERY:
+            return
+        problem = self._double_dropout()
+        if self._zeros is None:
+            arrived = torch.cuda.Event() if opacities.is_cuda else None  # type: ignore[no-untyped-call]
+            self._zeros = (self._latest == 0).float().mean().to("cpu", non_blocking=True), arrived
+            if arrived is not None:
+                arrived.record(torch.cuda.current_stream(opacities.device))
+        if problem := problem or (self._double_dropout() if opacities.device.type == "cpu" else None):
             raise RuntimeError(problem)
 
-    def _double_dropout(self) -> str | None:
-        """Describe a dropout of the code base's own, if too many opacities were 0 since the last call; else None."""
-        share, self._zeros = 0.0 if self._zeros is None else float(self._zeros), None
+    def _double_dropout(self, *, wait: bool = False) -> str | None:
+        """Describe a dropout of the code base's own, if too many opacities were 0 when last counted; else None."""
+        share = 0.0
+        counted, arrived = self._zeros or (None, None)
+        if counted is not None and (arrived is None or arrived.query()):  # type: ignore[no-untyped-call]
+            share, self._zeros = float(counted), None
+        if wait and self._latest is not None:
+            share = max(share, float((self._latest == 0).float().mean()))
         if share <= _MANY_ZEROS:
             return None
         return (

@@ -9,7 +9,7 @@ from stand_ins.gsplat import intrinsics, rasterization
 from stand_ins.inria import PIPE, Model, make_render, settings_of
 
 from ca_reg import Chain, Draw, IndependentDropout, Params, Regularizer
-from ca_reg.integrations._calls import RasterizerCall, forward_signature
+from ca_reg.integrations._calls import RasterizerCall, Signature, forward_signature
 from ca_reg.integrations.gsplat import regularized
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.regularizer import Learned
@@ -162,8 +162,9 @@ def test_every_field_reaches_the_rasterizer_changed(split):
     given = {"means3D": torch.rand(5, 3), "scales": torch.rand(5, 3), "rotations": torch.rand(5, 4)}
     sh = torch.rand(5, 4, 3)
     shs = {"dc": sh[:, :1], "shs": sh[:, 1:]} if split else {"shs": sh}
-    bound = forward_signature(kind).bind(kind(), means2D=None, opacities=torch.rand(5, 1), **given, **shs)
-    call, chain = RasterizerCall(kind.forward, bound), Chain(Move())
+    arguments = {"means2D": None, "opacities": torch.rand(5, 1), **given, **shs}
+    call = RasterizerCall(kind.forward, Signature(forward_signature(kind)), [kind()], arguments)
+    chain = Chain(Move())
     before = call.params(chain, 3)
     assert call._replace(before, chain(before))
     for factor, (was, now) in enumerate(zip([*given.values(), sh], call(), strict=True), start=2):
@@ -180,8 +181,8 @@ def test_a_regularizer_of_opacities_touches_nothing_else():
 
     other = Untouchable()
     rasterizer = type("GaussianRasterizer", (), {"forward": forward})
-    bound = forward_signature(rasterizer).bind(other, other, other, torch.rand(5, 1), other, other, other)
-    call = RasterizerCall(forward, bound)
+    arguments = other, other, other, torch.rand(5, 1), other, other, other
+    call = RasterizerCall(forward, Signature(forward_signature(rasterizer)), arguments, {})
     assert call.params(Chain(IndependentDropout()), 3)[1:] == (None,) * 6 + (3,)
 
 

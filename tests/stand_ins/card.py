@@ -190,7 +190,7 @@ def _compute(op: Any, *args: Any, **kwargs: Any) -> Any:
     name, device = op._schema.name, kwargs.get("device")
     leaves = pytree.tree_leaves((args, kwargs))
     ours = [x for x in leaves if isinstance(x, CardTensor)]
-    _check(name, args, leaves, ours, CARD if device is None else device)
+    _check(name, args, kwargs, leaves, ours)
     if device is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
     inner = pytree.tree_map(_numbers, args)
@@ -207,12 +207,13 @@ def _compute(op: Any, *args: Any, **kwargs: Any) -> Any:
     return return_and_correct_aliasing(op, args, kwargs, out) if ours else out
 
 
-def _check(name: str, args: Sequence[Any], leaves: Sequence[Any], ours: Sequence[Tensor], device: Any) -> None:
+def _check(name: str, args: Sequence[Any], kwargs: Any, leaves: Sequence[Any], ours: Sequence[Tensor]) -> None:
     """Refuse what CUDA would refuse."""
+    device = kwargs.get("device") or CARD
     for x in leaves:
         if isinstance(x, torch._C.Generator):
             check_generator(_generators.get(x._cdata, torch.device("cpu")), torch.device(device))
-    if ours and (name in SYNCHRONIZES or _leaves(name, args, device) or _indexes_by_mask(name, args)):
+    if ours and (name in SYNCHRONIZES or _leaves(name, args, kwargs) or _indexes_by_mask(name, args)):
         _count(name)
     if ours:
         check_supported(name, ours)
@@ -226,11 +227,15 @@ def _count(name: str) -> None:
         found[name] += 1
 
 
-def _leaves(name: str, args: Sequence[Any], device: Any) -> bool:
-    """Whether this is a copy from the card to the processor."""
+def _leaves(name: str, args: Sequence[Any], kwargs: Any) -> bool:
+    """Whether this is a copy from the card to the processor that the host waits for.
+
+    A tensor that PyTorch makes for a copy with ``non_blocking`` is pinned, and nothing waits for it.
+    """
     if name == "aten::copy_":
         return not isinstance(args[0], CardTensor)
-    return name == "aten::_to_copy" and not _is_card(device)
+    device = kwargs.get("device")
+    return name == "aten::_to_copy" and not kwargs.get("non_blocking") and device is not None and not _is_card(device)
 
 
 def _indexes_by_mask(name: str, args: Sequence[Any]) -> bool:

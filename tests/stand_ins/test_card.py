@@ -78,6 +78,7 @@ def test_eigenvalues_are_there_for_batches_that_cusolver_takes(card):
         (lambda x: x.tolist(), 1),
         (lambda x: x.cpu(), 1),
         (lambda x: torch.ones(3).copy_(x), 1),
+        (lambda x: x.to("cpu", non_blocking=True), 0),
         (lambda x: x.nonzero(), 1),
         (lambda x: x[x > 0], 1),
         (lambda x: x.unique(), 1),
