@@ -14,7 +14,7 @@ def graph() -> Graph:
 
 def test_the_modules_are_read(graph):
     """Guards the tests below, which an empty graph would pass: one import of each kind is found."""
-    assert "reference_trainer.render.numba.engine" in graph["reference_trainer.render.engine"]  # within a function
+    assert "reference_trainer.runs.measure" in graph["reference_trainer.cli.models"]  # within a function
     assert "ca_reg.schedules" in graph["ca_reg.regularizer"]
     assert "ca_reg.integrations._report" in graph["ca_reg.integrations.run"]  # relative
     assert {x for floor in FLOORS for x in floor} >= set(rooms(graph)) - {""}

@@ -42,4 +42,8 @@ BLOCK_PAIRS_CPU: Final = 1 << 19
 """Pixel-Gaussian pairs that the torch engine holds at once on a CPU: temporaries of 2 MiB."""
 
 BLOCK_PAIRS_CUDA: Final = 1 << 25
-"""The same on a GPU: temporaries of 128 MiB keep it busy and the number of launches low."""
+"""The same on a GPU, at most: temporaries of 128 MiB keep it busy and the number of launches low."""
+
+BYTES_PER_PAIR_CUDA: Final = 1024
+"""And one for so many bytes that the card has: a pair takes up to 215 bytes, of shares, so a fifth
+of them. Of all its memory, not of what is free, so that a training repeats itself to the bit."""

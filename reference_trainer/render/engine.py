@@ -9,11 +9,13 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
+from typing import Any
 from unittest.mock import patch
 
 import torch
+from torch import Tensor
 
-from reference_trainer.render.splats import Engine
+from reference_trainer.render.splats import Engine, Splats
 from reference_trainer.render.torch.engine import TorchEngine
 
 __all__ = [
@@ -51,9 +53,9 @@ def use_engine(name: str) -> None:
         >>> use_engine("auto")
     """
     _check_name(name, "there is no engine {name!r}")
-    if name == "numba" and _numba_engine() is None:
+    if name == "numba" and _compiled_engine("numba") is None:
         raise ImportError("the engine numba needs numba: pip install 'ca_reg[trainer]', or use the engine torch.")
-    if name == "triton" and _triton_engine() is None:
+    if name == "triton" and _compiled_engine("triton") is None:
         raise ImportError("the engine triton needs Triton: pip install triton (Linux), or use the engine torch.")
     os.environ[_VARIABLE] = name
 
@@ -87,15 +89,15 @@ def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engi
     if chosen == "torch" or dtype != torch.float32:
         return _TORCH
     if _runs_triton(device, chosen):
-        return _triton_engine() or _TORCH
-    return (_numba_engine() if device.type == "cpu" else None) or _TORCH
+        return _compiled_engine("triton") or _TORCH
+    return (_compiled_engine("numba") if device.type == "cpu" else None) or _TORCH
 
 
 def engines_on(device: torch.device) -> tuple[str, ...]:
     """Return the engines that render float32 on a device; "numba" only on a CPU, "triton" on a card."""
-    if _runs_triton(device, "auto") and _triton_engine() is not None:
+    if _runs_triton(device, "auto") and _compiled_engine("triton") is not None:
         return ("triton", "torch")
-    return ("numba", "torch") if device.type == "cpu" and _numba_engine() is not None else ("torch",)
+    return ("numba", "torch") if device.type == "cpu" and _compiled_engine("numba") is not None else ("torch",)
 
 
 @contextmanager
@@ -124,17 +126,48 @@ def describe_engine(device: torch.device | str) -> str:
     return f"numba ({version('numba')}, {count} thread{'s' if count > 1 else ''})"
 
 
+class _CompiledEngine:
+    """The functions of one package, compiled for float32; see `Engine`.
+
+    Numba's loops give the same bits for any number of threads. The gradients of Triton's kernels are sums by atomics,
+    or in one order where PyTorch is asked for deterministic ones.
+    """
+
+    project: Any
+    bin: Any
+    composite: Any
+    composite_masks: Any
+    absolute_gradients: Any
+    moments: Any
+    shares: Any
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        for module, functions in {
+            "projection": ("project",),
+            "binning": ("bin",),
+            "compositing": ("composite", "composite_masks", "absolute_gradients"),
+            "moments": ("moments", "shares"),
+        }.items():
+            found = importlib.import_module(f"reference_trainer.render.{name}.{module}")
+            for function in functions:
+                setattr(self, function, getattr(found, {"bin": "bin_gaussians"}.get(function, function)))
+
+    def masked(self, splats: Splats, opacities: Tensor) -> Splats:
+        """Keep the lists: what is too faint is skipped."""
+        return splats._replace(opacities=opacities)
+
+
 @functools.cache
-def _numba_engine() -> Engine | None:
-    """Return the engine of compiled loops, or None if numba is missing or does not work."""
-    if importlib.util.find_spec("numba") is None:
+def _compiled_engine(name: str) -> Engine | None:
+    """Return the engine numba or triton, or None if that package is missing or does not work."""
+    if importlib.util.find_spec(name) is None:
         return None
     try:
-        from reference_trainer.render.numba.engine import NumbaEngine
-    except ImportError as error:  # such as a NumPy that is too new for it
-        warnings.warn(f"numba is installed but cannot be imported ({error}): the engine torch renders.", stacklevel=2)
+        return _CompiledEngine(name)
+    except ImportError as error:  # such as a NumPy that is too new for numba
+        warnings.warn(f"{name} is installed but cannot be imported ({error}): the engine torch renders.", stacklevel=2)
         return None
-    return NumbaEngine()
 
 
 def _runs_triton(device: torch.device, chosen: str) -> bool:
@@ -145,16 +178,3 @@ def _runs_triton(device: torch.device, chosen: str) -> bool:
         return False
     known = torch.cuda.is_available() and torch.version.hip is None
     return not known or torch.cuda.get_device_capability(device) >= (7, 5)
-
-
-@functools.cache
-def _triton_engine() -> Engine | None:
-    """Return the engine of Triton kernels, or None if Triton is missing or does not work."""
-    if importlib.util.find_spec("triton") is None:
-        return None
-    try:
-        from reference_trainer.render.triton.engine import TritonEngine
-    except ImportError as error:
-        warnings.warn(f"triton is installed but cannot be imported ({error}): the engine torch renders.", stacklevel=2)
-        return None
-    return TritonEngine()

@@ -20,6 +20,7 @@ from torch.autograd.function import once_differentiable
 from reference_trainer.render.constants import (
     BLOCK_PAIRS_CPU,
     BLOCK_PAIRS_CUDA,
+    BYTES_PER_PAIR_CUDA,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_TRANSMITTANCE,
@@ -28,8 +29,8 @@ from reference_trainer.render.constants import (
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
-    "PIXELS", "Block", "blend_weights", "blocks", "composite", "first_order", "geometry_rows", "moments", "over",
-    "pad_entries", "pixel_offsets", "tile", "untile", "walk",
+    "PIXELS", "Block", "blend_weights", "block_pairs", "blocks", "composite", "first_order", "geometry_rows", "moments",
+    "over", "pad_entries", "pixel_offsets", "tile", "untile", "walk",
 ]  # fmt: skip
 
 PIXELS = TILE * TILE
@@ -90,9 +91,16 @@ def geometry_rows(splats: Splats) -> Tensor:
     return torch.cat([means.T, factors.T, torch.log2(opacities)[None]])
 
 
+def block_pairs(device: torch.device) -> int:
+    """Return how many pixel-Gaussian pairs a device holds at once."""
+    if device.type != "cuda":
+        return BLOCK_PAIRS_CPU if device.type == "cpu" else BLOCK_PAIRS_CUDA
+    return min(BLOCK_PAIRS_CUDA, torch.cuda.get_device_properties(device).total_memory // BYTES_PER_PAIR_CUDA)
+
+
 def blocks(lists: TileLists, device: torch.device) -> Iterator[Block]:
     """Yield blocks of all tiles with a list; one that is too long gets a block of its own."""
-    pairs = BLOCK_PAIRS_CPU if device.type == "cpu" else BLOCK_PAIRS_CUDA
+    pairs = block_pairs(device)
     lengths, tiles = torch.sort(lists.lengths, descending=True, stable=True)
     sizes = lengths.cpu().tolist()
     end = next((i for i, n in enumerate(sizes) if n == 0), len(sizes))

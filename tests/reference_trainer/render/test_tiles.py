@@ -100,3 +100,12 @@ def test_blocks_hold_every_list_once_whatever_their_size(budget, monkeypatch):
     assert found == {
         tile: lists.gaussians[a:b].tolist() for tile, (a, b) in enumerate(itertools.pairwise(starts)) if b > a
     }
+
+
+@pytest.mark.parametrize(("gibibytes", "pairs"), [(80, 1 << 25), (8, 1 << 23)])
+def test_blocks_take_a_fraction_of_what_a_card_has(gibibytes, pairs, monkeypatch):
+    class Properties:
+        total_memory = gibibytes << 30
+
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: Properties)
+    assert compositing.block_pairs(torch.device("cuda")) == pairs

@@ -215,7 +215,7 @@ def test_every_engine_draws_its_own_moments(scene, monkeypatch):
 
 
 def test_where_there_are_no_loops_torch_alone_is_measured(scene, monkeypatch):
-    monkeypatch.setattr("reference_trainer.render.engine._numba_engine", lambda: None)
+    monkeypatch.setattr("reference_trainer.render.engine._compiled_engine", lambda name: None)
     measured = error_runtime(*scene, max_samples=16, seeds=1)
     assert [m["name"] for m in measured["estimators"][-3:]] == [FIRST_ORDER, TORCH, DOUBLE]
     assert single(measured) is entry(measured, TORCH)
