@@ -3,6 +3,7 @@
     python -m benchmarks.gpu          # everything that this machine can do; what fails is named, and the rest goes on
     python -m benchmarks.gpu ahead    # without a card: all kernels compiled for all targets (or for those named)
     python -m benchmarks.gpu count    # without a card: operations, read-backs and bytes of an exact score
+    python -m benchmarks.gpu lists    # without a card: operations and bytes of the exact moments of per-pixel lists
 
 ``count`` runs the kernels in Triton's interpreter where there is no card.
 """
@@ -447,9 +448,9 @@ def _agreement() -> str:
 
 def main(arguments: list[str]) -> int:
     """Print one section, or all that this machine can do; return the number of those that failed."""
-    alone: dict[str, Callable[[], str]] = {"ahead": partial(_ahead, arguments[1:]), "count": _count}
+    alone: dict[str, Callable[[], str]] = {"ahead": partial(_ahead, arguments[1:]), "count": _count, "lists": _lists}
     if arguments and arguments[0] not in alone:
-        print(f"there is no {arguments[0]!r}: give ahead, count, or nothing.", file=sys.stderr)
+        print(f"there is no {arguments[0]!r}: give ahead, count, lists, or nothing.", file=sys.stderr)
         return 2
     if arguments:
         sections = {arguments[0]: alone[arguments[0]]}
@@ -458,7 +459,9 @@ def main(arguments: list[str]) -> int:
         print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}, {describe_engine('cuda')}\n")
     else:
         sections = alone
-        print("No card: what follows was compiled, or interpreted on a processor. Nothing here ran on a card.\n")
+        print(
+            "No card, so no agreement, times and tests on one: what follows was compiled, or interpreted on a processor.\n"
+        )
     failed = 0
     for name, section in sections.items():
         begun = time.perf_counter()

@@ -35,6 +35,13 @@ def _pass(alpha, t):
     return tl.where(goes_on, alpha * t, 0.0), tl.where(goes_on, rest, -tl.abs(t))
 
 
+@triton.jit
+def _store_over(image, place, size, inside, r, g, b, t, background):
+    """Store colors over a background (3,), of which t shows."""
+    r, g = r + t * tl.load(background), g + t * tl.load(background + 1)
+    tiles.store3(image, place, size, inside, r, g, b + t * tl.load(background + 2))
+
+
 @triton.jit(do_not_specialize=["width", "height", "columns"])
 def composite_forward(
     table, starts, gaussians, background, image, alpha, width, height,
@@ -61,9 +68,7 @@ def composite_forward(
         begin += _CHUNK
     t, size = tl.abs(t), width * height
     tl.store(alpha + place, 1 - t, mask=inside)
-    tl.store(image + place, r + t * tl.load(background), mask=inside)
-    tl.store(image + size + place, g + t * tl.load(background + 1), mask=inside)
-    tl.store(image + 2 * size + place, b + t * tl.load(background + 2), mask=inside)
+    _store_over(image, place, size, inside, r, g, b, t, background)
     if DEPTH:
         tl.store(image + 3 * size + place, d, mask=inside)
 
@@ -87,13 +92,9 @@ def composite_backward(
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
     size = width * height
     u_a = tl.load(to_alpha + place, mask=inside, other=0.0)
-    u_r = tl.load(to_image + place, mask=inside, other=0.0)
-    u_g = tl.load(to_image + size + place, mask=inside, other=0.0)
-    u_b = tl.load(to_image + 2 * size + place, mask=inside, other=0.0)
-    beyond = u_a * tl.load(alpha + place, mask=inside, other=0.0)
-    beyond += u_r * tl.load(image + place, mask=inside, other=0.0)
-    beyond += u_g * tl.load(image + size + place, mask=inside, other=0.0)
-    beyond += u_b * tl.load(image + 2 * size + place, mask=inside, other=0.0)
+    u_r, u_g, u_b = tiles.load3(to_image, place, size, inside)
+    r, g, b = tiles.load3(image, place, size, inside)
+    beyond = u_a * tl.load(alpha + place, mask=inside, other=0.0) + u_r * r + u_g * g + u_b * b
     u_d = tl.zeros_like(u_a)
     if DEPTH:
         u_d = tl.load(to_image + 3 * size + place, mask=inside, other=0.0)
@@ -166,9 +167,7 @@ def composite_masked(
     at = which.to(tl.int64)[:, None] * size + place[None, :]
     tl.store(alphas + at, 1 - t, mask=shown)
     at += which.to(tl.int64)[:, None] * (2 * size)  # three channels each
-    tl.store(images + at, r + t * tl.load(background), mask=shown)
-    tl.store(images + size + at, g + t * tl.load(background + 1), mask=shown)
-    tl.store(images + 2 * size + at, b + t * tl.load(background + 2), mask=shown)
+    _store_over(images, at, size, shown, r, g, b, t, background)
 
 
 class _Composite(torch.autograd.Function):

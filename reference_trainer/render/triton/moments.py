@@ -38,22 +38,6 @@ def _random(row, raw, MAX: tl.constexpr):
     return alpha, expected, spread, passed, passed * passed + spread
 
 
-@triton.jit
-def _load3(image, place, size, inside):
-    """Return the three channels of an image at the pixels."""
-    r = tl.load(image + place, mask=inside, other=0.0)
-    g = tl.load(image + size + place, mask=inside, other=0.0)
-    return r, g, tl.load(image + 2 * size + place, mask=inside, other=0.0)
-
-
-@triton.jit
-def _store3(image, place, size, inside, r, g, b):
-    """Store the three channels of an image at the pixels."""
-    tl.store(image + place, r, mask=inside)
-    tl.store(image + size + place, g, mask=inside)
-    tl.store(image + 2 * size + place, b, mask=inside)
-
-
 @triton.jit(do_not_specialize=["width", "height", "columns"])
 def moments_forward(
     table, starts, gaussians, background, mean, variance, alpha, width, height,
@@ -63,7 +47,7 @@ def moments_forward(
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
     size = width * height
-    m0, m1, m2 = _load3(background, place, size, inside)
+    m0, m1, m2 = tiles.load3(background, place, size, inside)
     v0, v1, v2, t = tl.zeros_like(m0), tl.zeros_like(m0), tl.zeros_like(m0), tl.zeros_like(m0) + 1
     begin, e = tl.load(starts + tile), tl.load(starts + tile + 1) - 1
     while e >= begin:
@@ -78,8 +62,8 @@ def moments_forward(
             t *= passed
         e -= 1
     tl.store(alpha + place, 1 - t, mask=inside)
-    _store3(mean, place, size, inside, m0, m1, m2)
-    _store3(variance, place, size, inside, v0, v1, v2)
+    tiles.store3(mean, place, size, inside, m0, m1, m2)
+    tiles.store3(variance, place, size, inside, v0, v1, v2)
 
 
 @triton.jit
@@ -150,9 +134,9 @@ def moments_backward(
     size = width * height
     for tile in range(program, count, tl.num_programs(0)):
         x, y, place, inside = pixels(tile, width, height, columns, TILE)
-        of_variance = _load3(images + 3 * size, place, size, inside)
+        of_variance = tiles.load3(images + 3 * size, place, size, inside)
         U0, U1, U2 = of_variance
-        m0, m1, m2 = _load3(images + 7 * size, place, size, inside)
+        m0, m1, m2 = tiles.load3(images + 7 * size, place, size, inside)
         state = m0, m1, m2, tl.zeros_like(m0), tl.zeros_like(m0) + 1
         begin, end = tl.load(starts + tile), tl.load(starts + tile + 1)
         # Floor and one more per tile: no two tiles share a checkpoint, wherever their lists begin.
@@ -165,7 +149,7 @@ def moments_backward(
             last = tl.minimum(first + _CHUNK, end)
             state = _behind_chunk(state, table, gaussians, first, last, x, y, of_variance, kept, STRIDE, MAX, False)
             chunk -= 1
-        u0, u1, u2 = _load3(images, place, size, inside)
+        u0, u1, u2 = tiles.load3(images, place, size, inside)
         u_a = tl.load(images + 6 * size + place, mask=inside, other=0.0)
         front = tl.zeros_like(u_a) + 1
         for chunk in range(0, chunks):
@@ -197,7 +181,7 @@ def moments_backward(
                     to_m, to_v = tl.sum(to_expected * alpha), tl.sum(to_spread * alpha * alpha)
                     gradients = make_row((g0, g1, g2, g3), (g4, g5, to_r, to_g), (to_b, to_m, to_v, share))
                     add_row(rows, gradients, e, i, 12, EACH)
-        _store3(images, place, size, inside, u0, u1, u2)
+        tiles.store3(images, place, size, inside, u0, u1, u2)
 
 
 def moments_of(table: Tensor, lists: Lists, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -20,8 +20,8 @@ from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
-    "FAINT", "LAUNCHED", "ROW", "Lists", "add_row", "alpha_at", "geometry_sums", "gradient_rows", "launch", "make_row",
-    "make_table", "over_tiles", "pixels", "sum_rows",
+    "FAINT", "LAUNCHED", "ROW", "Lists", "add_row", "alpha_at", "geometry_sums", "gradient_rows", "launch", "load3",
+    "make_row", "make_table", "over_tiles", "pixels", "store3", "sum_rows",
 ]  # fmt: skip
 
 ROW = tl.constexpr(16)
@@ -115,6 +115,22 @@ def pixels(tile, width, height, columns, TILE: tl.constexpr):
     x = tile % columns * TILE + p % TILE
     y = tile // columns * TILE + p // TILE
     return x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5, y * width + x, (x < width) & (y < height)
+
+
+@triton.jit
+def load3(image, place, size, inside):
+    """Return the three channels of an image at the pixels."""
+    r = tl.load(image + place, mask=inside, other=0.0)
+    g = tl.load(image + size + place, mask=inside, other=0.0)
+    return r, g, tl.load(image + 2 * size + place, mask=inside, other=0.0)
+
+
+@triton.jit
+def store3(image, place, size, inside, r, g, b):
+    """Store the three channels of an image at the pixels."""
+    tl.store(image + place, r, mask=inside)
+    tl.store(image + size + place, g, mask=inside)
+    tl.store(image + 2 * size + place, b, mask=inside)
 
 
 @triton.jit
