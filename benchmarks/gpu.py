@@ -459,9 +459,7 @@ def main(arguments: list[str]) -> int:
         print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}, {describe_engine('cuda')}\n")
     else:
         sections = alone
-        print(
-            "No card, so no agreement, times and tests on one: what follows was compiled, or interpreted on a processor.\n"
-        )
+        print("No card, so no agreement, times and tests on one: what follows was compiled or interpreted.\n")
     failed = 0
     for name, section in sections.items():
         begun = time.perf_counter()
