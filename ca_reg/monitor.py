@@ -25,10 +25,10 @@ from ca_reg.functional import scale_opacity
 from ca_reg.regularizer import Params
 from ca_reg.result import new_axes, summarize
 from ca_reg.score import CAScore
+from ca_reg.sinks import Sink, Sinks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from torch.utils.tensorboard import SummaryWriter
 
 __all__ = ["LOG_NAME", "CAMonitor", "plot_dynamics", "read_dynamics", "read_log"]
 
@@ -43,8 +43,9 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
 
     Each measurement becomes one line of ``ca.jsonl``, on disk when the call returns: ``step``, ``gaussians``, the
     settings of the score, and for each group of views ``ca/<group>``, ``ca_std_error/<group>``, ``ca_reason/<group>``,
-    ``ca_empty_views/<group>`` and ``psnr/<group>``; null is a missing value. Where tensorboard is installed,
-    ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` become scalars as well. :func:`plot_dynamics` plots the file.
+    ``ca_empty_views/<group>`` and ``psnr/<group>``; null is a missing value. Where tensorboard is installed, and in
+    the ``sinks``, ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` become scalars as well. :func:`plot_dynamics`
+    plots the file.
 
     As long as the number of Gaussians stays the same, every measurement of a view uses the same masks: sampling noise
     does not disturb the comparison of steps.
@@ -59,12 +60,13 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
             by ``1 - p`` for test time. Called without gradients. None leaves PSNR out.
         details: ``details(opacity, view)`` returns, by name, what TensorBoard shows of the first view of each group
             besides the curves: images (3, H, W) in [0, 1], and numbers (N,) as histograms. Called without gradients.
+        sinks: where the same goes besides TensorBoard, such as :class:`ca_reg.sinks.WandbSink`; closed at the end.
         resume_step: None for a new run, which replaces an existing log; else the step of the checkpoint, after which
             the lines of the log are dropped.
 
     Attributes:
-        backends: ``("jsonl",)`` or ``("jsonl", "tensorboard")``.
-        writer: of the TensorBoard events, for curves of one's own; None where TensorBoard is not installed.
+        backends: ``("jsonl",)`` or ``("jsonl", "tensorboard")``, and the classes of the sinks.
+        writer: of TensorBoard and all sinks, for curves of one's own; None where there is neither.
 
     Raises:
         TypeError: if ``views`` is not a mapping or an argument is of the wrong type.
@@ -93,6 +95,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         last_step: int | None = None,
         psnr: Callable[[Tensor, Any], float] | None = None,
         details: Callable[[Tensor, Any], Mapping[str, Tensor]] | None = None,
+        sinks: Sequence[Sink] = (),
         resume_step: int | None = None,
     ) -> None:
         check_count(every, "every", minimum=1)
@@ -123,12 +126,13 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         try:
             self._logged = _keep_lines(self.path, resume_step)
             self._file = self.path.open("ab", buffering=0)
-            self.writer = _summary_writer(folder, resume_step)
+            board = _summary_writer(folder, resume_step)
         except BaseException:
             self._unlock()
             raise
-        self.backends: tuple[str, ...] = ("jsonl",) if self.writer is None else ("jsonl", "tensorboard")
-        hint = "" if self.writer else "; for TensorBoard: pip install 'ca_reg[tensorboard]'"
+        self.writer = Sinks([*board, *sinks]) if board or sinks else None
+        self.backends = ("jsonl", *["tensorboard"] * len(board), *(type(sink).__name__ for sink in sinks))
+        hint = "" if board else "; for TensorBoard: pip install 'ca_reg[tensorboard]'"
         _log.info("co-adaptation is logged to %s (%s)%s", self.path, ", ".join(self.backends), hint)
 
     def __call__(self, step: int, opacity: Tensor | Params) -> dict[str, float | int | str | None] | None:
@@ -187,7 +191,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
     @torch.no_grad()
     def _show(
         self,
-        writer: SummaryWriter,
+        writer: Sinks,
         details: Callable[[Tensor, Any], Mapping[str, Tensor]],
         opacity: Tensor,
         step: int,
@@ -270,14 +274,14 @@ def _keep_lines(path: Path, resume_step: int | None) -> int:
     return max((step for _, step in kept), default=-1)
 
 
-def _summary_writer(folder: Path, resume_step: int | None) -> SummaryWriter | None:
-    """Return a TensorBoard writer, or None where tensorboard is not installed."""
+def _summary_writer(folder: Path, resume_step: int | None) -> list[Sink]:
+    """Return a TensorBoard writer, none where tensorboard is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        return None
+        return []
     # Hides what the earlier run wrote beyond the checkpoint; for a new run, all of it.
-    return SummaryWriter(str(folder), purge_step=0 if resume_step is None else resume_step + 1)
+    return [SummaryWriter(str(folder), purge_step=0 if resume_step is None else resume_step + 1)]
 
 
 def read_log(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -124,6 +124,8 @@ class Train:
     monitor_pictures: Literal["auto", "on", "off"] = "auto"
     """Show TensorBoard render, error, exact CA map and shares of the first view of each split as well; "auto": where
     that costs less than 2 % of the time, with at least 400 steps between measurements."""
+    log_to: tuple[Literal["wandb", "mlflow"], ...] = ()
+    """Where curves and pictures go besides TensorBoard, as these are set up on this machine."""
     lpips: Lpips = None
     viewer: Annotated[tuple[()] | tuple[int] | None, tyro.conf.arg(metavar="[PORT]")] = None
     """Show the model in a browser while it trains, by default at port 8080; needs ca_reg[viewer]."""
@@ -148,7 +150,7 @@ class Train:
 
         between = min(self.monitor_every, self.config.iterations)
         pictures = between >= PICTURES_FROM if self.monitor_pictures == "auto" else self.monitor_pictures == "on"
-        monitoring = Monitoring(self.monitor_every, pictures=pictures)
+        monitoring = Monitoring(self.monitor_every, pictures=pictures, sinks=self.log_to)
         with ExitStack() as stack:
             watched: dict[str, Any] = {}
             if self.viewer is not None:

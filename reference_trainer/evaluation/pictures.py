@@ -286,6 +286,6 @@ def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split:
         split: of the view, such as ``"test"``.
     """
     panels = [read_image(folder / "views" / split / f"{view}{PANEL}.png")[0] for folder in runs.values()]
-    widest = max(panel.shape[2] for panel in panels)  # long labels widen the panels of narrow pictures
-    panels = [pad(panel, (0, widest - panel.shape[2]), value=1.0) for panel in panels]
+    height, width = (max(panel.shape[axis] for panel in panels) for axis in (1, 2))  # labels differ, and versions
+    panels = [pad(panel, (0, width - panel.shape[2], 0, height - panel.shape[1]), value=1.0) for panel in panels]
     save_png(path, side_by_side(panels, [*map(readable, runs)], columns=1))

@@ -37,7 +37,7 @@ function drawChart({ key, title, box }) {
     svg("line", { x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value), class: "rule" }),
     svg("text", { x: LEFT - 5, y: y(value) + 4, "text-anchor": "end" }, value));
   for (const step of ticks(x0, x1, width / 90))
-    box.append(svg("text", { x: x(step), y: HEIGHT - 18, "text-anchor": "middle" }, step.toLocaleString("en")));
+    box.append(svg("text", { x: x(step), y: HEIGHT - 18, "text-anchor": x(step) > width - 25 ? "end" : "middle" }, step.toLocaleString("en")));
   const edge = LEFT - 3, inner = width - LEFT - RIGHT + 6; // an inner picture cuts what is out of the range
   const lines = svg("svg", { x: edge, width: inner, height: HEIGHT, viewBox: `${edge} 0 ${inner} ${HEIGHT}` });
   for (const { run, group, step, [key]: values } of curves) {

@@ -10,12 +10,13 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from ca_reg import CAMonitor
+from ca_reg.sinks import MLflowSink, WandbSink
 from reference_trainer.evaluation.evaluate import evaluate, training_snapshot
 from reference_trainer.evaluation.lpips import LPIPS, load_lpips
 from reference_trainer.evaluation.metrics import psnr
@@ -52,8 +53,9 @@ from reference_trainer.training.interruption import TrainingInterrupted, Trainin
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.trainer import Trainer
 
-__all__ = ["Monitoring", "load_run", "model_of", "run_experiment", "save_for_viewers"]
+__all__ = ["Monitoring", "SinkName", "load_run", "model_of", "run_experiment", "save_for_viewers"]
 
+SinkName = Literal["wandb", "mlflow"]
 _log = logging.getLogger(__name__)
 _CURVES_EVERY = 10  # steps between points of the loss; more would not be told apart in a curve
 
@@ -67,6 +69,7 @@ class Monitoring:
         protocol: whether to log the paper's CA of five renders in the place of the exact score of all tables.
         pictures: whether each measurement also logs the ``details`` of `CAMonitor` (see `training_snapshot`).
         checkpoint_every: steps between checkpoints, the most that a dead worker costs.
+        sinks: where measurements and curves go besides TensorBoard: ``"wandb"``, ``"mlflow"``.
 
     Raises:
         ValueError: if an interval is out of range.
@@ -76,6 +79,7 @@ class Monitoring:
     protocol: bool = False
     pictures: bool = False
     checkpoint_every: int = 500
+    sinks: tuple[SinkName, ...] = ()
 
     def __post_init__(self) -> None:
         if self.every < 0 or self.checkpoint_every < 1:
@@ -285,6 +289,10 @@ def _train(
             last_step=last,
             psnr=quality,
             details=details if monitoring.pictures else None,
+            sinks=[
+                WandbSink(project="ca_reg", name=out.name) if name == "wandb" else MLflowSink()
+                for name in monitoring.sinks
+            ],
             resume_step=trainer.step if resumed else None,
         )
     with monitored as monitor:
@@ -308,7 +316,7 @@ def _train(
 
 
 def _write_settings(monitor: CAMonitor, trainer: Trainer) -> None:
-    """Show TensorBoard what is trained: the settings that are not at their default."""
+    """Show in TensorBoard and the sinks what is trained: the settings that are not at their default."""
     if monitor.writer is not None:
         usual = vars(TrainConfig())
         chosen = {name: value for name, value in vars(trainer.config).items() if value != usual[name]}
@@ -317,7 +325,7 @@ def _write_settings(monitor: CAMonitor, trainer: Trainer) -> None:
 
 
 def _write_curves(monitor: CAMonitor, trainer: Trainer) -> None:
-    """Show TensorBoard the loss of the step and the rates that change."""
+    """Show in TensorBoard and the sinks the loss of the step and the rates that change."""
     if monitor.writer is not None and trainer.step % _CURVES_EVERY == 0:
         rate = trainer.config.means_rate_at(trainer.step - 1) * trainer.scene.extent
         shown = {"loss": trainer.loss, "learning rate/means": rate, "dropout rate": model_of(trainer).dropout}
