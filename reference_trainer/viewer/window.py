@@ -345,7 +345,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             frustum = scene.add_camera_frustum(
                 f"/cameras/{number}", pose["fov"], camera.width / camera.height, scale=size,
                 thickness=0.02 * size, color=(230, 90, 30) if name.startswith("train") else (60, 120, 220),
-                wxyz=turned.data.numpy(), position=pose["position"],
+                wxyz=turned.data.numpy(), position=pose["position"], visible=number > 0,
             )  # fmt: skip
             frustum.on_click(lambda event, pose=pose: self._jump(event.client, pose))
             self._frusta.append((pose["position"], frustum))
