@@ -86,9 +86,9 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Render a run's views as PNG, or a flight also as a movie.
+    """Render a run's views as PNG, or a flight also as a film.
 
-    The movie is an MP4 with ca_reg[photos], else an animated WebP.
+    The film is an MP4 with ca_reg[photos], else an animated WebP.
     """
 
     run: Annotated[Path, tyro.conf.Positional]

@@ -239,7 +239,7 @@ class Run:
             write_report([self.folder], device=self.device)
         print_table(summary(read_results(self.folder)))
         out = shlex.quote(str(self.folder))
-        print(f"The page is {page}. Live: ca-reg view {out}; a movie: ca-reg render {out} --what flight")
+        print(f"The page is {page}. Live: ca-reg view {out}; a film: ca-reg render {out} --what flight")
         screen = not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
         if self.open and screen:
             with suppress(webbrowser.Error):

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from fractions import Fraction
 from functools import cache
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
@@ -35,15 +34,16 @@ __all__ = [
     "is_own_png",
     "label_font",
     "logs_exact",
+    "save_film",
     "save_png",
     "side_by_side",
-    "write_movie",
 ]
 
 PANEL = "_panel"
 """Suffix of a view's panel, after the name of its render."""
 
 _MADE_BY = "ca_reg"  # in the header of every PNG
+_RATE = 20  # pictures of a film per second
 _GAP = 4  # pixels between pictures
 _TEXT, _LINE, _BAR = 15, 20, 8  # pixels: size of letters, height of a line of them, height of a color bar
 _UNDEFINED = "0.5"  # gray for values that are not finite; not a color of the map
@@ -96,6 +96,30 @@ def is_own_png(path: Path) -> bool:
         return True
     with path.open("rb") as file:  # the text is the first thing after the size, and nothing has to be decoded
         return b"Software\0" + _MADE_BY.encode() in file.read(200)
+
+
+def save_film(folder: Path, name: str, images: Sequence[Tensor]) -> Path:
+    """Write pictures, at least one, of equal and even size or cut to it, as a film of 20 a second; return its file.
+
+    An MP4 (H.264), which everything plays, where PyAV is installed; else a looping animated WebP, for browsers. Errors
+    as for `save_png`.
+    """
+    frames = [as_pillow(image) for image in images]
+    try:
+        import av
+    except ImportError:
+        with replacing(path := folder / f"{name}.webp") as place:
+            frames[0].save(
+                place, "WEBP", save_all=True, append_images=frames[1:], duration=1000 // _RATE, loop=0, quality=85
+            )
+        return path
+    width, height = (side // 2 * 2 for side in frames[0].size)  # H.264 has half the resolution in color
+    with replacing(path := folder / f"{name}.mp4") as place, av.open(str(place), "w", format="mp4") as file:
+        stream = file.add_stream("h264", rate=_RATE, options={"crf": "18"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for frame in [*(av.VideoFrame.from_image(each.crop((0, 0, width, height))) for each in frames), None]:
+            file.mux(stream.encode(frame))
+    return path
 
 
 def as_pillow(image: Tensor) -> Any:
@@ -215,35 +239,6 @@ def side_by_side(
         if scale:
             sheet.paste(as_pillow(color_bar(*scale, width=width)), (left, top + _LINE + height + 2))
     return torch.from_numpy(np.array(sheet)).permute(2, 0, 1) / 255
-
-
-def write_movie(frames: Iterable[Tensor], path: Path, fps: float = 24) -> Path:
-    """Write pictures (3, H, W) of one size as a movie, and return the file.
-
-    That is an MP4 (H.264) where PyAV is installed, which `pip install av` does, else a WebP that plays in a loop; the
-    file's extension says which. A last row or column beyond an even number is cut from an MP4.
-    """
-    try:
-        import av
-    except ImportError:
-        pictures = [as_pillow(frame) for frame in frames]
-        with replacing(path := path.with_suffix(".webp")) as place:
-            pictures[0].save(
-                place, "WEBP", save_all=True, append_images=pictures[1:], duration=round(1000 / fps), loop=0, quality=85
-            )
-        return path
-    with replacing(path := path.with_suffix(".mp4")) as place, av.open(str(place), "w", format="mp4") as file:
-        stream = None
-        for frame in frames:
-            picture = np.asarray(as_pillow(frame))
-            picture = np.ascontiguousarray(picture[: len(picture) // 2 * 2, : picture.shape[1] // 2 * 2])
-            if stream is None:
-                stream = file.add_stream("h264", rate=Fraction(fps).limit_denominator(1000), options={"crf": "18"})
-                stream.height, stream.width, stream.pix_fmt = *picture.shape[:2], "yuv420p"
-            file.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        if stream is not None:
-            file.mux(stream.encode())
-    return path
 
 
 def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:

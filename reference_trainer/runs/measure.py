@@ -13,7 +13,7 @@ import torch
 from ca_reg.regularizers import parse
 from reference_trainer.evaluation.evaluate import Evaluation, evaluate
 from reference_trainer.evaluation.lpips import LPIPS
-from reference_trainer.evaluation.pictures import file_names, is_own_png, save_png, write_movie
+from reference_trainer.evaluation.pictures import file_names, is_own_png, save_film, save_png
 from reference_trainer.evaluation.results import PARTIAL, machine, write_json
 from reference_trainer.evaluation.shares import guard
 from reference_trainer.evaluation.tables import evaluation_table
@@ -130,7 +130,7 @@ def render_run(
         run: folder of the run.
         what: ``"test"``, ``"train"``, ``"flight"`` through the training cameras, or ``"auto"``: the test views, or if
             there is none the training views.
-        out: folder for PNG files, and for a flight also a movie (`write_movie`); ``<run>/render_<what>`` by default.
+        out: folder for PNG files, and for a flight also a film (`save_film`); ``<run>/render_<what>`` by default.
         frames: number of pictures of a flight.
         device: where to render.
         trust: as for `load_run`.
@@ -163,6 +163,6 @@ def render_run(
         images.append(image.clamp(0, 1).cpu())
         save_png(folder / f"{name}.png", images[-1])
     if what == "flight":
-        _log.info("The movie is %s", write_movie(images, folder / "flight.mp4", fps=20))
+        _log.info("The film is %s", save_film(folder, "flight", images))
     _log.info("%d pictures are in %s", len(images), folder)
     return folder

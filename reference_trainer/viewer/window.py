@@ -20,7 +20,7 @@ import torch
 
 from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.pictures import as_pillow, color_bar, side_by_side, write_movie
+from reference_trainer.evaluation.pictures import as_pillow, color_bar, save_film, side_by_side
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import NotFiniteError
@@ -43,8 +43,8 @@ FEWEST, MOST = 10_000, 1_000_000
 """Limits on the pixels of a picture."""
 TRAINING_SHARE = 0.1
 """Fraction of a training's time that showing its new states may take; moving the camera takes more."""
-MOVIE_PIXELS, MOVIE_FPS, MOVIE_SECONDS = 400_000, 24, 2
-"""Of a recorded flight: most pixels of a picture of a model, pictures a second, seconds from one camera to the next."""
+MOVIE_PIXELS, MOVIE_FRAMES = 400_000, 40
+"""Of a recorded flight: most pixels of a picture of a model, and pictures from one camera to the next."""
 BOTH = "side by side"
 
 
@@ -237,7 +237,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             as_pillow(self._sheet(_camera(window.client.camera, MOST))).save(file, "PNG")
             window.client.send_file_download("view.png", file.getvalue(), save_immediately=True)
             return
-        cameras = interpolate_cameras(window.path, MOVIE_FPS * MOVIE_SECONDS * (len(window.path) - 1) + 1)
+        cameras = interpolate_cameras(window.path, MOVIE_FRAMES * (len(window.path) - 1) + 1)
 
         def frames() -> Iterator[torch.Tensor]:
             for number, camera in enumerate(cameras):
@@ -245,7 +245,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
                 yield self._sheet(camera)
 
         with tempfile.TemporaryDirectory() as folder:
-            file_ = write_movie(frames(), Path(folder, "flight.mp4"), MOVIE_FPS)
+            file_ = save_film(Path(folder), "flight", [*frames()])
             window.client.send_file_download(file_.name, file_.read_bytes(), save_immediately=True)
         self._status.content = f"flight: {len(cameras)} pictures in {file_.name}"
 
@@ -306,7 +306,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             self._changed.set()
         else:
             cameras = f"{len(window.path)} camera{'s' * (len(window.path) != 1)}"
-            self._status.content = f"path: {cameras}; a flight needs 2 or more, {MOVIE_SECONDS} s from each to the next"
+            self._status.content = f"path: {cameras}; a flight needs 2 or more, 2 s from each to the next"
 
     def _hide_nearest_frustum(self, position: Any, *, beside: bool) -> None:
         """Hide the frustum that a page looks out of, which would lie across its picture, and all beside each other."""

@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-import sys
-
 import matplotlib
 import numpy as np
 import pytest
 import torch
-from PIL import Image, ImageSequence
+from PIL import Image
 
 from reference_trainer.evaluation.pictures import (
     PANEL,
@@ -16,7 +14,6 @@ from reference_trainer.evaluation.pictures import (
     heat_map,
     save_png,
     side_by_side,
-    write_movie,
 )
 from reference_trainer.evaluation.style import STRATEGIES
 from reference_trainer.scenes.images import read_image
@@ -109,27 +106,6 @@ def test_a_map_has_its_colors_below_it_and_what_they_mean_at_the_ends():
     sheet = side_by_side([torch.zeros(3, 30, 200)] * 2, ["a", "b"], scales=[None, ("0", "0.02")])
     torch.testing.assert_close(sheet[:, 52:80, 204:], bar)
     assert (sheet[:, 52:, :204] == 1).all()
-
-
-@pytest.mark.parametrize("with_av", [False, True])
-def test_a_movie_shows_its_frames_in_order(tmp_path, monkeypatch, with_av):
-    if with_av:
-        av = pytest.importorskip("av")
-    else:
-        monkeypatch.setitem(sys.modules, "av", None)
-    levels = [0.1, 0.5, 0.9]
-    frames = (torch.full((3, 21, 32), level) for level in levels)
-    path = write_movie(frames, tmp_path / "flight.mp4", fps=10)
-    if with_av:
-        with av.open(str(path)) as file:
-            shown = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
-            assert file.streams.video[0].average_rate == 10
-    else:
-        with Image.open(path) as movie:
-            shown = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(movie)]
-            assert movie.info["duration"] == 100
-    assert [path.name] == [place.name for place in tmp_path.iterdir()] == ["flight.mp4" if with_av else "flight.webp"]
-    assert [frame.mean() / 255 for frame in shown] == pytest.approx(levels, abs=0.02)
 
 
 @pytest.mark.parametrize(

@@ -209,4 +209,4 @@ def test_a_flight_begins_and_ends_at_training_cameras(suffix, run, tmp_path, sai
     for frame, view in (("0000", "train_0"), ("0002", "train_1"), ("0004", "train_2")):
         one, other = (read_image(path)[0] for path in (folder / f"{frame}.png", out / f"views/train/{view}.png"))
         assert (one - other).abs().max() <= 1 / 255 + 1e-6
-    assert said == [f"The movie is {film}", f"5 pictures are in {folder}"]
+    assert said == [f"The film is {film}", f"5 pictures are in {folder}"]

@@ -152,7 +152,7 @@ def test_two_models_share_the_width_and_a_screenshot_names_them(run, scaled, vie
 
 
 def test_a_flight_along_added_cameras_is_a_movie(run, viewer, page, monkeypatch):
-    monkeypatch.setattr(window, "MOVIE_FPS", 3)
+    monkeypatch.setattr(window, "MOVIE_FRAMES", 6)
     viewer._ask(page, "flight")  # nowhere to fly to
     viewer.update()
     assert not page.files
@@ -166,7 +166,7 @@ def test_a_flight_along_added_cameras_is_a_movie(run, viewer, page, monkeypatch)
     assert name in ("flight.webp", "flight.mp4")
     if name == "flight.webp":
         with Image.open(BytesIO(content)) as movie:
-            assert movie.n_frames == 3 * window.MOVIE_SECONDS + 1
+            assert movie.n_frames == 7
             assert movie.size[0] >= view.camera.width
 
 
