@@ -3,8 +3,8 @@
     python -m benchmarks.error_map SCENE-SETTING-SEED=RUN ... [--keep FOLDER] [--rivals] [--weights]
 
 RUN is the folder of a finished training. Prints the tables of ``benchmarks/error_map.md``, which has the protocol;
-``--weights`` prints those of `ca_reg.error_map.FORMS`, fitted on all scenes. What is measured of a model is kept in the
-folder, and not measured again.
+``--weights`` prints those of `ca_reg.error_maps.FORMS`, fitted on all scenes. What is measured of a model is kept in
+the folder, and not measured again.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from scipy.optimize import nnls
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from ca_reg import error_map as form_of
+from ca_reg import error_maps as form_of
 from ca_reg.functional import Multiplier
-from reference_trainer.evaluation.error_map import ErrorMaps
+from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.metrics import ssim
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.model.rendering import render_gaussians
@@ -43,12 +43,17 @@ RATES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 
 
 class Seen(NamedTuple):
-    """One view of a model: the terms of the forms, the rivals, and the error, (P,) each, of the pixels that count."""
+    """One view of a model: the terms of the forms, the rivals, and the error, (P,) each, of the pixels that count.
+
+    ``own`` has the means of the terms over the training views, each without its own photograph, and under "difference"
+    what these photographs differ by, where another one can be brought.
+    """
 
     terms: dict[str, np.ndarray]
     rivals: dict[str, np.ndarray]
     error: np.ndarray
     squared: np.ndarray
+    own: dict[str, float]
 
 
 def left(order: np.ndarray, error: np.ndarray, *, root: bool = False) -> np.ndarray:
@@ -71,6 +76,7 @@ def ause(predicted: np.ndarray, error: np.ndarray, *, root: bool = False) -> flo
 
 def rate_of_ph_dropout(model: TrainedModel, train: Sequence[View]) -> float:
     """Return the largest rate at which the mean SSIM on the training views falls by at most 5 %, of five masks each."""
+
     def quality(rate: float) -> float:
         generator, n = torch.Generator().manual_seed(0), len(model.gaussians)
         renders = MaskedRenders(model)
@@ -80,6 +86,7 @@ def rate_of_ph_dropout(model: TrainedModel, train: Sequence[View]) -> float:
             images, _ = renders.render_batch(model.gaussians.opacities * keep, view)
             values += [ssim(image.clamp(0, 1), view.image) for image in images]
         return float(np.mean(values))
+
     best = quality(0.0)
     return max((rate for rate in RATES if quality(rate) >= 0.95 * best), default=RATES[0])
 
@@ -143,6 +150,12 @@ def look(model: TrainedModel, scene: Scene, *, rivals: bool) -> tuple[list[Seen]
         return found
 
     maps = timed("once a model", lambda: ErrorMaps(model, scene.train))
+    sums: dict[str, float] = {}
+    for number in range(len(scene.train)):
+        difference, features = maps.left_out(number)
+        for name, x in {**with_products(features), "difference": difference}.items():
+            sums[name] = sums.get(name, 0.0) + x[features["hidden"] == 0].sum().item()
+    own = {name: x / sums["constant"] for name, x in sums.items()}
     fisher = Fisher(model, scene.train) if rivals else None
     rate = model.dropout or form_of.PLAIN_RATE
     rule = rate_of_ph_dropout(model, scene.train) if rivals else rate
@@ -151,38 +164,73 @@ def look(model: TrainedModel, scene: Scene, *, rivals: bool) -> tuple[list[Seen]
     for number, view in enumerate(views):
         out = timed("a render", lambda view=view: model.test_rendering(view))
         features = timed("error map", lambda view=view: maps.features(view))
-        terms = {"constant": torch.ones_like(out.alpha)} | features
-        terms["hidden*colors"] = features["hidden"] * features["colors"]
+        terms = with_products(features)
         keep = torch.ones_like(out.alpha, dtype=torch.bool)
         if view.mask is not None:
             keep = view.mask > 254.5 / 255
         elif view.alpha is not None:
             keep = (view.alpha > 0.5) | (out.alpha > 0.5)
-        others = {"deviation": features["deviation"], "colors": features["colors"], "gradient": features["contrast"],
-                  "1 - alpha": features["empty"], "random": torch.rand(out.alpha.shape, generator=torch.Generator().manual_seed(number))}  # fmt: skip
+        others = {
+            "deviation": features["deviation"], "colors": features["colors"], "gradient": features["contrast"],
+            "1 - alpha": features["empty"],
+            "random": torch.rand(out.alpha.shape, generator=torch.Generator().manual_seed(number)),
+        }  # fmt: skip
         if fisher is not None:
             with torch.no_grad():
                 splats = model.splats(model.gaussians.opacities, view)
                 moments = render_moments(splats, Multiplier.dropout(rule), background=model.background)
                 others["PH-Dropout's rate"] = moments.variance.mean(0).sqrt()
                 for count in (5, 100):
-                    others[f"{count} masks"] = timed(f"{count} masks", lambda c=count, v=view: sampled(model, v, c, rate))
+                    others[f"{count} masks"] = timed(
+                        f"{count} masks", lambda c=count, v=view: sampled(model, v, c, rate)
+                    )
             others["Fisher"] = timed("Fisher", lambda view=view: fisher(view))
         off = out.image.clamp(0, 1) - view.image
-        smooth = {name: form_of._smooth(x)[keep].numpy().astype(np.float32) for name, x in terms.items()}
+        smooth = {name: form_of.smoothed(x)[keep].numpy().astype(np.float32) for name, x in terms.items()}
         flat = {name: x[keep].double().numpy().astype(np.float32) for name, x in others.items()}
-        seen.append(Seen(smooth, flat, off.abs().mean(0)[keep].double().numpy(), off.square().mean(0)[keep].double().numpy()))
+        seen.append(
+            Seen(
+                smooth, flat, off.abs().mean(0)[keep].double().numpy(), off.square().mean(0)[keep].double().numpy(), own
+            )
+        )
     return seen, spent
 
 
-def fitted(views: Sequence[Seen], terms: Sequence[str]) -> tuple[dict[str, float], float, float]:
-    """Fit the shape to errors relative to their view's mean, every view counting alike; then the units.
+def with_products(features: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return all terms of all forms."""
+    products = {
+        "constant": torch.ones_like(features["empty"]),
+        "hidden*colors": features["hidden"] * features["colors"],
+    }
+    return {**features, **products}
 
-    Returns the weights; the squared error over the square of the expectation; and the spread of the PSNR, dB.
-    """
+
+def unit(view: Seen, weights: Mapping[str, float]) -> float:
+    """Return the unit that the model's own photographs give; 1 for a form without them."""
+    return view.own["difference"] / sum(w * view.own[t] for t, w in weights.items()) if "warp" in weights else 1.0
+
+
+class Fitted(NamedTuple):
+    """Weights in units of color; what the unit of a model is times; squares; spread of the PSNR, dB."""
+
+    weights: dict[str, float]
+    transfer: float
+    peaked: float
+    spread: float
+
+    def expect(self, view: Seen) -> np.ndarray:
+        """Return the expected error of a view's pixels."""
+        factor = self.transfer * unit(view, self.weights) if "warp" in self.weights else 1.0
+        return factor * predict(view, self.weights)
+
+
+def fitted(views: Sequence[Seen], terms: Sequence[str]) -> Fitted:
+    """Fit the shape to errors relative to their view's mean, every view counting alike; then the units."""
     rng = np.random.default_rng(0)
     picks = [rng.permutation(len(v.error))[:PIXELS] for v in views]
-    x = np.concatenate([np.stack([v.terms[t][p] for t in terms], 1) for v, p in zip(views, picks, strict=True)]).astype(float)
+    x = np.concatenate([np.stack([v.terms[t][p] for t in terms], 1) for v, p in zip(views, picks, strict=True)]).astype(
+        float
+    )
     y = np.concatenate([v.error[p] / v.error.mean() for v, p in zip(views, picks, strict=True)])
     each = np.concatenate([np.full(len(p), 1 / len(p)) for p in picks])
     expected = np.ones(len(y))
@@ -192,10 +240,20 @@ def fitted(views: Sequence[Seen], terms: Sequence[str]) -> tuple[dict[str, float
         root = np.linalg.cholesky(gram + 1e-12 * np.trace(gram) * np.eye(len(terms)))
         weights = nnls(root.T, np.linalg.solve(root, right))[0]
         expected = x @ weights
-    means = [(predict(v, dict(zip(terms, weights, strict=True))), v) for v in views]
-    unit = math.exp(np.mean([math.log(v.error.mean() / p.mean()) for p, v in means]))
-    ratios = [math.log10(v.squared.mean() / ((unit * p) ** 2).mean()) for p, v in means]
-    return dict(zip(terms, (unit * weights).tolist(), strict=True)), 10 ** float(np.mean(ratios)), 10 * float(np.std(ratios, ddof=1))
+    found = dict(zip(terms, weights.tolist(), strict=True))
+    own = np.array([unit(v, found) for v in views])
+    of_scene = np.array([v.own["difference"] for v in views])  # one number a model: views of a scene count together
+    counts = np.array([1 / np.sum(of_scene == d) for d in of_scene])
+    logs = np.array([math.log(v.error.mean() / predict(v, found).mean()) for v in views])
+    size = math.exp(np.average(logs, weights=counts))
+    transfer = math.exp(np.average(logs - np.log(own), weights=counts))
+    found = {t: size * w for t, w in found.items()}
+    factors = [transfer * unit(v, found) if "warp" in found else 1.0 for v in views]
+    ratios = [
+        math.log10(v.squared.mean() / ((f * predict(v, found)) ** 2).mean())
+        for f, v in zip(factors, views, strict=True)
+    ]
+    return Fitted(found, transfer, 10 ** float(np.average(ratios, weights=counts)), 10 * float(np.std(ratios, ddof=1)))
 
 
 def predict(view: Seen, weights: Mapping[str, float]) -> np.ndarray:
@@ -218,12 +276,16 @@ def held_out(models: Mapping[str, list[Seen]], terms: Sequence[str], *, kinds: b
             others = {m: v for m, v in models.items() if scene_of(m) != key[0] and key[1] in (None, plain[m])}
             scenes = {scene_of(m) for m in others}
             # A scene counts once, however many models it has.
-            picked = [v for s in sorted(scenes) for v in [w for m, of in others.items() if scene_of(m) == s for w in of]]
+            picked = [
+                v for s in sorted(scenes) for v in [w for m, of in others.items() if scene_of(m) == s for w in of]
+            ]
             known[key] = fitted(picked, terms)
     return {name: known[scene_of(name), plain[name] if kinds else None] for name in models}
 
 
-def row(label: str, models: Mapping[str, list[Seen]], of: Callable[[str, Seen], np.ndarray], score: Callable[..., float]) -> list[float]:
+def row(
+    label: str, models: Mapping[str, list[Seen]], of: Callable[[str, Seen], np.ndarray], score: Callable[..., float]
+) -> list[float]:
     """Print and return a figure of every model, mean over its views, and their mean over models."""
     found = [float(np.mean([score(of(name, v), v.error) for v in views])) for name, views in models.items()]
     print(f"| {label} | " + " | ".join(f"{x:.3f}" for x in found) + f" | {np.mean(found):.3f} |", flush=True)
@@ -251,35 +313,47 @@ def main() -> None:
             print("measured", name, flush=True)
         found, times[name] = torch.load(file, weights_only=False)
         models[name] = [Seen(*v) for v in found]
-    forms = [[*form] for form in form_of.FORMS]
-    if options.weights:
+    forms = [[*form.weights] for form in form_of.FORMS]
+    if options.weights:  # the spread is that of the scenes of the fit: the larger one, over left-out scenes, ships
         for terms in forms:
-            weights, peaked, spread = fitted([v for views in models.values() for v in views], terms)
-            print({t: round(w, 4) for t, w in weights.items()}, f"PEAKED {peaked:.2f} spread in sample {spread:.2f} dB")
+            found = fitted([v for views in models.values() for v in views], terms)
+            print({t: round(w, 4) for t, w in found.weights.items()}, found[1:])
         return
     print("| AUSE-MAE | " + " | ".join(models) + " | mean |\n|:---" + "|---:" * (len(models) + 1) + "|")
-    names = [*next(iter(models.values()))[0].rivals]
-    for rival in names:
+    for rival in next(iter(models.values()))[0].rivals:
         row(rival, models, lambda _, v, r=rival: v.rivals[r], ause)
     best = {}
-    for label, terms, kinds in [("all features", forms[0], False), ("all features, kinds apart", forms[0], True),
-                                ("model alone", forms[1], False), ("moments", forms[2], False), ("image and alpha", forms[3], False)]:  # fmt: skip
+    shapes = [("all features", forms[0], False), ("all features, kinds apart", forms[0], True)]
+    names = ("model alone", "moments", "image and alpha")
+    for label, terms, kinds in [*shapes, *((name, form, False) for name, form in zip(names, forms[1:], strict=True))]:
         best[label] = held_out(models, terms, kinds=kinds)
-        row(label, models, lambda n, v, b=best[label]: predict(v, b[n][0]), ause)
+        row(label, models, lambda n, v, b=best[label]: b[n].expect(v), ause)
     chosen = best["all features"]
-    of = lambda n, v: predict(v, chosen[n][0])  # noqa: E731
+    of = lambda n, v: chosen[n].expect(v)  # noqa: E731
     for term in forms[0]:
         less = held_out(models, [t for t in forms[0] if t != term])
-        row(f"without {term}", models, lambda n, v, b=less: predict(v, b[n][0]), ause)
+        row(f"without {term}", models, lambda n, v, b=less: b[n].expect(v), ause)
     print("\nothers:")
     row("AUSE-RMSE", models, of, lambda u, e: ause(u, e, root=True))
     row("AUSE-RMSE, deviation", models, lambda _, v: v.rivals["deviation"], lambda u, e: ause(u, e, root=True))
     row("Spearman", models, of, lambda u, e: float(spearmanr(u, e).statistic))
-    row("Spearman, deviation", models, lambda _, v: v.rivals["deviation"], lambda u, e: float(spearmanr(u, e).statistic))
+    row(
+        "Spearman, deviation", models, lambda _, v: v.rivals["deviation"], lambda u, e: float(spearmanr(u, e).statistic)
+    )
     row("expected over measured mean error", models, of, lambda u, e: float(u.mean() / e.mean()))
-    row("share of errors below 2.303 expected (0.9 if exponential)", models, of, lambda u, e: float((e < math.log(10) * u).mean()))
+    row(
+        "share of errors below 2.303 expected (0.9 if exponential)",
+        models,
+        of,
+        lambda u, e: float((e < math.log(10) * u).mean()),
+    )
     row("negative log likelihood, exponential", models, of, lambda u, e: float((np.log(u) + e / u).mean()))
-    row("the same, of one number, the view's true mean", models, lambda _, v: np.full_like(v.error, v.error.mean()), lambda u, e: float((np.log(u) + e / u).mean()))
+    row(
+        "the same, of one number, the view's true mean",
+        models,
+        lambda _, v: np.full_like(v.error, v.error.mean()),
+        lambda u, e: float((np.log(u) + e / u).mean()),
+    )
     deciles = np.zeros((2, 10))
     errors, off = [], []
     for name, views in models.items():
@@ -288,13 +362,18 @@ def main() -> None:
             for i, part in enumerate(np.array_split(np.argsort(u), 10)):
                 deciles[:, i] += u[part].mean(), v.error[part].mean()
             errors.append(u.mean() / v.error.mean())
-            _, peaked, _ = chosen[name]
-            off.append(-10 * math.log10(peaked * (u**2).mean()) + 10 * math.log10(v.squared.mean()))
+            off.append(-10 * math.log10(chosen[name].peaked * (u**2).mean()) + 10 * math.log10(v.squared.mean()))
     count = sum(map(len, models.values()))
-    print("deciles, expected:", *(f"{x:.3f}" for x in deciles[0] / count), "\ndeciles, measured:", *(f"{x:.3f}" for x in deciles[1] / count))
+    print(
+        "deciles, expected:",
+        *(f"{x:.3f}" for x in deciles[0] / count),
+        "\ndeciles, measured:",
+        *(f"{x:.3f}" for x in deciles[1] / count),
+    )
     ratio, shift = np.array(errors), np.array(off)
-    print(f"{count} views: within 20 % {np.mean((ratio > 0.8) & (ratio < 1.25)):.0%}; PSNR off by {shift.mean():+.2f} ± {shift.std(ddof=1):.2f} dB (rms {np.sqrt((shift**2).mean()):.2f})")
-    print("rank correlation of expected and measured mean error over views:", f"{spearmanr([of(n, v).mean() for n, vs in models.items() for v in vs], [v.error.mean() for vs in models.values() for v in vs]).statistic:.2f}")
+    close, rms = np.mean((ratio > 0.8) & (ratio < 1.25)), np.sqrt((shift**2).mean())
+    print(f"{count} views, mean error within 20 %: {close:.0%}; PSNR off by {shift.mean():+.2f} dB, rms {rms:.2f}")
+    print(f"in the interval of 80 %: {np.mean(np.abs(shift) < 1.2816 * form_of.FORMS[0].spread):.0%}")
     for name, spent in times.items():
         print(name, {k: round(v, 3) for k, v in spent.items()})
 

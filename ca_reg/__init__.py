@@ -6,6 +6,7 @@
   moments. :class:`CAMonitor` logs it during training, and :func:`attribute` tells which Gaussians it comes from.
 - :class:`CAPenalty` replaces sampled dropout or noise in training by the expected render, with the exact co-adaptation
   as a term of the loss; the renderer must offer moments.
+- :func:`error_map` expects the error of every pixel of a view that has no photograph.
 - :class:`Regularizer` and :class:`IndependentDropout` are the base classes of regularizers of your own.
 
 The modules hold the rest: :mod:`ca_reg.regularizers` all regularizers by name, :mod:`ca_reg.schedules` rates that
@@ -19,6 +20,7 @@ Importing this package loads torch and numpy only.
 
 from ca_reg.attribution import attribute
 from ca_reg.chain import Chain
+from ca_reg.error_maps import ErrorMap, error_map
 from ca_reg.functional import expected_opacity, scale_opacity
 from ca_reg.monitor import CAMonitor
 from ca_reg.penalty import CAPenalty
@@ -31,7 +33,7 @@ __version__ = "0.2.0"
 
 __all__ = [  # noqa: RUF022  # in the order in which one meets them, which the API page follows
     "GaussianDropout", "OpacityNoise", "Chain", "CAScore",
-    "CAResult", "Reason", "CAMonitor", "CAPenalty", "attribute",
+    "CAResult", "Reason", "CAMonitor", "CAPenalty", "attribute", "error_map", "ErrorMap",
     "IndependentDropout", "Regularizer", "Params", "Draw", "scale_opacity", "expected_opacity",
     "__version__",
 ]  # fmt: skip

@@ -93,9 +93,13 @@ class Render:
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of a run of `ca-reg train`."""
-    what: Literal["auto", "test", "train", "flight"] = "auto"
+    what: Literal["auto", "test", "train", "flight", "error"] = "auto"
     """Which views: "auto" is the test views, or if none was held out the training views; "flight" moves through the
-    training cameras."""
+    training cameras. "error" also writes where each picture is expected to be wrong: of the test views, or if none was
+    held out, of views between and around the training cameras."""
+    mask: float | None = None
+    """With --what error: also write masks, white where the expected error is above this, such as 0.05: where to repaint
+    (an absolute difference of colors in [0, 1])."""
     frames: int = 60
     """Pictures of a flight."""
     out: Path | None = None
@@ -108,12 +112,15 @@ class Render:
         """Refuse what cannot work, before anything heavy is imported."""
         check_run(self.run)
         check_out(self.out, self.run)
+        if self.mask is not None and not (self.what == "error" and 0 < self.mask < 1):
+            raise ValueError(f"--mask needs --what error and a threshold in (0, 1), got {self.mask:g}.")
 
     def __call__(self) -> None:
         from reference_trainer.runs.measure import render_run
 
         self.rendering.begin(self.device)
-        render_run(self.run, self.what, self.out, frames=self.frames, device=self.device, trust=self.trust)
+        shared: dict[str, Any] = {"frames": self.frames, "device": self.device, "trust": self.trust}
+        render_run(self.run, self.what, self.out, mask=self.mask, **shared)
 
 
 @dataclass(frozen=True)

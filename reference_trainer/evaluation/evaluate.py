@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAResult, CAScore, attribute
+from ca_reg.error_maps import ErrorMap
+from reference_trainer.evaluation.error_maps import ErrorMaps, error_map
 from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.metrics import DepthErrors, color_variance_map, depth_errors, on_white, psnr, ssim
 from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
@@ -22,7 +24,15 @@ from reference_trainer.evaluation.results import ResultStore, machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.scenes.scene import View, Viewpoint
 
-__all__ = ["Evaluation", "ViewScores", "ca_picture", "error_picture", "evaluate", "training_snapshot"]
+__all__ = [
+    "Evaluation",
+    "ViewScores",
+    "ca_picture",
+    "error_picture",
+    "evaluate",
+    "expected_error_picture",
+    "training_snapshot",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +40,9 @@ CA_PICTURE_RANGE = 0.02
 """Variance that maps to the brightest color of CA heat maps."""
 ERROR_PICTURE_RANGE = 0.25
 """Absolute error, averaged over channels, that maps to the brightest color."""
+
+
+_EXPECTED = "psnr_expected", "psnr_low", "psnr_high"
 
 
 @dataclass(frozen=True)
@@ -42,7 +55,9 @@ class ViewScores:
     ``ca_neutral`` is ``ca_exact`` with every pixel composited on its own expected color, so that the background does
     not count. ``visible`` is the share of pixels that ``ca`` covers, ``covered`` the mean alpha of the test-time image.
     ``depth_abs_rel`` to ``depth_log10`` are the `DepthErrors` of the test-time image where the true depth is known.
-    ``ca_reason`` is the name of the `Reason` why ``ca`` has its value, or is nan.
+    ``ca_reason`` is the name of the `Reason` why ``ca`` has its value, or is nan. ``psnr_expected`` is what an
+    `ErrorMap` expects without the photograph, of views that the model was not trained on, and in 80 % of the cases the
+    PSNR is between ``psnr_low`` and ``psnr_high``.
     """
 
     name: str
@@ -64,6 +79,9 @@ class ViewScores:
     depth_mae: float = math.nan
     depth_log10: float = math.nan
     ca_reason: str = ""
+    psnr_expected: float = math.nan
+    psnr_low: float = math.nan
+    psnr_high: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -119,12 +137,13 @@ def evaluate(
 
     Args:
         model: what to measure.
-        views: by split, such as those of `measured_views`.
+        views: by split, such as those of `measured_views`; the photographs of "train" are those of the error maps.
         samples: K of the CA score.
         seed: of the CA score's masks.
         perceptual: a perceptual metric, or None to leave it out.
         pictures: folder for two PNG files per view, ``<split>/<view>``: the render, and a panel of photograph, render,
-            error and exact CA map, or without a photograph of the render and the maps of all scores; None for none.
+            error, expected error and exact CA map, or without a photograph of the render, the expected error and the
+            maps of all scores; None for none.
         partial: file for the scores of finished views, see `ResultStore`: an interrupted evaluation continues with the
             next view. The caller removes it once the result is written.
         on_view: called before each view is measured.
@@ -140,6 +159,8 @@ def evaluate(
         model.exact_ca_score(drop_rate=0.5),
         model.exact_ca_score(neutral=True),
     )
+    own = [view for view in views.get("train", ()) if isinstance(view, View)]
+    errors = ErrorMaps(model, own) if {*views} - {"train"} else None
     members = [(split, *each) for split, group in views.items() for each in enumerate(group)]
     names = [name for group in views.values() for name in file_names([view.name for view in group])]
     photographs = (view.image.to(model.background.device) for _, _, view in members if isinstance(view, View))
@@ -158,7 +179,7 @@ def evaluate(
         left = "" if seconds is None else f", about {seconds:.0f} s left"
         _log.info("[%d/%d] %s %s%s", number + 1, len(members), split, view.name, left)
         on_view()
-        done.append(_measure(model, view.to(model.background.device), split, index, scores, perceptual, files))
+        done.append(_measure(model, view.to(model.background.device), split, index, scores, errors, perceptual, files))
         store.add(f"{split} {index}", asdict(done[-1]))
         measured += 1
     return Evaluation(done, len(model.gaussians), None if perceptual is None else perceptual.name)
@@ -170,6 +191,7 @@ def _measure(
     split: str,
     index: int,
     scores: Sequence[CAScore],
+    errors: ErrorMaps | None,
     perceptual: LPIPS | None,
     files: Sequence[Path],
 ) -> ViewScores:
@@ -190,6 +212,8 @@ def _measure(
             found[score.settings] = score(opacities, view, index=index)
     ca, half, exact, exact_half, neutral = (found[score.settings] for score in scores)
     variance, covered = color_variance_map(out.splats)
+    mask = view.mask if isinstance(view, View) else None
+    expected = errors(view, mask) if errors is not None and split != "train" else None
     measured = ViewScores(
         name=view.name,
         split=split,
@@ -207,17 +231,36 @@ def _measure(
         cv=variance[covered].double().mean().item() if bool(covered.any()) else math.nan,
         **{f"depth_{name}": error for name, error in depth._asdict().items()},
         ca_reason=ca.reason.name,
+        **{} if expected is None else dict(zip(_EXPECTED, (expected.psnr, *expected.interval), strict=True)),
     )
     if files:
+        guessed = (
+            {}
+            if expected is None
+            else {
+                f"expected error {expected.psnr:.1f} dB": (
+                    expected_error_picture(expected),
+                    ("0", f"{ERROR_PICTURE_RANGE:g}"),
+                )
+            }
+        )
         title = "render" if photograph is None else f"render {measured.psnr:.2f} dB"
         panels: dict[str, tuple[Tensor, tuple[str, str] | None]] = {title: (image, None)}
         if photograph is None:
             own = {} if scores[2].settings == scores[3].settings else {f"exact CA{_at(exact)}": exact}
             sampled = f"CA, {ca.samples} renders{_at(ca)}"
-            panels |= _maps({"exact CA": exact_half, **own, sampled: ca, f"neutral CA{_at(neutral)}": neutral})
+            panels |= guessed | _maps(
+                {"exact CA": exact_half, **own, sampled: ca, f"neutral CA{_at(neutral)}": neutral}
+            )
         else:
             error = error_picture(image, photograph), ("0", f"{ERROR_PICTURE_RANGE:g}")
-            panels = {"photograph": (photograph, None)} | panels | {"error": error} | _maps({"exact CA": exact_half})
+            panels = (
+                {"photograph": (photograph, None)}
+                | panels
+                | {"error": error}
+                | guessed
+                | _maps({"exact CA": exact_half})
+            )
         save_png(files[0], image)
         pictures, scales = zip(*panels.values(), strict=True)
         save_png(files[1], side_by_side(pictures, [*panels], scales=scales))
@@ -225,17 +268,20 @@ def _measure(
 
 
 @torch.no_grad()
-def training_snapshot(model: TrainedModel, view: View) -> dict[str, Tensor]:
+def training_snapshot(model: TrainedModel, view: View, train: Sequence[View] = ()) -> dict[str, Tensor]:
     """Return what is worth watching while a model trains: pictures of a view, and the shares of the exact score.
 
     Returns:
-        ``"render"``, ``"error"`` and ``"co-adaptation"``, (3, H, W), and ``"log10 of share"`` of the Gaussians that
+        ``"render"``, ``"error"``, ``"expected error"`` (with the training photographs ``train``, if they are given, of
+        other views) and ``"co-adaptation"``, (3, H, W), and ``"log10 of share"`` of the Gaussians that
         have a share; the last two at drop rate 1/2.
     """
     image = model.test_rendering(view).image.clamp(0, 1)
     score = model.exact_ca_score(drop_rate=0.5)
     shares, result = attribute(score, model.shares, model.gaussians.opacities, view)
     pictures = {"render": image, "error": error_picture(image, view.image), "co-adaptation": ca_picture(result)}
+    if all(view.name != other.name for other in train):
+        pictures["expected error"] = expected_error_picture(error_map(model, view, train))
     return pictures | {"log10 of share": shares[shares > 0].log10()}
 
 
@@ -258,3 +304,8 @@ def ca_picture(result: CAResult) -> Tensor:
 def error_picture(image: Tensor, photograph: Tensor) -> Tensor:
     """Return the absolute difference of two pictures (3, H, W), averaged over channels, as a heat map."""
     return heat_map((image - photograph).abs().mean(0), ERROR_PICTURE_RANGE)
+
+
+def expected_error_picture(found: ErrorMap) -> Tensor:
+    """Return an expected error as a heat map (3, H, W), in the colors of `error_picture`."""
+    return heat_map(found.error, ERROR_PICTURE_RANGE)

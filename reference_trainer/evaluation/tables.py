@@ -25,6 +25,9 @@ _ABSENT = "n/a"
 _FIGURE = re.compile(r"[-+]?\d|-?$")  # also a dash or nothing in its place
 _SHOWN: dict[str, tuple[str, int]] = {
     "psnr": ("PSNR", 2),
+    "psnr_expected": ("expected", 1),
+    "psnr_low": ("from", 1),
+    "psnr_high": ("to (80 %)", 1),
     "ssim": ("SSIM", 3),
     "lpips": ("LPIPS", 3),
     "ca_exact_half": (EXACT, 2),
@@ -43,7 +46,10 @@ _SHOWN: dict[str, tuple[str, int]] = {
     "seconds": ("seconds", 0),
 }
 """Title and decimals of every quantity, in the order of the columns; the decimals are the same down a column."""
-_NOT_EVERYWHERE = ("psnr", "ssim", "lpips", "depth_abs_rel", "depth_rmse", "depth_mae", "depth_log10")
+_NOT_EVERYWHERE = (
+    "psnr", "psnr_expected", "psnr_low", "psnr_high", "ssim", "lpips",
+    "depth_abs_rel", "depth_rmse", "depth_mae", "depth_log10",
+)  # fmt: skip
 _HIGHEST_IS_BEST = {"PSNR": True, "SSIM": True, "LPIPS": False, EXACT: False, "depth AbsRel": False}
 
 

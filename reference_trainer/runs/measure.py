@@ -11,7 +11,8 @@ from typing import Any
 import torch
 
 from ca_reg.regularizers import parse
-from reference_trainer.evaluation.evaluate import Evaluation, evaluate
+from reference_trainer.evaluation.error_maps import ErrorMaps
+from reference_trainer.evaluation.evaluate import Evaluation, evaluate, expected_error_picture
 from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.pictures import file_names, is_own_png, save_film, save_png
 from reference_trainer.evaluation.results import PARTIAL, machine, write_json
@@ -22,7 +23,7 @@ from reference_trainer.files import remove_leftovers, write_text
 from reference_trainer.runs.folder import VIEWS, check_output, run_lock
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene, Viewpoint
-from reference_trainer.scenes.virtual_cameras import interpolate_cameras
+from reference_trainer.scenes.virtual_cameras import interpolate_cameras, measured_views
 from reference_trainer.threads import threads_for
 
 __all__ = ["load_run_model", "log_what_hangs", "measure", "render_run"]
@@ -121,6 +122,7 @@ def render_run(
     out: Path | None = None,
     *,
     frames: int = 60,
+    mask: float | None = None,
     device: str = "cpu",
     trust: Collection[str] = (),
 ) -> Path:
@@ -129,9 +131,11 @@ def render_run(
     Args:
         run: folder of the run.
         what: ``"test"``, ``"train"``, ``"flight"`` through the training cameras, or ``"auto"``: the test views, or if
-            there is none the training views.
+            there is none the training views. ``"error"`` adds a heat map of the expected error to each test view, or if
+            there is none, to views between and around the training cameras.
         out: folder for PNG files, and for a flight also a film (`save_film`); ``<run>/render_<what>`` by default.
         frames: number of pictures of a flight.
+        mask: expected error above which a third picture is white, for ``"error"``.
         device: where to render.
         trust: as for `load_run`.
 
@@ -150,19 +154,30 @@ def render_run(
     if what == "flight":
         path = interpolate_cameras([view.camera for view in scene.train], frames)
         views = [Viewpoint(f"{i:04d}", camera) for i, camera in enumerate(path)]
+    elif what == "error":
+        views = [view for split, group in measured_views(scene).items() if split != "train" for view in group]
     else:
         views = scene.test if what == "test" else scene.train
     if not views:
         raise ValueError(f"the scene of {run} has no test view: give --what train or --what flight.")
     folder, names = out or run / f"render_{what}", file_names([view.name for view in views])
-    check_output(folder, None, [f"{name}.png" for name in names if not is_own_png(folder / f"{name}.png")])
+    endings = ["", *(["_error"] if what == "error" else []), *(["_mask"] if mask is not None else [])]
+    files = [f"{name}{end}.png" for name in names for end in endings]
+    check_output(folder, None, [file for file in files if not is_own_png(folder / file)])
+    maps = ErrorMaps(model, scene.train) if what == "error" else None
     images = []
     for name, view in zip(names, views, strict=True):
         with threads_for(view.camera.width * view.camera.height):
             image = model.test_rendering(view.to(device)).image
         images.append(image.clamp(0, 1).cpu())
         save_png(folder / f"{name}.png", images[-1])
+        if maps is not None:
+            found = maps(view)
+            _log.info("%s: expected %.1f dB, %.1f to %.1f", view.name, found.psnr, *found.interval)
+            save_png(folder / f"{name}_error.png", expected_error_picture(found))
+            if mask is not None:
+                save_png(folder / f"{name}_mask.png", (found.error > mask).float().cpu().expand(3, -1, -1))
     if what == "flight":
         _log.info("The film is %s", save_film(folder, "flight", images))
-    _log.info("%d pictures are in %s", len(images), folder)
+    _log.info("%d pictures are in %s", len(files), folder)
     return folder

@@ -13,6 +13,7 @@ import ca_reg
 
 EXPECTED = [
     "GaussianDropout", "OpacityNoise", "Chain", "CAScore", "CAResult", "Reason", "CAMonitor", "CAPenalty", "attribute",
+    "error_map", "ErrorMap",
     "IndependentDropout", "Regularizer", "Params", "Draw", "scale_opacity", "expected_opacity", "__version__",
 ]  # fmt: skip
 ELSEWHERE = {
