@@ -1,4 +1,4 @@
-"""Published methods as data: the settings of each, where they come from, and what differs from the original."""
+"""Published methods as data, and the best known setting for few photographs: settings, source, and what differs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["RECIPES", "Recipe", "with_recipe", "with_steps"]
 
 @dataclass(frozen=True)
 class Recipe:
-    """A published method in the settings of this package; docs/recipes.md has more on each.
+    """A method in the settings of this package; docs/recipes.md has more on each.
 
     Args:
         config: at the method's own number of iterations; loss and density by the names of their registries. Whole
@@ -127,6 +127,20 @@ RECIPES: dict[str, Recipe] = {
         "AbsGS (ACM MM 2024), TY424/AbsGS 87d7a5a",
         "no pruning by pixels on the screen, which has no effect there",
     ),
+    "sparse": Recipe(
+        TrainConfig(
+            iterations=3_000,
+            dropout=0.2,
+            sh_every=150,
+            densify_from=150,
+            prune_size_from=900,
+            opacity_reset_from=600,
+            opacity_decay=0.995,
+            guard=3_000,
+        ),
+        "no publication: 3dgs, dropout (Chen et al. 2025), Binocular3DGS's opacity decay and the guard of this package",
+        "nothing; benchmarks/guard.md says how it was chosen",
+    ),
 }
 """All recipes, by the name that ``--recipe`` knows."""
 
@@ -143,16 +157,16 @@ def with_steps(expression: str, times: float) -> str:
     return re.sub(r"(?<![\w.])[1-9][\d_]{2,}(?![\w.])", lambda at: str(round(times * int(at[0]))), expression)
 
 
-_MARKS = "sh_every", "densify_from", "densify_until", "prune_size_from", "opacity_reset_from"
+_MARKS = "sh_every", "densify_from", "densify_until", "prune_size_from", "opacity_reset_from", "guard"
 
 
 def with_recipe(name: str, **changes: object) -> TrainConfig:
     """Return the settings of a recipe with some fields changed.
 
     With other ``iterations`` the steps at which something begins or ends are scaled in proportion: ``sh_every``,
-    ``densify_from``, ``densify_until``, ``prune_size_from``, ``opacity_reset_from``, and in loss and density the whole
-    numbers from 100 on. Rates and the steps between two densifications or resets stay: the optimizer needs its time
-    after either. ``changes`` are taken as they are.
+    ``densify_from``, ``densify_until``, ``prune_size_from``, ``opacity_reset_from``, ``guard``, and in loss and density
+    the whole numbers from 100 on. Rates and the steps between two densifications or resets stay: the optimizer needs
+    its time after either. ``changes`` are taken as they are.
 
     Args:
         name: a key of `RECIPES`.

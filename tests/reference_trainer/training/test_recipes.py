@@ -84,9 +84,20 @@ def absgs(white: bool) -> Iterator[Event]:
             yield iteration, "reset", 0.8  # there before resets, of which the lower one holds in either order
 
 
+def sparse(white: bool) -> Iterator[Event]:  # ours: fsgs at three tenths, with Binocular3DGS's decay
+    for iteration in range(1, 3_000):
+        if iteration > 150:
+            yield iteration, "decay", 0.995
+            if iteration % 100 == 0:
+                yield iteration, "densify", 5e-4
+                yield iteration, "prune", None
+        if iteration == 600:
+            yield iteration, "reset", 0.05
+
+
 CODE_BASES = {
     "3dgs": fsgs, "inria": inria, "fsgs": fsgs, "dngaussian": dngaussian, "binocular": binocular, "mvgs": inria,
-    "absgs": absgs, "corgs": corgs, "segs": corgs,
+    "absgs": absgs, "corgs": corgs, "segs": corgs, "sparse": sparse,
 }  # fmt: skip
 
 
@@ -198,6 +209,13 @@ def test_terms_act_when_those_of_the_code_base_do(name, share):
                 number = math.ceil(share * iteration) - 1
                 weights = [as_schedule(term.weight)(number) for term in terms if type(term).__name__ == kind]
                 assert sum(weights) == pytest.approx(weight(iteration), abs=1e-6), (kind, iteration)
+
+
+def test_sparse_is_3dgs_of_as_many_steps_with_three_options():
+    """Dropout, decay and the guard after the last step, whatever the iterations."""
+    for iterations in (1_000, 1_500, 3_000):
+        options = {"dropout": 0.2, "opacity_decay": 0.995, "guard": iterations}
+        assert with_recipe("sparse", iterations=iterations) == with_recipe("3dgs", iterations=iterations, **options)
 
 
 def test_steps_scale_with_the_iterations_and_all_else_stays():
