@@ -60,7 +60,7 @@ SCHEDULE = {  # what decides when and how fast, and enters no single step
     "opacity_rate", "color_rate", "initial_points", "initial_scale", "initial_opacity", "densify_from", "densify_until",
     "densify_every", "densify_gradient", "dense_fraction", "prune_opacity", "prune_size", "prune_size_from",
     "max_gaussians", "opacity_reset", "opacity_reset_from", "opacity_reset_every", "opacity_reset_over_white",
-    "opacity_decay", "density",
+    "opacity_decay", "density", "guard",
 }  # fmt: skip
 
 
