@@ -234,33 +234,19 @@ def _measure(
         **{} if expected is None else dict(zip(_EXPECTED, (expected.psnr, *expected.interval), strict=True)),
     )
     if files:
-        guessed = (
-            {}
-            if expected is None
-            else {
-                f"expected error {expected.psnr:.1f} dB": (
-                    expected_error_picture(expected),
-                    ("0", f"{ERROR_PICTURE_RANGE:g}"),
-                )
-            }
-        )
+        bar, found = ("0", f"{ERROR_PICTURE_RANGE:g}"), {"exact CA": exact_half}
+        guessed = {}
+        if expected is not None:
+            guessed = {f"expected error {expected.psnr:.1f} dB": (expected_error_picture(expected), bar)}
         title = "render" if photograph is None else f"render {measured.psnr:.2f} dB"
         panels: dict[str, tuple[Tensor, tuple[str, str] | None]] = {title: (image, None)}
         if photograph is None:
-            own = {} if scores[2].settings == scores[3].settings else {f"exact CA{_at(exact)}": exact}
-            sampled = f"CA, {ca.samples} renders{_at(ca)}"
-            panels |= guessed | _maps(
-                {"exact CA": exact_half, **own, sampled: ca, f"neutral CA{_at(neutral)}": neutral}
-            )
+            if scores[2].settings != scores[3].settings:
+                found[f"exact CA{_at(exact)}"] = exact
+            found |= {f"CA, {ca.samples} renders{_at(ca)}": ca, f"neutral CA{_at(neutral)}": neutral}
         else:
-            error = error_picture(image, photograph), ("0", f"{ERROR_PICTURE_RANGE:g}")
-            panels = (
-                {"photograph": (photograph, None)}
-                | panels
-                | {"error": error}
-                | guessed
-                | _maps({"exact CA": exact_half})
-            )
+            panels = {"photograph": (photograph, None)} | panels | {"error": (error_picture(image, photograph), bar)}
+        panels |= guessed | _maps(found)
         save_png(files[0], image)
         pictures, scales = zip(*panels.values(), strict=True)
         save_png(files[1], side_by_side(pictures, [*panels], scales=scales))
