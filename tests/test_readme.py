@@ -32,6 +32,7 @@ COMMANDS = [
     if line.startswith(("ca-reg", "python"))
 ]
 QUICK = {
+    "run": ["--quick", "--no-open"],
     "train": ["--iterations", "4", "--images", "images"],
     "compare": ["--iterations", "2", "--images", "images", "--seeds", "1"],  # a process for each run
 }

@@ -113,6 +113,7 @@ class Run:
         scene = self._photographs()
         self.rendering.begin(self.device, trains=True)
         options, config = self._settings(scene)
+        self._begin_again("evaluate", "report")  # only now: other settings are refused with all results in place
         print(self._forecast(scene, options, config), flush=True)
         self._poses(scene)
         self._plan(options, config)
@@ -138,9 +139,7 @@ class Run:
             raise ValueError(f"{self.photos} holds {len(sources)} photographs that can be read; it takes at least 2.")
         about: dict[str, Any] = {"frames": self.frames, "files": {path.name: path.stat().st_size for path in sources}}
         with run_lock(self.folder):
-            for step in list(_WRITTEN)[list(_WRITTEN).index(self.again) :] if self.again else ():
-                for path in [path for name in _WRITTEN[step] for path in self.folder.glob(name)]:
-                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+            self._begin_again("photographs", "poses", "train")
             before = read_json(mark) if mark.exists() else {}
             if not before:
                 write_json(mark, before)  # the folder is ours from now on, should this be interrupted
@@ -165,6 +164,14 @@ class Run:
         else:
             paths = list_images(scene / "images")
         return max(map(image_size, paths), key=math.prod), len(paths)
+
+    def _begin_again(self, *steps: Step) -> None:
+        """Delete what these steps wrote, as far as `--from` says."""
+        order = list(_WRITTEN)
+        for step in steps:
+            if self.again and order.index(step) >= order.index(self.again):
+                for path in [path for name in _WRITTEN[step] for path in self.folder.glob(name)]:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def _settings(self, scene: Path) -> tuple[SceneOptions, TrainConfig]:
         """Return what is trained; refuses to go on with a run that was begun with other settings, which are named."""

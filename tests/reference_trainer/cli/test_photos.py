@@ -104,6 +104,9 @@ def test_three_photographs_become_a_page(garden, tmp_path, capsys, monkeypatch):
     # Other settings or photographs are named, unless they are asked for.
     assert "iterations: 3 -> 2" in (text := refused(["run", "garden", "--quick"], capsys))
     assert "--from train" in text
+    there = seen(out)
+    refused(["run", "garden", "--quick", "--from", "evaluate"], capsys)
+    assert seen(out) == there
     (garden / "train_2.png").unlink()
     assert "other photographs, see train_2.png" in refused(["run", "garden"], capsys)
     shutil.copy(out / "scene/garden/images/train_2.png", garden)
