@@ -200,7 +200,7 @@ def test_three_real_photographs_from_nothing_to_the_page(data_root, tmp_path, ca
     said = capsys.readouterr().out
     assert "3 of 3 photographs registered" in said
     assert re.search(r"will take about \d+ (s|min) on this machine as it is now: poses \d+ s, training \d+ s", said)
-    assert (tmp_path / "out/report.html").stat().st_size > 1e6
+    assert (tmp_path / "out/report.html").stat().st_size > 1e5  # with pictures and model
     results = json.loads((tmp_path / "out/results.json").read_text())
     assert set(results["mean"]) == {"train", "between", "around"}
     assert results["mean"]["train"]["psnr"] > 12
