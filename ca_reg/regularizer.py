@@ -150,6 +150,8 @@ class Regularizer(Scheduled):
     @property
     def last(self) -> Draw | None:
         """The last draw of the calling thread; that of any thread if this one has not called the module."""
+        if torch.compiler.is_compiling():
+            return self._latest
         thread = weakref.ref(threading.current_thread())  # the same object for a thread
         for caller, draw in self._by_thread:
             if caller is thread:
