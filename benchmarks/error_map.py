@@ -1,6 +1,7 @@
 """How well an error map knows the error: leave one scene out, against its rivals, on the same models.
 
     python -m benchmarks.error_map SCENE-SETTING-SEED=RUN ... [--keep FOLDER] [--rivals] [--weights]
+    python -m benchmarks.error_map NAME=RUN ... --picture docs/images/error_map.webp
 
 RUN is the folder of a finished training. Prints the tables of ``benchmarks/error_map.md``, which has the protocol;
 ``--weights`` prints those of `ca_reg.error_maps.FORMS`, fitted on all scenes. What is measured of a model is kept in
@@ -26,7 +27,10 @@ from torch import Tensor
 from ca_reg import error_maps as form_of
 from ca_reg.functional import Multiplier
 from reference_trainer.evaluation.error_maps import ErrorMaps
+from reference_trainer.evaluation.evaluate import error_picture, expected_error_picture
 from reference_trainer.evaluation.metrics import ssim
+from reference_trainer.evaluation.pictures import heat_map
+from reference_trainer.evaluation.style import WIDTH, new_figure, readable
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render.renderer import render_moments
@@ -292,6 +296,28 @@ def row(
     return found
 
 
+def draw(runs: Mapping[str, str], file: Path) -> None:
+    """Draw the last test view of every run: render, measured error, expected error, and what no photograph shows."""
+    with new_figure(file) as figure:
+        figure.set_size_inches(WIDTH, 1.75 * len(runs) + 0.3)
+        axes = figure.subplots(len(runs), 4, squeeze=False)
+        for of_run, (name, run) in zip(axes, runs.items(), strict=True):
+            model, scene = load_run_model(Path(run))
+            view, maps = scene.test[-1], ErrorMaps(model, scene.train)
+            found, image = maps(view), model.test_rendering(view).image.clamp(0, 1)
+            error = (image - view.image).abs().mean(0)
+            hidden = heat_map(maps.features(view)["hidden"], 1.0)
+            pictures = {
+                f"{readable(name)}: render": image,
+                f"measured, mean {error.mean():.3f}": error_picture(image, view.image),
+                f"expected, {found.error.mean():.3f}": expected_error_picture(found), "seen by no photograph": hidden,
+            }  # fmt: skip
+            for ax, (title, picture) in zip(of_run, pictures.items(), strict=True):
+                ax.imshow((picture.permute(1, 2, 0) * 255).round().byte().numpy())
+                ax.set_title(title, fontsize=10, fontweight="normal")
+                ax.set_axis_off()
+
+
 def main() -> None:
     """Measure, fit, print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -299,7 +325,11 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, default=Path("error_map"))
     parser.add_argument("--rivals", action="store_true")
     parser.add_argument("--weights", action="store_true")
+    parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
+    if options.picture:
+        draw(dict(each.split("=") for each in options.runs), options.picture)
+        return
     torch.set_num_threads(1)
     options.keep.mkdir(parents=True, exist_ok=True)
     models: dict[str, list[Seen]] = {}

@@ -5,7 +5,7 @@ much the colors along its ray disagree, what covers it, how many training photog
 photographs show there. :func:`expected_error` adds such maps up with fixed weights. A renderer that offers less gets a
 coarser map from what it has.
 
-The weights were fitted on eight scenes, to models with and without dropout; what they are worth on a scene that had no
+The weights were fitted on seven scenes, to models with and without dropout; what they are worth on a scene that had no
 part in the fit is in ``benchmarks/error_map.md``.
 """
 

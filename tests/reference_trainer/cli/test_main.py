@@ -42,7 +42,7 @@ from reference_trainer.training.recipes import RECIPES
         (["evaluate"], ["--cameras", "--size", "--world", "--arc", "--background"]),
         (["bake"], ["PATH", "--regularizer", "--out"]),
         (["view"], ["PATH", "--scene", "--arc", "--regularizer", "--port", "--device"]),
-        (["render"], ["--what", "--frames", "{auto,test,train,flight}"]),
+        (["render"], ["--what", "--frames", "{auto,test,train,flight,error}"]),
         (
             ["compare"],
             [

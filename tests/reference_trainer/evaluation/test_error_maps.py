@@ -78,7 +78,7 @@ def test_what_no_photograph_saw_is_hidden(plane):
 
 
 def test_what_another_surface_hides_from_the_photograph_is_hidden(plane):
-    """A wall at half the depth, from -0.3 to 0.8, hides the plane at 0.8 from a camera at 0, not at 1.2."""
+    """A wall at half the depth, from -0.3 to 0.8, hides the plane at 0.8 from a camera at 0, not from one at 1.2."""
     near = torch.tensor([[x, y, 1.0] for x in torch.arange(-0.3, 0.8, 0.02) for y in torch.arange(-0.6, 0.6, 0.02)])
     with_wall = dataclasses.replace(plane, gaussians=joined(plane.gaussians, of_points(near, 0.03)))
     for model, expected in ((with_wall, 1), (plane, 0)):

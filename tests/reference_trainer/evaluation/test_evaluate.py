@@ -224,7 +224,7 @@ def test_no_gradient_and_no_global_random_number(tiny_scene, gaussians):
 
 
 def of(name: str, split: str, value: float) -> ViewScores:
-    return ViewScores(name, split, *[value] * 16)
+    return ViewScores(name, split, *[value] * 16, "", value, value, value)
 
 
 def test_means_leave_out_what_does_not_exist():
