@@ -113,7 +113,8 @@ class Render:
         check_run(self.run)
         check_out(self.out, self.run)
         if self.mask is not None and not (self.what == "error" and 0 < self.mask < 1):
-            raise ValueError(f"--mask needs --what error and a threshold in (0, 1), got {self.mask:g}.")
+            got = f"--what {self.what} --mask {self.mask:g}"
+            raise ValueError(f"--mask needs --what error and a threshold in (0, 1), got {got}.")
 
     def __call__(self) -> None:
         from reference_trainer.runs.measure import render_run

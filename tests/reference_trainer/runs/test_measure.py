@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image, ImageSequence
 
+from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores
 from reference_trainer.evaluation.results import PARTIAL
 from reference_trainer.evaluation.tables import EXACT, evaluation_table
@@ -210,3 +211,17 @@ def test_a_flight_begins_and_ends_at_training_cameras(suffix, run, tmp_path, sai
         one, other = (read_image(path)[0] for path in (folder / f"{frame}.png", out / f"views/train/{view}.png"))
         assert (one - other).abs().max() <= 1 / 255 + 1e-6
     assert said == [f"The film is {film}", f"5 pictures are in {folder}"]
+
+
+def test_where_a_run_is_expected_to_be_wrong(run, tmp_path):
+    out, _ = run
+    model, scene = load_run_model(out)
+    error = ErrorMaps(model, scene.train)(scene.test[0]).error
+    threshold = error.median().item()
+    render_run(out, "error", tmp_path, mask=threshold)
+    assert len([*tmp_path.iterdir()]) == 3 * len(scene.test)
+    mask = read_image(tmp_path / "test_0_mask.png")[0]
+    assert torch.equal(mask[0] > 0.5, error > threshold)
+    assert 0 < mask.mean() < 1
+    render_run(out, "error", tmp_path / "no_mask")
+    assert len([*(tmp_path / "no_mask").iterdir()]) == 2 * len(scene.test)
