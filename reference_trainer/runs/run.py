@@ -272,7 +272,7 @@ def _train(
         return psnr(model_of(trainer).test_rendering(view).image.clamp(0, 1), view.image, view.mask)
 
     def details(opacity: Tensor, view: View) -> dict[str, Tensor]:
-        return training_snapshot(model_of(trainer), view, trainer.views)
+        return training_snapshot(model_of(trainer), view)
 
     monitored: AbstractContextManager[CAMonitor | None] = nullcontext()
     if every:

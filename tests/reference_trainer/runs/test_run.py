@@ -259,7 +259,8 @@ def test_tensorboard_shows_pictures_of_a_view_of_each_split_if_asked_to(finished
     for out in (finished[0], scaled[0]):
         shown[out] = accumulator.EventAccumulator(str(out))
         shown[out].Reload()
-    tags = {f"{what}/{split}" for what in ("render", "error", "co-adaptation") for split in ("train", "test")}
+    pictures = ("render", "error", "expected error", "co-adaptation")
+    tags = {f"{what}/{split}" for what in pictures for split in ("train", "test")}
     assert set(shown[finished[0]].Tags()["images"]) == tags
     for tag in tags:
         images = shown[finished[0]].Images(tag)
