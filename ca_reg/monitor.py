@@ -25,7 +25,7 @@ from ca_reg.functional import scale_opacity
 from ca_reg.regularizer import Params
 from ca_reg.result import new_axes, summarize
 from ca_reg.score import CAScore
-from ca_reg.sinks import Sink, Sinks
+from ca_reg.sinks import Sinks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -95,7 +95,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         last_step: int | None = None,
         psnr: Callable[[Tensor, Any], float] | None = None,
         details: Callable[[Tensor, Any], Mapping[str, Tensor]] | None = None,
-        sinks: Sequence[Sink] = (),
+        sinks: Sequence[Any] = (),
         resume_step: int | None = None,
     ) -> None:
         check_count(every, "every", minimum=1)
@@ -274,7 +274,7 @@ def _keep_lines(path: Path, resume_step: int | None) -> int:
     return max((step for _, step in kept), default=-1)
 
 
-def _summary_writer(folder: Path, resume_step: int | None) -> list[Sink]:
+def _summary_writer(folder: Path, resume_step: int | None) -> list[Any]:
     """Return a TensorBoard writer, none where tensorboard is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask
 from reference_trainer.evaluation.metrics import first_order_map
-from reference_trainer.evaluation.style import COLORS, WIDTH
+from reference_trainer.evaluation.style import COLORS, WIDTH, readable
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import is_ply
@@ -283,7 +283,7 @@ def _draw(records: Records, figure: Any) -> None:
     panels = figure.subplots(1, len(records), squeeze=False, sharey=True)[0]
     for axes, (name, record) in zip(panels, records.items(), strict=True):
         _panel(axes, record)
-        axes.set_title(name)
+        axes.set_title(readable(name.rsplit("/", 1)[-1]))
     panels[0].set_ylabel("relative error")
     lines = dict(zip(*reversed(panels[-1].get_legend_handles_labels()), strict=True))
     figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=3)
