@@ -183,7 +183,8 @@ class Diff:
 class View:
     """Explore a run, or any 3DGS PLY, live in a browser.
 
-    Two are shown side by side, with one camera. Shows render, co-adaptation, depth or heat, as this package renders them. Needs ca_reg[viewer]; Ctrl-C ends it.
+    Two are shown side by side, with one camera. Shows render, co-adaptation, depth or heat, as this package renders
+    them. Needs ca_reg[viewer]; Ctrl-C ends it.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
