@@ -13,7 +13,13 @@ from torch.nn.functional import grid_sample
 
 from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise, Reason
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ca_picture
+from reference_trainer.evaluation.error_maps import ErrorMaps
+from reference_trainer.evaluation.evaluate import (
+    CA_PICTURE_RANGE,
+    ERROR_PICTURE_RANGE,
+    ca_picture,
+    expected_error_picture,
+)
 from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE, Heat, colored_by
 from reference_trainer.evaluation.trained_model import TrainedModel
@@ -21,7 +27,7 @@ from reference_trainer.scenes.scene import View, Viewpoint
 
 __all__ = ["DisplayOptions", "Mode", "Picture", "ViewerModel", "with_photograph"]
 
-Mode = Literal["render", "co-adaptation", "depth", "heat"]
+Mode = Literal["render", "co-adaptation", "expected error", "depth", "heat"]
 
 
 @dataclass(frozen=True)
@@ -29,7 +35,8 @@ class DisplayOptions:
     """How a model is shown.
 
     Args:
-        mode: the test-time render, the exact CA map, depth, or the Gaussians in the colors of their `Heat`.
+        mode: the test-time render, the exact CA map, where the render is expected to be wrong (`ErrorMaps`), depth, or
+            the Gaussians in the colors of their `Heat`.
         drop_rate: of the CA map and of the mask, in [0, 1).
         noise: standard deviation of the opacity noise, at least 0: the CA map is that of dropout and noise together,
             all other pictures show one draw of it.
@@ -59,6 +66,7 @@ class ViewerModel:
         model: what to draw.
         views: that its heat is measured at, on the model's device.
         beside: whose mean heat is the unit of the colors, so that two models can be compared; by default its own.
+        train: the photographs that the model was trained on, for the expected error.
 
     Example:
         >>> from reference_trainer.model.gaussians import Gaussians
@@ -70,9 +78,16 @@ class ViewerModel:
         (torch.Size([3, 16, 16]), ('0', '0.02'))
     """
 
-    def __init__(self, model: TrainedModel, views: Sequence[Viewpoint], beside: ViewerModel | None = None) -> None:
+    def __init__(
+        self,
+        model: TrainedModel,
+        views: Sequence[Viewpoint],
+        beside: ViewerModel | None = None,
+        train: Sequence[View] = (),
+    ) -> None:
         self.model = model
         self.views = views
+        self.train = train
         self._beside = beside or self
         self._chosen_last: tuple[DisplayOptions | None, TrainedModel] = None, model
 
@@ -80,6 +95,11 @@ class ViewerModel:
     def heat(self) -> Heat:
         """The heat at drop rate 1/2; ValueError if no view has a score, or all scores are 0."""
         return Heat.of(self.model, self.views)
+
+    @cached_property
+    def error_maps(self) -> ErrorMaps:
+        """What is expected to be wrong, by the model and its training photographs."""
+        return ErrorMaps(self.model, self.train)
 
     @torch.no_grad()
     def render(self, options: DisplayOptions, camera: Camera) -> Picture:
@@ -91,8 +111,8 @@ class ViewerModel:
         if options != self._chosen_last[0]:
             self._chosen_last = options, self._chosen(options)
         model, view = self._chosen_last[1], Viewpoint("", camera.to(self.model.gaussians.means.device))
-        draw = {"co-adaptation": self._co_adaptation, "depth": self._depth}.get(options.mode, self._render)
-        return draw(options, model, view)
+        draw = {"co-adaptation": self._co_adaptation, "expected error": self._expected_error, "depth": self._depth}
+        return draw.get(options.mode, self._render)(options, model, view)
 
     def _render(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
         """Draw the colors of a model, which those of its heat may have replaced."""
@@ -117,6 +137,13 @@ class ViewerModel:
             note += f", {1 - result.visible.double().mean().item():.0%} of the picture not covered"
             scale += "; gray, not covered: when Gaussians are left out, more than a fifth is background on average"
         return Picture(ca_picture(result), note, ("0", f"{CA_PICTURE_RANGE:g}", scale))
+
+    def _expected_error(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
+        """Draw the expected error of the whole model: hidden and masked Gaussians count."""
+        found = self.error_maps(view)
+        low, high = found.interval
+        scale = "0", f"{ERROR_PICTURE_RANGE:g}", "expected absolute error of the color"
+        return Picture(expected_error_picture(found), f"expected {found.psnr:.1f} dB, {low:.1f} to {high:.1f}", scale)
 
     def _depth(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
         """Draw the nearness of what covers half of a pixel at least."""

@@ -123,14 +123,16 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
 
     def show(self, model: TrainedModel, views: Mapping[str, Sequence[Viewpoint]], name: str = "") -> None:
         """Show a model from now on; one of another name beside the first, whose views are the cameras to jump to."""
-        flat = [view.to(model.gaussians.means.device) for group in views.values() for view in group]
+        device = model.gaussians.means.device
+        flat = [view.to(device) for group in views.values() for view in group]
+        train = [view for view in views.get("train", ()) if isinstance(view, View)]  # test views must not tell
         if not self._models:
             self._add_cameras(views, model.gaussians)
         elif name not in self._models:
             self._chosen = self._server.gui.add_dropdown("Model", [BOTH, *self._models, name], order=-1)
             self._chosen.on_update(lambda event: self._moved())
         first = next(iter(self._models), name)
-        self._models[name] = ViewerModel(model, flat, self._models[first] if name != first else None)
+        self._models[name] = ViewerModel(model, flat, self._models[first] if name != first else None, train)
         self._moved(still=True)
 
     def serve(self) -> None:
@@ -268,7 +270,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         gui = self._server.gui
         gui.configure_theme(show_share_button=False, show_logo=False)
         self._controls = [
-            gui.add_dropdown("Show", get_args(Mode), hint="Hidden or masked Gaussians are missing in every mode."),
+            gui.add_dropdown("Show", get_args(Mode), hint="The expected error is that of all Gaussians, hidden or not."),
             gui.add_slider("Drop rate", 0.0, 0.95, 0.05, 0.5, hint="Of the co-adaptation, and of the mask."),
             gui.add_slider("Noise", 0.0, 2.0, 0.1, 0.0, hint="Opacity noise: a draw of it, or in the co-adaptation."),
             gui.add_checkbox("Draw a mask", False, hint="Leave Gaussians out at random, as many as the drop rate says, "
