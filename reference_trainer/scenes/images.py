@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "check_image", "composite", "image_size", "is_image", "list_images", "match_images", "path_inside",
-    "picture_folder", "read_image", "resize_image", "unreadable_photographs",
+    "check_image", "composite", "image_size", "is_image", "list_images", "match_images", "opened_image",
+    "path_inside", "picture_folder", "read_image", "resize_image", "unreadable_photographs",
 ]  # fmt: skip
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
@@ -69,14 +69,14 @@ def check_image(path: str | Path) -> None:
 
 def _decoded(path: str | Path) -> Any:
     """Return the picture of an image file, RGBA if it has transparency, else RGB; errors as for `read_image`."""
-    with _opened(path) as file:
+    with opened_image(path) as file:
         mode, width, height = file.mode, file.width, file.height
         file.verify()  # checks a PNG's checksums, which decoding does not
     if mode.startswith(("I", "F")):
         raise ValueError(f"{path} has pixel mode {mode}; convert it to 8 bits per channel first.")
     if width * height > LARGEST_IMAGE:
         raise ValueError(f"{path} has {width}x{height} pixels, more than {LARGEST_IMAGE}; make it smaller first.")
-    with _opened(path) as file:
+    with opened_image(path) as file:
         if file.format == "TIFF":
             _check_strips(file)
         has_alpha = mode in ("RGBA", "LA", "PA") or "transparency" in file.info
@@ -85,19 +85,19 @@ def _decoded(path: str | Path) -> Any:
 
 def image_size(path: str | Path) -> tuple[int, int]:
     """Return the width and height of an image file, pixels, without decoding it; errors as for `read_image`."""
-    with _opened(path) as file:
+    with opened_image(path) as file:
         return int(file.width), int(file.height)
 
 
 @contextmanager
-def _opened(path: str | Path) -> Iterator[Any]:
+def opened_image(path: str | Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
     """Open an image with Pillow; whatever it raises becomes ValueError."""
     from PIL import Image, UnidentifiedImageError
 
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no image file {path}.")
     try:
-        with Image.open(path, formats=FORMATS) as file:
+        with Image.open(path, formats=formats) as file:
             yield file
     except UnidentifiedImageError as error:
         raise ValueError(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from reference_trainer.files import replacing
-from reference_trainer.scenes.images import FORMATS, OTHER_PHOTOGRAPHS, check_image, is_image
+from reference_trainer.scenes.images import FORMATS, OTHER_PHOTOGRAPHS, check_image, is_image, opened_image
 
 __all__ = ["collect_photographs", "is_video", "sharpest_frames", "sort_photographs"]
 
@@ -155,7 +155,7 @@ def _opened_video(path: Path) -> Any:
 
 def _upright(path: Path) -> Any:
     """Return a photograph as a Pillow image, turned as its EXIF data say; None where the file will do as it is."""
-    from PIL import Image, ImageOps
+    from PIL import ImageOps
 
     kind = path.suffix.lower()
     if kind in HEIC:
@@ -164,7 +164,7 @@ def _upright(path: Path) -> Any:
         except ImportError as error:
             raise ImportError(f"{path.name} needs pi-heif: pip install 'ca_reg[photos]'.") from error
         pi_heif.register_heif_opener()
-    with Image.open(path, formats=("HEIF",) if kind in HEIC else FORMATS) as picture:
+    with opened_image(path, ("HEIF",) if kind in HEIC else FORMATS) as picture:
         if kind in _AS_THEY_ARE and picture.getexif().get(_ORIENTATION, 1) == 1:
             return None
         return ImageOps.exif_transpose(picture.convert("RGB"))

@@ -88,7 +88,7 @@ def test_absolute_gradients_cost_nothing_unless_they_are_asked_for(tiny_scene, m
     def refuse(*arguments):
         raise AssertionError("computed without need")
 
-    monkeypatch.setattr(type(engine_for(torch.device("cpu"))), "absolute_gradients", refuse)
+    monkeypatch.setattr(engine_for(torch.device("cpu")), "absolute_gradients", refuse)
     Trainer(tiny_scene, TrainConfig(iterations=1)).train()
     with pytest.raises(AssertionError, match="without need"):
         Trainer(tiny_scene, TrainConfig(iterations=1, density="absgrad")).train()
