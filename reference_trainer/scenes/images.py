@@ -90,7 +90,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
 
 
 @contextmanager
-def opened_image(path: str | Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
+def opened_image(path: str | Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
     """Open an image with Pillow; whatever it raises becomes ValueError."""
     from PIL import Image, UnidentifiedImageError
 
