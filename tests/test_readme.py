@@ -20,7 +20,7 @@ from PIL import Image
 from stand_ins import gsplat as gsplat_stand_in
 from subprocesses import subprocess_environment
 
-from reference_trainer.cli import main
+from reference_trainer.cli import main, photos
 from reference_trainer.scenes import synthetic_scene
 
 README = ROOT / "README.md"
@@ -128,8 +128,9 @@ def my_photos(request, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_from_photographs_to_a_page(my_photos, capsys):
+def test_from_photographs_to_a_page(my_photos, capsys, monkeypatch):
     """Every command for photographs, one after the other, with few steps; what waits for a browser is left out."""
+    monkeypatch.setattr(photos, "PRESETS", {"quick": (30, 20_000)})
     for _, *arguments in (command for command in COMMANDS if command[0] == "ca-reg"):
         name = arguments[0]
         if name == "view" or (name == "poses" and (my_photos / "my_photos/transforms.json").exists()):
