@@ -38,7 +38,7 @@ from reference_trainer.training.recipes import with_recipe
 __all__ = ["Run"]
 
 RECIPE = "3dgs"
-"""The schedule under the setting that is best known for few photographs, `plan_rules.RECOMMENDED`."""
+"""The schedule under the setting that is best known for few photographs, `recipes.RECOMMENDED`."""
 PRESETS = {"quick": (1_000, 100_000), "default": (2_000, 200_000), "quality": (5_000, 500_000)}
 """Training steps, and pixels to which photographs are reduced."""
 MARK = "photographs.json"
@@ -175,7 +175,7 @@ class Run:
 
     def _settings(self, scene: Path) -> tuple[SceneOptions, TrainConfig]:
         """Return what is trained; refuses to go on with a run that was begun with other settings, which are named."""
-        from reference_trainer.training.plan_rules import RECOMMENDED
+        from reference_trainer.training.recipes import RECOMMENDED
 
         steps, pixels = PRESETS["quick" if self.quick else "quality" if self.quality else "default"]
         factor = max(1.0, math.sqrt(math.prod(self._sizes(scene)[0]) / pixels))

@@ -39,7 +39,7 @@ class Poses:
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.scenes.poses import find_poses
-        from reference_trainer.training.plan_rules import RECOMMENDED
+        from reference_trainer.training.recipes import RECOMMENDED
 
         found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, progress=True)
         scene = found.folder.parents[1]

@@ -15,9 +15,9 @@ from reference_trainer.training.assembly import make_density, make_losses, make_
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import Photometric
 from reference_trainer.training.model_state import initial_gaussians, seen_by_any
-from reference_trainer.training.recipes import with_recipe
+from reference_trainer.training.recipes import RECOMMENDED, with_recipe
 
-__all__ = ["DROPOUT_GAINS", "FAR_APART_GAINS", "RECOMMENDED", "RULES", "PlanItem"]
+__all__ = ["DROPOUT_GAINS", "FAR_APART_GAINS", "RULES", "PlanItem"]
 
 
 @dataclass(frozen=True)
@@ -259,8 +259,6 @@ DROPOUT_GAINS = {
 rows that docs/results.md shows."""
 DECAY_GAINS = {"fern": 0.37, "herz-jesu": 0.64, "lego": 0.45}
 """What opacity decay of 0.995 gained beside dropout of 0.2, with 3, 3 and 8 views: benchmarks/remedy.md."""
-RECOMMENDED = {"dropout": 0.2, "opacity_decay": 0.995}
-"""The setting that is best known for few views near each other."""
 WORTH = 0.2
 """What dropout must have gained in half of the trainings with about as many views to be recommended, dB."""
 FAR_APART = 25
