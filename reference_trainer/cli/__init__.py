@@ -100,7 +100,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     peek.add_argument("--iterations", type=int, default=argparse.SUPPRESS)
     peeked = vars(peek.parse_known_args(arguments)[0])
     recipe, given = peeked.pop("recipe"), given_fields(arguments)
-    config = with_recipe(recipe, **peeked) if recipe else TrainConfig()
+    config = with_recipe(recipe or "3dgs", **({} if recipe else {"iterations": usual.iterations}) | peeked)
     defaults: dict[str, Any] = {
         "demo": Demo(),
         "run": Run(tyro.MISSING),

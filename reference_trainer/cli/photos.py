@@ -37,8 +37,8 @@ from reference_trainer.training.recipes import with_recipe
 
 __all__ = ["Run"]
 
-RECIPE = "3dgs"
-"""The schedule under the setting that is best known for few photographs, `recipes.RECOMMENDED`."""
+RECIPE = "sparse"
+"""The best setting known for few photographs."""
 PRESETS = {"quick": (1_000, 100_000), "default": (2_000, 200_000), "quality": (5_000, 500_000)}
 """Training steps, and pixels to which photographs are reduced."""
 MARK = "photographs.json"
@@ -175,12 +175,10 @@ class Run:
 
     def _settings(self, scene: Path) -> tuple[SceneOptions, TrainConfig]:
         """Return what is trained; refuses to go on with a run that was begun with other settings, which are named."""
-        from reference_trainer.training.recipes import RECOMMENDED
-
         steps, pixels = PRESETS["quick" if self.quick else "quality" if self.quality else "default"]
         factor = max(1.0, math.sqrt(math.prod(self._sizes(scene)[0]) / pixels))
         options = SceneOptions(str(scene), test=self.test, points=self.points, downscale=round(factor, 3))
-        config = with_recipe(RECIPE, iterations=steps, **RECOMMENDED)
+        config = with_recipe(RECIPE, iterations=steps)
         if (self.folder / CONFIG).exists():
             try:
                 settings_of_run(self.folder, options, config, auto=True, given=())

@@ -39,13 +39,11 @@ class Poses:
     def __call__(self) -> None:
         """Run the command."""
         from reference_trainer.scenes.poses import find_poses
-        from reference_trainer.training.recipes import RECOMMENDED
 
         found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, progress=True)
         scene = found.folder.parents[1]
-        options = " ".join(f"--{name.replace('_', '-')} {value:g}" for name, value in RECOMMENDED.items())
         out = shlex.quote(f"runs/{scene.resolve().name}")
-        command = f"ca-reg train {shlex.quote(str(scene))} {options} --out {out}"
+        command = f"ca-reg train {shlex.quote(str(scene))} --recipe sparse --out {out}"
         print(f"{found}\nThe cameras are in {found.folder}. The best setting known for few photographs:\n  {command}")
 
 

@@ -15,7 +15,6 @@ from reference_trainer.training.assembly import make_density, make_losses, make_
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import Photometric
 from reference_trainer.training.model_state import initial_gaussians, seen_by_any
-from reference_trainer.training.recipes import RECOMMENDED, with_recipe
 
 __all__ = ["DROPOUT_GAINS", "FAR_APART_GAINS", "RULES", "PlanItem"]
 
@@ -100,9 +99,6 @@ def densification(scene: Scene, config: TrainConfig) -> PlanItem:
     pixels = sum(view.camera.width * view.camera.height for view in scene.train) / len(scene.train)
     reason = f"{len(points.positions)} initial points are {len(points.positions) / pixels:.2f} per pixel of a view"
     reason += f"; detail comes from clones and splits, from step {config.densify_from} of {config.iterations} on"
-    scaled = with_recipe("3dgs", iterations=config.iterations).densify_from
-    if config.densify_from == TrainConfig().densify_from != scaled:
-        reason += f" (without a recipe nothing scales with the iterations: --recipe 3dgs would begin at {scaled})"
     return PlanItem(name, "used", reason)
 
 
@@ -137,8 +133,7 @@ def dropout(scene: Scene, config: TrainConfig) -> PlanItem:
         decay = _range([*DECAY_GAINS.values()])
         reason += f", and opacity decay beside it by another {decay} (means of 3 seeds; a single training can lose)"
         if config.opacity_decay == 1 or not make_regularizer(config).drops:
-            options = " ".join(f"--{name.replace('_', '-')} {value:g}" for name, value in RECOMMENDED.items())
-            reason += f": use {options}"
+            reason += ": use --recipe sparse"
     if make_regularizer(config).drops:
         return PlanItem("dropout", "used", f"asked for; {reason}")
     return PlanItem("dropout", "recommended" if pays else "left out", f"not asked for; {reason}")

@@ -1,15 +1,14 @@
-"""Published methods as data, and the best known setting for few photographs: settings, source, and what differs."""
+"""Published methods, and the best known setting for few photographs, as data: settings, source, and what differs."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
 from dataclasses import dataclass
-from typing import Any
 
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["RECIPES", "RECOMMENDED", "Recipe", "with_recipe", "with_steps"]
+__all__ = ["RECIPES", "Recipe", "with_recipe", "with_steps"]
 
 
 @dataclass(frozen=True)
@@ -49,9 +48,6 @@ _CORGS = TrainConfig(
     density="co_pruning(5.0)",
 )
 _LOUDER = 1.2  # DNGaussian's L1 + 0.2 (1 - SSIM) over (1 - l) L1 + l (1 - SSIM) with l = 0.2 / 1.2
-
-RECOMMENDED: dict[str, Any] = {"dropout": 0.2, "opacity_decay": 0.995}
-"""The setting that is best known for few views near each other."""
 
 RECIPES: dict[str, Recipe] = {
     "3dgs": Recipe(
@@ -139,7 +135,8 @@ RECIPES: dict[str, Recipe] = {
             prune_size_from=900,
             opacity_reset_from=600,
             guard=3_000,
-            **RECOMMENDED,
+            dropout=0.2,
+            opacity_decay=0.995,
         ),  # the schedule of 3dgs at 3,000 steps
         "no publication: 3dgs, dropout (Chen et al. 2025), Binocular3DGS's opacity decay and the guard of this package",
         "nothing; benchmarks/guard.md says how it was chosen",

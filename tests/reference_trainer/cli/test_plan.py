@@ -65,7 +65,7 @@ def test_the_scene_may_be_given_either_way(monkeypatch, tmp_path):
 
 
 def test_an_option_at_its_default_is_still_the_users(capsys):
-    arguments = ["plan", "--downscale", "8", "--iterations", "400"]
+    arguments = ["plan", "--downscale", "8", "--iterations", "400", "--sh-every", "500"]
     main(arguments)
     assert "sh_degree=0" in capsys.readouterr().out
     main([*arguments, "--sh-degree", "3", "--verbose"])

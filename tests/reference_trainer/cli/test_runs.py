@@ -188,8 +188,7 @@ def test_options_override_the_recipe(recipe, monkeypatch, tmp_path):
     main(["train", *chosen, "--iterations", "3000", "--densify-from", "70", "--noise", "0.8", "--path", "fern",
           "--images", "images_8", "--views", "5", "--out", "out"])  # fmt: skip
     given = {"iterations": 3_000, "densify_from": 70, "noise": 0.8}
-    expected = with_recipe(recipe, **given) if recipe else TrainConfig(**given)  # at which nothing scales
-    assert asked["config"] == expected
+    assert asked["config"] == with_recipe(recipe or "3dgs", **given)
     assert asked["scene"] == SceneOptions("fern", images="images_8", views=5)
     assert asked["out"] == Path("out")
 
@@ -275,7 +274,7 @@ def test_a_capture_needs_no_word_of_explanation(name, data_root, tmp_path, monke
     """The README's commands on captures that nothing here was tuned on, one of them of a masked object."""
     monkeypatch.chdir(tmp_path)
     scene, quick = str(data_root / name), ["--downscale", "4", "--monitor-every", "0"]
-    best = ["--dropout", "0.2", "--opacity-decay", "0.995"]
+    best = ["--recipe", "sparse"]
     main(["plan", scene, *best])
     assert "3 training views" in capsys.readouterr().out
     main(["train", scene, *best, *quick, "--iterations", "30", "--out", "runs/mine"])
