@@ -1,5 +1,9 @@
 """No import of any kind points to a higher floor or closes a circle."""
 
+import ast
+import re
+import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -35,6 +39,29 @@ def test_there_is_no_circle_between_modules(graph):
 
 def test_there_is_no_circle_between_rooms(graph):
     assert circle(rooms(graph)) == []
+
+
+def test_what_is_imported_from_elsewhere_is_declared():
+    """A package that only others bring along, such as rich, is missing one day."""
+    root = Path(__file__).parents[1]
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    asked = [project["dependencies"], *project["optional-dependencies"].values()]
+    declared = {_distribution(each) for group in asked for each in group}
+    declared |= {"llvmlite", "cycler"}  # numba's and matplotlib's, which cannot do without
+    imported: dict[str, str] = {}
+    rooms_of_the_package = ("ca_reg", "integrations", "reference_trainer")
+    for path in [path for room in rooms_of_the_package for path in (root / room).rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            imported |= {name.partition(".")[0]: str(path.relative_to(root)) for name in names}
+    brought = {name: set(map(_distribution, of)) for name, of in packages_distributions().items() if name in imported}
+    assert brought["PIL"] == {"pillow"}
+    assert not {name: imported[name] for name, of in brought.items() if declared.isdisjoint(of)}
+
+
+def _distribution(requirement: str) -> str:
+    return re.split(r"[^\w.-]", requirement)[0].lower().replace("_", "-")
 
 
 FILES = {

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 import statistics
 import sys
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 __all__ = [
@@ -192,33 +195,45 @@ def print_table(markdown: str, *, width: int | None = None) -> None:
     if not sys.stdout.isatty():
         print(markdown, flush=True)
         return
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    console = Console(width=width, highlight=False)
+    width = width or shutil.get_terminal_size().columns
     head, rule, *rows = [
         [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
         for line in markdown.strip().splitlines()
     ]
-    aligned = ["left" if cell.startswith(":") else "right" for cell in rule]
-    best = _best(head, rows) if head[0] in ("strategy", "model") else set()
-    cells = [[Text(cell, "bold" if (i, j) in best else "") for j, cell in enumerate(row)] for i, row in enumerate(rows)]
-    title, *others = head
-    widths = [
-        max(map(len, column)) for column in zip(*([cell for cell in line] for line in [head, *rows]), strict=True)
-    ]
-    turned = [max(map(len, head)), *(max(map(len, row)) for row in rows)]
-    figures = all(align == "right" for align in aligned[1:])
-    if sum(widths) + 3 * len(widths) > console.width >= sum(turned) + 3 * len(turned) and figures:
-        cells = [[Text(name), *(row[j] for row in cells)] for j, name in enumerate(others, start=1)]
-        head, aligned = [title, *(row[0] for row in rows)], ["left", *["right"] * len(rows)]
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name, align in zip(head, aligned, strict=True):
-        table.add_column(name, justify="left" if align == "left" else "right")
-    for line in cells:
-        table.add_row(*line)
-    console.print(table)
+    figures = [not cell.startswith(":") for cell in rule]
+    bold = {(i + 1, j) for i, j in (_best(head, rows) if head[0] in ("strategy", "model") else ())}
+    lines: list[Sequence[str]] = [head, *rows]
+    turned: list[Sequence[str]] = list(zip(*lines, strict=True))
+    if _room(map(_widest, turned)) > width >= _room(map(_widest, lines)) and all(figures[1:]):
+        lines, figures, bold = turned, [False, *[True] * len(rows)], {(j, i) for i, j in bold}
+    columns = list(zip(*lines, strict=True))
+    # A figure is never broken, as words are.
+    bodies = [column[1:] if of else " ".join(column[1:]).split() for column, of in zip(columns, figures, strict=True)]
+    least = [_widest([*column[0].split(), *body, ""]) for column, body in zip(columns, bodies, strict=True)]
+    widths, gap = list(map(_widest, columns)), 2 if _room(least) <= width else 1
+    while _room(widths, gap) > width and widths != least:
+        widths[max(range(len(widths)), key=lambda j: (widths[j] > least[j], widths[j]))] -= 1
+    for i, line in enumerate(lines):
+        parts = [textwrap.wrap(cell, w, break_long_words=False, break_on_hyphens=False)
+                 for cell, w in zip(line, widths, strict=True)]  # fmt: skip
+        for texts in zip_longest(*parts, fillvalue=""):
+            shown = []
+            for j, text in enumerate(texts):
+                style = "2" if i == 0 else "1" if (i, j) in bold else None
+                space = " " * (widths[j] - len(text))
+                styled = f"\x1b[{style}m{text}\x1b[0m" if style and text else text
+                shown.append(space + styled if figures[j] else styled + space)
+            print((" " * gap).join(shown).rstrip())
+    sys.stdout.flush()
+
+
+def _widest(cells: Iterable[str]) -> int:
+    return max(map(len, cells))
+
+
+def _room(widths: Iterable[int], gap: int = 2) -> int:
+    """Return the width of a table with columns of these widths."""
+    return sum(width + gap for width in widths) - gap
 
 
 def _best(head: Sequence[str], rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:

@@ -127,8 +127,6 @@ WIDE = markdown_table(
 def test_a_table_fits_the_terminal(width, capsys, monkeypatch):
     """Every figure is there and no line is longer; the best strategy is bold."""
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("TERM", "xterm-256color")
     print_table(WIDE, width=width)
     out = capsys.readouterr().out
     plain = re.sub(r"\x1b\[[0-9;]*m", "", out)
