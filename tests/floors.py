@@ -12,7 +12,7 @@ from pathlib import Path
 FLOORS = (
     {"ca_reg"},
     {"integrations"},
-    {"camera", "rotations", "devices", "threads", "compiled"},
+    {"camera", "rotations", "devices", "threads", "progress", "compiled"},
     {"files", "json_files", "npy_files", "ply_files", "tensor_files"},
     {"render"},  # which thereby knows neither scenes nor the model
     {"renderers", "model"},

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import torch
 
+from reference_trainer.progress import progress_bar
 from reference_trainer.render import describe_engine, render_moments, variance_shares
 from reference_trainer.scenes.scene import View
 
@@ -29,20 +30,18 @@ def warm_up() -> tuple[str, ...]:
     """
     if describe_engine("cpu") == "torch":
         return ()
-    from tqdm import tqdm
-
-    from reference_trainer.compiled.compiling import KERNELS, describe_compilation, reported_to
+    from reference_trainer.compiled.compiling import describe_compilation, reported_to
 
     names: list[str] = []
-    with tqdm(delay=1e9, unit="loop", leave=False) as bar:
+    # Without a total: a loop is compiled once for each kind of arguments, unless that is in the cache.
+    with progress_bar(delay=1e9, leave=False, bar_format="loop {n_fmt}{postfix}, {elapsed}") as bar:
 
         def note(name: str, folder: str | None) -> None:
             if not names:
                 _log.info(describe_compilation(folder))
                 bar.delay = 0.0
             names.append(name)
-            bar.total = max(len(KERNELS), len(names))
-            bar.set_postfix_str(name)
+            bar.set_postfix_str(name, refresh=False)
             bar.update()
 
         with reported_to(note):

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from reference_trainer.progress import progress_bar
 from reference_trainer.scenes.colmap import colmap_folders
 from reference_trainer.scenes.images import check_image, image_size, list_images, unreadable_photographs
 
@@ -189,10 +190,10 @@ def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, 
 def _watched(job: Callable[..., None], database: Path, table: str, total: int, **bar: Any) -> None:
     """Run a COLMAP job in another thread, with a progress bar over the rows it has written; Ctrl-C cancels it."""
     import pycolmap
-    from tqdm import tqdm
 
     stop, rows = pycolmap.CancellationToken(), f"SELECT count(*) FROM {table}"
-    with ThreadPoolExecutor(1) as pool, closing(sqlite3.connect(database)) as opened, tqdm(total=total, **bar) as shown:
+    shown = progress_bar(total=total, **bar)
+    with ThreadPoolExecutor(1) as pool, closing(sqlite3.connect(database)) as opened, shown:
         running = pool.submit(job, cancellation_token=stop)
         try:
             done: set[Any] = set()

@@ -17,6 +17,7 @@ from ca_reg import Chain
 from reference_trainer.evaluation.shares import guard
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.progress import progress_bar
 from reference_trainer.render import NotFiniteError
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.scenes.virtual_cameras import unseen_views
@@ -132,12 +133,10 @@ class Trainer:
             TrainingInterrupted: on Ctrl-C or SIGTERM, between two steps: what is saved then continues to the identical
                 result.
         """
-        from tqdm import tqdm
-
         last = self.config.iterations if until is None else min(until, self.config.iterations)
         with (
             hold_interrupts() as stop_if_interrupted,
-            tqdm(total=self.config.iterations, initial=self.step, disable=not progress, mininterval=0.5) as bar,
+            progress_bar(total=self.config.iterations, initial=self.step, disable=not progress) as bar,
         ):
             while self.step < last:
                 stop_if_interrupted()
@@ -147,7 +146,8 @@ class Trainer:
                 self.processor_seconds += time.process_time() - spent
                 if progress and self.step % 10 == 0:
                     psnr = -10 * math.log10(max(mse, 1e-12))
-                    bar.set_postfix(loss=f"{loss:.4f}", psnr=f"{psnr:.2f}", gaussians=len(self.gaussians))
+                    shown = {"loss": f"{loss:.4f}", "psnr": f"{psnr:.2f}", "gaussians": len(self.gaussians)}
+                    bar.set_postfix(shown, refresh=False)
                 bar.update()
                 if after_step is not None:
                     after_step(self)
