@@ -17,4 +17,5 @@ def progress_bar(**options: Any) -> Any:
     """
     from tqdm import tqdm
 
-    return tqdm(mininterval=0.5 if sys.stderr.isatty() else 60.0, **options)
+    shown = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"  # fits 80 columns
+    return tqdm(**{"bar_format": shown, "mininterval": 0.5 if sys.stderr.isatty() else 60.0} | options)

@@ -116,7 +116,6 @@ class Run:
         self._begin_again("evaluate", "report")  # only now: other settings are refused with all results in place
         print(self._forecast(scene, options, config), flush=True)
         self._poses(scene)
-        self._plan(options, config)
         run_experiment(options, config, self.folder, auto=True, device=self.device, progress=True)
         self._report()
 
@@ -224,15 +223,6 @@ class Run:
         with run_lock(self.folder):
             print(find_poses(scene, progress=True))
 
-    def _plan(self, options: SceneOptions, config: TrainConfig) -> None:
-        """Say what training will use, unless it has begun."""
-        from reference_trainer.scenes import load_scene
-        from reference_trainer.training.plan import make_plan
-
-        if not (self.folder / CHECKPOINT).exists():
-            scene = load_scene(options, seed=config.seed)
-            print(f"{scene}\n{make_plan(scene, config).summary()}")
-
     def _report(self) -> None:
         """Write the page and open it."""
         from reference_trainer.evaluation.tables import print_table, summary
@@ -240,11 +230,13 @@ class Run:
         from reference_trainer.runs.folder import read_results
 
         page, results = self.folder / "report.html", self.folder / RESULTS
+        print_table(summary(read_results(self.folder)))
         if not page.exists() or page.stat().st_mtime < results.stat().st_mtime:
             write_report([self.folder], device=self.device)
-        print_table(summary(read_results(self.folder)))
+        else:
+            print(f"The report is {page}, as before.")
         out = shlex.quote(str(self.folder))
-        print(f"The page is {page}. Live: ca-reg view {out}; a film: ca-reg render {out} --what flight")
+        print(f"Live: ca-reg view {out}; a film: ca-reg render {out} --what flight")
         screen = not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
         if self.open and screen:
             with suppress(webbrowser.Error):

@@ -78,7 +78,8 @@ def evaluation_table(data: Mapping[str, Any]) -> str:
 
 def summary(results: Mapping[str, Any]) -> str:
     """Return the means of ``results.json`` as a short table."""
-    rows = {split: {**results, **mean} for split, mean in sorted(results["mean"].items())}
+    order = ["test", "train", "between", "around"]
+    rows = {split: {**results, **mean} for split in order if (mean := results["mean"].get(split)) is not None}
     names = ["psnr", "ssim", "lpips", "ca_exact_half", "cv", "gaussians", "seconds"]
     if all(row.get("lpips") is None for row in rows.values()):
         names.remove("lpips")

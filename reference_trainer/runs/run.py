@@ -167,8 +167,7 @@ def run_experiment(
         return _complete(out)
     # Before the folder is made, so that a mistyped scene does not claim it.
     scene = load_scene(options, seed=config.seed)
-    for note in scene.notes:
-        _log.info(note)
+    _log.info(scene)
     with run_lock(out), threads_for(scene.pixels):
         begun = settings_of_run(out, options, config, auto=auto, given=given)  # perhaps since, by another process
         if (out / RESULTS).exists():
@@ -229,8 +228,7 @@ def _planned(scene: Scene, config: TrainConfig, out: Path, *, auto: bool, given:
     changing = [row for row in plan.rows() if row["change"] != "-"]
     for row in changing:
         _log.info("plan: %s %s (%s): %s", row["item"], row["decision"], row["change"], row["reason"])
-    changed = "1 setting" if len(changing) == 1 else f"{len(changing)} settings"
-    _log.info("plan: %s changed, reasons in %s; --no-auto trains exactly as asked", changed, out / PLAN)
+    _log.info("plan: all decisions, with reasons, are in %s", out / PLAN)
     return plan.applied(config, given=given)
 
 

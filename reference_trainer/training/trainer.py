@@ -126,7 +126,7 @@ class Trainer:
         Args:
             until: stop after this step; the configured number by default.
             after_step: called after every step.
-            progress: whether to show a progress bar with loss, PSNR, count and time left.
+            progress: whether to show a progress bar with PSNR, number of Gaussians and time left.
 
         Raises:
             TrainingStoppedError: if the loss or the Gaussians are not finite, or no Gaussian is left.
@@ -141,13 +141,12 @@ class Trainer:
             while self.step < last:
                 stop_if_interrupted()
                 start, spent = time.perf_counter(), time.process_time()
-                loss, mse = self.train_step()
+                _, mse = self.train_step()
                 self.seconds += time.perf_counter() - start
                 self.processor_seconds += time.process_time() - spent
                 if progress and self.step % 10 == 0:
                     psnr = -10 * math.log10(max(mse, 1e-12))
-                    shown = {"loss": f"{loss:.4f}", "psnr": f"{psnr:.2f}", "gaussians": len(self.gaussians)}
-                    bar.set_postfix(shown, refresh=False)
+                    bar.set_postfix_str(f"{psnr:.1f} dB, {len(self.gaussians):,} Gaussians", refresh=False)
                 bar.update()
                 if after_step is not None:
                     after_step(self)

@@ -76,8 +76,9 @@ def test_three_photographs_become_a_page(garden, tmp_path, capsys, monkeypatch):
     assert "IMG_4.CR2" in warned
     assert "3 of 3 photographs registered" in said
     assert (
-        said.index("will take about") < said.index("registered") < said.index("| train |") < said.index("The page is")
+        said.index("will take about") < said.index("registered") < said.index("| train |") < said.index("report.html")
     )
+    assert len(re.findall("^initial points", said, re.M)) == 1
     assert {path: at for path, at in seen(garden).items() if path.suffix == ".png"} == before
     page = (out / "report.html").read_text()
     assert opened == [(out / "report.html").as_uri()]
