@@ -12,6 +12,7 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ try:
 except ImportError as error:
     raise SystemExit("ca-reg: the command needs the trainer's packages: pip install 'ca_reg[trainer]'.") from error
 
+from reference_trainer.cli.listing import registry
 from reference_trainer.cli.models import Bake, Clean, Diff, Evaluate, Render, Report, View
 from reference_trainer.cli.options import refuse_old_options
 from reference_trainer.cli.photos import Run
@@ -35,7 +37,7 @@ __all__ = ["main"]
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``ca-reg``; errors that a user can fix exit with one line and code 2, an interruption with 130."""
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    arguments = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
     with _log_shown():
         _run(arguments)
 
@@ -96,11 +98,14 @@ def _parse(arguments: Sequence[str]) -> Any:
     usual = TrainConfig()
     refuse_old_options(arguments, [usual.renderer, *(f"--{name}" for name in vars(usual))])
     peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
-    peek.add_argument("--recipe", choices=list(RECIPES))
-    peek.add_argument("--iterations", type=int, default=argparse.SUPPRESS)
-    peeked = vars(peek.parse_known_args(arguments)[0])
-    recipe, given = peeked.pop("recipe"), given_fields(arguments)
-    config = with_recipe(recipe or "3dgs", **({} if recipe else {"iterations": usual.iterations}) | peeked)
+    peek.add_argument("--recipe", nargs="?")
+    peek.add_argument("--iterations", nargs="?")
+    peeked, given = peek.parse_known_args(arguments)[0], given_fields(arguments)
+    recipe, steps = peeked.recipe, peeked.iterations or ""
+    if recipe and recipe not in RECIPES:
+        raise ValueError(f"there is no recipe {recipe!r}; choose one of {', '.join(RECIPES)}.")
+    asked = {"iterations": int(steps)} if steps.isdecimal() else {} if recipe else {"iterations": usual.iterations}
+    config = with_recipe(recipe or "3dgs", **asked)
     defaults: dict[str, Any] = {
         "demo": Demo(),
         "run": Run(tyro.MISSING),
@@ -133,12 +138,26 @@ def _parse(arguments: Sequence[str]) -> Any:
                 prog="ca-reg",
                 description="Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting.",
                 args=arguments,
+                registry=registry,
                 config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
             )
-    except SystemExit:
-        # What the options refuse themselves comes in a box with tyro's inner names: say it like all other errors.
-        text = " ".join(re.sub(r"[│╭╮╰╯─]", " ", heard.getvalue()).split())
-        if found := re.search(r"Error parsing \S+: (.*?) For full helptext", text):
-            raise ValueError(found[1]) from None
-        sys.stderr.write(heard.getvalue())
-        raise
+    except SystemExit as end:
+        raise _in_a_line(heard.getvalue(), arguments) or end from None
+
+
+def _in_a_line(heard: str, arguments: Sequence[str]) -> ValueError | None:
+    """Return what tyro says in a box, with inner names and help of other commands, as an error like all others."""
+    text = " ".join(re.sub(r"[│╭╮╰╯─|]|-{3,}", " ", heard).split()).partition(" For full helptext")[0]
+    command = next((word for word in arguments if not word.startswith("-")), "")
+    if found := re.search(r"Error parsing \S+: (.*?)( Argument helptext: (\S+) (\S+) .*)?$", text):
+        return ValueError(f"{found[3]} expects {found[4]}: {found[1]}." if found[2] else found[1])
+    if found := re.search(r"(?<=Unrecognized options: )([^ ,]+)(?:.*Available subcommands: (.*))?", text):
+        near = re.findall(r"--[a-z-]+(?= )", text.partition("Perhaps you meant:")[2])
+        near = near or get_close_matches(found[1], (names := (found[2] or "").split(", ")), 1) or names
+        meant = f": did you mean {near[0]}?" if len(near) == 1 or near[0][0] == "-" else f": choose one of {found[2]}."
+        help_ = "--help" if found[2] else f"{command} --help"
+        return ValueError(f"there is no {found[1]}{meant if near[0] else '.'} All options: ca-reg {help_}")
+    if found := re.search(r"Missing from .*?: (\S+) (.*) \(required\)", text):
+        return ValueError(f"{command} needs {found[1]}: {found[2]} See ca-reg {command} --help")
+    text = re.sub(r"^.*?(?=invalid choice|Expected one|Missing value)", "", text)
+    return ValueError(f"{text} See ca-reg {command} --help") if heard else None

@@ -144,6 +144,8 @@ class Report:
 
     def check(self) -> None:
         """Refuse what cannot work, before anything heavy is imported."""
+        if not self.runs:
+            raise ValueError("expected at least 1 run to report on: give the --out folders of ca-reg train.")
         if self.out is not None and self.out.is_dir():
             report_file(self.runs, self.out)
         for run in self.runs:

@@ -152,6 +152,6 @@ def refuse_old_options(arguments: Sequence[str], known: Sequence[str]) -> None:
     """
     words = [part for word in arguments for part in (word.split("=", 1) if word.startswith("--") else [word])]
     for (option, value), now in _OLD.items():
-        for word, after in zip(words, [*words[1:], ""], strict=True):
+        for word, after in zip(words, [*words, ""][1:], strict=True):
             if word.replace("_", "-") == option and value in (None, after) and (value or option) not in known:
                 raise ValueError(f"{option}{f' {value}' if value else ''} is a name of earlier versions: {now}.")

@@ -30,9 +30,11 @@ measurement take the time of 7 steps (fern at 252x189, 40,110 Gaussians)."""
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="scene")]
 Folder = Annotated[
-    str | None, tyro.conf.Positional, tyro.conf.arg(help='Scene folder, or "synthetic"; the same as --path.')
+    str | None,
+    tyro.conf.Positional,
+    tyro.conf.arg(metavar="[SCENE]", help='Scene folder, or "synthetic"; the same as --path.'),
 ]
-Config = Annotated[TrainConfig, tyro.conf.arg(name="training")]
+Config = Annotated[TrainConfig, tyro.conf.arg(name="")]  # whose groups have names
 Recipe = Annotated[
     str | None,
     tyro.conf.arg(
@@ -219,11 +221,10 @@ class Plan:
         scene = load_scene(options, seed=self.config.seed)
         plan = make_plan(scene, self.config, given=self.given)
         print(scene)
-        print(plan.summary())
+        first, *others = plan.summary().splitlines()
+        print("\n".join([first if self.verbose else f"{first} All {len(plan.items)} decisions: --verbose", *others]))
         if self.verbose:
             print_table(f"\n{markdown_table(plan.rows(), ['item', 'decision', 'change', 'reason'])}")
-        else:
-            print(f"All {len(plan.items)} decisions, with what is left out by construction: --verbose")
         if self.out is not None:
             write_json(self.out, plan.as_dict())
             print(f"The plan is in {self.out}.")

@@ -1,5 +1,6 @@
 """What every command has: help, errors in one line, devices, and the ends that it may come to."""
 
+import dataclasses
 import re
 import socket
 import subprocess
@@ -13,7 +14,8 @@ import ca_reg
 from reference_trainer import cli
 from reference_trainer.cli import main
 from reference_trainer.runs import run as run_module
-from reference_trainer.training.recipes import RECIPES
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.recipes import RECIPES, with_recipe
 
 
 @pytest.mark.parametrize(
@@ -66,6 +68,36 @@ def test_help(command, options, capsys):
     assert "usage: ca-reg" in text
     for option in options:
         assert option in text
+
+
+@pytest.mark.parametrize(
+    ("command", "named"),
+    [("trian", "train"), ("xyzzy", "compare"), ("train synthetic --dropuot 0.2", "--dropout"), ("run", "PATH"),
+     ("train --iterations few", "--iterations"), ("train --recipe 3dgz", "3dgs"), ("train --out", "--out"),
+     ("run p --from trian", "photographs"), ("study stabilty", "stability"), ("report", "run")],
+)  # fmt: skip
+def test_a_mistake_is_answered_in_one_line(command, named, capsys):
+    """With what was meant, and without the help of other commands."""
+    text = refused(command.split(), capsys)
+    assert text.startswith("ca-reg: ")
+    assert named in text
+    assert len(text) < 250
+    assert "tyro" not in text
+
+
+def test_without_a_command_there_is_help(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main([])
+    assert exit_.value.code == 0
+    assert "compare" in capsys.readouterr().out
+
+
+def test_settings_given_in_groups_are_those_of_the_training(monkeypatch):
+    options = ["--noise", "0.5", "--no-analytic", "--densify-until", "9", "--means-rate=2e-4", "--recipe", "3dgs"]
+    command = cli._parse(["train", "garden", *options])
+    assert command.config == with_recipe("3dgs", noise=0.5, densify_until=9, means_rate=2e-4)
+    assert command.folder == "garden"
+    assert {"noise", "analytic", "densify_until", "means_rate"} <= command.given
 
 
 def test_the_list_of_commands_says_what_each_does(capsys):
@@ -275,11 +307,14 @@ def test_a_folder_of_runs_names_one(capsys, tmp_path):
 
 
 def test_the_options_of_a_training_stand_in_groups(capsys):
+    """Every setting once, below a name that says what it is about; texts are paragraphs, whatever their lines."""
     with pytest.raises(SystemExit):
         main(["train", "--help"])
-    text = plain(capsys.readouterr().out)
-    places = [text.index(f" {name} options ") for name in ("scene", "training", "rendering")]
-    assert places == sorted(places)
-    assert (
-        places[0] < text.index("--path ") < places[1] < text.index("--dropout ") < places[2] < text.index("--engine ")
-    )
+    text = capsys.readouterr().out
+    groups = dict(zip(*[iter(re.split(r" ([\w-]+) options ", text)[1:])] * 2, strict=True))
+    told = {"scene": "path", "schedule": "seed", "regularizer": "dropout", "method": "loss", "density": "prune-opacity"}
+    for name, option in told.items():
+        assert f" --{option} " in groups[name]
+    for field in dataclasses.fields(TrainConfig):
+        assert len(re.findall(rf"^\W+--{field.name.replace('_', '-')}[ ,]", text, re.M)) == 1
+    assert 'view of each split as well; "auto": where' in plain(text)
