@@ -12,7 +12,8 @@ from oracles import brute_force, random_scene
 from stand_ins import gsplat as gsplat_stand_in
 from stand_ins.gsplat import centered, intrinsics
 
-from ca_reg import CAScore, GaussianDropout
+from ca_reg import CAScore, GaussianDropout, attribute
+from ca_reg.attribution import hanging
 from ca_reg.functional import Multiplier
 from ca_reg.integrations import gsplat_model as module
 from ca_reg.integrations.gsplat import regularized
@@ -96,6 +97,28 @@ def test_lists_go_on_behind_an_opaque_surface(package):
     middle = lists.pixels == 7 * WIDTH + 9
     assert lists.gaussians[middle].tolist() == [0, 1, 2, 3]  # gsplat's own lists end after two of 0.99
     assert float(lists.alphas.max()) == pytest.approx(0.99)
+
+
+def test_what_hangs_between_the_cameras_is_found(package):
+    """A wall that both cameras see, and a veil between them that neither does, by the lines of docs/lists.md."""
+    x, y = torch.meshgrid(torch.linspace(-3, 3, 13), torch.linspace(-1, 1, 5), indexing="ij")
+    wall = torch.stack([x, y, torch.full_like(x, 4.0)], -1).reshape(-1, 3)
+    means = torch.cat([wall, torch.tensor([[0.0, 0.0, 0.5]])])
+    scales = torch.cat([torch.full((65, 3), 0.25), torch.full((1, 3), 0.1)])
+    opacities = torch.cat([torch.full((65,), 0.5), torch.tensor([0.9])])
+    colors = torch.rand(66, 3, generator=torch.Generator().manual_seed(0))
+    model = GsplatModel(means, torch.eye(4)[0].expand(66, 4), scales, colors)
+
+    def at(place):
+        camera = torch.eye(4)
+        camera[0, 3] = -place
+        return GsplatView(camera, torch.tensor([[18.0, 0.0, 9.0], [0.0, 18.0, 7.0], [0.0, 0.0, 1.0]]), WIDTH, HEIGHT)
+
+    moments, unseen, taken = ListMoments(model.lists), [at(0.0), at(-2.0), at(2.0)], [at(-1.0), at(1.0)]
+    score = CAScore.exact(moments, p=0.2, threshold=0.3)
+    shares = torch.stack([attribute(score, moments.shares, opacities, view).shares for view in unseen]).mean(0)
+    there, here = (torch.stack([moments.weights(opacities, v) for v in views]).mean(0) for views in (unseen, taken))
+    assert hanging(shares, there, here).nonzero().flatten().tolist() == [65]
 
 
 def test_harmonics_and_gradients(package):
