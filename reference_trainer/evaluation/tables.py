@@ -12,7 +12,8 @@ import shutil
 import statistics
 import sys
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Any
 
@@ -187,7 +188,8 @@ def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str])
 def print_table(markdown: str, *, width: int | None = None) -> None:
     """Print a Markdown table; to a terminal as one that fits its width, with the best models and strategies in bold.
 
-    A table that is too wide is turned around if that helps: many quantities of few strategies are read as rows.
+    A table that is too wide is turned around if that helps: many quantities of few strategies are read as rows. Else its
+    columns go on below.
 
     Args:
         markdown: from `markdown_table`.
@@ -207,25 +209,53 @@ def print_table(markdown: str, *, width: int | None = None) -> None:
     turned: list[Sequence[str]] = list(zip(*lines, strict=True))
     if _room(map(_widest, turned)) > width >= _room(map(_widest, lines)) and all(figures[1:]):
         lines, figures, bold = turned, [False, *[True] * len(rows)], {(j, i) for i, j in bold}
-    columns = list(zip(*lines, strict=True))
-    # A figure is never broken, as words are.
-    bodies = [column[1:] if of else " ".join(column[1:]).split() for column, of in zip(columns, figures, strict=True)]
-    least = [_widest([*column[0].split(), *body, ""]) for column, body in zip(columns, bodies, strict=True)]
-    widths, gap = list(map(_widest, columns)), 2 if _room(least) <= width else 1
+    columns = [
+        _Column(cells, of_figures, {i for i, k in bold if k == j}, whole=of_figures or (j == 0 and len(head) > 2))
+        for j, (cells, of_figures) in enumerate(zip(zip(*lines, strict=True), figures, strict=True))
+    ]
+    while columns:
+        # What is too wide even so goes on below, with the first column again.
+        shown = columns
+        while len(shown) > 2 and _room((column.least for column in shown), 1) > width:
+            shown = shown[:-1]
+        _print_columns(shown, width)
+        rest = columns[len(shown) :]
+        columns = [columns[0], *rest] if rest else []
+        print("\n" * bool(rest), end="", flush=True)
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A column: its cells, the title first; whether they are figures, to the right; the bold ones; if all are whole."""
+
+    cells: Sequence[str]
+    figures: bool
+    bold: Collection[int]
+    whole: bool
+
+    @property
+    def least(self) -> int:
+        """The least width, with lines broken between words where they may be."""
+        title, *body = self.cells
+        return _widest([*title.split(), *(body if self.whole else " ".join(body).split()), ""])
+
+
+def _print_columns(columns: Sequence[_Column], width: int) -> None:
+    """Print columns side by side, as wide as they need or as they may."""
+    widths, least = [_widest(column.cells) for column in columns], [column.least for column in columns]
+    gap = 2 if _room(least) <= width else 1
     while _room(widths, gap) > width and widths != least:
         widths[max(range(len(widths)), key=lambda j: (widths[j] > least[j], widths[j]))] -= 1
-    for i, line in enumerate(lines):
-        parts = [textwrap.wrap(cell, w, break_long_words=False, break_on_hyphens=False)
-                 for cell, w in zip(line, widths, strict=True)]  # fmt: skip
+    for i in range(len(columns[0].cells)):
+        parts = [textwrap.wrap(column.cells[i], w, break_long_words=False, break_on_hyphens=False)
+                 for column, w in zip(columns, widths, strict=True)]  # fmt: skip
         for texts in zip_longest(*parts, fillvalue=""):
-            shown = []
-            for j, text in enumerate(texts):
-                style = "2" if i == 0 else "1" if (i, j) in bold else None
-                space = " " * (widths[j] - len(text))
-                styled = f"\x1b[{style}m{text}\x1b[0m" if style and text else text
-                shown.append(space + styled if figures[j] else styled + space)
-            print((" " * gap).join(shown).rstrip())
-    sys.stdout.flush()
+            line = []
+            for text, column, w in zip(texts, columns, widths, strict=True):
+                style = "2" if i == 0 else "1" if i in column.bold else ""
+                styled, space = f"\x1b[{style}m{text}\x1b[0m" if style and text else text, " " * (w - len(text))
+                line.append(space + styled if column.figures else styled + space)
+            print((" " * gap).join(line).rstrip())
 
 
 def _widest(cells: Iterable[str]) -> int:

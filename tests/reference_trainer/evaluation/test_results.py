@@ -137,6 +137,23 @@ def test_a_table_fits_the_terminal(width, capsys, monkeypatch):
     assert not re.search(r"\x1b\[1m[^\x1b]*20\.00", out)
 
 
+@pytest.mark.parametrize("names", [["a", "b"], [f"view {i}" for i in range(20)]])
+def test_a_table_of_many_columns_goes_on_below(names, capsys, monkeypatch):
+    """Nothing is lost, however many rows there are; every part says which row is which."""
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    rows = [{"view": name} | {f"quantity{j}": f"{i}.{j:02}" for j in range(30)} for i, name in enumerate(names)]
+    print_table(markdown_table(rows, list(rows[0])), width=80)
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert max(map(len, plain.splitlines())) <= 80
+    words = plain.split()
+    for row in rows:
+        assert all(words.count(cell) == 1 for name, cell in row.items() if name != "view")
+    if len(names) > 2:
+        parts = plain.strip().split("\n\n")
+        assert len(parts) > 2
+        assert all(re.search("^view 19 ", part, re.M) for part in parts)
+
+
 def test_a_table_is_markdown_in_a_pipe(capsys):
     print_table(WIDE)
     assert capsys.readouterr().out == WIDE + "\n"
