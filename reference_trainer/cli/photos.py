@@ -127,7 +127,7 @@ class Run:
 
         sources, wrong = sort_photographs(self.photos)
         for name, why in wrong.items():
-            print(f"not read, and left out: {name}: {why}", file=sys.stderr)
+            print(f"not read, and left out: {'' if name in why else f'{name}: '}{why}", file=sys.stderr)
         scene, mark = self.folder / SCENE / self.photos.resolve().stem, self.folder / MARK
         with suppress(ValueError, FileNotFoundError):
             find_format(self.photos, "auto")
@@ -135,7 +135,8 @@ class Run:
         if scene != self.photos and find_spec("pycolmap") is None:
             raise ImportError("these photographs have no cameras, and finding them needs pip install 'ca_reg[colmap]'.")
         if scene != self.photos and len(sources) < 2 and not is_video(self.photos):
-            raise ValueError(f"{self.photos} holds {len(sources)} photographs that can be read; it takes at least 2.")
+            held = f"{len(sources) or 'no'} photograph{'s' * (len(sources) != 1)}"
+            raise ValueError(f"{self.photos} holds {held} that can be read; it takes at least 2, better 3 or more.")
         about: dict[str, Any] = {"frames": self.frames, "files": {path.name: path.stat().st_size for path in sources}}
         with run_lock(self.folder):
             self._begin_again("photographs", "poses", "train")

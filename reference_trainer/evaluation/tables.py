@@ -188,8 +188,8 @@ def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str])
 def print_table(markdown: str, *, width: int | None = None) -> None:
     """Print a Markdown table; to a terminal as one that fits its width, with the best models and strategies in bold.
 
-    A table that is too wide is turned around if that helps: many quantities of few strategies are read as rows. Else its
-    columns go on below.
+    A table that is too wide is turned around if that helps: many quantities of few strategies are read as rows.
+    Else its columns go on below.
 
     Args:
         markdown: from `markdown_table`.
