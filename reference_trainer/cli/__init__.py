@@ -147,7 +147,9 @@ def _parse(arguments: Sequence[str]) -> Any:
 
 def _in_a_line(heard: str, arguments: Sequence[str]) -> ValueError | None:
     """Return what tyro says in a box, with inner names and help of other commands, as an error like all others."""
-    text = " ".join(re.sub(r"[│╭╮╰╯─|]|-{3,}", " ", heard).split()).partition(" For full helptext")[0]
+    text = " ".join(re.sub(r"[│╭╮╰╯─|]|-{3,}", " ", re.sub(r"\x1b\[[0-9;]*m", "", heard)).split()).partition(
+        " For full helptext"
+    )[0]
     command = next((word for word in arguments if not word.startswith("-")), "")
     if found := re.search(r"Error parsing \S+: (.*?)( Argument helptext: (\S+) (\S+) .*)?$", text):
         return ValueError(f"{found[3]} expects {found[4]}: {found[1]}." if found[2] else found[1])

@@ -76,11 +76,18 @@ def test_help(command, options, capsys):
      ("train --iterations few", "--iterations"), ("train --recipe 3dgz", "3dgs"), ("train --out", "--out"),
      ("run p --from trian", "photographs"), ("study stabilty", "stability"), ("report", "run")],
 )  # fmt: skip
-def test_a_mistake_is_answered_in_one_line(command, named, capsys):
-    """With what was meant, and without the help of other commands."""
-    text = refused(command.split(), capsys)
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_mistake_is_answered_in_one_line(command, named, terminal, capsys, monkeypatch):
+    """With what was meant, and without the help of other commands, whether or not tyro answers in colors."""
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with pytest.raises(SystemExit) as exit_:
+        main(command.split())
+    assert exit_.value.code == 2
+    text = capsys.readouterr().err.strip()
     assert text.startswith("ca-reg: ")
     assert named in text
+    assert text.isprintable()
     assert len(text) < 250
     assert "tyro" not in text
 
