@@ -66,15 +66,16 @@ class _Shown(logging.Handler):
     """Shows what happens on the output, tables fitted to the terminal, and warnings on the error output."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        text = record.getMessage()
-        if record.levelno >= logging.WARNING:
-            print(text, file=sys.stderr, flush=True)
-        elif text.startswith("| "):
+        text, to = record.getMessage(), sys.stderr if record.levelno >= logging.WARNING else sys.stdout
+        if text.startswith("| ") and to is sys.stdout:
             from reference_trainer.evaluation.tables import print_table
 
             print_table(text)
+        elif "tqdm" in sys.modules:  # there may be a progress bar, which steps aside
+            sys.modules["tqdm"].tqdm.write(text, file=to)
+            to.flush()
         else:
-            print(text, flush=True)
+            print(text, file=to, flush=True)
 
 
 @contextmanager
