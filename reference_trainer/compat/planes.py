@@ -117,12 +117,7 @@ def surface_planes(
     The distortion is that of 2DGS, equation 13, of depths mapped by ``FAR / (FAR - NEAR) (1 - NEAR / z)``. Depths are
     those of the centers, whereas 2DGS intersects the surfels; the mean depth takes the place of 2DGS's median.
 
-    Args:
-        rendering: with depth.
-        means: of all Gaussians, world coordinates, shape (N, 3).
-        quaternions: likewise, wxyz, shape (N, 4).
-        scales: likewise, shape (N, 3).
-        camera: of the rendering.
+    The rendering has depth; means (N, 3), quaternions (N, 4) and scales (N, 3) are those of all Gaussians.
     """
     splats, alpha, depth = rendering.splats, rendering.alpha, rendering.depth
     assert depth is not None

@@ -74,8 +74,7 @@ _report: Callable[[str, str | None], None] = _log
 def reported_to(report: Callable[[str, str | None], None]) -> Iterator[None]:
     """Report every kernel that is compiled, for lack of a cached one, to a function instead of the log.
 
-    Args:
-        report: receives the kernel's name, and the folder of the cache, None if there is none.
+    It receives the kernel's name, and the folder of the cache, None if there is none.
     """
     global _report
     before, _report = _report, report

@@ -58,15 +58,9 @@ if hasattr(os, "register_at_fork"):
 
 
 def in_threads(kernel: Callable[..., None], count: int, *arguments: Any, least: int) -> None:
-    """Call ``kernel(first, last, *arguments)`` for ranges that make up ``range(count)``.
+    """Call ``kernel(first, last, *arguments)`` for ranges of at least ``least`` items that make up ``range(count)``.
 
     Once this returns, or raises a kernel's error or KeyboardInterrupt, no thread writes any more.
-
-    Args:
-        kernel: compiled with `reference_trainer.compiled.compiling.kernel`.
-        count: number of items.
-        arguments: of the kernel, after the first two.
-        least: number of items that is worth a range.
     """
     threads = torch.get_num_threads()
     size = max(least, -(-count // (_RANGES * threads)))

@@ -24,20 +24,11 @@ _WINDOW = 11
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Return the peak signal-to-noise ratio ``-10 log10(mean squared error)`` in decibels; the peak is 1.
+    """Return the peak signal-to-noise ratio ``-10 log10(mean squared error)`` of images (3, H, W); the peak is 1.
 
-    For several images report the mean of their PSNR, as the papers do, not the PSNR of the pooled error.
-
-    Args:
-        image: colors in [0, 1], shape (3, H, W).
-        target: colors in [0, 1], shape (3, H, W).
-        mask: in [0, 1], shape (H, W), such as DTU's object; see `counted`.
-
-    Returns:
-        Decibels, computed in float64; infinite for equal images, nan if no pixel counts.
-
-    Raises:
-        ValueError: if the shapes differ, are not (C, H, W), or a value is not finite.
+    In decibels, computed in float64; infinite for equal images, nan if no pixel counts of a mask (H, W), such as DTU's
+    object (`counted`). For several images report the mean of their PSNR, as the papers do, not the PSNR of the pooled
+    error. Raises ValueError if the shapes differ, are not (C, H, W), or a value is not finite.
 
     Example:
         >>> import torch
@@ -55,21 +46,11 @@ def counted(image: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def ssim(image: Tensor, target: Tensor) -> float:
-    """Return the structural similarity of the Gaussian-splatting papers (the INRIA code's variant).
+    """Return the structural similarity of the Gaussian-splatting papers (the INRIA code's variant) of images (3, H, W).
 
     That is Wang et al. (2004) with an 11 x 11 Gaussian window of sigma 1.5, zero padding, constants 0.01^2 and 0.03^2,
     population variances, and the mean over all pixels and channels. scikit-image crops the border instead, so its
-    numbers differ.
-
-    Args:
-        image: colors in [0, 1], shape (3, H, W).
-        target: colors in [0, 1], shape (3, H, W).
-
-    Returns:
-        A number in [-1, 1], computed in float64, because in float32 it can exceed 1.
-
-    Raises:
-        ValueError: if the shapes differ, are not (C, H, W), or a value is not finite.
+    numbers differ. In [-1, 1], computed in float64, because in float32 it can exceed 1. Errors are those of `psnr`.
 
     Example:
         >>> import torch
@@ -91,16 +72,10 @@ class DepthErrors(NamedTuple):
 
 
 def depth_errors(depth: Tensor, truth: Tensor) -> DepthErrors:
-    """Return the errors of a depth over the pixels where the true depth is known.
+    """Return the errors of a depth (H, W) over the pixels where the true depth is known, that is not 0; in float64.
 
-    No scale or shift is fitted: rendered depth has the units of the scene.
-
-    Args:
-        depth: d, along the camera's z axis, world units, shape (H, W); for a render, accumulated depth over alpha.
-        truth: t, likewise; 0 where unknown.
-
-    Returns:
-        The errors in float64.
+    Both are along the camera's z axis, in world units; of a render, the accumulated depth over alpha. No scale or shift
+    is fitted.
 
     Example:
         >>> import torch
@@ -139,9 +114,8 @@ def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
     It is taken around the mean color of the image, so what it loses by cancellation is a rounding of the squared
     distance from that color, not of the squared color.
 
-    Returns:
-        The variance, averaged over RGB, shape (H, W), and where any splat contributes, shape (H, W) bool; the variance
-        is 0 elsewhere. The image's CV is the mean over the contributing pixels.
+    Returns the variance, averaged over RGB, (H, W), and where any splat contributes, (H, W) bool; elsewhere the
+    variance is 0. The image's CV is the mean over the contributing pixels.
 
     Example:
         >>> from reference_trainer.camera import Camera

@@ -159,12 +159,9 @@ def heat_map(values: Tensor, vmax: float) -> Tensor:
 
 
 def heat_colors(values: Tensor, low: float, high: float) -> Tensor:
-    """Color values on a logarithmic scale; return colors (N, 3) in [0, 1] on the CPU.
+    """Color values (N,), at least 0 and possibly infinite, on a logarithmic scale from ``low``, above 0, to ``high``.
 
-    Args:
-        values: at least 0, possibly infinite, shape (N,).
-        low: positive; values up to it get the darkest color.
-        high: values from it on get the brightest color.
+    Returns colors (N, 3) in [0, 1] on the CPU; values beyond the ends take the end colors.
     """
     along = (values.clamp(low, high) / low).log() / math.log(high / low)
     return heat_map(along[None], 1.0)[:, 0].T
@@ -201,13 +198,9 @@ def side_by_side(
     """Arrange pictures (3, H, W) in [0, 1] of one size in a grid, each with a label above, with thin white gaps.
 
     A column is at least as wide as its labels. Without ``columns`` all pictures form one row. ``scales`` are the ends
-    of each picture's color bar, which is drawn below it; None for a picture without.
-
-    Returns:
-        Colors in [0, 1], shape (3, H', W'), on the CPU, rounded to bytes.
-
-    Raises:
-        ValueError: if there is no image, the sizes or the numbers differ, or ``columns`` is not positive.
+    of each picture's color bar, which is drawn below it; None for a picture without. Returns colors in [0, 1], (3, H',
+    W'), on the CPU, rounded to bytes. Raises ValueError if there is no image, the sizes or the numbers differ, or
+    ``columns`` is not positive.
 
     Example:
         >>> side_by_side([torch.zeros(3, 30, 40)] * 3, ["a", "b", "c"], columns=2).shape
@@ -242,12 +235,7 @@ def side_by_side(
 
 
 def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
-    """Draw CA and PSNR of several runs against the iteration (paper, training dynamics).
-
-    Args:
-        runs: folder of each run by label.
-        path: the PNG or SVG to write.
-    """
+    """Draw CA and PSNR of several runs, folders by label, against the iteration (paper, training dynamics)."""
     with new_figure(path) as figure:
         figure.set_size_inches(WIDTH, 4.4)
         colors = {label: color(label, number) for number, label in enumerate(runs)}
@@ -272,13 +260,9 @@ def logs_exact(folder: Path) -> bool:
 
 
 def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split: str = "test") -> None:
-    """Stack the panels (photograph, render, error, CA map) of one view under several strategies.
+    """Stack the panels (photograph, render, error, CA map) of one view under several strategies, runs by label.
 
-    Args:
-        runs: folder of each run by label.
-        path: the PNG to write.
-        view: name of the view's files, see `file_names`.
-        split: of the view, such as ``"test"``.
+    ``view`` is the name of the view's files, see `file_names`.
     """
     panels = [read_image(folder / "views" / split / f"{view}{PANEL}.png")[0] for folder in runs.values()]
     height, width = (max(panel.shape[axis] for panel in panels) for axis in (1, 2))  # labels differ, and versions

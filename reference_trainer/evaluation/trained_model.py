@@ -151,9 +151,6 @@ class MaskedRenders:
 
     Projection, colors and sorted tile lists are computed once per view, for all Gaussians, and all masks of a view are
     drawn in one pass. The images are those of `TrainedModel.render`.
-
-    Args:
-        model: what to render.
     """
 
     def __init__(self, model: TrainedModel) -> None:

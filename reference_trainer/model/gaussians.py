@@ -68,18 +68,10 @@ class Gaussians:
     def from_points(
         cls, positions: Tensor, colors: Tensor, distances: Tensor, *, sh_degree: int, opacity: float = 0.1
     ) -> Gaussians:
-        """Make isotropic Gaussians at points.
+        """Make isotropic Gaussians of one opacity, in (0, 1), at positions (N, 3) in the world, of these colors (N, 3).
 
-        Args:
-            positions: world coordinates, shape (N, 3).
-            colors: RGB in [0, 1], shape (N, 3).
-            distances: standard deviation of each Gaussian, positive, shape (N,).
-            sh_degree: degree of the color's spherical harmonics, 0 to 3.
-            opacity: opacity of each, in (0, 1).
-
-        Raises:
-            ValueError: if a position or color is not finite, a distance not positive and finite, the opacity not in
-                (0, 1), or the shapes disagree.
+        Colors are RGB in [0, 1]; ``distances`` (N,), positive, are the standard deviations; ``sh_degree`` is 0 to 3.
+        Raises ValueError for values that are not finite or out of range, and if the shapes disagree.
         """
         n = positions.shape[0]
         for name, x in (("positions", positions), ("colors", colors)):

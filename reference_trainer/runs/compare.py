@@ -44,14 +44,9 @@ def strategies(
 ) -> dict[str, TrainConfig]:
     """Return the settings of a comparison, by names that can serve as folder names.
 
-    Args:
-        names: keys of `NAMED`, or expressions of regularizers, such as ``"d2gs"`` or ``"dropout(0.1) + noise(0.4)"``.
-        config: everything else.
-        dropout: rate for those of `NAMED`.
-        noise: standard deviation for those of `NAMED`.
-
-    Raises:
-        ValueError: if an expression cannot be parsed, or ``config`` is analytic or has a ``regularizer``.
+    ``names`` are keys of `NAMED`, with these rates of dropout and noise, or expressions of regularizers, such as
+    ``"d2gs"`` or ``"dropout(0.1) + noise(0.4)"``; ``config`` is everything else. Raises ValueError if an expression
+    cannot be parsed, or ``config`` is analytic or has a ``regularizer``.
 
     Example:
         >>> made = strategies(["analytic-dropout", "dropout(0.1) + noise(0.4)"], TrainConfig())
@@ -81,13 +76,8 @@ def strategies(
 def scene_folders(paths: Sequence[str], options: SceneOptions, out: Path) -> dict[Path, SceneOptions]:
     """Return the scenes of a comparison by folder: ``out`` for a single scene, else ``out/<scene name>`` for each.
 
-    Args:
-        paths: of the scenes, or ``"synthetic"``.
-        options: all other options, shared by all scenes.
-        out: folder of the comparison.
-
-    Raises:
-        ValueError: if there is no scene, or two have the same name.
+    ``paths`` are those of the scenes, or ``"synthetic"``; they share all other options. Raises ValueError if there is
+    no scene, or two have the same name.
 
     Example:
         >>> [str(folder) for folder in scene_folders(["data/fern", "synthetic"], SceneOptions(), Path("runs"))]
@@ -113,14 +103,8 @@ def compare(
 ) -> dict[Path, Comparison]:
     """Train every strategy on every scene with every seed; finished runs are kept, interrupted ones continue.
 
-    Args:
-        scenes: by folder of the comparison; the run with seed k is in ``<folder>/<strategy>/seed_<k>``.
-        configs: settings by name of the strategy.
-        seeds: of the runs; they replace the seed of the settings.
-        running: where and how the runs are executed.
-
-    Returns:
-        For every folder the results of the finished runs and the failures of the others; both are also written there.
+    The run with seed k is in ``<folder>/<strategy>/seed_<k>``; seeds replace that of the settings. Returns, for every
+    folder, the results of the finished runs and the failures of the others; both are also written there.
 
     Raises:
         ValueError: if there is nothing to run, a scene lacks what a term of the loss needs, or a folder holds a table

@@ -37,15 +37,8 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> s
     """Write a PLY with a model's test-time opacities, such as those times 1 - p after dropout p.
 
     A header comment records what was done, so that no program of this package does it again. The layout is that of
-    `save_ply`; unknown properties are dropped.
-
-    Args:
-        source: the PLY of a model that was trained with regularizers, opacities plain.
-        target: the file to write; it must not exist.
-        regularizer: what it was trained with, such as ``"dropout(0.2)"``, if the PLY does not say.
-
-    Returns:
-        The expression of the regularizers.
+    `save_ply`; unknown properties are dropped. ``source`` holds plain opacities; ``regularizer`` says what it was
+    trained with, such as ``"dropout(0.2)"``, if the PLY does not. Returns the expression of the regularizers.
 
     Raises:
         ValueError: if the regularizers are unknown or cannot be parsed, the test-time opacities are the plain ones or
@@ -82,10 +75,8 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> s
 def compress_ply(source: Path, target: Path, *, regularizer: str | None = None) -> None:
     """Write a model with its test-time opacities as one of the small files that viewers in the web read.
 
-    Args:
-        source: the PLY of a model, its opacities plain or of the test already.
-        target: the file to write, one of `SMALL` by its name; it must not exist. SPZ takes a tenth of a PLY.
-        regularizer: as for `bake_ply`.
+    The opacities of ``source`` are plain or of the test already; ``target`` is one of `SMALL` by its name. SPZ takes a
+    tenth of a PLY. ``regularizer`` is as for `bake_ply`.
 
     Raises:
         ImportError: if GaussForge is missing.

@@ -28,12 +28,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Task:
-    """A call to be made in another process, perhaps on another machine.
+    """A call to be made in another process, perhaps on another machine; ``label`` names it in messages.
 
-    Args:
-        label: what to call it in messages.
-        function: importable there by module and name.
-        arguments: its arguments, picklable.
+    The function is importable there by module and name, and its arguments are picklable.
     """
 
     label: str
@@ -252,12 +249,10 @@ class RayCluster:
     Needs Ray (``ca_reg[ray]``). On a cluster of several machines all need the same installation, and a file system that
     they share with this machine under the same path.
 
-    Args:
-        jobs: tasks at a time; each reserves its share of the cluster's processors, at most those of one machine.
-        address: of a running cluster, as for `ray.init`: ``"host:6379"``, ``"ray://host:10001"``, or ``"auto"`` for the
-            one that this machine belongs to. None for ``$RAY_ADDRESS``, or if that is unset for a cluster on this
-            machine that ends with the sweep.
-        gpus: GPUs that a task reserves; fractions share one.
+    Of ``jobs`` tasks at a time, each reserves its share of the cluster's processors, at most those of one machine, and
+    so many ``gpus``; fractions share one. ``address`` names a running cluster, as for `ray.init`: ``"host:6379"``,
+    ``"ray://host:10001"``, or ``"auto"`` for the one that this machine belongs to; by default ``$RAY_ADDRESS``, or if
+    that is unset a cluster on this machine that ends with the sweep.
 
     Raises:
         ValueError: if ``jobs`` is not positive.
@@ -342,14 +337,10 @@ ExecutorName: TypeAlias = Literal["auto", "processes", "ray"]
 
 
 def choose_executor(name: ExecutorName, *, jobs: int, address: str | None = None, device: str = "cpu") -> Executor:
-    """Return the executor of the given name.
+    """Return the executor of the given name, for so many tasks at a time.
 
-    Args:
-        name: ``"auto"`` is Ray if ``address`` or ``$RAY_ADDRESS`` names a cluster, else local processes: on a single
-            machine Ray has no advantage over them.
-        jobs: tasks at a time.
-        address: of a Ray cluster; see `RayCluster`.
-        device: where the tasks compute; on a Ray cluster a task on ``"cuda"`` reserves one GPU.
+    ``"auto"`` is Ray if ``address`` or ``$RAY_ADDRESS`` names a cluster, else local processes: on a single machine Ray
+    has no advantage over them. On a Ray cluster a task on the device ``"cuda"`` reserves one GPU.
 
     Raises:
         ValueError: if ``"processes"`` is given an address, or ``jobs`` is not positive.

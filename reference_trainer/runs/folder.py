@@ -83,12 +83,8 @@ def settings_of_run(
 ) -> TrainConfig | None:
     """Return the settings that the run in a folder began with, None if none has begun.
 
-    Args:
-        out: the folder.
-        options: the requested scene.
-        config: the requested training.
-        auto: whether to apply the plan that the run began with, if any, to ``config``.
-        given: the settings that no plan changes.
+    ``options`` and ``config`` are what is asked for; with ``auto`` the plan that the run began with, if any, is applied
+    to ``config``, but not to the settings that are ``given``.
 
     Raises:
         ValueError: if the folder holds a run with other settings, a checkpoint without settings, or a damaged file;
@@ -124,15 +120,10 @@ def settings_of_run(
 
 
 def check_output(folder: Path, scene: str | Path | None, files: Collection[str]) -> None:
-    """Refuse to write into a folder of somebody else's.
+    """Refuse to write into a folder of somebody else's, with a ValueError.
 
-    Args:
-        folder: where to write.
-        scene: the folder of the photographs, which is never written to.
-        files: names of what would be overwritten, although nothing says that this program wrote it.
-
-    Raises:
-        ValueError: if ``folder`` is the scene, or holds one of the files.
+    That is the scene, the folder of the photographs, or one that holds ``files``, names of what would be overwritten
+    although nothing says that this program wrote it.
     """
     if scene not in (None, "synthetic") and folder.exists() and folder.resolve() == Path(str(scene)).resolve():
         raise ValueError(f"{folder} is the folder of the scene, to which nothing is written: give another --out.")
@@ -264,9 +255,6 @@ def run_lock(folder: Path) -> Iterator[None]:
     The operating system releases the lock when the process ends, however it ends: there are no stale locks, although
     the empty file ``.lock`` stays. The lock is advisory: readers are not kept out. On a network file system that
     supports locks it holds across machines; on one that does not, a warning is issued and the folder used unlocked.
-
-    Args:
-        folder: of the run.
 
     Raises:
         FolderInUseError: at once, if the folder is locked; nothing in it was touched.

@@ -24,14 +24,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a grid.
-
-    Args:
-        label: what to call it.
-        options: the scene.
-        config: the training.
-        out: folder of the run, unique within the grid.
-    """
+    """One run of a grid: its label for messages, its scene and training, and its folder, unique within the grid."""
 
     label: str
     options: SceneOptions

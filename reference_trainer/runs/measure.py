@@ -37,12 +37,8 @@ def load_run_model(
 ) -> tuple[TrainedModel, Scene]:
     """Return a run's model at its last checkpoint, and its scene.
 
-    Args:
-        run: folder of the run.
-        device: where to render.
-        regularizer: treat the model as if it had been trained with these, such as "noise(0.8, scale=True)" for a run
-            with "noise(0.8)"; by default with those of the run.
-        trust: as for `load_run`.
+    With ``regularizer``, such as "noise(0.8, scale=True)" for a run with "noise(0.8)", the model is treated as if it
+    had been trained with that. ``trust`` is as for `load_run`.
 
     Raises:
         FileNotFoundError: if the folder holds no run.
@@ -68,16 +64,8 @@ def measure(
 ) -> Evaluation:
     """Measure a model at views; write ``evaluation.json``, ``evaluation.md`` and pictures, and print the table.
 
-    After an interruption, the same call continues with the next view.
-
-    Args:
-        model: what to measure.
-        views: by split, see `evaluate`.
-        out: folder for the results.
-        about: further entries of the JSON file, such as the name of the scene.
-        samples: K of the CA score.
-        seed: of its masks.
-        perceptual: a perceptual metric.
+    After an interruption, the same call continues with the next view. Views, samples, seed and metric are as for
+    `evaluate`; ``about`` holds further entries of the JSON file, such as the name of the scene.
 
     Raises:
         ValueError: if ``out`` holds files of these names that are not from here.

@@ -79,18 +79,13 @@ def load_ply_model(
     device: str = "cpu",
     trust: Collection[str] = (),
 ) -> tuple[TrainedModel, PlyFacts]:
-    """Return the model of a standard 3DGS PLY, and what the file says about it.
+    """Return the model of a standard 3DGS PLY over a background (3,), and what the file says about it.
 
     A PLY of this package records the regularizers of the training, which decide the test-time opacities, and whether
     its opacities are scaled by 1 - p already: that is undone, because CA is measured on plain opacities and the
     evaluation does its own scaling. Test-time opacities of any other kind are used as they are, for CA too.
-
-    Args:
-        ply: the model.
-        background: color behind it, shape (3,).
-        regularizer: what the model was trained with, overriding the PLY.
-        device: where to render.
-        trust: modules that the PLY's comments may import, as for `load_run`.
+    ``regularizer`` overrides what the PLY says; ``trust`` names modules that its comments may import, as for
+    `load_run`.
 
     Raises:
         ValueError: if the PLY is damaged or holds no Gaussian, was scaled for another rate than ``regularizer`` says,
@@ -196,17 +191,10 @@ def score_ply(
 ) -> Evaluation:
     """Measure the model of a PLY at the views of a scene or on an orbit; writes and prints what `measure` does.
 
-    Args:
-        ply: the model, in the frame of the scene's cameras; for an orbit in any frame and of any size.
-        where: the scene or the orbit.
-        out: folder for the results; ``<ply>_evaluation`` by default.
-        background: of an orbit, ``"black"`` (the default) or ``"white"``; a scene has its own.
-        regularizer: as in `load_ply_model`.
-        samples: K of the CA score.
-        seed: of its masks.
-        perceptual: a perceptual metric.
-        device: where to render.
-        trust: as in `load_ply_model`.
+    For a scene the model is in the frame of its cameras, for an orbit in any frame and of any size; an orbit has a
+    background, ``"black"`` (the default) or ``"white"``, a scene its own. Results go to ``out``, ``<ply>_evaluation``
+    by default. ``regularizer`` and ``trust`` are as in `load_ply_model`, ``samples``, ``seed`` and ``perceptual`` as in
+    `evaluate`.
 
     Raises:
         ValueError: from `load_ply_model`, `check_frame` or `orbit_views`, or if the background is unknown.
@@ -278,18 +266,11 @@ NEARLY_NONE = 0.01
 
 
 def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[str]:
-    """Count, before anything is rendered, the Gaussians that the cameras of a scene see.
+    """Count, before anything is rendered, the Gaussians that the cameras of a scene, of both splits, see.
 
     A Gaussian counts if its center is beyond the near plane (0.2) and inside the picture, and its opacity is at least
-    1/255: fainter ones are never drawn.
-
-    Args:
-        gaussians: the model.
-        scene: with the cameras, of both splits.
-        name: of the model, for messages.
-
-    Returns:
-        Doubts: one line about the cameras that see less than 1 %, nothing if all see more.
+    1/255: fainter ones are never drawn. Returns doubts for people: a line about the cameras that see less than 1 % of
+    the model, which messages call ``name``; nothing if all see more.
 
     Raises:
         ValueError: if no Gaussian can be drawn, or all cameras together see less than 1 %.

@@ -18,16 +18,10 @@ __all__ = ["point_prior", "read_depth", "true_priors", "with_prior"]
 
 
 def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> View:
-    """Return a view with the depth prior of its photograph, resized and undistorted like it.
+    """Return a view with the depth prior of its photograph, the frame on disk, resized and undistorted like it.
 
     Where some of the map is unknown, a pixel gets the bilinearly weighted mean of the known values, if there is one
     within the pixel or, in a coarser map, where the pixel is.
-
-    Args:
-        view: as loaded from the frame.
-        frame: the photograph on disk.
-        root: the scene folder.
-        options: those of the scene; `depth` is not None.
 
     Raises:
         FileNotFoundError: if there is no depth file for the photograph.
@@ -116,11 +110,8 @@ def point_prior(view: View, cloud: PointCloud) -> View:
 def read_depth(path: str | Path) -> Tensor:
     """Read a depth map with the values of the file, shape (H, W), float32; nan where they are not finite.
 
-    Args:
-        path: an ``.npy`` file of floats or integers, (H, W) up to axes of length 1, or a gray PNG of 8 or 16 bits.
-
-    Raises:
-        ValueError: if it is neither.
+    The file is an ``.npy`` of floats or integers, (H, W) up to axes of length 1, or a gray PNG of 8 or 16 bits;
+    ValueError if it is neither.
     """
     from PIL import Image
 

@@ -31,17 +31,12 @@ _BAND = 100_000  # pixels converted at a time
 
 
 def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
-    """Read an 8-bit image file.
+    """Read an 8-bit image file, PNG, JPEG, BMP, TIFF or WebP by its content: colors and alpha, both in [0, 1], float32.
+
+    Colors are (3, H, W); alpha is (H, W), or None if the file has no transparency.
 
     Convention: alpha is straight, as PNG defines it: the colors are not premultiplied. An orientation tag is ignored,
     as by COLMAP, because the cameras belong to the stored pixels.
-
-    Args:
-        path: PNG, JPEG, BMP, TIFF or WebP, by content, not by name.
-
-    Returns:
-        Colors in [0, 1], shape (3, H, W), float32, and alpha in [0, 1], shape (H, W), or None if the file has no
-        transparency.
 
     Raises:
         FileNotFoundError: if there is no such file.

@@ -52,12 +52,8 @@ DTU_TEST = (1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, *range(29, 36), 41, 42,
 def load_scene(options: SceneOptions, *, seed: int = 0) -> Scene:
     """Load a scene: photographs with cameras, split into training and test views, and initial points.
 
-    Args:
-        options: which scene, and how.
-        seed: seed of random points, and of the points of the built-in scene.
-
-    Returns:
-        The scene, float32 on the CPU; views are sorted by name, those of Blender scenes in the order of the JSON file.
+    The scene is float32 on the CPU; views are sorted by name, those of Blender scenes in the order of the JSON file.
+    The seed is that of random points, and of the points of the built-in scene.
 
     Raises:
         FileNotFoundError: if a file or folder is missing.

@@ -30,11 +30,8 @@ def is_video(path: Path) -> bool:
 def sort_photographs(source: Path) -> tuple[list[Path], dict[str, str]]:
     """Return the photographs and videos that can be read, and by name the others with what is wrong with them.
 
-    Every photograph is decoded to its end. One that is there twice, as a phone exports IMG_1.HEIC beside IMG_1.JPG, is
-    taken once.
-
-    Args:
-        source: folder with the files, or with a folder ``images`` of them; or one video.
+    ``source`` is a folder with the files, or with a folder ``images`` of them, or one video. Every photograph is
+    decoded to its end. One that is there twice, as a phone exports IMG_1.HEIC beside IMG_1.JPG, is taken once.
 
     Raises:
         FileNotFoundError: if there is no such file or folder.
@@ -71,15 +68,11 @@ def sort_photographs(source: Path) -> tuple[list[Path], dict[str, str]]:
 
 
 def collect_photographs(sources: Sequence[Path], folder: Path, frames: int = 16) -> list[str]:
-    """Write photographs and frames of videos to a folder, upright; return the names there.
+    """Write photographs and frames of videos, of `sort_photographs`, to a folder, upright; return the names there.
 
     JPEG and PNG files are copied as they are unless an orientation tag turns them; all others become JPEG, with their
-    EXIF data, of which COLMAP uses the focal length.
-
-    Args:
-        sources: of `sort_photographs`.
-        folder: where to write.
-        frames: how many of each video, the sharpest in as many equal parts of its duration.
+    EXIF data, of which COLMAP uses the focal length. Of each video so many ``frames`` are taken, the sharpest in as
+    many equal parts of its duration.
     """
     folder.mkdir(parents=True, exist_ok=True)
     names = []

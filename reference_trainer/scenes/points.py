@@ -133,10 +133,8 @@ def colmap_points(folder: Path) -> PointCloud | None:
 def ply_points(path: str | Path, *, seen_by: frozenset[str] | None = None) -> PointCloud:
     """Read the vertices of a PLY file: a point cloud, or the centers and base colors of a 3DGS model.
 
-    Args:
-        path: a PLY file, binary or ASCII, whose first element is ``vertex`` with at least ``x y z``. Its colors are
-            ``red green blue``, as bytes or as floats up to 1 or 255, else ``f_dc_0`` to ``f_dc_2``, else gray.
-        seen_by: names of the images that it was made from, if known: a PLY file does not say.
+    Colors are ``red green blue``, as bytes or as floats up to 1 or 255, else ``f_dc_0`` to ``f_dc_2``, else gray.
+    ``seen_by`` names the images that it was made from, if known: a PLY file does not say.
 
     Raises:
         FileNotFoundError: if there is no such file.

@@ -229,13 +229,9 @@ def cameras_between(
 ) -> Callable[[torch.Generator], Camera]:
     """Return a function that draws cameras between two random training cameras, with the intrinsics of one of them.
 
-    Args:
-        scene: with the training cameras.
-        path: the path from one to the other, see `camera_between`.
-        past: how far beyond either end a camera may stand, as a share of the path; by default 0.15 short of both.
-
-    Raises:
-        ValueError: if the scene has fewer than two training cameras.
+    The path from one to the other is that of `camera_between`; ``past`` is how far beyond either end a camera may
+    stand, as a share of it, by default 0.15 short of both. Raises ValueError if the scene has fewer than two training
+    cameras.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene

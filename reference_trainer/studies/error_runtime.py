@@ -44,16 +44,11 @@ PICTURE = 256  # side length of the picture of a PLY, pixels
 def error_runtime_study(
     sources: Sequence[Path], *, max_samples: int = 1024, seeds: int = 3, device: str = "cpu"
 ) -> Study:
-    """Declare the study for runs of this package and for any PLY files.
+    """Declare the study for runs of this package, by their folders, and for any PLY files.
 
     A run is measured at its first test view, or training view if there is none; a PLY at the first camera of an orbit,
-    over black. Both use the plain opacities: CA is defined without the test-time scaling.
-
-    Args:
-        sources: folders of runs, and ``.ply`` files.
-        max_samples: largest K, a power of two, at least 16.
-        seeds: number of Monte Carlo runs, at least 1.
-        device: where to render.
+    over black. Both use the plain opacities: CA is defined without the test-time scaling. ``max_samples`` is the
+    largest K, a power of two of at least 16; ``seeds`` the number of Monte Carlo runs.
 
     Raises:
         FileNotFoundError: if a folder holds no run.

@@ -153,15 +153,10 @@ def _decisive(settings: Any) -> Any:
 
 
 def in_turns(calls: Mapping[str, Callable[[], object]], repeats: int, clock: Clock) -> dict[str, list[float]]:
-    """Time several calls in turns, so that a change in the machine's load affects all of them alike.
+    """Time several calls, by name, in turns, so that a change in the machine's load affects all of them alike.
 
-    Args:
-        calls: by name.
-        repeats: number of timed rounds, after one untimed round.
-        clock: such as `now` of a device, or `time.process_time`.
-
-    Returns:
-        Seconds of every round, by name.
+    After one untimed round, returns the seconds of every one of the ``repeats`` rounds, by name. The clock is such as
+    `now` of a device, or `time.process_time`.
 
     Example:
         >>> len(in_turns({"nothing": lambda: None}, 3, perf_counter)["nothing"])

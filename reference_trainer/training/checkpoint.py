@@ -25,16 +25,10 @@ _FORMAT = "ca_reg-checkpoint-1"
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a state of tensors, numbers and strings; an interrupted write leaves the file that was there before.
+    """Write nested tensors, numbers, strings and None; an interrupted write leaves the file that was there before.
 
-    Tensors are written from the CPU, so that any machine can read them.
-
-    Args:
-        path: the file; its folder is created if missing.
-        state: nested dicts and lists of tensors, numbers, strings and None.
-
-    Raises:
-        OSError: if the file cannot be written, as on a full disk; the error names it.
+    Tensors are written from the CPU, so that any machine can read them. Raises OSError, which names the file, if it
+    cannot be written, as on a full disk.
     """
     content = io.BytesIO()  # torch.save to a file hides the error of a full disk behind one of its own
     torch.save({"format": _FORMAT, **moved(state, "cpu")}, content)
@@ -87,13 +81,10 @@ def read_state(
     where: Path,
     refuse: Callable[[TrainConfig], None] = lambda config: None,
 ) -> TrainingState:
-    """Check that what `Trainer.save` wrote is complete and consistent, and belongs to the scene.
+    """Check that what `Trainer.save` wrote is complete and consistent, and belongs to the scene to continue on.
 
-    Args:
-        state: content of the checkpoint.
-        scene: the scene to continue on.
-        where: the file, for errors.
-        refuse: called with the settings before anything that they name is made; raises to refuse them.
+    ``where`` is the file, for errors; ``refuse`` is called with the settings before anything that they name is made,
+    and raises to refuse them.
 
     Raises:
         ValueError: if something is missing, unknown, or of another type or shape, a number is not finite or out of

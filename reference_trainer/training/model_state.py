@@ -28,10 +28,6 @@ def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
     If the scene has a model to start from, its Gaussians are taken as they are, their spherical harmonics cut or padded
     with zeros to ``config.sh_degree``.
 
-    Args:
-        scene: with its initial points or model.
-        config: says which points to take and how large and how opaque the Gaussians are.
-
     Raises:
         ValueError: if only seen points are to be taken and there are none.
 

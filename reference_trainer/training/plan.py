@@ -84,15 +84,8 @@ def make_plan(scene: Scene, config: TrainConfig, *, given: Collection[str] = ())
     """Look at a scene and decide what its training needs.
 
     A choice of the user always wins: fields of ``config`` that differ from the defaults of `TrainConfig` (a recipe's
-    among them) and the fields in ``given`` are never changed.
-
-    Args:
-        scene: photographs, cameras and initial points.
-        config: what was asked for.
-        given: names of fields that were asked for explicitly, even if at their default.
-
-    Raises:
-        ValueError: if ``given`` names something that is not a field of `TrainConfig`.
+    among them), and those that ``given`` names because they were asked for at their default, are never changed. Raises
+    ValueError if ``given`` names something that is not a field of `TrainConfig`.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene

@@ -13,13 +13,7 @@ __all__ = ["deterministic", "stream", "view_order"]
 
 
 def stream(seed: int, step: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
-    """Return the random generator for one purpose at one step.
-
-    Args:
-        seed: of the run, not negative.
-        step: not negative.
-        purpose: a label, such as ``"dropout"``; different labels give independent streams.
-        device: of the numbers to be drawn.
+    """Return the random generator of one purpose, such as ``"dropout"``, at one step; other purposes are independent.
 
     Example:
         >>> a, b = (torch.rand(3, generator=stream(0, 7, "dropout")) for _ in range(2))
@@ -50,14 +44,9 @@ def deterministic(device: torch.device | str = "cpu") -> Iterator[None]:
 
     Without this a run on a CPU repeats bit for bit with the same number of threads. With another number, some
     exponentials differ in their last bit, because the ends of a thread's share are computed by other instructions, and
-    training amplifies that. On CUDA, sums by atomic additions differ from run to run.
-
-    Args:
-        device: where to compute. On CUDA, enter the block before the first computation of the process, which is when
-            cuBLAS reads its settings.
-
-    Raises:
-        RuntimeError: from within, on CUDA, if an operation has no deterministic algorithm.
+    training amplifies that. On CUDA, sums by atomic additions differ from run to run; there, enter the block before the
+    first computation of the process, which is when cuBLAS reads its settings. An operation without a deterministic
+    algorithm raises a RuntimeError.
 
     Example:
         >>> with deterministic():

@@ -84,11 +84,9 @@ def of_scene(
 ) -> Probe:
     """Compare everything computed from a scene with float64, at inputs that both precisions represent exactly.
 
-    Args:
-        scene: what to render; it is first rounded to ``dtype``, except for the pose.
-        dtype: of the computation.
-        independent: compare image, alpha and gradients with the independent renderer, not with the same one in float64.
-        rate: of dropout, in the draw, the moments and the score.
+    The scene, all but its pose, is first rounded to ``dtype``. If ``independent``, image, alpha and gradients are
+    compared with the independent renderer, else with the same one in float64. ``rate`` is that of dropout, in the draw,
+    the moments and the score.
     """
     scene = scene.rounded(dtype)
     return Probe(

@@ -74,11 +74,7 @@ def camera_of(width: int = 32, height: int = 24, *, focal: float = 40.0, distanc
 
 
 def base_scene(n: int = 24, *, camera: Camera | None = None) -> StressScene:
-    """Draw n ordinary Gaussians around the origin, float64.
-
-    Args:
-        n: number of Gaussians.
-        camera: the view, by default 32 x 24 pixels from a distance of 3.
+    """Draw n ordinary Gaussians around the origin, float64; by default 32 x 24 pixels from a distance of 3.
 
     Example:
         >>> base_scene(5).means.shape
@@ -117,24 +113,14 @@ _TILE = 16
 def render_simply(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, camera: Camera
 ) -> Tensor:
-    """Render Gaussians over black by the textbook formulas, tile by tile, with autograd's own backward pass.
+    """Render Gaussians over black by the textbook formulas, tile by tile, with autograd's own backward pass: (3, H, W).
 
     A tile of 16 x 16 pixels considers every Gaussian whose bounding box at alpha = 1/255 overlaps it, so nothing that
-    the definition draws is left out: in float64 the result is that of brute force.
+    the definition draws is left out: in float64 the result is that of brute force. All pixel-Gaussian pairs are kept
+    for the backward pass.
 
-    Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA rasterizer; the gradient
-    passes through the clamp at 0.99.
-
-    Args:
-        means: world coordinates, shape (N, 3).
-        quaternions: need not be normalized, shape (N, 4).
-        scales: standard deviations, shape (N, 3).
-        opacities: activated, shape (N,).
-        colors: RGB, shape (N, 3).
-        camera: the view.
-
-    Returns:
-        The image, shape (3, H, W), differentiable. All pixel-Gaussian pairs are kept for the backward pass.
+    Convention: OpenCV camera, half-pixel centers, wxyz quaternions of any norm; the constants of the INRIA rasterizer;
+    the gradient passes through the clamp at 0.99.
 
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 8.5, 8.5, 16, 16)
@@ -218,17 +204,11 @@ _SIGMA, _SEED = 0.5, 7
 def scene_quantities(
     scene: StressScene, dtype: torch.dtype, *, rate: float = RATE, sigma: float = _SIGMA, keep: Tensor | None = None
 ) -> Quantities:
-    """Compute image, gradients, exact moments, score, and renders under one draw of dropout and of noise.
+    """Compute `SCENE_QUANTITIES`: image, gradients, exact moments, score, and renders under a draw of dropout or noise.
 
-    Args:
-        scene: what to render; its tensors are converted.
-        dtype: the precision of the Gaussians. The pose stays in float64, as a careful caller would keep it.
-        rate: of dropout, in the draw, the moments and the score.
-        sigma: standard deviation of the opacity noise.
-        keep: the dropout mask, shape (N,); drawn by default.
-
-    Returns:
-        `SCENE_QUANTITIES`.
+    ``dtype`` is that of the Gaussians; the pose stays in float64, as a careful caller would keep it. ``rate`` is that
+    of dropout, in the draw, the moments and the score, ``sigma`` that of the opacity noise, ``keep`` (N,) the dropout
+    mask, drawn by default.
     """
     scene = scene.to(dtype, camera=torch.float64)
     n = scene.means.shape[0]
@@ -263,8 +243,7 @@ def scene_quantities(
 def reference_quantities(scene: StressScene, *, rate: float = RATE) -> Quantities:
     """Compute the same in float64, with image, alpha and gradients by the independent renderer `render_simply`.
 
-    Returns:
-        `SCENE_QUANTITIES`. Moments, score and draws are those of the package's renderer in float64.
+    Moments, score and draws are those of the package's renderer in float64.
     """
     return {**scene_quantities(scene, torch.float64, rate=rate), **independent_images(scene)}
 
@@ -283,8 +262,7 @@ def independent_images(scene: StressScene) -> Quantities:
 def loss_weights(camera: Camera) -> Tensor:
     """Return the weights of red, green, blue and alpha in the loss: random, so that nothing cancels by symmetry.
 
-    Returns:
-        Multiples of 1/64, exact in every precision, shape (4, H, W), float64.
+    They are multiples of 1/64, exact in every precision, (4, H, W), float64.
     """
     generator = torch.Generator().manual_seed(_SEED)
     return torch.randint(-20, 45, (4, camera.height, camera.width), generator=generator).double() / 64

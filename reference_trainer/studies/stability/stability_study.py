@@ -45,14 +45,10 @@ _ALLOWED = {
 def judge(case: Case) -> Record:
     """Run a case at all its magnitudes, and search for the one at which it starts to fail.
 
-    Args:
-        case: what to judge.
-
-    Returns:
-        The description of the case; under "ending" how it ends: "ok"; "refused" or "limit" as declared; "defect" for
-        anything else; under "onset" the smallest magnitude that failed, None if none did; under "points" for every
-        magnitude, including those of the search, the "status" ("ok", "inexact", "not finite", "refused" or "crash"),
-        the relative "errors" of the quantities, which of them are "wrong", and the "message" of an exception.
+    Returns the description of the case; under "ending" how it ends: "ok"; "refused" or "limit" as declared; "defect"
+    for anything else; under "onset" the smallest magnitude that failed, None if none did; under "points" for every
+    magnitude, including those of the search, the "status" ("ok", "inexact", "not finite", "refused" or "crash"), the
+    relative "errors" of the quantities, which of them are "wrong", and the "message" of an exception.
     """
     points = [_point(case, magnitude) for magnitude in case.magnitudes]
     failed = next((i for i, point in enumerate(points) if point["status"] != "ok"), None)
@@ -130,11 +126,7 @@ _FLOOR = 1e-9  # lower end of the figure's color scale
 def study_stability(out: Path) -> Records:
     """Push both engines of the renderer and the functions of `ca_reg` to extremes, and report where and how they fail.
 
-    Args:
-        out: folder for the results.
-
-    Raises:
-        RuntimeError: after everything is written, if cases end other than declared; lists them.
+    Raises a RuntimeError that lists the cases which end other than declared, after everything is written.
     """
     records = run_study(stability_study(), out)
     if defects := [name for name, record in records.items() if record["ending"] == "defect"]:

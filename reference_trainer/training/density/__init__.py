@@ -1,4 +1,7 @@
-"""Density control: the strategies and their registry: what ``--density`` knows by name."""
+"""Density control: the strategies and their registry: what ``--density`` knows by name.
+
+A strategy refuses arguments out of range with a ValueError, what should be a whole number with a TypeError.
+"""
 
 from ca_reg.registry import Registry
 from reference_trainer.training.density.adaptive import AbsGradDensity, AdaptiveDensity

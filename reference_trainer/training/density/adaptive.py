@@ -129,10 +129,6 @@ class AbsGradDensity(AdaptiveDensity):
         dense_fraction: larger Gaussians are split, smaller ones cloned, as with the setting of this name.
         opacity_ceiling: value that higher opacities are regularly lowered to, in (0, 1).
         ceiling_every: number of steps between these, until densification ends; 0 never lowers.
-
-    Raises:
-        TypeError: if ``ceiling_every`` is no integer.
-        ValueError: if one is out of range.
     """
 
     needs = frozenset({"absgrad"})

@@ -43,10 +43,6 @@ class ProximityDensity(AdaptiveDensity):
         until: step before which Gaussians are added between others.
         distance: multiple of the extent beyond which sparse Gaussians are unpooled; positive.
         split_distance: multiple of the extent beyond which they are split; positive.
-
-    Raises:
-        TypeError: if ``until`` is no integer.
-        ValueError: if one is out of range.
     """
 
     def __init__(self, until: int = 2_000, distance: float = 5.0, split_distance: float = 10.0) -> None:
@@ -81,10 +77,7 @@ class ProximityDensity(AdaptiveDensity):
 def between(gaussians: Gaussians, selected: Tensor, neighbors: Tensor) -> Gaussians:
     """Return new Gaussians halfway from the selected to each of their neighbors, with the neighbor's size and opacity.
 
-    Args:
-        gaussians: all N.
-        selected: which are the sources, shape (N,) bool.
-        neighbors: of every Gaussian, shape (N, K).
+    Of all N Gaussians, ``selected`` (N,) bool are the sources; ``neighbors`` (N, K) are those of every Gaussian.
 
     Example:
         >>> gaussians = Gaussians.from_points(
@@ -121,10 +114,6 @@ class RayBoxDensity(AdaptiveDensity):
         views: number of views, at least 2; all, if there are fewer training views.
         height: of a region, pixels, positive.
         width: of a region, pixels, positive.
-
-    Raises:
-        TypeError: if one is no integer.
-        ValueError: if one is out of range.
     """
 
     def __init__(self, views: int = 3, height: int = 20, width: int = 40) -> None:
@@ -163,17 +152,11 @@ class RayBoxDensity(AdaptiveDensity):
 
 
 def worst_region(error: Tensor, height: int, width: int) -> Tensor:
-    """Return the corners of the region of a picture with the largest mean; the first of equal ones.
+    """Return the corners of the region of a picture (H, W) with the largest mean; the first of equal ones.
 
-    Args:
-        error: shape (H, W).
-        height: of a region, pixels. Regions tile the picture from the upper left, without its last row and column; one
-            that would be larger is cut to that size.
-        width: of a region, pixels.
-
-    Returns:
-        Centers of the pixels at the corners, (x, y): upper left and right, lower left and right, shape (4, 2). The
-        right and lower ones lie one pixel outside the region.
+    Regions tile the picture from the upper left, without its last row and column; one that would be larger is cut to
+    that size. Returned are the centers of the pixels at the corners, (x, y): upper left and right, lower left and
+    right, (4, 2); the right and lower ones lie one pixel outside the region.
 
     Example:
         >>> error = torch.zeros(9, 9)
@@ -192,15 +175,9 @@ def worst_region(error: Tensor, height: int, width: int) -> Tensor:
 def ray_box(one: Camera, corners: Tensor, other: Camera, others: Tensor) -> tuple[Tensor, Tensor] | None:
     """Return the box around the points where the rays of two cameras come closest, or None if two are parallel.
 
-    Args:
-        one: a camera.
-        corners: pixels of its rays, (x, y), shape (M, 2).
-        other: another camera.
-        others: pixels of its rays, in the same order, shape (M, 2).
-
-    Returns:
-        Lower and upper corner of the axis-aligned box in the world, shape (3,) each. A point is the middle of the
-        shortest segment between two rays' lines, even if it lies behind a camera.
+    The rays go through pixels (M, 2) of either camera, in the same order. A point is the middle of the shortest segment
+    between two rays' lines, even if it lies behind a camera; the box is given by its lower and upper corner in the
+    world, (3,) each.
 
     Example:
         >>> from reference_trainer.camera import Camera

@@ -44,9 +44,6 @@ class MCMCDensity(DensityStrategy):
     Args:
         noise: strength of the exploration noise, at least 0.
         growth: factor on the number of Gaussians, at least 1.
-
-    Raises:
-        ValueError: if one is out of range or not finite.
     """
 
     def __init__(self, noise: float = 5e5, growth: float = 1.05) -> None:
@@ -96,9 +93,7 @@ def drawn_copies(optimizer: GaussianOptimizer, weights: Tensor, count: int, gene
 def shared(gaussians: Gaussians, drawn: Tensor) -> Gaussians:
     """Return copies of the drawn Gaussians, with the opacities and scales that make all at one place look as before.
 
-    Args:
-        gaussians: all N.
-        drawn: their indices, shape (M,), repeated if drawn more than once.
+    Their indices (M,) are repeated if drawn more than once.
     """
     table = [[math.comb(n, k) for k in range(_MOST)] for n in range(_MOST)]
     copies = gaussians[drawn]

@@ -48,10 +48,6 @@ class SharePruning(AdaptiveDensity):
         every: positive number of steps.
         fraction: of the Gaussians, in (0, 1).
         drop_rate: of the score, in (0, 1).
-
-    Raises:
-        TypeError: if ``every`` is no integer.
-        ValueError: if one is out of range.
     """
 
     def __init__(self, every: int = 500, fraction: float = 0.02, drop_rate: float = 0.5) -> None:
@@ -93,10 +89,6 @@ class CoPruning(AdaptiveDensity):
     Args:
         distance: world units, positive: 5 in the worlds of LLFF, 10 in those of DTU.
         every: positive number of steps.
-
-    Raises:
-        TypeError: if ``every`` is no integer.
-        ValueError: if one is out of range.
     """
 
     needs = frozenset({"models"})
@@ -155,10 +147,6 @@ class SelfEnsembling(CoPruning):
         views: number of cameras.
         share: greatest share of a picture's pixels that is uncertain, in (0, 1).
         least: smallest standard deviation of an uncertain pixel, in colors of [0, 1].
-
-    Raises:
-        TypeError: if ``every`` or ``views`` is no integer.
-        ValueError: if one is out of range, or the scene has no `pseudo_cameras`.
     """
 
     def __init__(

@@ -1,4 +1,8 @@
-"""The terms of the training loss, and their registry: what ``--loss`` knows by name."""
+"""The terms of the training loss, and their registry: what ``--loss`` knows by name.
+
+A term refuses arguments out of range with a ValueError, what should be a whole number with a TypeError; its `begin`
+refuses a scene that lacks what it compares with, such as cameras that look to one side, with a ValueError.
+"""
 
 from ca_reg.registry import Registry
 from ca_reg.schedules import SCHEDULES

@@ -44,11 +44,9 @@ def _blur(first: int, last: int, maps: Array, weights: Array, blurred: Array) ->
 
 
 def blur(maps: Tensor, weights: list[float]) -> Tensor:
-    """Blur images (..., H, W) with a symmetric separable window, zeros beyond the border.
+    """Blur images (..., H, W), float32 on the CPU, with a symmetric separable window, zeros beyond the border.
 
-    Args:
-        maps: float32, on the CPU.
-        weights: of the window's center and of the pixels to one side of it.
+    The weights are those of the window's center and of the pixels to one side of it.
     """
     images = maps.contiguous().view(-1, *maps.shape[-2:])
     blurred = torch.empty_like(images)
@@ -79,15 +77,10 @@ def _similarity(first: int, last: int, blurred: Array, c1: float, c2: float, res
 
 
 def similarity(blurred: Tensor, c1: float, c2: float) -> tuple[Tensor, Tensor]:
-    """Return SSIM, and its derivatives with respect to the blurred x, x^2 + y^2 and x y.
+    """Return SSIM (C, H, W), and its derivatives (3, C, H, W) by the blurred x, x^2 + y^2 and x y.
 
-    Args:
-        blurred: x, y, x y and x^2 + y^2, float32 on the CPU, shape (4, C, H, W).
-        c1: the constant added to the means.
-        c2: the constant added to the variances.
-
-    Returns:
-        Similarities (C, H, W) and derivatives (3, C, H, W).
+    ``blurred`` holds x, y, x y and x^2 + y^2, float32 on the CPU, (4, C, H, W); ``c1`` is added to the means, ``c2`` to
+    the variances.
     """
     result, slopes = torch.empty_like(blurred[0]), torch.empty_like(blurred[:3])
     pixels = result.numel()

@@ -35,10 +35,6 @@ class CoAdaptation(WeightedTerm):
             either, or in their ``"box"`` (`pseudo_cameras`).
         every: the term acts once in so many steps, multiplied by their number, so that ``weight`` is the mean per step.
 
-    Raises:
-        TypeError: if ``every`` is no integer.
-        ValueError: if one is out of range, or the scene has no such cameras.
-
     Example:
         >>> from reference_trainer.training.losses import LOSSES
         >>> (term,) = LOSSES.make("co_adaptation(between(3.0, 200), where='arc', every=4)")
@@ -90,9 +86,6 @@ class Consistency(WeightedTerm):
         weight: at least 0, or a schedule. The source uses 0.2 on LLFF, 0.5 on DTU.
         lambda_dssim: weight of the structural term, in [0, 1]; of the sampled form only.
         exact: take the expected squared error instead of a draw.
-
-    Raises:
-        ValueError: if one is out of range.
 
     Example:
         >>> from reference_trainer.training.losses import LOSSES
@@ -149,9 +142,6 @@ class CoRegularization(WeightedTerm):
         weight: at least 0, or a schedule. The source uses 1 from step 500 on with LLFF, from 2,000 on with DTU:
             ``between(1.0, 500)``.
         lambda_dssim: weight of the structural term, in [0, 1].
-
-    Raises:
-        ValueError: if one is out of range, or the scene has no `pseudo_cameras`.
     """
 
     needs = frozenset({"models"})
@@ -195,9 +185,6 @@ class StraightThrough(WeightedTerm):
         error: the render whose error is taken, ``"full"`` or ``"dropped"``.
         lambda_dssim: weight of the structural term, in [0, 1].
         weight: of the whole, at least 0, or a schedule.
-
-    Raises:
-        ValueError: if one is none of these.
 
     Example:
         >>> from reference_trainer.training.losses import LOSSES

@@ -31,9 +31,6 @@ class Pearson(PriorTerm):
     Args:
         weight: at least 0, or a schedule. The source uses 0.05, and 0.001 after step 9,500.
         offset: larger than every D; None for the first reading alone.
-
-    Raises:
-        ValueError: if the weight is negative, or a prior reaches the offset.
     """
 
     def __init__(self, weight: float | Schedule = 0.05, offset: float | None = 200.0) -> None:
@@ -87,10 +84,6 @@ class PatchDepth(PriorTerm):
         which: ``"plain"`` for the render of the step; ``"hard"`` for one with all opacities 0.95, of which only the
             positions learn; ``"soft"`` for one of the plain model, of which only the opacities learn. The source begins
             the soft pass at step 1,000.
-
-    Raises:
-        TypeError: if ``smallest`` or ``largest`` is no integer.
-        ValueError: if one is out of range or not finite.
     """
 
     def __init__(
@@ -142,18 +135,11 @@ class PatchDepth(PriorTerm):
 def patch_error(depth: Tensor, prior: Tensor, side: int, tolerance: float, *, overall: bool = False) -> Tensor:
     """Return the mean squared difference of two pictures, their patches normalized, where it exceeds a tolerance.
 
-    A patch is centered and divided by its standard deviation, or with ``overall`` by that of the whole picture, through
-    which no gradient goes; in either case plus 0.01 times that of all patches.
-
-    Args:
-        depth: shape (H, W).
-        prior: nan where unknown, shape (H, W); patches with such pixels are left out.
-        side: of the patches, pixels; rows and columns beyond the last whole patch are left out.
-        tolerance: of normalized differences.
-        overall: whether to divide by the contrast of the picture, DNGaussian's global part, instead of the patch's.
-
-    Returns:
-        A scalar, 0 if nothing differs by more or no patch is known.
+    The pictures are (H, W); patches of ``side`` pixels tile them without the rows and columns beyond the last whole
+    one, and those with a pixel unknown to the prior (nan) are left out. A patch is centered and divided by its standard
+    deviation, or with ``overall``, DNGaussian's global part, by that of the whole picture, through which no gradient
+    goes; in either case plus 0.01 times that of all patches. A scalar, 0 if nothing differs by more or no patch is
+    known.
 
     Example:
         >>> depth = torch.rand(12, 12, dtype=torch.float64)
@@ -183,9 +169,6 @@ class SmoothDepth(WeightedTerm):
 
     Args:
         weight: at least 0, or a schedule. Monodepth2 uses 0.001.
-
-    Raises:
-        ValueError: if it is negative.
     """
 
     needs = frozenset({"depth"})
@@ -211,9 +194,6 @@ class Warp(WeightedTerm):
         weight: at least 0, or a schedule. The source begins at step 20,000 of 30,000: ``between(1.0, 20_000)``.
         shift: largest shift, above 0, world units: for a world in other units than the source's, scale it.
         smooth: weight of the smoothness, at least 0.
-
-    Raises:
-        ValueError: if one is out of range, or ``smooth`` not finite.
     """
 
     needs = frozenset({"depth"})
@@ -240,14 +220,9 @@ class Warp(WeightedTerm):
 
 
 def warp_horizontally(image: Tensor, disparity: Tensor) -> tuple[Tensor, Tensor]:
-    """Sample a picture a disparity to the right of every pixel; return the result and where that stays inside.
+    """Sample a picture (C, H, W) a disparity (H, W), in pixels, to the right of every pixel.
 
-    Args:
-        image: shape (C, H, W).
-        disparity: pixels, shape (H, W).
-
-    Returns:
-        The picture (C, H, W), bilinearly interpolated, and a mask (H, W) of zeros and ones.
+    Returns the picture, bilinearly interpolated, and a mask (H, W) of zeros and ones: where that stays inside.
 
     Example:
         >>> image, disparity = torch.arange(4.0).expand(1, 2, 4), torch.full((2, 4), 0.5)
@@ -268,9 +243,7 @@ def warp_horizontally(image: Tensor, disparity: Tensor) -> tuple[Tensor, Tensor]
 def edge_aware_smoothness(disparity: Tensor, image: Tensor) -> Tensor:
     """Return ``mean |exp(-0.33 |dI|) dD|`` along x plus along y: central differences, I the sum of the channels.
 
-    Args:
-        disparity: shape (H, W).
-        image: shape (C, H, W), same size; the border pixels are left out.
+    The disparity D is (H, W), the picture (C, H, W); the border pixels are left out.
 
     Example:
         >>> edge_aware_smoothness(torch.arange(5.0).expand(4, 5), torch.zeros(3, 4, 5)).item()

@@ -23,9 +23,6 @@ class Alpha(WeightedTerm):
         weight: at least 0, or a schedule.
         dark: threshold of `dark_background`, which then takes the place of one minus the photograph's alpha.
             DNGaussian and Binocular3DGS use 30/255 on DTU, 15/255 for scan 110.
-
-    Raises:
-        ValueError: if one is out of range, or photographs have no alpha and ``dark`` is not given.
     """
 
     def __init__(self, weight: float | Schedule = 1.0, dark: float | None = None) -> None:
@@ -63,10 +60,6 @@ class Alpha(WeightedTerm):
 def dark_background(image: Tensor, threshold: float) -> Tensor:
     """Return 1 where all channels of a pixel and of the 49 above it are below a threshold, shape (H, W), else 0.
 
-    Args:
-        image: colors in [0, 1], shape (3, H, W).
-        threshold: above 0.
-
     Example:
         >>> import torch
         >>> image = torch.zeros(3, 60, 1)
@@ -84,9 +77,6 @@ class Flat(WeightedTerm):
     Args:
         weight: at least 0, or a schedule. DNGaussian uses 0.002 on LLFF and 0.005 on DTU.
         limit: ratio up to which nothing is penalized, at least 1; 1 gives DNGaussian's term but for a constant.
-
-    Raises:
-        ValueError: if one is out of range, or ``limit`` not finite.
     """
 
     analytic = True
@@ -109,9 +99,6 @@ class Scale(WeightedTerm):
     Args:
         weight: at least 0, or a schedule. DNGaussian uses 0.001 on LLFF and 0.005 on DTU, per squared world unit.
         limit: standard deviation up to which nothing is penalized, at least 0, world units; DNGaussian has none.
-
-    Raises:
-        ValueError: if one is out of range, or ``limit`` not finite.
     """
 
     analytic = True
@@ -135,9 +122,6 @@ class Opacity(WeightedTerm):
         weight: at least 0, or a schedule. 3DGS-MCMC uses 0.01 for the mean, DNGaussian 0.001 for its reward.
         split: in (0, 1): the value is ``1 - mean(o^2 | o > split) + mean((1 - o)^2 | o < split)``, as in DNGaussian's
             code with 0.2; an empty part counts 0.
-
-    Raises:
-        ValueError: if one is out of range.
     """
 
     analytic = True

@@ -31,9 +31,6 @@ class Photometric(WeightedTerm):
     Args:
         lambda_dssim: weight of the structural term, in [0, 1].
         weight: of the whole, at least 0, or a schedule.
-
-    Raises:
-        ValueError: if one is out of range.
     """
 
     analytic = True
@@ -54,17 +51,9 @@ class Photometric(WeightedTerm):
 def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -> Tensor:
     """Return ``(1 - lambda) mean|image - target| + lambda (1 - SSIM)``, the loss of Kerbl et al. 2023, equation 7.
 
-    Args:
-        image: a rendering, shape (3, H, W), colors in [0, 1] (values outside are allowed), floating point.
-        target: the photograph, same shape, dtype and device; a constant.
-        lambda_dssim: weight of the structural term, in [0, 1].
-
-    Returns:
-        A scalar, differentiable (once) in ``image``.
-
-    Raises:
-        ValueError: if the images disagree or are not (C, H, W), ``target`` requires a gradient or ``lambda_dssim``
-            lies outside [0, 1].
+    The rendering, whose colors may lie outside [0, 1], and the photograph, a constant, are (3, H, W), of one
+    floating-point dtype; the scalar is differentiable (once) in the rendering. Raises ValueError if the images
+    disagree, ``target`` requires a gradient or ``lambda_dssim`` lies outside [0, 1].
 
     Example:
         >>> image = torch.full((3, 16, 16), 0.5, requires_grad=True)
@@ -87,18 +76,9 @@ def expected_photometric_loss(mean: Tensor, variance: Tensor, target: Tensor, la
     moment is replaced by its expectation; all variance counts as contrast within the window and none as variance of the
     window's mean, which holds where splats are smaller than the window.
 
-    Args:
-        mean: expected rendering, shape (3, H, W).
-        variance: of its pixels, at least 0, same shape.
-        target: the photograph, same shape; a constant.
-        lambda_dssim: weight of the structural term, in [0, 1].
-
-    Returns:
-        A scalar, differentiable (once) in mean and variance; for variance 0 it is `photometric_loss`, but for the
-        rounding error that the photograph is assumed to have.
-
-    Raises:
-        ValueError: as `photometric_loss`.
+    Arguments and errors are those of `photometric_loss`; the variance (3, H, W) is at least 0. Differentiable (once) in
+    mean and variance; for variance 0 it is `photometric_loss`, but for the rounding error that the photograph is
+    assumed to have.
 
     Example:
         >>> mean, target = torch.full((3, 16, 16), 0.5), torch.full((3, 16, 16), 0.7)
@@ -118,16 +98,9 @@ def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None = None) -> T
     backward take a third of the time of ``kornia.metrics.ssim`` (one CPU thread, 252 x 189 and 504 x 378). In float32 a
     value errs by up to about 1e-3 in flat bright areas: for reports, take the float64 metric.
 
-    Args:
-        image: a rendering, shape (C, H, W), floating point.
-        target: the photograph, same shape, dtype and device; a constant.
-        variance: of a random image whose mean is ``image``, added to the variance within the window; None for none.
-
-    Returns:
-        Similarities in [-1, 1] up to rounding, shape (C, H, W), differentiable (once) in ``image`` and ``variance``.
-
-    Raises:
-        ValueError: if the images disagree or are not (C, H, W), or if ``target`` requires a gradient.
+    Images and errors are those of `photometric_loss`; ``variance`` is that of a random image whose mean is ``image``,
+    and is added to the variance within the window. Similarities are in [-1, 1] up to rounding, (C, H, W),
+    differentiable (once) in ``image`` and ``variance``.
 
     Example:
         >>> image = torch.rand(3, 20, 30, dtype=torch.float64)
@@ -196,8 +169,7 @@ class _SSIMMap(torch.autograd.Function):
 def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
     """Return SSIM = a1 a2 / (b1 b2), and its derivatives with respect to the blurred x, x^2 + y^2 and x y.
 
-    Args:
-        blurred: x, y, x y and x^2 + y^2, shape (4, C, H, W).
+    ``blurred`` holds x, y, x y and x^2 + y^2, (4, C, H, W).
     """
     if engine_for(blurred.device, blurred.dtype).name == "numba":
         from reference_trainer.training.losses._ssim_numba import similarity
@@ -242,10 +214,6 @@ class Views(WeightedTerm):
         n: views in a step, including the step's own, at least 2; all, if there are fewer training views.
         weight: at least 0, or a schedule.
         lambda_dssim: of `photometric_loss`.
-
-    Raises:
-        TypeError: if ``n`` is no integer.
-        ValueError: if one is out of range.
     """
 
     analytic = True

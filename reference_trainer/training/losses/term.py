@@ -48,9 +48,6 @@ class WeightedTerm(LossTerm):
     Args:
         weight: at least 0, or a schedule: ``between(1.0, 20_000)``, ``ramp(0.0, 0.5, 2_000, 2_500)``, ``decay(...)``.
 
-    Raises:
-        ValueError: if it is negative or nan; a schedule raises at the step that has such a weight.
-
     Example:
         >>> from reference_trainer.training.losses import LOSSES
         >>> (term,) = LOSSES.make("opacity(between(0.01, 500))")
