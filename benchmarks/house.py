@@ -1,7 +1,7 @@
-"""How large the code and its pages are, and whether it has floors: ``python -m benchmarks.house [ROOT]``.
+"""How large the code and its pages are, and whether it has floors: ``python -m benchmarks.house [ROOT] [--walk]``.
 
 Prints one table for the packages that are installed and one for the whole, then a circle of imports, if there is one,
-and every import of a higher floor.
+and every import of a higher floor. With ``--walk`` it prints instead what a stranger opens and reads, see house.md.
 """
 
 from __future__ import annotations
@@ -17,10 +17,57 @@ from pathlib import Path
 from reference_trainer.evaluation.tables import markdown_table
 from tests.floors import circle, import_graph, sources, upward
 
-__all__ = ["comments_and_code", "main"]
+__all__ = ["WALKS", "comments_and_code", "main", "walked"]
 
 GOALS = {"installed lines": 25_000, "lines of ca_reg": 5_000, "words in docs": 30_000, "names exported by ca_reg": 18,
          "circles of imports": 0, "imports of a higher floor": 0, "files per 1,000 lines": 6}  # fmt: skip
+
+README_TO_DROPOUT = ("README.md", "## Your own code base", "from ca_reg import GaussianDropout")
+README_TO_SCORE = ("README.md", "## Your own code base", "from ca_reg import CAScore")
+WALKS: dict[str, tuple[tuple[str, str, str], ...]] = {
+    "the line that drops a Gaussian": (
+        README_TO_DROPOUT,
+        ("ca_reg/regularizers/dropout.py", "    def draw(", "functional.apply_dropout("),
+        ("ca_reg/functional/opacities.py", "def apply_dropout(", "opacity.masked_fill("),
+    ),
+    "its test": (
+        ("tests/ca_reg/test_dropout.py", "import ", "def test_scaling_is_the_mean_over_all_masks"),
+    ),
+    "the line that computes the variance, of renders": (
+        README_TO_SCORE,
+        ("ca_reg/score.py", "    def _measure(", "moments.variance(settings.ddof)"),
+        ("ca_reg/_accumulate.py", "    def variance(", "scatter.clamp_("),
+    ),
+    "its test, over all tuples of masks": (
+        ("tests/ca_reg/test_score.py", "import ", "def test_expected_value_over_all_tuples_of_masks"),
+    ),
+    "the line that computes the variance, exactly": (
+        README_TO_SCORE,
+        ("docs/theory.md", "## The recursion", "*Code:* `pixel_moments`"),
+        ("ca_reg/functional/moments.py", "def _moments(", "(colors - mean[..., 1:, :]).square()"),
+    ),
+    "its test, by the enumeration of all masks": (
+        ("tests/ca_reg/test_moments.py", "def test_dropout_equals_the_enumeration", "result.variance"),
+    ),
+}  # fmt: skip
+"""What a stranger looks for: the files on the way, each with the text from which on and up to which it is read."""
+
+
+def walked(root: Path) -> list[dict[str, object]]:
+    """Return a row for each of `WALKS`: files that are opened, and lines read; ValueError if a way is lost."""
+    rows: list[dict[str, object]] = []
+    for goal, way in WALKS.items():
+        read, places = 0, []
+        for file, since, until in way:
+            lines = (root / file).read_text("utf-8").splitlines()
+            first = next((i for i, line in enumerate(lines) if since in line), None)
+            last = next((i for i, line in enumerate(lines) if first is not None and i >= first and until in line), None)
+            if first is None or last is None:
+                raise ValueError(f"{file} does not go from {since!r} to {until!r} any more: find the new way there.")
+            read += last - first + 1
+            places.append(f"{file}:{last + 1}")
+        rows.append({"from the README to": goal, "files": len(way), "lines read": read, "where": ", ".join(places)})
+    return rows
 
 
 def comments_and_code(source: str) -> tuple[int, int]:
@@ -89,7 +136,13 @@ def main(arguments: list[str] | None = None) -> None:
     """Print the tables of a checkout."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.house", description=main.__doc__)
     parser.add_argument("root", nargs="?", type=Path, default=Path(__file__).parents[1], help="root of a checkout")
-    print("\n".join(text for text in _tables(parser.parse_args(arguments).root) if text), end="")
+    parser.add_argument("--walk", action="store_true", help="what a stranger opens and reads from the README on")
+    options = parser.parse_args(arguments)
+    if options.walk:
+        rows = walked(options.root)
+        print(markdown_table(rows, list(rows[0])), end="")
+        return
+    print("\n".join(text for text in _tables(options.root) if text), end="")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""The table of the house, on a small checkout whose figures are known."""
+"""The tables of the house, on a small checkout whose figures are known, and the ways through this one."""
+
+from pathlib import Path
 
 import pytest
 
@@ -31,3 +33,15 @@ def test_the_table_counts_what_is_there(checkout, capsys):
                  "| names exported by ca_reg | 1 |", "| circles of imports | 1 |",
                  "- circle: ca_reg.", "- upward: reference_trainer.files -> reference_trainer.runs"):  # fmt: skip
         assert line in text
+
+
+def test_no_way_from_the_readme_is_lost():
+    rows = house.walked(Path(__file__).parents[2])
+    assert len(rows) == len(house.WALKS)
+    assert all(row["files"] <= 3 and row["lines read"] <= 150 for row in rows)
+
+
+def test_a_way_that_is_lost_is_named(checkout, monkeypatch):
+    monkeypatch.setattr(house, "WALKS", {"goal": (("ca_reg/a.py", "def f", "def g"),)})
+    with pytest.raises(ValueError, match=r"ca_reg/a\.py"):
+        house.walked(checkout)
