@@ -1,4 +1,4 @@
-"""What the tests of the INRIA hook and of the launcher share."""
+"""What the tests of the INRIA hook, of the launcher and of the gsplat adapter share."""
 
 import importlib
 import sys
@@ -6,9 +6,38 @@ import textwrap
 from types import ModuleType
 
 import pytest
+import torch
 from launched import FILES
+from oracles import random_scene
 from pages import ROOT, blocks
+from stand_ins.gsplat import intrinsics
 from stand_ins.inria import Model, make_rasterizer
+from torch import nn
+
+WIDTH, HEIGHT = 24, 16
+
+
+@pytest.fixture
+def cameras():
+    """Two views of one scene, as gsplat takes them."""
+    camera = random_scene(60, WIDTH, HEIGHT, seed=3).camera
+    poses = torch.stack([camera.world_to_camera, camera.world_to_camera]).float()
+    poses[1, 0, 3] += 0.4
+    return {"viewmats": poses, "Ks": intrinsics(camera).float().expand(2, 3, 3), "width": WIDTH, "height": HEIGHT}
+
+
+@pytest.fixture
+def params():
+    """Raw parameters by gsplat's names."""
+    scene = random_scene(60, WIDTH, HEIGHT, seed=3).to(torch.float32)
+    raw = {
+        "means": scene.means,
+        "quats": scene.quaternions,
+        "scales": scene.scales.log(),
+        "opacities": torch.logit(scene.opacities),
+        "colors": scene.colors,
+    }
+    return nn.ParameterDict({name: nn.Parameter(x.clone()) for name, x in raw.items()})
 
 
 @pytest.fixture

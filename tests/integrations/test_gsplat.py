@@ -5,71 +5,20 @@ On a machine with a CUDA device: ``pip install 'gsplat>=1.5' && pytest tests/int
 
 import copy
 import functools
-import inspect
 import sys
-from types import ModuleType
 
 import pytest
 import torch
-from oracles import random_scene
 from stand_ins.card import counted_synchronizations
-from stand_ins.gsplat import intrinsics, rasterization, rasterization_1_4
+from stand_ins.gsplat import activated, rasterization, rasterization_1_4, rasterization_that_culls_nothing
 from torch import nn
 
 from ca_reg import GaussianDropout, OpacityNoise
 from ca_reg.functional import apply_dropout
-from ca_reg.integrations._report import Skip
-from ca_reg.integrations.gsplat import Installation, install, regularized, unregularized
-from ca_reg.schedules import LinearRamp, StartStop
+from ca_reg.integrations.gsplat import install, regularized, unregularized
+from ca_reg.schedules import LinearRamp
 
-N, WIDTH, HEIGHT = 60, 24, 16
-
-
-@pytest.fixture
-def cameras():
-    """Two views of one scene, as gsplat takes them."""
-    camera = random_scene(N, WIDTH, HEIGHT, seed=3).camera
-    poses = torch.stack([camera.world_to_camera, camera.world_to_camera]).float()
-    poses[1, 0, 3] += 0.4
-    return {"viewmats": poses, "Ks": intrinsics(camera).float().expand(2, 3, 3), "width": WIDTH, "height": HEIGHT}
-
-
-@pytest.fixture
-def params():
-    """Raw parameters by gsplat's names."""
-    scene = random_scene(N, WIDTH, HEIGHT, seed=3).to(torch.float32)
-    raw = {
-        "means": scene.means,
-        "quats": scene.quaternions,
-        "scales": scene.scales.log(),
-        "opacities": torch.logit(scene.opacities),
-        "colors": scene.colors,
-    }
-    return nn.ParameterDict({name: nn.Parameter(x.clone()) for name, x in raw.items()})
-
-
-@functools.wraps(rasterization_1_4)
-def rasterization_that_culls_nothing(*args, **kwargs):
-    """Radii of [C, N, 2] and no culling by opacity, as `gsplat.rasterization_2dgs`."""
-    image, alpha, info = rasterization_1_4(*args, **kwargs)
-    info["radii"] = info["radii"][..., None].repeat_interleave(2, dim=-1)
-    return image, alpha, info
-
-
-@functools.wraps(rasterization_1_4)
-def rasterization_without_radii(*args, **kwargs):
-    """As `gsplat.rasterization_inria_wrapper`, which returns an empty dict."""
-    return *rasterization_1_4(*args, **kwargs)[:2], {}
-
-
-def activated(params):
-    return {
-        "means": params["means"],
-        "quats": params["quats"],
-        "scales": params["scales"].exp(),
-        "opacities": params["opacities"].sigmoid(),
-        "colors": params["colors"],
-    }
+N = 60
 
 
 def select(splats, which):
@@ -266,94 +215,6 @@ def test_batches_are_drawn_as_one_set():
     assert wrapped(0, 0, 0, opacities, 0, 0, 0, 8, 8)[2]["gaussian_ids"].numel() > 0
 
 
-@pytest.fixture
-def fake_gsplat(monkeypatch):
-    """A package gsplat with the two places of the function."""
-    gsplat, rendering = ModuleType("gsplat"), ModuleType("gsplat.rendering")
-    gsplat.rasterization = rendering.rasterization = rasterization
-    gsplat.rasterization_2dgs = rendering.rasterization_2dgs = rasterization_that_culls_nothing
-    rendering.rasterization_inria_wrapper = rasterization_without_radii
-    gsplat.rendering = rendering
-    monkeypatch.setitem(sys.modules, "gsplat", gsplat)
-    monkeypatch.setitem(sys.modules, "gsplat.rendering", rendering)
-    return gsplat
-
-
-def test_install_reaches_an_unedited_script_and_restores_exactly(fake_gsplat, params, cameras):
-    script = "from gsplat.rendering import rasterization\nimport gsplat\nfound = [rasterization, gsplat.rasterization]"
-    schedule = StartStop(0.5, start=2)
-    dropout = GaussianDropout(schedule)
-    with install(dropout) as installation:
-        names = {}
-        exec(script, names)
-        for _ in range(3):
-            names["rasterization"](**activated(params), **cameras)
-            dropped = dropout.keep is not None
-        assert (dropout.step, dropped) == (2, True)  # the calls are its steps
-        assert names["found"] == [installation.rasterization] * 2
-        assert inspect.signature(names["rasterization"]) == inspect.signature(rasterization)
-        with pytest.raises(ValueError, match="dropped twice"):
-            install(dropout)
-    assert fake_gsplat.rasterization is fake_gsplat.rendering.rasterization is rasterization
-    assert installation.tally.regularized == installation.rasterization.tally.regularized == 1
-    assert installation.tally.skipped[Skip.RATE_ZERO] == 2
-    installation.uninstall()
-    assert fake_gsplat.rasterization is rasterization
-
-
-def test_install_reaches_2dgs_and_refuses_what_returns_no_radii(fake_gsplat, params, cameras):
-    dropout = GaussianDropout(0.5)
-    with install(dropout) as installation:
-        fake_gsplat.rasterization(**activated(params), **cameras)
-        info = fake_gsplat.rendering.rasterization_2dgs(**activated(params), **cameras, packed=False)[2]
-        assert not info["radii"][:, ~dropout.keep].any()
-        assert dropout.step == 1  # one count for all functions
-        with pytest.raises(RuntimeError, match=r"returns no radii, .* train with gsplat\.rasterization"):
-            fake_gsplat.rendering.rasterization_inria_wrapper(**activated(params), **cameras)
-    assert installation.tally.regularized == 3
-    assert set(installation.functions) == {"rasterization", "rasterization_2dgs", "rasterization_inria_wrapper"}
-    assert fake_gsplat.rasterization_2dgs is rasterization_that_culls_nothing
-
-
-@pytest.mark.parametrize(("patience", "steps"), [(2, 9), (100, 2)])
-def test_a_training_past_the_installation_is_an_error(fake_gsplat, params, cameras, patience, steps):
-    kept = fake_gsplat.rasterization  # as a script that was imported first
-    groups = [{"params": [x], "name": name} for name, x in params.items()]
-    optimizers = [torch.optim.SGD([group], lr=0.1) for group in groups]  # one for each, as gsplat's trainers make them
-    made = 0
-
-    def train():
-        nonlocal made
-        for _ in range(steps):
-            loss_of(kept(**activated(params), **cameras)[0]).backward()
-            for optimizer in optimizers:
-                optimizer.step()
-            made += 1
-
-    with (
-        pytest.raises(RuntimeError, match=r"regularized.* before install"),
-        install(GaussianDropout(0.5), patience=patience),
-    ):
-        train()
-    assert made == 2
-
-
-def test_a_block_installs_what_is_not(fake_gsplat):
-    original = fake_gsplat.rasterization
-    with Installation(GaussianDropout(0.5)) as installation:
-        assert fake_gsplat.rasterization is installation.rasterization
-    assert fake_gsplat.rasterization is original
-
-
-def test_a_schedule_that_never_begins_is_an_error(fake_gsplat, params, cameras):
-    optimizer = torch.optim.SGD([{"params": [params["opacities"]], "name": "opacities"}], lr=0.1)
-    installation = install(GaussianDropout(StartStop(0.5, start=1000)))
-    loss_of(fake_gsplat.rasterization(**activated(params), **cameras)[0]).backward()
-    optimizer.step()
-    with pytest.raises(RuntimeError, match=r"The training was not regularized\..*let the schedule begin earlier"):
-        installation.__exit__(None, None, None)
-
-
 @pytest.mark.slow
 # Dynamo asks every tensor that crosses a cut for its gradient.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
@@ -376,24 +237,6 @@ def test_a_compiled_call_is_regularized(params, cameras):
     assert wrapped.tally.regularized == 2
 
 
-def test_the_package_is_replaced_and_restored():
-    gsplat = pytest.importorskip("gsplat", exc_type=ImportError)
-    names = ("rasterization", "rasterization_2dgs", "rasterization_inria_wrapper", "rasterization_2dgs_inria_wrapper")
-    originals = {name: getattr(gsplat, name) for name in names}
-    with install(GaussianDropout(0.2)) as installation:
-        for name, original in originals.items():
-            assert getattr(gsplat, name) is getattr(gsplat.rendering, name) is installation.functions[name]
-            assert inspect.signature(getattr(gsplat, name)) == inspect.signature(original)
-    for name, original in originals.items():
-        assert getattr(gsplat, name) is getattr(gsplat.rendering, name) is original
-
-
-def test_an_error_inside_restores_as_well(fake_gsplat):
-    with pytest.raises(KeyError), install(GaussianDropout(0.2)):
-        raise KeyError
-    assert fake_gsplat.rasterization is rasterization
-
-
 def test_mistakes_are_told(monkeypatch):
     wrapped = regularized(rasterization, GaussianDropout(0.2))
     assert unregularized(wrapped) is unregularized(rasterization) is rasterization
@@ -408,28 +251,6 @@ def test_mistakes_are_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(ImportError, match=r"pip install 'ca_reg\[gsplat\]'"):
         install(GaussianDropout(0.2))
-
-
-BEFORE = """
-from gsplat.rendering import rasterization
-colors, alphas, info = rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height)
-"""
-AFTER = """
-from gsplat.rendering import rasterization
-from ca_reg import GaussianDropout
-from ca_reg.integrations.gsplat import regularized
-rasterization = regularized(rasterization, GaussianDropout(0.2))
-colors, alphas, info = rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height)
-"""
-
-
-def test_a_users_file_takes_three_added_lines(fake_gsplat, params, cameras):
-    names = activated(params) | cameras
-    exec(AFTER, names)
-    assert names["rasterization"].tally.regularized == 1
-    added = [line for line in AFTER.splitlines() if line not in BEFORE.splitlines()]
-    assert len(added) <= 3
-    assert [line for line in AFTER.splitlines() if line not in added] == BEFORE.splitlines()
 
 
 @pytest.mark.gpu

@@ -45,6 +45,30 @@ def rasterization_1_4(means, quats, scales, opacities, *args, **kwargs):
     return images, alphas, info | listed | {"batch_ids": None}
 
 
+@functools.wraps(rasterization_1_4)
+def rasterization_that_culls_nothing(*args, **kwargs):
+    """Radii of [C, N, 2] and no culling by opacity, as `gsplat.rasterization_2dgs`."""
+    image, alpha, info = rasterization_1_4(*args, **kwargs)
+    info["radii"] = info["radii"][..., None].repeat_interleave(2, dim=-1)
+    return image, alpha, info
+
+
+@functools.wraps(rasterization_1_4)
+def rasterization_without_radii(*args, **kwargs):
+    """As `gsplat.rasterization_inria_wrapper`, which returns an empty dict."""
+    return *rasterization_1_4(*args, **kwargs)[:2], {}
+
+
+def activated(params):
+    return {
+        "means": params["means"],
+        "quats": params["quats"],
+        "scales": params["scales"].exp(),
+        "opacities": params["opacities"].sigmoid(),
+        "colors": params["colors"],
+    }
+
+
 def intrinsics(camera):
     """The (3, 3) matrix of a camera."""
     rows = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
