@@ -53,10 +53,9 @@ _REPORTED = ("script", "arguments", "regularizer", "dropout", "noise", "start", 
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the launcher; exceptions of the script, SystemExit included, pass through.
+    """Run the launcher with its options, the script and that one's arguments, by default those of the process.
 
-    Args:
-        arguments: launcher options, script and script arguments; by default those of the process.
+    Exceptions of the script, SystemExit included, pass through.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parse(arguments)
@@ -86,9 +85,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def resume(arguments: Sequence[str], script: Sequence[str]) -> None:
     """Hook a process that a launched script has started, and report to the launcher when it ends.
 
-    Args:
-        arguments: options of the launcher.
-        script: the launched script, or ``-m`` and its module; that of this process, if it has one, takes its place.
+    ``arguments`` are the launcher's options; ``script``, the launched one, or ``-m`` and its module, gives way to that
+    of this process, if it has one.
     """
     own = Path(sys.argv[0])
     this = [str(own)] if own.suffix == ".py" and own.is_file() else script

@@ -18,15 +18,6 @@ class Camera:
     Convention: OpenCV (x right, y down, z forward). Pixel centers lie at half-integers: the center of the pixel in row
     ``i`` and column ``j`` projects to ``(j + 0.5, i + 0.5)``, so the image spans ``[0, width] x [0, height]``.
 
-    Args:
-        world_to_camera: the view matrix, shape (4, 4): ``x_camera = R x_world + t``.
-        fx: focal length in x, pixels.
-        fy: focal length in y, pixels.
-        cx: principal point in x, pixels.
-        cy: principal point in y, pixels.
-        width: image width, pixels.
-        height: image height, pixels.
-
     Raises:
         ValueError: if the view matrix is not a finite (4, 4) tensor, a focal length is not positive and finite, the
             principal point not finite, or the size not positive.
@@ -37,13 +28,13 @@ class Camera:
         [0.0, 2.0, 2.0]
     """
 
-    world_to_camera: Tensor
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
+    world_to_camera: Tensor  # the view matrix, shape (4, 4): ``x_camera = R x_world + t``
+    fx: float  # focal length in x, pixels
+    fy: float  # focal length in y, pixels
+    cx: float  # principal point in x, pixels
+    cy: float  # principal point in y, pixels
+    width: int  # image width, pixels
+    height: int  # image height, pixels
 
     def __post_init__(self) -> None:
         pose = self.world_to_camera

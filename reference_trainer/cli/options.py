@@ -130,25 +130,16 @@ def check_out(out: Path | None, source: Path, place: SceneOptions | OrbitOptions
 
 
 def check_scenes(paths: Sequence[str]) -> None:
-    """Refuse scene folders that are not there.
-
-    Raises:
-        FileNotFoundError: for the first.
-    """
+    """Refuse scene folders that are not there, with a FileNotFoundError for the first."""
     for path in paths:
         if path != "synthetic" and not Path(path).exists():
             raise FileNotFoundError(f"there is no scene folder {path}; for the built-in scene, say 'synthetic'.")
 
 
 def refuse_old_options(arguments: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse options and values of earlier versions by their new names.
+    """Refuse options and values of earlier versions with a ValueError that has their new names.
 
-    Args:
-        arguments: of the command line.
-        known: options and values that are in use: what is old here may not be everywhere yet.
-
-    Raises:
-        ValueError: with the new name.
+    Those that are ``known`` are in use: what is old here may not be everywhere yet.
     """
     words = [part for word in arguments for part in (word.split("=", 1) if word.startswith("--") else [word])]
     for (option, value), now in _OLD.items():

@@ -25,14 +25,9 @@ from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedMod
 from reference_trainer.scenes.scene import View, Viewpoint
 
 __all__ = [
-    "Evaluation",
-    "ViewScores",
-    "ca_picture",
-    "error_picture",
-    "evaluate",
-    "expected_error_picture",
+    "Evaluation", "ViewScores", "ca_picture", "error_picture", "evaluate", "expected_error_picture",
     "training_snapshot",
-]
+]  # fmt: skip
 
 _log = logging.getLogger(__name__)
 

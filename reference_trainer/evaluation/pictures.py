@@ -23,21 +23,9 @@ from reference_trainer.files import replacing
 from reference_trainer.scenes.images import IMAGE_SUFFIXES, read_image
 
 __all__ = [
-    "PANEL",
-    "as_pillow",
-    "color_bar",
-    "comparison_figure",
-    "dynamics_figure",
-    "file_names",
-    "heat_colors",
-    "heat_map",
-    "is_own_png",
-    "label_font",
-    "logs_exact",
-    "save_film",
-    "save_png",
-    "side_by_side",
-]
+    "PANEL", "as_pillow", "color_bar", "comparison_figure", "dynamics_figure", "file_names", "heat_colors",
+    "heat_map", "is_own_png", "label_font", "logs_exact", "save_film", "save_png", "side_by_side",
+]  # fmt: skip
 
 PANEL = "_panel"
 """Suffix of a view's panel, after the name of its render."""

@@ -19,14 +19,8 @@ from reference_trainer.render.splats import Engine, Splats
 from reference_trainer.render.torch.engine import TorchEngine
 
 __all__ = [
-    "ENGINES",
-    "Engine",
-    "chosen_engine",
-    "describe_engine",
-    "engine_for",
-    "engines_on",
-    "use_engine",
-    "using_engine"
+    "ENGINES", "Engine", "chosen_engine", "describe_engine", "engine_for", "engines_on", "use_engine",
+    "using_engine",
 ]  # fmt: skip
 
 ENGINES = ("auto", "torch", "numba", "triton")

@@ -20,18 +20,12 @@ class Projection(NamedTuple):
     The inverse 2D covariance is kept as its triangular factor: the squared Mahalanobis distance of
     an offset (dx, dy) is ``(l11 dx + l21 dy)^2 + (l22 dy)^2``. The inverse covariance of a needle
     at 45 degrees has large entries that cancel; its factor does not cancel, so float32 is enough.
-
-    Args:
-        means: pixel coordinates, shape (M, 2).
-        factors: ``(l11, l21, l22)``, shape (M, 3).
-        covariances: ``(xx, xy, yy)`` of the dilated 2D covariance, square pixels, shape (M, 3).
-        depths: along the camera's z axis, shape (M,).
     """
 
-    means: Tensor
-    factors: Tensor
-    covariances: Tensor
-    depths: Tensor
+    means: Tensor  # pixel coordinates, shape (M, 2)
+    factors: Tensor  # ``(l11, l21, l22)``, shape (M, 3)
+    covariances: Tensor  # ``(xx, xy, yy)`` of the dilated 2D covariance, square pixels, shape (M, 3)
+    depths: Tensor  # along the camera's z axis, shape (M,)
 
 
 @dataclass(frozen=True)
@@ -128,21 +122,12 @@ class ViewSplats(Protocol):
 
 
 class Rendering(NamedTuple):
-    """A rendered view.
+    """A rendered view."""
 
-    Args:
-        image: colors over the background, not clamped, shape (3, H, W).
-        alpha: accumulated alpha, shape (H, W).
-        depth: sum of weight times camera depth, not divided by alpha, shape (H, W); None unless
-            asked for.
-        splats: what was rendered. ``splats.projection.means`` keeps its gradient (pixels) for
-            densification.
-    """
-
-    image: Tensor
-    alpha: Tensor
-    depth: Tensor | None
-    splats: Splats
+    image: Tensor  # colors over the background, not clamped, shape (3, H, W)
+    alpha: Tensor  # accumulated alpha, shape (H, W)
+    depth: Tensor | None  # sum of weight times camera depth, not divided by alpha, shape (H, W); None unless asked for
+    splats: Splats  # what was rendered. ``splats.projection.means`` keeps its gradient (pixels) for densification
 
 
 class MomentImages(NamedTuple):

@@ -150,15 +150,10 @@ def _label(name: str, seed: int) -> str:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The results of all runs on one scene.
+    """The results of all runs on one scene."""
 
-    Args:
-        runs: for every strategy the content of ``results.json`` of each finished seed.
-        failures: runs that did not finish, and why.
-    """
-
-    runs: dict[str, list[dict[str, Any]]]
-    failures: dict[str, Failure]
+    runs: dict[str, list[dict[str, Any]]]  # for every strategy the content of ``results.json`` of each finished seed
+    failures: dict[str, Failure]  # runs that did not finish, and why
 
 
 def save(comparison: Comparison, out: Path) -> None:

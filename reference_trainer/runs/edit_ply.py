@@ -119,26 +119,14 @@ def clean_ply(
     """Write a model without the Gaussians of highest share of the exact score per blend weight, or without what hangs.
 
     With ``hanging`` those go that `guard` finds, which is for models trained with dropout or noise. Otherwise, shares
-    (at drop rate 1/2) and weights are measured at the training views, or at those of the orbit. The removal leaves
-    holes, which a few training steps on the photographs close; without a scene or with ``refine=0`` they stay. Logs a
-    table of quality and co-adaptation before and after, and says so if the photographs are fitted worse.
+    (at drop rate 1/2) and weights are measured at the training views, or at those of the orbit, and the ``fraction``,
+    in (0, 1), of all Gaussians is removed; those without a share stay. The removal leaves holes, which ``refine``
+    training steps on the photographs close, without densification and with the regularizers of the model: by default
+    100, or none with ``hanging``, which leaves no holes, or without a scene. Logs a table of quality and co-adaptation
+    before and after, and says so if the photographs are fitted worse. Returns the evaluations by row of the table.
 
-    Args:
-        ply: a standard 3DGS PLY.
-        where: its scene, or an orbit around it.
-        out: the file to write, opacities plain; it must not exist.
-        fraction: of the Gaussians to remove, in (0, 1); those without a share stay.
-        refine: training steps afterwards, without densification, with the regularizers of the model; by default 100,
-            or none with ``hanging``, which leaves no holes.
-        hanging: remove what hangs where nobody took a photograph instead.
-        background: as in `score_ply`.
-        regularizer: as in `score_ply`.
-        anyway: clean a model that was trained with dropout, too, which made all measured ones worse.
-        device: where to render and train.
-        trust: as in `load_ply_model`.
-
-    Returns:
-        The evaluations by row of the table.
+    ``where`` is the model's scene, or an orbit around it; opacities are written plain. ``anyway`` cleans a model that
+    was trained with dropout, too, which made all measured ones worse. The rest is as in `score_ply`.
 
     Raises:
         ValueError: as `score_ply`, if ``fraction`` or ``refine`` is out of range, no view has a score, the PLY has

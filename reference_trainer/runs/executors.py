@@ -47,15 +47,10 @@ class Value:
 
 @dataclass(frozen=True)
 class Failure:
-    """The call raised, or all its workers died.
+    """The call raised, or all its workers died."""
 
-    Args:
-        error: type and message of the exception, or how the last worker died.
-        traceback: where it was raised; empty if the workers died.
-    """
-
-    error: str
-    traceback: str
+    error: str  # type and message of the exception, or how the last worker died
+    traceback: str  # where it was raised; empty if the workers died
 
 
 @dataclass(frozen=True)

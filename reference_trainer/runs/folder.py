@@ -90,8 +90,6 @@ def settings_of_run(
         ValueError: if the folder holds a run with other settings, a checkpoint without settings, or a damaged file;
             or no run, but files that a run would overwrite, or the photographs.
     """
-    from reference_trainer.training.plan import Plan  # needs torch
-
     trained = (out / CHECKPOINT).exists()  # looked for first: another process writes it last
     if not (out / CONFIG).exists():
         if trained:
@@ -99,7 +97,7 @@ def settings_of_run(
         check_output(out, options.path, (PLY, BAKED_PLY, RESULTS, VIEWS))
         return None
     if auto and (out / PLAN).exists():
-        from reference_trainer.training.plan import Plan
+        from reference_trainer.training.plan import Plan  # needs torch
 
         try:
             config = Plan.from_dict(read_json(out / PLAN)).applied(config, given=given)

@@ -114,21 +114,13 @@ def render_run(
     device: str = "cpu",
     trust: Collection[str] = (),
 ) -> Path:
-    """Render a run with its test-time opacities.
+    """Render a run with its test-time opacities; return the folder of the pictures, ``<run>/render_<what>`` by default.
 
-    Args:
-        run: folder of the run.
-        what: ``"test"``, ``"train"``, ``"flight"`` through the training cameras, or ``"auto"``: the test views, or if
-            there is none the training views. ``"error"`` adds a heat map of the expected error to each test view, or if
-            there is none, to views between and around the training cameras.
-        out: folder for PNG files, and for a flight also a film (`save_film`); ``<run>/render_<what>`` by default.
-        frames: number of pictures of a flight.
-        mask: expected error above which a third picture is white, for ``"error"``.
-        device: where to render.
-        trust: as for `load_run`.
-
-    Returns:
-        The folder.
+    ``what`` is ``"test"``, ``"train"``, ``"flight"`` through the training cameras in so many ``frames``, which is also
+    written as a film (`save_film`), or ``"auto"``: the test views, or if there is none the training views. ``"error"``
+    adds a heat map of the expected error to each test view, or if there is none, to views between and around the
+    training cameras, and with ``mask`` a third picture, white where the expected error is above that. ``trust`` is as
+    for `load_run`.
 
     Raises:
         ValueError: if there is no test view to render, or a picture of somebody else's would be overwritten.

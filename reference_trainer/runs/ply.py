@@ -40,23 +40,14 @@ SMALLEST_RADIUS = 0.25
 
 @dataclass(frozen=True)
 class PlyFacts:
-    """What a PLY file says about its model.
+    """What a PLY file says about its model."""
 
-    Args:
-        gaussians: number of Gaussians.
-        sh_degree: of the coefficients in the file.
-        sh_degree_used: highest band with a nonzero coefficient.
-        opacity_scale: the factor baked into the stored opacities, 1 if none is.
-        for_rendering: whether they are test-time opacities from which the plain ones cannot be recovered.
-        regularizer: what the model was trained with, from the file or the caller.
-    """
-
-    gaussians: int
-    sh_degree: int
-    sh_degree_used: int
-    opacity_scale: float
-    for_rendering: bool
-    regularizer: str
+    gaussians: int  # number of Gaussians
+    sh_degree: int  # of the coefficients in the file
+    sh_degree_used: int  # highest band with a nonzero coefficient
+    opacity_scale: float  # the factor baked into the stored opacities, 1 if none is
+    for_rendering: bool  # whether they are test-time opacities from which the plain ones cannot be recovered
+    regularizer: str  # what the model was trained with, from the file or the caller
 
     def __str__(self) -> str:
         used = "" if self.sh_degree_used == self.sh_degree else f" (bands above {self.sh_degree_used} are zero)"
@@ -134,15 +125,7 @@ def load_plain_ply_model(
 
 @dataclass(frozen=True)
 class ModelWithViews:
-    """A model and the views that it is measured at.
-
-    Args:
-        model: the model, enlarged if it is tiny and there is no scene.
-        enlarged: the factor by which it is enlarged.
-        views: by split; ``"orbit"`` without a scene.
-        scene: None for an orbit.
-        about: entries about all this for a file of results.
-    """
+    """A model and the views that it is measured at."""
 
     model: TrainedModel
     enlarged: float
@@ -153,11 +136,11 @@ class ModelWithViews:
 
 def load_for_views(
     ply: Path,
-    where: SceneOptions | OrbitOptions,
-    *,
-    background: str = "auto",
-    regularizer: str | None = None,
-    device: str = "cpu",
+    where: SceneOptions | OrbitOptions,  # the model, enlarged if it is tiny and there is no scene
+    *,  # the factor by which it is enlarged
+    background: str = "auto",  # by split; ``"orbit"`` without a scene
+    regularizer: str | None = None,  # None for an orbit
+    device: str = "cpu",  # entries about all this for a file of results
     trust: Collection[str] = (),
 ) -> ModelWithViews:
     """Load the model of a PLY and the views of a scene, or cameras on an orbit; arguments and errors of `score_ply`."""

@@ -190,11 +190,8 @@ def run_experiment(
 def load_run(folder: Path, device: torch.device | str = "cpu", *, trust: Collection[str] = ()) -> Trainer:
     """Load the trainer of a run, finished or not, with its scene.
 
-    Args:
-        folder: of the run.
-        device: where to render.
-        trust: modules that the run's settings may import. A folder may come from anybody, and what its settings name
-            as module:Class would be executed here.
+    ``trust`` names modules that the run's settings may import: a folder may come from anybody, and what its settings
+    name as module:Class would be executed here.
 
     Raises:
         FileNotFoundError: if the folder holds no run.

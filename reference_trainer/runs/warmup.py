@@ -21,12 +21,10 @@ _UNTIMED, _TIMED = 3, 9  # steps
 
 @functools.cache
 def warm_up() -> tuple[str, ...]:
-    """Use every loop once per process, if the CPU engine is the loops; those in the disk cache are loaded from it.
+    """Use every loop once per process, if the CPU engine is the loops; return the names of those that were compiled.
 
-    A training step of each kind and a score of each kind compile exactly the variants of the loops that are needed.
-
-    Returns:
-        The names of the loops that had to be compiled.
+    A training step of each kind and a score of each kind compile exactly the variants of the loops that are needed;
+    those in the disk cache are loaded from it.
     """
     if describe_engine("cpu") == "torch":
         return ()

@@ -379,12 +379,8 @@ def _thinned(
     cells = torch.cat([positions / torch.exp2(level)[:, None], level[:, None]], 1)[best].double().numpy()
 
     def chosen(size: float) -> NDArray[Any]:
-        keys = np.floor(cells / [size, size, size, 1]).astype(np.int64) @ [
-            1,
-            2**20,
-            2**40,
-            2**58,
-        ]  # wraps, rarely meets
+        places = np.floor(cells / [size, size, size, 1]).astype(np.int64)
+        keys = places @ [1, 2**20, 2**40, 2**58]  # wraps, rarely meets
         return np.unique(keys, return_index=True)[1]
 
     low, high = 1e-4, 1.0  # too many and few enough, unless there are few anyway

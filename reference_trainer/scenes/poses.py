@@ -29,25 +29,15 @@ LARGEST_SIDE = 1600
 
 @dataclass(frozen=True)
 class FoundPoses:
-    """The outcome of `find_poses`.
+    """The outcome of `find_poses`."""
 
-    Args:
-        folder: of the COLMAP model, ``sparse/0`` in the scene.
-        registered: names of the photographs that now have a camera.
-        left_out: names of the others.
-        unread: names of photographs in a format that is not read, such as HEIC.
-        points: number of points.
-        error: mean reprojection error of their features, pixels of the photographs.
-        focal: focal lengths of the cameras, pixels, sorted.
-    """
-
-    folder: Path
-    registered: tuple[str, ...]
-    left_out: tuple[str, ...]
-    unread: tuple[str, ...]
-    points: int
-    error: float
-    focal: tuple[float, ...]
+    folder: Path  # of the COLMAP model, ``sparse/0`` in the scene
+    registered: tuple[str, ...]  # names of the photographs that now have a camera
+    left_out: tuple[str, ...]  # names of the others
+    unread: tuple[str, ...]  # names of photographs in a format that is not read, such as HEIC
+    points: int  # number of points
+    error: float  # mean reprojection error of their features, pixels of the photographs
+    focal: tuple[float, ...]  # focal lengths of the cameras, pixels, sorted
 
     def __str__(self) -> str:
         """Describe what was found, and what to do about photographs left out."""

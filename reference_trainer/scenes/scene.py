@@ -20,14 +20,9 @@ _NAMES_SHOWN = 12
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A named camera; with its photograph it is a `View`.
+    """A named camera; with its photograph it is a `View`."""
 
-    Args:
-        name: a label, unique within its split.
-        camera: the camera.
-    """
-
-    name: str
+    name: str  # a label, unique within its split
     camera: Camera
 
     def to(self, device: torch.device | str) -> Self:
@@ -77,27 +72,16 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene: training and test views and the points to start from.
+    """A scene: training and test views and the points to start from."""
 
-    Args:
-        name: short label for reports.
-        train: views to fit.
-        test: held-out views, never used in training.
-        points: initial points.
-        background: the color (3,) behind everything, in [0, 1].
-        source: where the photographs come from.
-        notes: what a user should know about how it was loaded, one note each.
-        start: a model to start from instead of points; ``points`` are then its centers.
-    """
-
-    name: str
-    train: tuple[View, ...]
-    test: tuple[View, ...]
-    points: PointCloud
-    background: Tensor
-    source: str = "built in"
-    notes: tuple[str, ...] = ()
-    start: Gaussians | None = None
+    name: str  # short label for reports
+    train: tuple[View, ...]  # views to fit
+    test: tuple[View, ...]  # held-out views, never used in training
+    points: PointCloud  # initial points
+    background: Tensor  # the color (3,) behind everything, in [0, 1]
+    source: str = "built in"  # where the photographs come from
+    notes: tuple[str, ...] = ()  # what a user should know about how it was loaded, one note each
+    start: Gaussians | None = None  # a model to start from instead of points; ``points`` are then its centers
 
     def __str__(self) -> str:
         """Summarize the scene: source and size of the photographs, names of the views, and the notes."""

@@ -87,20 +87,14 @@ def _measure(source: Path, max_samples: int, seeds: int, device: str) -> Record:
 def error_runtime(model: TrainedModel, view: Viewpoint, *, max_samples: int = 1024, seeds: int = 3) -> Record:
     """Measure error and wall-clock time of all estimators of one view's co-adaptation at drop rate 1/2.
 
-    - Monte Carlo with K = 2, 4, 8, ... renders: the unbiased variance (ddof = 1), accumulated in float64 in one running
-      pass per seed. Its time includes drawing the masks.
+    - Monte Carlo with K = 2, 4, 8, ... up to ``max_samples`` renders, for so many ``seeds``: the unbiased variance
+      (ddof = 1), accumulated in float64 in one running pass per seed. Its time includes drawing the masks.
     - The paper's first-order form, and the exact moments in float32, drawn by every engine, and in float64.
 
     All share one region, the pixels whose expected alpha exceeds 0.8 in the exact float64 result. Times start from the
-    parameters of the model, so they include projection and tile lists; on a GPU the clock waits for the work to be
-    done. Everything but Monte Carlo is called once untimed and then timed in turns with the plain render (`in_turns`),
-    which is drawn by the engine in use, as are the Monte Carlo renders.
-
-    Args:
-        model: what to measure, float32; its dropout rate does not matter.
-        view: what to render, on the model's device.
-        max_samples: largest K.
-        seeds: number of Monte Carlo runs; their masks come from the seeds 0, 1, 2, ...
+    parameters of the float32 model, so they include projection and tile lists; on a GPU the clock waits for the work to
+    be done. Everything but Monte Carlo is called once untimed and then timed in turns with the plain render
+    (`in_turns`), which is drawn by the engine in use, as are the Monte Carlo renders.
 
     Returns:
         The exact float64 ``score``, the mean over RGB and the region, which covers the share ``covered`` of the pixels;

@@ -58,21 +58,13 @@ _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 class TrainingState(NamedTuple):
-    """A trainer between two steps.
+    """A trainer between two steps."""
 
-    Args:
-        config: all settings.
-        step: number of steps taken.
-        seconds: wall-clock time that they took.
-        processor_seconds: CPU time that all threads spent on them.
-        models: the `ModelState.state_dict` of each model.
-    """
-
-    config: TrainConfig
-    step: int
-    seconds: float
-    processor_seconds: float
-    models: list[dict[str, Any]]
+    config: TrainConfig  # all settings
+    step: int  # number of steps taken
+    seconds: float  # wall-clock time that they took
+    processor_seconds: float  # CPU time that all threads spent on them
+    models: list[dict[str, Any]]  # the `ModelState.state_dict` of each model
 
 
 def read_state(

@@ -29,25 +29,15 @@ _DISTANCE = 3.0  # from the camera to the center of the scene, whose half width 
 
 @dataclass(frozen=True)
 class StressScene:
-    """Gaussians, a camera and a background.
+    """Gaussians, a camera and a background."""
 
-    Args:
-        means: world coordinates, shape (N, 3).
-        quaternions: wxyz, shape (N, 4).
-        scales: standard deviations, shape (N, 3).
-        opacities: activated, shape (N,).
-        colors: RGB, shape (N, 3).
-        background: shape (3,).
-        camera: the view.
-    """
-
-    means: Tensor
-    quaternions: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor
-    background: Tensor
-    camera: Camera
+    means: Tensor  # world coordinates, shape (N, 3)
+    quaternions: Tensor  # wxyz, shape (N, 4)
+    scales: Tensor  # standard deviations, shape (N, 3)
+    opacities: Tensor  # activated, shape (N,)
+    colors: Tensor  # RGB, shape (N, 3)
+    background: Tensor  # shape (3,)
+    camera: Camera  # the view
 
     @property
     def parameters(self) -> list[Tensor]:
