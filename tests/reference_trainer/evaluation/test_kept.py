@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from reference_trainer.evaluation import evaluate as evaluate_module
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.results import ResultStore, fingerprint
 from reference_trainer.evaluation.trained_model import TrainedModel
@@ -110,22 +109,19 @@ def test_a_fingerprint_tells_everything_apart():
 
 
 @pytest.mark.parametrize("done", [0, 1, 3])
-def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path, monkeypatch, done, said):
+def test_an_interrupted_evaluation_measures_the_rest(model, tiny_scene, tmp_path, done, said):
     views = {"train": tiny_scene.train, "around": [Viewpoint("000", tiny_scene.test[0].camera)]}
     file, pictures = tmp_path / "kept.json", tmp_path / "views"
     whole = evaluate(model, views, samples=2, pictures=tmp_path / "whole")
-    measure, measured = evaluate_module._measure, []
+    begun = []
 
-    def stopped(model, view, *arguments):
-        if len(measured) == done:
+    def stop():
+        if len(begun) == done:
             raise KeyboardInterrupt
-        measured.append(view.name)
-        return measure(model, view, *arguments)
+        begun.append(None)
 
-    monkeypatch.setattr(evaluate_module, "_measure", stopped)
     with pytest.raises(KeyboardInterrupt):
-        evaluate(model, views, samples=2, pictures=pictures, partial=file)
-    monkeypatch.setattr(evaluate_module, "_measure", measure)
+        evaluate(model, views, samples=2, pictures=pictures, partial=file, on_view=stop)
     said.clear()
     assert repr(evaluate(model, views, samples=2, pictures=pictures, partial=file)) == repr(whole)
     assert sum(text.startswith("[") for text in said) == 4 - done

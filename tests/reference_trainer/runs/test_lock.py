@@ -150,22 +150,12 @@ def test_what_another_process_finished_while_the_scene_was_read_is_not_trained_a
         return scene
 
     monkeypatch.setattr("reference_trainer.runs.run.load_scene", load)
-    monkeypatch.setattr("reference_trainer.runs.run._train", train_once(monkeypatch))
-    assert run_experiment(options, short, tmp_path, monitoring=Monitoring(0)) == results[0]
 
+    def trained_again(trainer):
+        pytest.fail("trained again")
 
-def train_once(monkeypatch):
-    """Train, but not a second time."""
-    from reference_trainer.runs.run import _train
-
-    calls = []
-
-    def train(*args, **keywords):
-        calls.append(1)
-        assert len(calls) == 1, "trained again"
-        return _train(*args, **keywords)
-
-    return train
+    found = run_experiment(options, short, tmp_path, monitoring=Monitoring(0), on_step=trained_again)
+    assert found == results[0]
 
 
 def test_a_sweep_goes_on_without_the_run_that_is_at_work_elsewhere(tmp_path, options, short, elsewhere):
