@@ -3,6 +3,7 @@
 Its two commands at the top are what `.ci/run` begins with.
 """
 
+import itertools
 import json
 import shlex
 import shutil
@@ -15,16 +16,20 @@ import numpy as np
 import pytest
 import torch
 from launched import FILES
+from oracles import brute_force, random_scene
 from pages import ROOT, blocks
 from PIL import Image
 from stand_ins import gsplat as gsplat_stand_in
 from subprocesses import subprocess_environment
 
+from ca_reg import CAScore
+from ca_reg.integrations import gsplat_model
 from reference_trainer.cli import main, photos
+from reference_trainer.model.gaussians import SH_C0
 from reference_trainer.scenes import synthetic_scene
 
 README = ROOT / "README.md"
-PYTHON = dict(zip(("two lines", "chain", "gsplat", "score"), blocks(README, "python"), strict=True))
+PYTHON = dict(zip(("two lines", "chain", "gsplat", "score", "exact score"), blocks(README, "python"), strict=True))
 COMMANDS = [
     shlex.split(line, comments=True)
     for block in blocks(README, "bash")
@@ -94,6 +99,35 @@ def test_the_score(gaussians, capsys):
     value, std_error = (float(x) for x in capsys.readouterr().out.split()[:2])
     assert (value, std_error) == pytest.approx((found.result.value, found.result.std_error))
     assert value == pytest.approx(0.8 * 0.5**2 / 4, rel=0.05)  # 1,000 pixels, 5 renders: 2 % of standard error
+
+
+def test_the_exact_score_of_gsplat(monkeypatch, capsys):
+    """The variance over all masks of six Gaussians, each as likely as any, over gsplat's own torch functions."""
+    pytest.importorskip("gsplat.cuda._torch_impl", exc_type=ImportError)
+    monkeypatch.setattr(gsplat_model, "load_gsplat", lambda device: gsplat_stand_in.package())
+    gsplat_model._largest_alpha.cache_clear()
+    scene = gsplat_stand_in.centered(random_scene(6, 12, 10, seed=9, size=0.4))
+    # In one place, so that half of them cover a pixel; none so opaque that a render would stop early.
+    scene = scene._replace(means=0.2 * scene.means, opacities=0.6 + 0.1 * scene.opacities)
+    images, alphas = zip(
+        *(
+            brute_force(*scene[:3], scene.opacities * torch.tensor(keep).double(), scene.colors, scene.camera)
+            for keep in itertools.product((0.0, 1.0), repeat=6)
+        ),
+        strict=True,
+    )
+    visible = torch.stack(alphas).mean(0) > 0.8
+    assert 10 < visible.sum() < 120
+    sh = torch.zeros(6, 16, 3, dtype=torch.float64)
+    sh[:, 0] = (scene.colors - 0.5) / SH_C0
+    run(
+        "exact score", CAScore=CAScore, means=scene.means, quats=scene.quaternions, scales=scene.scales,
+        sh=sh, opacities=scene.opacities, viewmat=scene.camera.world_to_camera,
+        K=gsplat_stand_in.intrinsics(scene.camera), width=12, height=10,
+    )  # fmt: skip
+    gsplat_model._largest_alpha.cache_clear()
+    expected = torch.stack(images).var(0, unbiased=False).mean(0)[visible].mean().item()
+    assert float(capsys.readouterr().out) == pytest.approx(expected, rel=1e-3)
 
 
 def camera_file(scene):
