@@ -8,6 +8,7 @@ import torch
 from ca_reg import CAMonitor, CAPenalty, CAScore, GaussianDropout, OpacityNoise, attribute
 from ca_reg.functional import Multiplier
 from ca_reg.lists import ListMoments, PixelLists
+from ca_reg.regularizers import parse
 from ca_reg.result import summarize
 from reference_trainer.training.randomness import deterministic
 
@@ -111,3 +112,21 @@ def test_a_monitor_logs_what_is_there(scenes, tmp_path):
     scene = scenes[1]
     with CAMonitor(CAScore(scene.render, threshold=0.1), tmp_path, views={"train": [None]}, every=1) as monitor:
         assert monitor(1, scene.opacity)["ca/train"] > 0
+
+
+@pytest.mark.parametrize("train", [True, False])
+@pytest.mark.parametrize(
+    "text", ["dropout(0.2)", "dropout(0.2, compensate=True)", "noise(0.8)", "noise(0.8, scale=True)"]
+)
+def test_autocast_changes_nothing(card, text, train):
+    """Neither values nor gradients, on the processor and on the card."""
+    opacity = torch.rand(500, 1, generator=torch.Generator().manual_seed(0))
+    for device in ("cpu", card):
+        found = []
+        for enabled in (False, True):
+            x, regularizer = opacity.to(device, copy=True).requires_grad_(), parse(text).train(train)
+            with torch.autocast(torch.device(device).type, dtype=torch.bfloat16, enabled=enabled):
+                out = regularizer(x, generator=torch.Generator().manual_seed(1))
+            out.square().sum().backward()
+            found.append((out.detach().cpu(), x.grad.cpu()))
+        assert all(torch.equal(*pair) for pair in zip(*found, strict=True))
