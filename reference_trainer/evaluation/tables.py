@@ -29,7 +29,7 @@ _ABSENT = "n/a"
 _FIGURE = re.compile(r"[-+]?\d|-?$")  # also a dash or nothing in its place
 _SHOWN: dict[str, tuple[str, int]] = {
     "psnr": ("PSNR", 2),
-    "psnr_expected": ("expected", 1),
+    "psnr_expected": ("expected PSNR", 1),
     "psnr_low": ("from", 1),
     "psnr_high": ("to (80 %)", 1),
     "ssim": ("SSIM", 3),

@@ -1,4 +1,4 @@
-"""What a report shows of one run: its pictures, and how much every Gaussian co-adapts relative to its contribution."""
+"""What a report shows of one run: its pictures, what is expected where nobody was, and how every Gaussian co-adapts."""
 
 from __future__ import annotations
 
@@ -9,22 +9,27 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import avg_pool2d, normalize
 
 from ca_reg import CAResult, Reason
-from reference_trainer.evaluation.evaluate import ca_picture, error_picture
+from ca_reg.error_maps import ErrorMap
+from reference_trainer.evaluation.error_maps import ErrorMaps
+from reference_trainer.evaluation.evaluate import ca_picture, error_picture, expected_error_picture
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.pictures import heat_colors
-from reference_trainer.evaluation.shares import Heat, concentration
+from reference_trainer.evaluation.shares import Guard, Heat, concentration, guard
 from reference_trainer.evaluation.tables import EXACT
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.report.packing import heat_uri, image_uri, quantized
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.load import evenly_spaced
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
-from reference_trainer.scenes.virtual_cameras import measured_views
+from reference_trainer.scenes.virtual_cameras import measured_views, unseen_views
 
-__all__ = ["Findings", "find"]
+__all__ = ["Findings", "find", "pictures_of"]
+
+NOBODY = 27
+"""Cameras that nobody took, of which the worst are shown: all there are between and beyond three."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +42,12 @@ class Findings:
         opacities: that the page draws it with, (N,).
         scene: what it was trained on.
         views: that it is shown from, by split, those that were not trained on first if they have photographs.
-        pictures: per view, ``"render"`` and where they exist ``"error"`` and ``"co-adaptation"``, and a ``"caption"``.
+        pictures: per view, ``"render"`` and where they exist ``"error"``, ``"expected error"`` and ``"co-adaptation"``,
+            and a ``"caption"``.
         heat: of the exact score over these views; None if there is no score to attribute.
         notes: what is missing, and why.
+        unseen: cameras that nobody took, with what is expected there.
+        hangs: what hangs there; None for a model that cannot be guarded.
     """
 
     label: str
@@ -50,6 +58,8 @@ class Findings:
     pictures: list[dict[str, str]]
     heat: Heat | None
     notes: list[str]
+    unseen: Sequence[tuple[Viewpoint, ErrorMap]] = ()
+    hangs: Guard | None = None
 
     def packed(self, low: float, high: float) -> dict[str, Any]:
         """Return the model as the page draws it: its Gaussians in the order of their heat, those of least heat first.
@@ -111,6 +121,8 @@ class Findings:
 def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Collection[str] = ()) -> Findings:
     """Draw a run's last checkpoint from its views, and attribute the exact score at drop rate 1/2 to its Gaussians.
 
+    What is expected of a view is expected from the model and the training photographs, so not of those themselves.
+
     Args:
         run: its folder.
         label: what the page calls it.
@@ -135,17 +147,39 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
     except ValueError as error:
         notes.append(f"{label}: no co-adaptation: {error}")
     results = [None] * len(flat) if heat is None else heat.results
-    pictures = [_pictures(model, view, result) for view, result in zip(flat, results, strict=True)]
-    return Findings(label, model, model.without_camera.test_opacities, scene, chosen, pictures, heat, notes)
+    errors = ErrorMaps(model, scene.train)
+    pictures = []
+    for view, result in zip(flat, results, strict=True):
+        own = any(view is each for each in chosen["train"])
+        expected = None if own else errors(view, view.mask if isinstance(view, View) else None)
+        pictures.append(pictures_of(model, view, expected, result))
+    unseen, hangs = [], None
+    if len(scene.train) > 1:
+        places = unseen_views(scene)
+        places = [places[i].to(device) for i in evenly_spaced(len(places), min(NOBODY, len(places)))]
+        unseen = [(place, errors(place)) for place in places]
+        hangs = guard(model, scene, places) if len(model.chain) else None
+    else:
+        notes.append(f"{label}: no views that you did not take, because none lies between or beyond a single camera.")
+    opacities = model.without_camera.test_opacities
+    return Findings(label, model, opacities, scene, chosen, pictures, heat, notes, unseen, hangs)
 
 
-def _pictures(model: TrainedModel, view: Viewpoint, result: CAResult | None) -> dict[str, str]:
-    """Return the pictures of a view and their caption."""
+@torch.no_grad()
+def pictures_of(
+    model: TrainedModel, view: Viewpoint, expected: ErrorMap | None, result: CAResult | None = None
+) -> dict[str, str]:
+    """Return the pictures of a view as data URIs, and their caption."""
     image = model.test_rendering(view).image.clamp(0, 1)
     found, said = {"render": image_uri(image)}, []
     if isinstance(view, View):
         found["error"] = heat_uri(error_picture(image, view.image))
         said.append(f"PSNR {psnr(image, view.image, view.mask):.2f} dB")
+    if expected is not None:
+        half = avg_pool2d(expected.error[None], 2, ceil_mode=True)[0]  # it is smooth, and a third of the size
+        found["expected error"] = heat_uri(expected_error_picture(expected._replace(error=half)))
+        low, high = expected.interval
+        said.append(f"expected {'' if said else 'PSNR '}{expected.psnr:.1f} dB ({low:.1f} to {high:.1f})")
     if result is not None and result.reason is Reason.OK:
         found["co-adaptation"] = heat_uri(ca_picture(result))
         said.append(f"exact CA {result.value * 1e3:.2f}e-3")

@@ -7,6 +7,8 @@ const TERMS = {
     + "left out at random, averaged over the pixels that count, computed exactly and not by sampling. In thousandths; "
     + "less is better if the quality is no worse.",
   "CA (": "Co-adaptation estimated from a few random renders, as in the paper. Noisy; compare models by the exact CA.",
+  "expected PSNR": "What the model and the training photographs let expect of a view that has no photograph; so not of the "
+    + "training views. Below it, or beside it as from and to, where the measured PSNR of a view lies in 80 % of the cases.",
   "PSNR": "Peak signal-to-noise ratio against the photograph, in dB. Higher is better; 1 dB is a fifth less squared error.",
   "SSIM": "Structural similarity to the photograph, at most 1. Higher is better.",
   "LPIPS": "Perceptual distance to the photograph, by a neural network. Lower is better.",
@@ -58,9 +60,10 @@ function scores() {
   const rows = data.strategies.map(({ name, seeds, color }, i) => [
     make("td", {}, swatch(color), name, ...(seeds > 1 ? [make("small", {}, `${seeds} seeds`)] : [])),
     ...data.scores.map(({ cells }) => {
-      const { text, best, delta, better } = cells[i], word = better == null ? "" : better ? "better" : "worse";
+      const { text, best, delta, better, interval } = cells[i], word = better == null ? "" : better ? "better" : "worse";
       const arrow = word && (delta[0] === "+" ? "▲△" : "▼▽")[better ? 0 : 1];
       return make("td", {}, make(best ? "strong" : "span", {}, text),
+        ...(interval ? [make("small", {}, interval)] : []),
         ...(delta ? [make("small", { className: word, title: word }, `${delta} ${arrow}`)] : []));
     })]);
   const legend = data.strategies.length < 2 ? "" : `Bold: the best of a column. Below: the difference to `
@@ -87,7 +90,8 @@ else $("dynamics").append(make("p", { className: "quiet" }, "Nothing was measure
 addEventListener("beforeprint", () => document.querySelectorAll("details").forEach(part => { part.open = true; }));
 
 // The views: two pictures upon each other, the right one shown to the right of the wipe, or both in turn.
-const KINDS = { photograph: "photograph", render: "render", error: "error", "co-adaptation": "CA map" }, stacks = [];
+const KINDS = { photograph: "photograph", render: "render", error: "error", "expected error": "expected error", "co-adaptation": "CA map" };
+const stacks = [], nobody = ["render", "expected error"]; // what is shown where nobody took a photograph
 const [first, ...more] = data.runs.length > 1 ? data.runs.keys() : [];
 for (const [id, usual] of [["left", "photograph"], ["right", "render"]]) {
   $(id).append(...Object.entries(KINDS).map(([kind, name]) => make("option", { value: kind }, name)));
@@ -96,17 +100,18 @@ for (const [id, usual] of [["left", "photograph"], ["right", "render"]]) {
       make("option", { value: `${kind}/${i}` }, `${name} of ${data.runs[i].label}`)));
   $(id).value = data.views.some(view => view.photograph) ? usual : id === "left" ? "render" : "co-adaptation";
 }
-function stack(view, run) {
-  const part = { view, run, box: make("button", { className: "stack", type: "button" }), turn: false };
-  part.images = [0, 1].map(() => make("img", {}));
+function stack(view, run, kinds) {
+  const part = { view, run, kinds, box: make("button", { className: "stack", type: "button" }), turn: false };
+  part.images = [0, 1].map(() => make("img", { style: `aspect-ratio: ${view.size.join(" / ")}` }));
   part.names = [0, 1].map(() => make("span", { ariaHidden: "true" }));
   part.box.append(...part.images, ...part.names);
   return part;
 }
 function refresh(part) {
-  const { view, run, images, names, turn } = part, wipe = $("flicker").checked ? (turn ? 0 : 100) : $("wipe").value;
+  const { view, run, kinds, images, names, turn } = part, beside = kinds && part !== large;
+  const flicker = $("flicker").checked && !beside, wipe = flicker ? (turn ? 0 : 100) : $("wipe").value;
   const found = ["left", "right"].map((id, side) => {
-    const [kind, of] = $(id).value.split("/"), picture = { photograph: view.photograph, ...view.pictures[of ?? run] }[kind];
+    const [kind, of] = (kinds?.[side] ?? $(id).value).split("/"), picture = { photograph: view.photograph, ...view.pictures[of ?? run] }[kind];
     const name = (of ? `${KINDS[kind]} of ${data.runs[of].label}` : KINDS[kind]) + (picture ? "" : ": none");
     if (picture && images[side].src !== picture) images[side].src = picture;
     images[side].hidden = !picture;
@@ -114,9 +119,9 @@ function refresh(part) {
     images[side].alt = `${name}, ${view.name}, ${data.runs[run].label}`;
     return Boolean(picture);
   });
-  const at = found[0] && found[1] ? wipe : 0;
+  const at = found[0] && found[1] && !beside ? wipe : 0;
   images[1].style.clipPath = `inset(0 0 0 ${at}%)`;
-  names.forEach((name, side) => { name.hidden = $("flicker").checked && side !== Number(turn); });
+  names.forEach((name, side) => { name.hidden = flicker && side !== Number(turn); });
 }
 const refreshAll = () => {
   $("wide").value = $("wipe").value;
@@ -124,14 +129,15 @@ const refreshAll = () => {
   if (large) refresh(large);
 };
 let large = null, flickering = 0;
-for (const view of data.views) {
+for (const [view, kinds] of [...data.views.map(view => [view]), ...data.unseen.map(view => [view, nobody])]) {
   const figures = view.pictures.map((pictures, run) => {
-    const part = stack(view, run), number = stacks.push(part) - 1;
+    const part = stack(view, run, kinds), number = stacks.push(part) - 1;
+    part.box.classList.toggle("pair", Boolean(kinds));
     part.caption = [data.runs[run].label, view.name, pictures.caption ?? "not among the views of this run"];
     part.box.onclick = () => enlarge(number);
     return make("figure", {}, part.box, make("figcaption", {}, swatch(data.runs[run].color), part.caption.filter(Boolean).join(" · ")));
   });
-  $("views").append(make("div", { className: "side" }, ...figures));
+  $(kinds ? "worst" : "views").append(make("div", { className: "side" }, ...figures));
 }
 for (const id of ["left", "right", "wipe"]) $(id).oninput = refreshAll;
 $("wide").oninput = () => { $("wipe").value = $("wide").value; refreshAll(); };
@@ -144,8 +150,8 @@ $("flicker").oninput = () => {
   refreshAll();
 };
 function enlarge(number) {
-  const { view, run, caption, turn } = stacks[number = (number + stacks.length) % stacks.length];
-  large = Object.assign(stack(view, run), { turn });
+  const { view, run, kinds, caption, turn } = stacks[number = (number + stacks.length) % stacks.length];
+  large = Object.assign(stack(view, run, kinds), { turn });
   large.box.onpointermove = event => {
     const { left, width } = large.box.getBoundingClientRect();
     $("wide").value = 100 * (event.clientX - left) / width;
@@ -163,7 +169,9 @@ $("large").onkeydown = ({ key }) => ({ PageUp: $("earlier"), PageDown: $("later"
 $("large").onclose = () => { large = null; };
 $("close").onclick = () => $("large").close();
 refreshAll();
-if (data.views.some(view => view.photograph)) $("ranges").append(bar("error (mean over the colors)", "0", `${data.ends.error} or more`));
+if (data.views.some(view => view.photograph)) $("ranges").append(bar("error and expected error (mean over the colors)", "0", `${data.ends.error} or more`));
+if (data.unseen.length) $("ranges-unseen").append(bar("expected error (of colors in [0, 1], mean over them)", "0", `${data.ends.error} or more`));
+else $("unseen").remove();
 if (data.attribution) $("ranges").append(bar("CA map (variance, half left out); gray does not count", "0", `${data.ends.ca} or more`));
 
 // The models, and one camera for all of them.
@@ -260,8 +268,9 @@ async function showModels() {
       redraw();
     };
   }
-  $("from").append(...data.views.map((view, i) => make("option", { value: i }, view.name)));
-  $("from").onchange = () => { lookFrom(data.views[$("from").value]); redraw(); };
+  const places = [...data.views, ...data.unseen];
+  $("from").append(...places.map((view, i) => make("option", { value: i }, view.name)));
+  $("from").onchange = () => { lookFrom(places[$("from").value]); redraw(); };
   $("reset").onclick = () => { stop(); $("hide").value = 0; $("from").onchange(); };
   $("full").onclick = () => document.fullscreenElement ? document.exitFullscreen() : $("stage").requestFullscreen();
   $("play").disabled = !data.flight.length;

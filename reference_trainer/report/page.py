@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import math
 import os
 import shlex
+from collections import Counter
 from collections.abc import Collection, Sequence
 from datetime import datetime
 from importlib.resources import files
@@ -24,7 +26,7 @@ from reference_trainer.evaluation.pictures import heat_map, logs_exact
 from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE
 from reference_trainer.evaluation.tables import evaluation_table, markdown_table
 from reference_trainer.files import write_text
-from reference_trainer.report.findings import Findings, find
+from reference_trainer.report.findings import Findings, find, pictures_of
 from reference_trainer.report.packing import image_uri
 from reference_trainer.report.verdict import (
     FEWEST_SEEDS,
@@ -39,6 +41,7 @@ from reference_trainer.report.verdict import (
 )
 from reference_trainer.runs.folder import (
     CONFIG,
+    PLY,
     RESULTS,
     check_run,
     read_results,
@@ -47,13 +50,16 @@ from reference_trainer.runs.folder import (
     runs_of,
 )
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.scene import View
+from reference_trainer.scenes.scene import View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import interpolate_cameras
 from reference_trainer.training.config import TrainConfig
 
 __all__ = ["compare_two", "labels", "view_name", "write_report"]
 
 _log = logging.getLogger(__name__)
+
+EACH = 3
+"""Views that nobody took, at most, of those between the training cameras and of those beyond."""
 
 
 def write_report(
@@ -68,8 +74,9 @@ def write_report(
 
     It begins with a verdict and its evidence, and shows the scores with their differences to the first run, CA and PSNR
     against the step, every model in 3D (all turn together) in its colors or its co-adaptation heat, any two of
-    photograph, render, error and CA map of all runs upon each other, and how concentrated the score is on few
-    Gaussians. Runs come in the order baseline, dropout, noise, both, under natural names. The heat is the share of the
+    photograph, render, error, expected error and CA map of all runs upon each other, the views that nobody took of
+    which least is expected, what hangs there, and how concentrated the score is on few Gaussians. Runs come in the
+    order baseline, dropout, noise, both, under natural names. The heat is the share of the
     exact score at drop rate 1/2 per blend weight, over the views of the page, on one logarithmic scale for all runs
     around the mean of the first run that has one. What a run lacks is left out, and the page says so.
 
@@ -210,7 +217,8 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
         "notes": notes + missing,
         "scene": found[0].scene.name,
         "verdict": said,
-        "evidence": evidence,
+        "evidence": evidence
+        + [line for each in found for line in _hanging(each, runs[each.label], configs[each.label][0])],
         "strategies": [{"name": of.name, "seeds": len(of.results), "color": of.color} for of in strategies],
         "scores": score_columns(strategies),
         "settings": table,
@@ -221,6 +229,7 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
         "legend": image_uri(heat_map(torch.linspace(0, 1, 256)[None].expand(8, -1), 1.0)),
         "ends": {"heat": [f"{low:.2g}", f"{high:.2g}"], "error": ERROR_PICTURE_RANGE, "ca": CA_PICTURE_RANGE},
         "views": _views(found),
+        "unseen": _unseen(found),
         "flight": _flight(found[0]),
         "runs": [each.packed(low, high) | {"color": colors[each.label]} for each in found],
     }
@@ -331,16 +340,56 @@ def _views(found: Sequence[Findings]) -> list[dict[str, Any]]:
         pictures = iter(each.pictures)
         for split, group in each.views.items():
             for view in group:
-                camera = view.camera
-                pose = camera.world_to_camera[:3].flatten().tolist()
-                entry = views.setdefault((split, view.name, str(pose)), {
-                    "name": view_name(split, view.name),
-                    "photograph": image_uri(view.image) if isinstance(view, View) else "",
-                    "pose": pose,
-                    "focal": [camera.fx, camera.fy],
-                    "center": [camera.cx, camera.cy],
-                    "size": [camera.width, camera.height],
-                    "pictures": [{}] * len(found),
-                })  # fmt: skip
+                entry = _entry(view, view_name(split, view.name), len(found))
+                entry = views.setdefault((split, view.name, str(entry["pose"])), entry)
                 entry["pictures"][number] = next(pictures)
     return list(views.values())
+
+
+def _entry(view: Viewpoint, name: str, runs: int) -> dict[str, Any]:
+    """Return a view with its camera, its photograph, and room for the pictures of every run."""
+    camera = view.camera
+    return {
+        "name": name,
+        "photograph": image_uri(view.image) if isinstance(view, View) else "",
+        "pose": camera.world_to_camera[:3].flatten().tolist(),
+        "focal": [camera.fx, camera.fy],
+        "center": [camera.cx, camera.cy],
+        "size": [camera.width, camera.height],
+        "pictures": [{}] * runs,
+    }
+
+
+def _unseen(found: Sequence[Findings]) -> list[dict[str, Any]]:
+    """Return the views that nobody took of which least is expected, of any run, the worst first.
+
+    Of the cameras of one way, between the same two or beyond the same one, only the worst: the others look like it.
+    """
+    least: dict[str, tuple[float, Viewpoint]] = {}
+    for view, expected in (one for each in found for one in each.unseen):
+        if expected.psnr < least.get(view.name, (math.inf,))[0]:
+            least[view.name] = expected.psnr, view
+    chosen, kinds = list[Viewpoint](), Counter[str]()
+    for _, view in sorted(least.values(), key=lambda one: one[0]):
+        kinds[kind := view.name.partition(" ")[0]] += 1
+        chosen += [view] * (kinds[kind] <= EACH)
+    entries = []
+    for view in chosen:
+        entries.append(_entry(view, view.name, len(found)))
+        for number, each in enumerate(found):
+            for other, expected in each.unseen:
+                if torch.equal(other.camera.world_to_camera, view.camera.world_to_camera):
+                    entries[-1]["pictures"][number] = pictures_of(each.model, other, expected)
+    return entries
+
+
+def _hanging(each: Findings, run: Path, options: SceneOptions) -> list[str]:
+    """Return a line on what hangs where nobody took a photograph, and how to remove it."""
+    if each.hangs is None or not each.hangs.where:
+        return []
+    command = ["ca-reg", "clean", str(run / PLY), "--scene", options.path, "--hanging"]
+    for name, usual in dataclasses.asdict(SceneOptions()).items():
+        if (x := getattr(options, name)) != usual and name not in ("path", "init"):  # a PLY is its own beginning
+            flag = name.replace("_", "-")
+            command += [f"--{flag}" if x else f"--no-{flag}"] if isinstance(x, bool) else [f"--{flag}", str(x)]
+    return [f"{each.label}: {each.hangs} To remove them: {shlex.join(command)}"]

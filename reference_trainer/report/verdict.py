@@ -29,9 +29,12 @@ __all__ = [
 _USUAL = TrainConfig()
 _COLUMNS = [  # split, key, title, decimals, unit, whether the highest is best; None where neither end is a merit
     ("test", "psnr", "PSNR", 2, 1.0, True),
+    ("test", "psnr_expected", "expected PSNR", 1, 1.0, None),
     ("test", "ssim", "SSIM", 3, 1.0, True),
     ("test", "lpips", "LPIPS", 3, 1.0, False),
     ("test", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
+    ("between", "psnr_expected", "expected PSNR", 1, 1.0, None),
+    ("around", "psnr_expected", "expected PSNR", 1, 1.0, None),
     ("between", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
     ("around", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
     ("train", "psnr", "PSNR", 2, 1.0, None),
@@ -152,7 +155,8 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
     """Return the columns of the scores: ``split``, ``title``, ``cells`` of ``text``, ``best``, ``delta``, ``better``.
 
     ``delta`` is the difference to the first strategy as text, ``better`` whether that is an improvement (None where
-    neither direction is one). The best figure of a column that has a best is marked, all that share it.
+    neither direction is one). The best figure of a column that has a best is marked, all that share it. Below what is
+    expected stands the ``interval`` of a view, the mean of its ends.
     """
     columns = []
     unseen = {split for of in strategies for run in of.results for split in run["mean"]}
@@ -166,6 +170,9 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
         cells: list[dict[str, Any]] = []
         for i, (of, mean) in enumerate(zip(strategies, rounded, strict=True)):
             cell = {"text": format_mean_std(of.values(split, key), unit=unit, decimals=decimals), "best": mean == best}
+            if key == "psnr_expected":
+                ends = (mean_std(of.values(split, end))[0] for end in ("psnr_low", "psnr_high"))
+                cell["interval"] = " to ".join(f"{end:.{decimals}f}" for end in ends)
             if i and highest is not None and math.isfinite(delta := mean - rounded[0]):
                 cell["delta"] = f"{delta:+.{decimals}f}".replace("-", "\N{MINUS SIGN}")
                 cell["better"] = None if not round(delta, decimals) else (delta > 0) == highest
