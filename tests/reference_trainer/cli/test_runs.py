@@ -14,7 +14,6 @@ from reference_trainer.runs import measure as measure_module
 from reference_trainer.runs import ply as ply_module
 from reference_trainer.runs import run as run_module
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
-from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
 from reference_trainer.viewer.window import Viewer
 

@@ -1,0 +1,177 @@
+"""The setting for few photographs: candidates by held-out views, the chosen one judged; see benchmarks/setting.md.
+
+    python -m benchmarks.setting measure RUN... --out setting.json    # folders of runs; what is measured is kept
+    python -m benchmarks.setting table setting.json
+
+A row is a training: PSNR of held-out views of training kind, which alone choose, and what `ca-reg train` has measured
+at the test views. Plain 3DGS and dropout alone, against which the chosen one is judged, are rows of the paper's grid.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Annotated, Any, Literal
+
+import torch
+import tyro
+
+from benchmarks.guard import OTHER_EXPOSURE, quality
+from benchmarks.paper.rows import Rows, value
+from benchmarks.paper.scenes import SCENES
+from benchmarks.remedy import held_out
+from reference_trainer.evaluation.results import write_json
+from reference_trainer.evaluation.tables import markdown_table
+from reference_trainer.json_files import read_json
+from reference_trainer.runs.folder import read_run_settings
+from reference_trainer.runs.measure import load_run_model
+from reference_trainer.training.config import TrainConfig
+
+__all__ = ["candidate", "choosing", "judging", "main", "measured"]
+
+Row = dict[str, Any]
+"""``scene``, ``candidate`` and ``seed``, ``held-out`` PSNR if there are such views, ``test`` figures, ``gaussians``."""
+
+_FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
+_REFERENCES = {"plain": {}, "dropout": {"regularizer": "dropout(0.2)"}}
+
+
+def main(
+    what: Annotated[Literal["measure", "table"], tyro.conf.Positional],
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path = Path("runs/setting.json"),
+    references: Path = Path("benchmarks/data/paper"),
+    chosen: str = "drawn",
+) -> None:
+    """Measure runs, or print the tables of what was measured.
+
+    Args:
+        what: "measure", or "table".
+        paths: folders of runs, or one file of rows.
+        out: the file of rows, which is continued.
+        references: folder with the rows of the paper's grid.
+        chosen: the candidate to judge.
+    """
+    torch.set_num_threads(1)
+    if what == "measure":
+        rows: list[Row] = json.loads(out.read_text("utf-8")) if out.exists() else []
+        known = {(row["scene"], row["candidate"], row["seed"]) for row in rows}
+        for run in paths:
+            options, config = read_run_settings(run / "config.json")
+            if (Path(options.path).name, candidate(config), config.seed) not in known:
+                rows.append(measured(run))
+                write_json(out, rows)
+    else:
+        rows = json.loads(paths[0].read_text("utf-8"))
+    print(choosing(rows), judging(rows, chosen, references), sep="\n\n")
+
+
+def candidate(config: TrainConfig) -> str:
+    """Return the name of a candidate.
+
+    Example:
+        >>> candidate(TrainConfig(dropout=0.2, analytic=True, opacity_decay=0.998))
+        'expectation, decay 0.998'
+    """
+    if not config.analytic:
+        return "drawn"
+    return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
+
+
+def measured(run: Path) -> Row:
+    """Return the row of a finished training."""
+    model, scene = load_run_model(run)
+    options, config = read_run_settings(run / "config.json")
+    results = read_json(run / "results.json")
+    name = Path(options.path).name
+    row: Row = {"scene": name, "candidate": candidate(config), "seed": config.seed}
+    if name != "lego":  # has no other photographs
+        others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(name, ())]
+        row["held-out"] = fmean(quality(model, view) for view in others)
+    test = results["mean"]["test"]
+    row |= {"test": {x: test[x] for x in _FIGURES if x in test}, "gaussians": results["gaussians"],
+            "seconds": results["processor_seconds"], "lpips": results.get("perceptual_metric"),
+            "cpu": results["machine"]["cpu"]}  # fmt: skip
+    print(scene.name, row["candidate"], row["seed"], row.get("held-out"), row["test"], flush=True)
+    return row
+
+
+def choosing(rows: Sequence[Row]) -> str:
+    """Return the table of the candidates: held-out PSNR of seed 0 by scene, and their mean over the scenes of all."""
+    of: dict[str, dict[str, Row]] = defaultdict(dict)
+    for row in rows:
+        if row["seed"] == 0 and "held-out" in row:
+            of[row["candidate"]][row["scene"]] = row
+    most = max(map(len, of.values()))
+    shared = [scene for scene in SCENES if sum(scene in found for found in of.values()) == len(of)]
+    lines = []
+    for name, found in of.items():
+        line = {"candidate": name} | {scene: f"{row['held-out']:.2f}" for scene, row in found.items()}
+        line["mean"] = f"{fmean(found[s]['held-out'] for s in shared):.2f}" if shared else "-"
+        lines.append(line)
+    columns = ["candidate", *(s for s in SCENES if any(s in found for found in of.values())), "mean"]
+    note = "" if len(shared) == most else f" (mean over {', '.join(shared)})"
+    return f"Held-out PSNR in dB, seed 0{note}\n\n" + markdown_table(
+        [dict.fromkeys(columns, "-") | line for line in lines], columns
+    )
+
+
+def judging(rows: Sequence[Row], chosen: str, references: Path) -> str:
+    """Return the table of a candidate against plain 3DGS and dropout alone at the test views, and the goals below."""
+    lines, gains, spreads, perceptual, counts = [], list[float](), list[float](), list[float](), list[float]()
+    for scene in SCENES:
+        own = {row["seed"]: row for row in rows if (row["scene"], row["candidate"]) == (scene, chosen)}
+        if not own:
+            continue
+        kept = Rows(references / f"{scene}.json")
+        plain, dropout = (
+            kept.of({"recipe": "3dgs", "iterations": 3_000, **setting}) for setting in _REFERENCES.values()
+        )
+        pairs = [value(own[s], "test psnr") - value(plain[s], "test psnr") for s in sorted(own.keys() & plain.keys())]
+        gains += pairs
+        spread = _spread(value(row, "test psnr") for row in own.values())
+        spreads += [] if spread is None else [spread]
+        perceptual.append(_mean(own, "test lpips") - _mean(dropout, "test lpips"))
+        counts.append(_mean(own, "gaussians") / _mean(dropout, "gaussians"))
+        columns = {"plain": plain, "dropout": dropout, chosen: own}
+        line = {"scene": scene, "seeds": str(len(own))}
+        line |= {
+            f"{name} PSNR": _with_spread(value(r, "test psnr") for r in of.values()) for name, of in columns.items()
+        }
+        line["gain over plain, by seed"] = ", ".join(f"{x:+.2f}" for x in pairs)
+        line["LPIPS"] = " / ".join(f"{_mean(of, 'test lpips'):.3f}".lstrip("0") for of in columns.values())
+        scores = (1e3 * _mean(of, "test ca_exact_half") for of in columns.values())
+        line["exact CA at 1/2, 1e-3"] = " / ".join(f"{score:.2f}" for score in scores)
+        line["Gaussians over dropout's"] = f"{counts[-1]:.2f}"
+        lines.append(line)
+    if not lines:
+        return f"Nothing of {chosen!r} was measured."
+    goals = [
+        f"mean gain over plain: {fmean(gains):+.2f} dB over {len(gains)} pairs of {len(lines)} scenes",
+        f"worst pair: {min(gains):+.2f} dB",
+        f"standard deviation of seeds, mean over scenes: {fmean(spreads):.2f} dB" if spreads else "one seed",
+        f"LPIPS against dropout alone, mean over scenes: {fmean(perceptual):+.4f}",
+        f"Gaussians against dropout alone, mean over scenes: {fmean(counts):.2f}",
+    ]
+    return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {goal}" for goal in goals)])
+
+
+def _mean(of: dict[int, Row], figure: str) -> float:
+    return fmean(value(row, figure) for row in of.values())
+
+
+def _spread(values: Iterable[float]) -> float | None:
+    return stdev(found) if len(found := list(values)) > 1 else None
+
+
+def _with_spread(values: Iterable[float]) -> str:
+    found = list(values)
+    spread = _spread(found)
+    return f"{fmean(found):.2f}" + ("" if spread is None else f" ± {spread:.2f}")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
