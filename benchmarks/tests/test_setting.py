@@ -1,0 +1,40 @@
+"""Candidates by held-out views, the chosen one against plain 3DGS and dropout: from rows made by hand."""
+
+from __future__ import annotations
+
+import json
+
+from benchmarks import setting
+
+
+def row(scene, candidate, seed, psnr, held_out=None):
+    test = {"psnr": psnr, "ssim": 0.8, "lpips": 0.1, "ca_exact_half": 1e-3}
+    found = {"scene": scene, "candidate": candidate, "seed": seed, "test": test, "gaussians": 100, "seconds": 60.0}
+    return found | ({} if held_out is None else {"held-out": held_out})
+
+
+def test_the_mean_of_a_candidate_is_over_the_scenes_that_all_have():
+    drawn = [row("fern", "drawn", 0, 25.0, 20.0), row("sceaux", "drawn", 0, 20.0, 30.0), row("lego", "drawn", 0, 24.0)]
+    other = [row("fern", "expectation", 0, 25.0, 21.0), row("sceaux", "expectation", 0, 20.0, 27.0)]
+    rows = [*drawn, row("cape", "drawn", 0, 20.0, 99.0), *other, row("fern", "expectation", 1, 25.0, 90.0)]
+    lines = [line for line in setting.choosing(rows).splitlines() if line.startswith("| ")][1:]
+    means = {cells[1].strip(): cells[-2].strip() for line in lines if (cells := line.split("|"))}
+    assert means == {"drawn": "25.00", "expectation": "24.00"}
+
+
+def test_a_pair_is_of_one_scene_and_seed(tmp_path):
+    def kept(options, psnr):
+        own = {"recipe": "3dgs", "iterations": 3_000, **options}
+        return [
+            {"setting": own, "seed": seed, "test": {"psnr": psnr + seed, "lpips": 0.1}, "gaussians": 200}
+            for seed in (0, 1)
+        ]
+
+    rows = kept({}, 20.0) + kept({"regularizer": "dropout(0.2)"}, 21.0)
+    (tmp_path / "fern.json").write_text(json.dumps({"scene": "fern", "rows": rows}))
+    own = [row("fern", "drawn", 0, 22.5), row("fern", "drawn", 1, 20.7), row("fern", "expectation", 0, 10.0)]
+    text = setting.judging(own, "drawn", tmp_path)
+    assert "+2.50, -0.30" in text
+    assert "mean gain over plain: +1.10 dB over 2 pairs of 1 scenes" in text
+    assert "worst pair: -0.30 dB" in text
+    assert "Gaussians against dropout alone, mean over scenes: 0.50" in text
