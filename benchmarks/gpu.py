@@ -2,7 +2,7 @@
 
     python -m benchmarks.gpu          # everything that this machine can do; what fails is named, and the rest goes on
     python -m benchmarks.gpu ahead    # without a card: all kernels compiled for all targets (or for those named)
-    python -m benchmarks.gpu count    # without a card: operations, read-backs and bytes of an exact score
+    python -m benchmarks.gpu count    # without a card: operations and read-backs of scores and training steps
     python -m benchmarks.gpu lists    # without a card: operations and bytes of the exact moments of per-pixel lists
 
 ``count`` runs the kernels in Triton's interpreter where there is no card.
@@ -36,11 +36,20 @@ from ca_reg.functional import Multiplier
 from ca_reg.lists import ListMoments, PixelLists
 from reference_trainer.camera import Camera
 from reference_trainer.render import describe_engine, rasterize, render_masks, render_moments, splat, use_engine
+from reference_trainer.scenes.synthetic import synthetic_scene
+from reference_trainer.training.losses.photometric import photometric_loss
+from reference_trainer.training.recipes import with_recipe
+from reference_trainer.training.trainer import Trainer
 
 __all__ = ["Counts", "bytes_per_entry", "count_exact_score", "main"]
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = "tests/reference_trainer/render/triton"
+_STEPS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "dropout": {"dropout": 0.2},
+    "expectation": {"dropout": 0.2, "analytic": True},
+}
 _SIZES = {"small": (20_000, 400, 0.02), "middle": (100_000, 800, 0.012), "large": (500_000, 800, 0.006)}
 
 
@@ -210,6 +219,29 @@ def count_exact_score(count: int, width: int, scale: float, device: torch.device
     return Counts(operations, _counted(rendering)[0], mode.read_backs, len(splats.lists.gaussians))
 
 
+class StepCounts(NamedTuple):
+    """What a training step costs: its operations without the optimizer's, those of the loss, the optimizer's; waits."""
+
+    operations: int
+    loss: int
+    optimizer: int
+    read_backs: int
+
+
+def count_step(device: torch.device | str = "cpu", **settings: Any) -> StepCounts:
+    """Count a training step of the built-in scene in little, with the engine triton, by PyTorch's dispatcher."""
+    use_engine("triton")
+    scene = synthetic_scene(width=32, height=24, points=40)
+    trainer = Trainer(scene, with_recipe("3dgs", iterations=3_000, **settings), device)
+    trainer.train_step()  # loads what is loaded once
+    photograph = scene.train[0].image.to(device)
+    image = (photograph / 2).requires_grad_()
+    loss, _, _ = _counted(lambda: photometric_loss(image, photograph).backward())
+    everything, mode, _ = _counted(trainer.train_step)
+    optimizer = sum(number for name, number in mode.names.items() if name in ("_fused_adam_", "_foreach_add_"))
+    return StepCounts(everything - optimizer, loss, optimizer, mode.read_backs)
+
+
 @torch.no_grad()
 def bytes_per_entry(device: torch.device | str = "cpu") -> float:
     """Return the bytes that every further list entry takes at the peak, which is while lists are made.
@@ -280,7 +312,12 @@ def _count() -> str:
     rows = [count_exact_score(*size, device) for size in ((24, 24, 0.05), (24, 24, 0.2), (48, 40, 0.1))]
     out = ["| entries | operations of an exact score | of them the engine's | read-backs |", "|---:|---:|---:|---:|"]
     out += [f"| {x.entries} | {x.operations} | {x.rendering} | {x.read_backs} |" for x in rows]
-    return "\n".join(out) + f"\n\n{bytes_per_entry(device):.1f} bytes per list entry at the peak."
+    out += ["", f"{bytes_per_entry(device):.1f} bytes per list entry at the peak.", ""]
+    out += ["| a training step | operations without Adam's | of them the loss's | Adam's | read-backs |"]
+    out += ["|:--|---:|---:|---:|---:|"]
+    for name, settings in _STEPS.items():
+        out.append(f"| {name} | {' | '.join(map(str, count_step(device, **settings)))} |")
+    return "\n".join(out)
 
 
 def _ahead(targets: list[str]) -> str:
