@@ -30,7 +30,7 @@ from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["candidate", "choosing", "judging", "main", "measured"]
+__all__ = ["candidate", "choosing", "differences", "judging", "main", "measured"]
 
 Row = dict[str, Any]
 """``scene``, ``candidate`` and ``seed``, ``held-out`` PSNR if there are such views, ``test`` figures, ``gaussians``."""
@@ -105,16 +105,14 @@ def choosing(rows: Sequence[Row]) -> str:
     for row in rows:
         if row["seed"] == 0 and "held-out" in row:
             of[row["candidate"]][row["scene"]] = row
-    most = max(map(len, of.values()))
     shared = [scene for scene in SCENES if sum(scene in found for found in of.values()) == len(of)]
     lines = []
     for name, found in of.items():
         line = {"candidate": name} | {scene: f"{row['held-out']:.2f}" for scene, row in found.items()}
         line["mean"] = f"{fmean(found[s]['held-out'] for s in shared):.2f}" if shared else "-"
         lines.append(line)
-    columns = ["candidate", *(s for s in SCENES if any(s in found for found in of.values())), "mean"]
-    note = "" if len(shared) == most else f" (mean over {', '.join(shared)})"
-    return f"Held-out PSNR in dB, seed 0{note}\n\n" + markdown_table(
+    columns = ["candidate", *(s for s in SCENES if sum(s in found for found in of.values()) > 1), "mean"]
+    return f"Held-out PSNR in dB, seed 0; mean over {', '.join(shared)}\n\n" + markdown_table(
         [dict.fromkeys(columns, "-") | line for line in lines], columns
     )
 
@@ -126,11 +124,8 @@ def judging(rows: Sequence[Row], chosen: str, references: Path) -> str:
         own = {row["seed"]: row for row in rows if (row["scene"], row["candidate"]) == (scene, chosen)}
         if not own:
             continue
-        kept = Rows(references / f"{scene}.json")
-        plain, dropout = (
-            kept.of({"recipe": "3dgs", "iterations": 3_000, **setting}) for setting in _REFERENCES.values()
-        )
-        pairs = [value(own[s], "test psnr") - value(plain[s], "test psnr") for s in sorted(own.keys() & plain.keys())]
+        plain, dropout = (_references(references, scene)[name] for name in _REFERENCES)
+        pairs = differences(rows, chosen, references)[scene]
         gains += pairs
         spread = _spread(value(row, "test psnr") for row in own.values())
         spreads += [] if spread is None else [spread]
@@ -157,6 +152,23 @@ def judging(rows: Sequence[Row], chosen: str, references: Path) -> str:
         f"Gaussians against dropout alone, mean over scenes: {fmean(counts):.2f}",
     ]
     return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {goal}" for goal in goals)])
+
+
+def differences(rows: Sequence[Row], chosen: str, references: Path) -> dict[str, list[float]]:
+    """Return by how much a candidate is ahead of the plain training of the same seed, test PSNR, by scene."""
+    found: dict[str, list[float]] = {}
+    for scene in SCENES:
+        plain = _references(references, scene)["plain"]
+        own = {row["seed"]: row for row in rows if (row["scene"], row["candidate"]) == (scene, chosen)}
+        shared = sorted(own.keys() & plain.keys())
+        found[scene] = [value(own[seed], "test psnr") - value(plain[seed], "test psnr") for seed in shared]
+    return found
+
+
+def _references(references: Path, scene: str) -> dict[str, dict[int, Row]]:
+    """Return the kept rows of what a candidate is compared with, by name and seed."""
+    kept = Rows(references / f"{scene}.json")
+    return {name: kept.of({"recipe": "3dgs", "iterations": 3_000, **own}) for name, own in _REFERENCES.items()}
 
 
 def _mean(of: dict[int, Row], figure: str) -> float:

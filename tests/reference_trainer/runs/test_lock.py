@@ -135,7 +135,7 @@ def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, opti
     end(process)
     said.clear()
     run_experiment(options, short, tmp_path, monitoring=Monitoring(0))
-    assert said[0] == f"{tmp_path}: continues from step 6"
+    assert f"{tmp_path}: continues from step 6" in said
 
 
 def test_what_another_process_finished_while_the_scene_was_read_is_not_trained_again(
@@ -183,7 +183,7 @@ def test_what_another_sweep_finished_meanwhile_counts(tmp_path, options, short, 
     outcomes = run_grid(runs, Running(Other(), monitoring=Monitoring(0)))
     assert outcomes[0] == outcomes[1]
     assert (tmp_path / "0" / RESULTS).exists()
-    assert "FAILED, FolderInUseError" in said[0]
+    assert any("FAILED, FolderInUseError" in line for line in said)
     assert said[-1].startswith("[2/2] 0: ")
     assert said[-1].endswith(" dB, finished meanwhile")
 
