@@ -13,7 +13,10 @@ from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.trainer import Trainer
 
-TRAIN = "train --downscale 8 --iterations 4 --densify-from 1 --densify-every 2 --no-auto --dropout 0.2 --device card"
+TRAIN = (
+    "train --downscale 8 --iterations 4 --densify-from 1 --densify-every 2 --opacity-reset-every 0 --no-auto "
+    "--dropout 0.2 --device card"
+)
 
 
 @pytest.mark.slow
