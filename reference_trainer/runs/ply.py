@@ -127,20 +127,20 @@ def load_plain_ply_model(
 class ModelWithViews:
     """A model and the views that it is measured at."""
 
-    model: TrainedModel
-    enlarged: float
-    views: Mapping[str, Sequence[Viewpoint]]
-    scene: Scene | None
-    about: dict[str, object]
+    model: TrainedModel  # enlarged if it is tiny and there is no scene
+    enlarged: float  # the factor by which it is enlarged
+    views: Mapping[str, Sequence[Viewpoint]]  # by split; ``"orbit"`` without a scene
+    scene: Scene | None  # None for an orbit
+    about: dict[str, object]  # entries about all this for a file of results
 
 
 def load_for_views(
     ply: Path,
-    where: SceneOptions | OrbitOptions,  # the model, enlarged if it is tiny and there is no scene
-    *,  # the factor by which it is enlarged
-    background: str = "auto",  # by split; ``"orbit"`` without a scene
-    regularizer: str | None = None,  # None for an orbit
-    device: str = "cpu",  # entries about all this for a file of results
+    where: SceneOptions | OrbitOptions,
+    *,
+    background: str = "auto",
+    regularizer: str | None = None,
+    device: str = "cpu",
     trust: Collection[str] = (),
 ) -> ModelWithViews:
     """Load the model of a PLY and the views of a scene, or cameras on an orbit; arguments and errors of `score_ply`."""
