@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Annotated, Any, Literal
 
 import torch
@@ -24,7 +24,7 @@ from benchmarks.paper.rows import Rows, value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.remedy import held_out
 from reference_trainer.evaluation.results import write_json
-from reference_trainer.evaluation.tables import markdown_table
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 from reference_trainer.json_files import read_json
 from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
@@ -36,6 +36,10 @@ Row = dict[str, Any]
 """``scene``, ``candidate`` and ``seed``, ``held-out`` PSNR if there are such views, ``test`` figures, ``gaussians``."""
 
 _FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
+CHOSEN = "drawn"
+"""The candidate that is judged."""
+REFERENCES = Path(__file__).with_name("data") / "paper"
+"""Folder with the rows of the paper's grid."""
 _REFERENCES = {"plain": {}, "dropout": {"regularizer": "dropout(0.2)"}}
 
 
@@ -43,8 +47,6 @@ def main(
     what: Annotated[Literal["measure", "table"], tyro.conf.Positional],
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
     out: Path = Path("runs/setting.json"),
-    references: Path = Path("benchmarks/data/paper"),
-    chosen: str = "drawn",
 ) -> None:
     """Measure runs, or print the tables of what was measured.
 
@@ -52,8 +54,6 @@ def main(
         what: "measure", or "table".
         paths: folders of runs, or one file of rows.
         out: the file of rows, which is continued.
-        references: folder with the rows of the paper's grid.
-        chosen: the candidate to judge.
     """
     torch.set_num_threads(1)
     if what == "measure":
@@ -66,7 +66,7 @@ def main(
                 write_json(out, rows)
     else:
         rows = json.loads(paths[0].read_text("utf-8"))
-    print(choosing(rows), judging(rows, chosen, references), sep="\n\n")
+    print(choosing(rows), judging(rows), sep="\n\n")
 
 
 def candidate(config: TrainConfig) -> str:
@@ -117,72 +117,60 @@ def choosing(rows: Sequence[Row]) -> str:
     )
 
 
-def judging(rows: Sequence[Row], chosen: str, references: Path) -> str:
-    """Return the table of a candidate against plain 3DGS and dropout alone at the test views, and the goals below."""
-    lines, gains, spreads, perceptual, counts = [], list[float](), list[float](), list[float](), list[float]()
-    for scene in SCENES:
-        own = {row["seed"]: row for row in rows if (row["scene"], row["candidate"]) == (scene, chosen)}
-        if not own:
-            continue
-        plain, dropout = (_references(references, scene)[name] for name in _REFERENCES)
-        pairs = differences(rows, chosen, references)[scene]
-        gains += pairs
-        spread = _spread(value(row, "test psnr") for row in own.values())
-        spreads += [] if spread is None else [spread]
+def judging(rows: Sequence[Row], references: Path = REFERENCES) -> str:
+    """Return the table of the chosen one against plain 3DGS and dropout alone at the test views, and the goals."""
+    lines, perceptual, counts, spreads = [], list[float](), list[float](), list[float]()
+    gains = differences(rows, references)
+    for scene, pairs in gains.items():
+        compared = {**_references(references, scene), CHOSEN: _chosen(rows, scene)}
+        _, dropout, own = compared.values()
         perceptual.append(_mean(own, "test lpips") - _mean(dropout, "test lpips"))
         counts.append(_mean(own, "gaussians") / _mean(dropout, "gaussians"))
-        columns = {"plain": plain, "dropout": dropout, chosen: own}
+        spreads.append(mean_std(value(row, "test psnr") for row in own.values())[1])
         line = {"scene": scene, "seeds": str(len(own))}
-        line |= {
-            f"{name} PSNR": _with_spread(value(r, "test psnr") for r in of.values()) for name, of in columns.items()
-        }
+        for name, of in compared.items():
+            line[f"{name} PSNR"] = format_mean_std((value(row, "test psnr") for row in of.values()), decimals=2)
         line["gain over plain, by seed"] = ", ".join(f"{x:+.2f}" for x in pairs)
-        line["LPIPS"] = " / ".join(f"{_mean(of, 'test lpips'):.3f}".lstrip("0") for of in columns.values())
-        scores = (1e3 * _mean(of, "test ca_exact_half") for of in columns.values())
+        line["LPIPS"] = " / ".join(f"{_mean(of, 'test lpips'):.3f}".lstrip("0") for of in compared.values())
+        scores = (1e3 * _mean(of, "test ca_exact_half") for of in compared.values())
         line["exact CA at 1/2, 1e-3"] = " / ".join(f"{score:.2f}" for score in scores)
         line["Gaussians over dropout's"] = f"{counts[-1]:.2f}"
         lines.append(line)
     if not lines:
-        return f"Nothing of {chosen!r} was measured."
+        return f"Nothing of {CHOSEN!r} was measured."
+    every = [gain for pairs in gains.values() for gain in pairs]
     goals = [
-        f"mean gain over plain: {fmean(gains):+.2f} dB over {len(gains)} pairs of {len(lines)} scenes",
-        f"worst pair: {min(gains):+.2f} dB",
-        f"standard deviation of seeds, mean over scenes: {fmean(spreads):.2f} dB" if spreads else "one seed",
+        f"mean gain over plain: {fmean(every):+.2f} dB over {len(every)} pairs of {len(lines)} scenes",
+        f"worst pair: {min(every):+.2f} dB",
+        f"standard deviation of seeds, mean over scenes: {mean_std(spreads)[0]:.2f} dB",
         f"LPIPS against dropout alone, mean over scenes: {fmean(perceptual):+.4f}",
         f"Gaussians against dropout alone, mean over scenes: {fmean(counts):.2f}",
     ]
     return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {goal}" for goal in goals)])
 
 
-def differences(rows: Sequence[Row], chosen: str, references: Path) -> dict[str, list[float]]:
-    """Return by how much a candidate is ahead of the plain training of the same seed, test PSNR, by scene."""
+def differences(rows: Sequence[Row], references: Path = REFERENCES) -> dict[str, list[float]]:
+    """Return by how much the chosen one is ahead of the plain training of the same seed, test PSNR, by scene."""
     found: dict[str, list[float]] = {}
     for scene in SCENES:
-        plain = _references(references, scene)["plain"]
-        own = {row["seed"]: row for row in rows if (row["scene"], row["candidate"]) == (scene, chosen)}
-        shared = sorted(own.keys() & plain.keys())
-        found[scene] = [value(own[seed], "test psnr") - value(plain[seed], "test psnr") for seed in shared]
+        own, plain = _chosen(rows, scene), _references(references, scene)["plain"]
+        if shared := sorted(own.keys() & plain.keys()):
+            found[scene] = [value(own[seed], "test psnr") - value(plain[seed], "test psnr") for seed in shared]
     return found
 
 
+def _chosen(rows: Sequence[Row], scene: str) -> dict[int, Row]:
+    return {row["seed"]: row for row in rows if (row["scene"], row["candidate"]) == (scene, CHOSEN)}
+
+
 def _references(references: Path, scene: str) -> dict[str, dict[int, Row]]:
-    """Return the kept rows of what a candidate is compared with, by name and seed."""
+    """Return the kept rows of what the chosen one is compared with, by name and seed."""
     kept = Rows(references / f"{scene}.json")
     return {name: kept.of({"recipe": "3dgs", "iterations": 3_000, **own}) for name, own in _REFERENCES.items()}
 
 
 def _mean(of: dict[int, Row], figure: str) -> float:
     return fmean(value(row, figure) for row in of.values())
-
-
-def _spread(values: Iterable[float]) -> float | None:
-    return stdev(found) if len(found := list(values)) > 1 else None
-
-
-def _with_spread(values: Iterable[float]) -> str:
-    found = list(values)
-    spread = _spread(found)
-    return f"{fmean(found):.2f}" + ("" if spread is None else f" ± {spread:.2f}")
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ def test_a_pair_is_of_one_scene_and_seed(tmp_path):
     rows = kept({}, 20.0) + kept({"regularizer": "dropout(0.2)"}, 21.0)
     (tmp_path / "fern.json").write_text(json.dumps({"scene": "fern", "rows": rows}))
     own = [row("fern", "drawn", 0, 22.5), row("fern", "drawn", 1, 20.7), row("fern", "expectation", 0, 10.0)]
-    text = setting.judging(own, "drawn", tmp_path)
+    text = setting.judging(own, tmp_path)
     assert "+2.50, -0.30" in text
     assert "mean gain over plain: +1.10 dB over 2 pairs of 1 scenes" in text
     assert "worst pair: -0.30 dB" in text

@@ -28,7 +28,7 @@ from reference_trainer.scenes.virtual_cameras import measured_views, unseen_view
 
 __all__ = ["Findings", "find", "pictures_of"]
 
-NOBODY = 27
+MOST_UNSEEN = 27
 """Cameras that nobody took, of which the worst are shown: all there are between and beyond three."""
 
 
@@ -156,7 +156,7 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
     unseen, hangs = [], None
     if len(scene.train) > 1:
         places = unseen_views(scene)
-        places = [places[i].to(device) for i in evenly_spaced(len(places), min(NOBODY, len(places)))]
+        places = [places[i].to(device) for i in evenly_spaced(len(places), min(MOST_UNSEEN, len(places)))]
         unseen = [(place, errors(place)) for place in places]
         hangs = guard(model, scene, places) if len(model.chain) else None
     else:

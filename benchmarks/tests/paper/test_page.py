@@ -262,7 +262,7 @@ def test_no_scene_is_left_out_of_what_is_said_of_dropout():
 def test_what_the_recommended_setting_gained_is_what_was_measured():
     """The figures of the rule against the kept rows, the worst pair of each scene among them."""
     data = ROOT / "benchmarks" / "data"
-    found = differences_to_plain(json.loads((data / "setting.json").read_text("utf-8")), "drawn", data / "paper")
+    found = differences_to_plain(json.loads((data / "setting.json").read_text("utf-8")))
     said = {FOLDERS.get(name, name): ends for name, ends in (SPARSE_GAINS | SPARSE_GAINS_FAR_APART).items()}
     assert said == {scene: pytest.approx((min(pairs), max(pairs)), abs=0.051) for scene, pairs in found.items()}
 
