@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.gpu import count_lists
+from benchmarks.counts import count_lists
 
 
 @pytest.mark.parametrize("gradient", [False, True])

@@ -12,7 +12,7 @@ pytest.importorskip("triton")
 ROOT = Path(__file__).parents[4]
 CODE = """
 import json
-from benchmarks.gpu import bytes_per_entry, count_exact_score
+from benchmarks.counts import bytes_per_entry, count_exact_score
 rows = [count_exact_score(*size)._asdict() for size in ((16, 12, 0.05), (40, 30, 0.1))]
 print(json.dumps({"rows": rows, "bytes": bytes_per_entry()}))
 """
