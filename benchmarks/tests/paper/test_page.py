@@ -265,6 +265,16 @@ def test_what_the_recommended_setting_gained_is_what_was_measured():
     found = differences_to_plain(json.loads((data / "setting.json").read_text("utf-8")))
     said = {FOLDERS.get(name, name): ends for name, ends in (SPARSE_GAINS | SPARSE_GAINS_FAR_APART).items()}
     assert said == {scene: pytest.approx((min(pairs), max(pairs)), abs=0.051) for scene, pairs in found.items()}
+    every = [gain for pairs in found.values() for gain in pairs]
+    for page_of in ("README.md", "docs/settings.md"):
+        text = " ".join((ROOT / page_of).read_text("utf-8").split())
+        figures = re.search(
+            r"gained (\d\.\d) dB .*?in the mean of (\d+) pairs of nine scenes, and lost (\d\.\d) dB", text
+        )
+        assert figures, page_of
+        mean, count, worst = map(float, figures.groups())
+        assert (count, len(found)) == (len(every), 9)
+        assert (mean, -worst) == pytest.approx((np.mean(every), min(every)), abs=0.051)
 
 
 def test_what_opacity_decay_gained_is_what_was_measured():
