@@ -30,7 +30,7 @@ registry = ConstructorRegistry()
 def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Return the fields of a dataclass of this package with their texts, those of a training in groups."""
     kind, default = info.type, info.default
-    if not (dataclasses.is_dataclass(kind) and kind.__module__.startswith("reference_trainer.")):
+    if not (dataclasses.is_dataclass(kind) and kind.__module__.startswith("reference_trainer.")) or _is_group(kind):
         return None
     given = vars(default) if isinstance(default, kind) else {}
     hints, texts = get_type_hints(kind, include_extras=True), _texts(kind)
@@ -46,11 +46,17 @@ def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
     for spec in fields:
         own = groups.setdefault(GROUPS.get(spec.name) or list(groups)[-1], [])
         own.append((spec.name, Annotated[spec.type, tyro.conf.arg(help=texts.get(spec.name))], spec.default))
-    kinds = {name: dataclasses.make_dataclass(name, own) for name, own in groups.items()}
+    # From Python 3.12 on, this module would be theirs without being told.
+    kinds = {x: dataclasses.make_dataclass(x, own, namespace={"__module__": __name__}) for x, own in groups.items()}
     return StructConstructorSpec(
         lambda **found: TrainConfig(**{name: x for group in found.values() for name, x in vars(group).items()}),
         tuple(StructFieldSpec(name, group, group()) for name, group in kinds.items()),
     )
+
+
+def _is_group(kind: type) -> bool:
+    """Return whether a class was made here: tyro reads what it needs from its fields, and it has no source."""
+    return kind.__module__ == __name__
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:
