@@ -28,6 +28,8 @@ from ca_reg.functional import Multiplier
 from ca_reg.lists import ListMoments, PixelLists
 from reference_trainer.camera import Camera
 from reference_trainer.render import render_moments, splat, use_engine
+from reference_trainer.render.engine import engine_for
+from reference_trainer.render.splats import Splats
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.training.losses.photometric import photometric_loss
 from reference_trainer.training.recipes import with_recipe
@@ -211,10 +213,9 @@ def count_exact_score(count: int, width: int, scale: float, device: torch.device
     multiplier, behind = torch.full((count, 2), 0.25, device=device), torch.zeros(3, width, width, device=device)
 
     def rendering() -> Any:
-        projection, shown = splats.engine.project(inputs, splats.indices, model.camera, None)
-        lists = splats.engine.bin(projection, opacities, width, width)
-        shown_splats = splats._replace(projection=projection, colors=shown, lists=lists)
-        return splats.engine.moments(shown_splats, multiplier, behind)
+        projected = splats.engine.project(inputs, model.camera, None)
+        lists = splats.engine.bin(projected, width, width, lambda numbers: None)
+        return splats.engine.moments(Splats(*projected[:4], lists, splats.engine), multiplier, behind)
 
     operations, mode, _ = _counted(score)
     return Counts(operations, _counted(rendering)[0], mode.read_backs, len(splats.lists.gaussians))
@@ -253,8 +254,10 @@ def bytes_per_entry(device: torch.device | str = "cpu") -> float:
     peaks, entries = [], []
     for scale in (0.1, 2.0):
         model = Model.of(60, 64, scale, device)
-        splats = splat(*model.tensors[:4], model.camera, colors=model.tensors[4])
-        _, mode, lists = _counted(partial(splats.engine.bin, splats.projection, splats.opacities, 64, 64))
+        inputs = dict(zip(("means", "quaternions", "scales", "opacities", "colors"), model.tensors, strict=True))
+        engine = engine_for(torch.device(device))
+        projected = engine.project(inputs, model.camera, None)
+        _, mode, lists = _counted(partial(engine.bin, projected, 64, 64, lambda numbers: None))
         peaks.append(mode.peak)
         entries.append(len(lists.gaussians))
     return (peaks[1] - peaks[0]) / (entries[1] - entries[0])

@@ -7,16 +7,21 @@ camera, and is culled.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping, Sequence
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
 
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import MAX_ROUNDING
-from reference_trainer.render.splats import Projection, Splats
+from reference_trainer.render.splats import Projected, Projection, Splats
 
-__all__ = ["NotFiniteError", "check_projection", "checked_background", "checked_colors"]
+__all__ = ["NotFiniteError", "check_projection", "checked_background", "checked_colors", "numbers_to_check"]
+
+
+_finite: MutableMapping[Tensor, int | None] = WeakIdKeyDictionary()
+"""Backgrounds that were found to be finite, by their version: to look again would be to wait for a card again."""
 
 
 class NotFiniteError(ValueError):
@@ -24,34 +29,37 @@ class NotFiniteError(ValueError):
 
 
 @torch.no_grad()
+def numbers_to_check(
+    depths: Tensor, opacities: Tensor, projection: Projection, colors: Tensor, camera: Camera
+) -> Tensor:
+    """Return the sum of the projected depths, numbers that are finite if all is, and the 16 of the pose.
+
+    ``depths`` and ``opacities``, those of all Gaussians, decide which of them are rendered.
+    """
+    norms = torch._foreach_norm([depths, opacities, projection.means, projection.covariances, colors])
+    sums = [x.reshape(1) for x in (projection.depths.sum(), *norms)]
+    return torch.cat([*sums, camera.world_to_camera.reshape(16)])
+
+
+@torch.no_grad()
 def check_projection(
-    depths: Tensor,
-    opacities: Tensor,
-    projection: Projection,
-    colors: Tensor,
-    inputs: Mapping[str, Tensor],
-    camera: Camera,
+    numbers: Sequence[float], projected: Projected, inputs: Mapping[str, Tensor], camera: Camera
 ) -> None:
     """Raise unless all numbers are finite and the world's coordinates not too large.
 
-    ``depths`` and ``opacities``, those of all Gaussians, decide which of them are rendered. Only if
-    they and the projected values add up to nan or infinity are the inputs (of all Gaussians, by
-    name) examined one by one.
+    Only if the numbers (of `Projected`, on the processor) add up to nan or infinity are the inputs
+    (of all Gaussians, by name) examined one by one.
 
     Raises:
         NotFiniteError: if an input, which the message names, or a projection is nan or infinite.
         ValueError: if the rounding of the coordinates moves Gaussians by more than `MAX_ROUNDING`.
     """
-    results = (projection.means, projection.covariances, colors)
-    # Everything at once: one wait for a GPU, and one kernel for all norms.
-    norms = torch._foreach_norm([depths, opacities, *results])
-    sums = [x.reshape(1) for x in (projection.depths.sum(), *norms)]
-    numbers = torch.cat([*sums, camera.world_to_camera.reshape(16)]).tolist()
-    depth, total, view = numbers[0], sum(numbers[: len(sums)]), numbers[len(sums) :]
+    projection, colors = projected.projection, projected.colors
+    depth, total, view = numbers[0], sum(numbers[:-16]), numbers[-16:]
     # How far the camera is from the world's origin along each axis: -R^T t.
     far = max(abs(sum(view[4 * row + axis] * view[4 * row + 3] for row in range(3))) for axis in range(3))
     if not math.isfinite(total):
-        _refuse(results, inputs, camera)
+        _refuse((projection.means, projection.covariances, colors), inputs, camera)
     share = far * len(colors) / depth if depth else 0.0  # in mean depths
     rounding = 0.5 * torch.finfo(colors.dtype).eps * share * max(camera.fx, camera.fy)
     if rounding > MAX_ROUNDING:
@@ -87,10 +95,13 @@ def checked_background(background: Tensor | None, splats: Splats, *shapes: tuple
         return splats.colors.new_zeros(3)
     if background.shape not in shapes:
         raise ValueError(f"background must have shape {' or '.join(map(str, shapes))}, got {tuple(background.shape)}.")
-    if count := int((~background.isfinite()).sum()):
-        raise NotFiniteError(
-            f"background must be finite, got nan or infinity in {count} of {background.numel()} numbers."
-        )
+    version = None if background.is_inference() else background._version
+    if version is None or _finite.get(background) != version:
+        if count := int((~background.isfinite()).sum()):
+            raise NotFiniteError(
+                f"background must be finite, got nan or infinity in {count} of {background.numel()} numbers."
+            )
+        _finite[background] = version
     return background.to(splats.colors)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
 from reference_trainer.render.checks import check_projection, checked_background, checked_colors
-from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.engine import engine_for
 from reference_trainer.render.splats import MomentImages, Rendering, Splats
 
@@ -52,18 +53,14 @@ def splat(
     inputs = {name: _working(name, x, means.dtype) for name, x in named.items()}
     # Mixed precision would move means by pixels: its products have 8 bits.
     with torch.autocast(means.device.type, enabled=False):
-        camera, opacities = camera.to(means.device, inputs["means"].dtype), inputs["opacities"]
+        camera = camera.to(means.device, inputs["means"].dtype)
         engine = engine_for(means.device, inputs["means"].dtype)
-        with torch.no_grad():
-            depths = inputs["means"] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
-            indices = torch.nonzero((depths > NEAR_PLANE) & (opacities >= MIN_ALPHA)).squeeze(1)
-        projection, shown = engine.project(inputs, indices, camera, degree)
-        check_projection(depths, opacities, projection, shown, inputs, camera)
-        if indices.shape[0] < n:
-            opacities = opacities.index_select(0, indices)
+        projected = engine.project(inputs, camera, degree)
+        check = partial(check_projection, projected=projected, inputs=inputs, camera=camera)
         # Which tile a splat touches is a decision, not a quantity: nothing flows through the lists.
         with torch.no_grad():
-            lists = engine.bin(projection, opacities, camera.width, camera.height)
+            lists = engine.bin(projected, camera.width, camera.height, check)
+        indices, projection, opacities, shown, _ = projected
         return Splats(indices, projection, opacities, shown, lists, engine)
 
 

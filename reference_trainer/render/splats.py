@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import TILE
 
-__all__ = ["Engine", "MomentImages", "Projection", "Rendering", "Splats", "TileLists", "ViewSplats"]
+__all__ = ["Engine", "MomentImages", "Projected", "Projection", "Rendering", "Splats", "TileLists", "ViewSplats"]
 
 
 class Projection(NamedTuple):
@@ -26,6 +27,16 @@ class Projection(NamedTuple):
     factors: Tensor  # ``(l11, l21, l22)``, shape (M, 3)
     covariances: Tensor  # ``(xx, xy, yy)`` of the dilated 2D covariance, square pixels, shape (M, 3)
     depths: Tensor  # along the camera's z axis, shape (M,)
+
+
+class Projected(NamedTuple):
+    """M of N Gaussians that lie in view of a camera, projected and colored."""
+
+    indices: Tensor  # which of the N, in order, (M,)
+    projection: Projection
+    opacities: Tensor  # activated, (M,)
+    colors: Tensor  # towards this camera, (M, 3)
+    numbers: Tensor  # what `check_projection` reads
 
 
 @dataclass(frozen=True)
@@ -148,22 +159,23 @@ class Engine(Protocol):
 
     name: str
 
-    def project(
-        self, inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
-    ) -> tuple[Projection, Tensor]:
-        """Project M of N Gaussians, those at ``indices`` (M,), and evaluate their colors, (M, 3).
+    def project(self, inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
+        """Project the Gaussians that lie in view and evaluate their colors.
 
-        The inputs, by name, are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,),
-        and either sh (N, K, 3), used up to band ``degree``, or colors (N, 3), whose ``degree`` is
-        None.
+        These are the ones beyond `NEAR_PLANE` with an opacity of at least `MIN_ALPHA`. The inputs,
+        by name, are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh
+        (N, K, 3), used up to band ``degree``, or colors (N, 3), whose ``degree`` is None.
         """
 
-    def bin(self, projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
-        """List the Gaussians of every tile, given their activated opacities (M,).
+    def bin(self, projected: Projected, width: int, height: int, check: Callable[[list[float]], None]) -> TileLists:
+        """List the Gaussians of every tile.
 
         A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the
         rectangle spanned by the tile's pixel centers. The test is exact: within a row of tiles, an
         ellipse covers an interval of columns.
+
+        ``check`` is called with the numbers of the projection, and raises if they are not finite:
+        here, because a card has to be waited for once for them and for the length of the lists.
         """
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:

@@ -7,17 +7,17 @@ which are thereby in order of depth as well.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from reference_trainer.compiled.compiling import inlined, kernel, prefetch
 from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.constants import TILE
 from reference_trainer.render.numba.tiles import LEAST_ALPHA
-from reference_trainer.render.splats import Projection, TileLists
+from reference_trainer.render.splats import Projected, TileLists
 
 __all__ = ["bin_gaussians"]
 
@@ -158,10 +158,11 @@ def _ends(counts: Array) -> Array:
     return result
 
 
-def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
+def bin_gaussians(projected: Projected, width: int, height: int, check: Callable[[list[float]], None]) -> TileLists:
     """List the Gaussians of every tile, see `Engine.bin`."""
-    m, f, c, z = (x.detach().numpy() for x in projection)
-    o = opacities.detach().numpy()
+    check(projected.numbers.tolist())
+    m, f, c, z = (x.detach().numpy() for x in projected.projection)
+    o = projected.opacities.detach().numpy()
     count, tiles, order = m.shape[0], -(-width // TILE) * -(-height // TILE), _nearest_first(z)
     ellipses, of_rows, entries = np.empty((count, 8), f4), np.empty(count, np.int32), np.empty(count, np.int32)
     in_threads(_measure, count, m, f, c, o, height, ellipses, of_rows, least=8192)

@@ -18,8 +18,10 @@ from torch.autograd.function import once_differentiable
 from reference_trainer.camera import Camera
 from reference_trainer.compiled.compiling import inlined, kernel
 from reference_trainer.compiled.threads import in_threads
+from reference_trainer.render.checks import numbers_to_check
 from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
-from reference_trainer.render.splats import Projection
+from reference_trainer.render.splats import Projected, Projection
+from reference_trainer.render.torch.projection import visible
 
 __all__ = ["basis", "basis_gradient", "project"]
 
@@ -348,13 +350,16 @@ class _Project(torch.autograd.Function):
         return (*found, None, None, None)
 
 
-def project(
-    inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
-) -> tuple[Projection, Tensor]:
+def project(inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
     """Project and color Gaussians, see `Engine.project`."""
+    depths, indices = visible(inputs, camera)
     # Plain colors are passed as coefficients (N, 1, 3) of degree -1.
     sh, band = (inputs["colors"][:, None], -1) if degree is None else (inputs["sh"], degree)
-    *projection, colors = _Project.apply(  # type: ignore[no-untyped-call]
+    *found, colors = _Project.apply(  # type: ignore[no-untyped-call]
         inputs["means"], inputs["quaternions"], inputs["scales"], sh, indices, camera, band
     )
-    return Projection(*projection), colors
+    projection, opacities = Projection(*found), inputs["opacities"]
+    numbers = numbers_to_check(depths, opacities, projection, colors, camera)
+    if indices.shape[0] < opacities.shape[0]:
+        opacities = opacities.index_select(0, indices)
+    return Projected(indices, projection, opacities, colors, numbers)

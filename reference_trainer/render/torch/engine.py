@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
+from reference_trainer.render.checks import numbers_to_check
 from reference_trainer.render.constants import MIN_ALPHA, TILE
-from reference_trainer.render.splats import MomentImages, Projection, Splats, TileLists
+from reference_trainer.render.splats import MomentImages, Projected, Splats, TileLists
 from reference_trainer.render.torch import compositing
 from reference_trainer.render.torch.compositing import blocks, geometry_rows, pad_entries, pixel_offsets, tile, walk
-from reference_trainer.render.torch.projection import evaluate_sh, project
+from reference_trainer.render.torch.projection import evaluate_sh, project, visible
 
 __all__ = ["TorchEngine", "bin_gaussians"]
 
 
-def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
+def bin_gaussians(projected: Projected, width: int, height: int, check: Callable[[list[float]], None]) -> TileLists:
     """List the Gaussians of every tile, see `Engine.bin`."""
-    device = opacities.device
+    check(projected.numbers.tolist())
+    projection, opacities, device = projected.projection, projected.opacities, projected.opacities.device
     order = torch.argsort(projection.depths, stable=True)
     mean_x, mean_y = projection.means[order].unbind(-1)
     l11, l21, l22 = projection.factors[order].unbind(-1)
@@ -82,19 +86,20 @@ class TorchEngine:
 
     name = "torch"
 
-    def project(
-        self, inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
-    ) -> tuple[Projection, Tensor]:
+    def project(self, inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
         """Project and color Gaussians."""
-        if degree is not None:
-            inputs = inputs | {"sh": inputs["sh"][:, : (degree + 1) ** 2]}
+        depths, indices = visible(inputs, camera)
+        seen = inputs if degree is None else inputs | {"sh": inputs["sh"][:, : (degree + 1) ** 2]}
         if indices.shape[0] < inputs["means"].shape[0]:
-            inputs = {name: x.index_select(0, indices) for name, x in inputs.items()}
-        projection = project(inputs["means"], inputs["quaternions"], inputs["scales"], camera)
+            seen = {name: x.index_select(0, indices) for name, x in seen.items()}
+        projection = project(seen["means"], seen["quaternions"], seen["scales"], camera)
         if degree is None:
-            return projection, inputs["colors"]
-        directions = torch.nn.functional.normalize(inputs["means"] - camera.position, dim=-1)
-        return projection, evaluate_sh(inputs["sh"], directions, degree)
+            colors = seen["colors"]
+        else:
+            directions = torch.nn.functional.normalize(seen["means"] - camera.position, dim=-1)
+            colors = evaluate_sh(seen["sh"], directions, degree)
+        numbers = numbers_to_check(depths, inputs["opacities"], projection, colors, camera)
+        return Projected(indices, projection, seen["opacities"], colors, numbers)
 
     bin = staticmethod(bin_gaussians)
 

@@ -8,11 +8,18 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
+from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.splats import Projection
 from reference_trainer.rotations import rotations
 
-__all__ = ["evaluate_sh", "project", "sh_basis"]
+__all__ = ["evaluate_sh", "project", "sh_basis", "visible"]
+
+
+@torch.no_grad()
+def visible(inputs: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return depths of all Gaussians (N,), and the indices of those in view, see `Engine.project`."""
+    depths = inputs["means"] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    return depths, torch.nonzero((depths > NEAR_PLANE) & (inputs["opacities"] >= MIN_ALPHA)).squeeze(1)
 
 
 def project(

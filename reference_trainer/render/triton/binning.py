@@ -1,6 +1,8 @@
-"""Which Gaussian touches which tile of the image, in depth order: one sort, and one number that the processor reads."""
+"""Which Gaussian touches which tile of the image, in depth order: one sort, and one wait of the processor."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 import triton
@@ -8,7 +10,7 @@ import triton.language as tl
 from torch import Tensor
 
 from reference_trainer.render.constants import MIN_ALPHA, TILE
-from reference_trainer.render.splats import Projection, TileLists
+from reference_trainer.render.splats import Projected, TileLists
 from reference_trainer.render.triton.tiles import launch
 
 __all__ = ["bin_gaussians"]
@@ -16,6 +18,7 @@ __all__ = ["bin_gaussians"]
 _MIN_ALPHA = tl.constexpr(MIN_ALPHA)
 _GROUP = 16  # Gaussians of a program, and columns of tiles that it lists at once: most cover fewer than 8,
 _LANES = 8  # and one that covers 10,000 tiles keeps a program busy for 1,250 steps, not for 10,000
+_WARPS = 4
 
 
 @triton.jit
@@ -53,7 +56,9 @@ def list_tiles(
     top = tl.minimum(tl.maximum(tl.ceil(y - reach - 0.5), 0.0), height.to(tl.float32)).to(tl.int32)
     bottom = tl.maximum(tl.minimum(tl.floor(y + reach - 0.5), height.to(tl.float32) - 1), -1.0).to(tl.int32)
     first_row = top // TILE
-    rows = tl.where(real & (bottom >= top), bottom // TILE - first_row + 1, 0)
+    # What is not finite, and refused once the numbers are read back, is in no list.
+    finite = (tl.abs(x) + tl.abs(y) + reach) < float("inf")
+    rows = tl.where(real & finite & (bottom >= top), bottom // TILE - first_row + 1, 0)
     found = tl.zeros([GROUP], tl.int32)
     # While counting, both are not yet written, and the difference not used.
     place = tl.load(ends + k, mask=real, other=0) - tl.load(counts + k, mask=real, other=0)
@@ -80,12 +85,13 @@ def list_tiles(
         tl.store(touched + i, found > 0, mask=real)
 
 
-def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
+def bin_gaussians(projected: Projected, width: int, height: int, check: Callable[[list[float]], None]) -> TileLists:
     """List the Gaussians of every tile, see `Engine.bin`.
 
     Listed nearest first, they only need a stable sort by tile: of 16-bit numbers in two passes, where keys of tile and
     depth would take eight. It holds at most 24 bytes per entry, the lists among them.
     """
+    _, projection, opacities, _, numbers = projected
     columns, count = -(-width // TILE), len(opacities)
     tiles = columns * -(-height // TILE)
     short = torch.int16 if tiles < 2**15 else torch.int32
@@ -99,12 +105,15 @@ def bin_gaussians(projection: Projection, opacities: Tensor, width: int, height:
 
     def fill(keys: Tensor, gaussians: Tensor, listing: int) -> None:
         size = count, width, height, columns, listing
-        constants = {"warps": 4, "TILE": TILE, "GROUP": _GROUP, "LANES": _LANES}
+        constants = {"warps": _WARPS, "TILE": TILE, "GROUP": _GROUP, "LANES": _LANES}
         launch(list_tiles, (-(-count // _GROUP),), *given, keys, gaussians, *size, **constants)
 
     nothing = counts[:0]
     fill(nothing.view(short), nothing, 0)
-    total = int(torch.cumsum(counts, 0, out=ends)[-1]) if count else 0  # the one number read back
+    torch.cumsum(counts, 0, out=ends)
+    read = torch.cat([numbers.view(torch.int64), ends[-1:]]).cpu()  # the one wait for the card, but for who is in view
+    total = int(read[-1]) if count else 0
+    check(read[: len(numbers)].view(torch.float64).tolist())
     keys, gaussians = counts.new_empty(total, dtype=short), counts.new_empty(total)
     if total:
         fill(keys, gaussians, 1)

@@ -132,19 +132,20 @@ def composite_backward(
         begin += _CHUNK
 
 
-@triton.jit(do_not_specialize=["width", "height", "columns", "count"])
+@triton.jit(do_not_specialize=["width", "height", "columns", "first", "count"])
 def composite_masked(
-    table, starts, gaussians, background, ratios, images, alphas, count,
+    table, starts, gaussians, background, ratios, images, alphas, first, count,
     width, height, columns, STRIDE: tl.constexpr, TILE: tl.constexpr, MASKS: tl.constexpr,
 ):  # fmt: skip
-    """Render a tile of MASKS of ``count`` images, given by ratios (M, count) on the opacities of the table.
+    """Render a tile of MASKS of ``count`` images, from the ``first`` on.
 
+    They are given by ratios (M, count) on the opacities of the table.
     What does not depend on the opacity, the exponential among it, is evaluated once for all of them: with pixels along
     the last axis and one warp, a lane holds all images of its two pixels.
     """
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
-    which = tl.program_id(1) * MASKS + tl.arange(0, MASKS)
+    which = first + tl.program_id(1) * MASKS + tl.arange(0, MASKS)
     shown = inside[None, :] & (which < count)[:, None]
     t = tl.where(shown, 1.0, -1.0)
     r, g, b = tl.zeros_like(t), tl.zeros_like(t), tl.zeros_like(t)
@@ -178,7 +179,7 @@ class _Composite(torch.autograd.Function):
         ctx: Any, splats: Splats, background: Tensor, depth: bool, *_differentiable: Tensor
     ) -> tuple[Tensor, Tensor]:
         lists = ctx.lists = Lists.of(splats.lists)
-        table = tiles.make_table(splats, *([splats.projection.depths[:, None]] if depth else []))
+        table = tiles.make_table(splats, splats.projection.depths if depth else None)
         image, alpha = table.new_empty(3 + depth, lists.height, lists.width), table.new_empty(lists.height, lists.width)
         tiles.over_tiles(composite_forward, lists, table, background.contiguous(), image, alpha, DEPTH=depth)
         ctx.save_for_backward(table, image, alpha)
@@ -209,7 +210,7 @@ def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tenso
     image, alpha = _Composite.apply(  # type: ignore[no-untyped-call]
         splats, background, depth, p.means, p.factors, splats.opacities, splats.colors, p.depths
     )
-    return image[:3], alpha, image[3] if depth else None
+    return (image[:3], alpha, image[3]) if depth else (image, alpha, None)
 
 
 def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
@@ -220,17 +221,22 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
     ratios = (opacities / highest.clamp_min(MIN_ALPHA)).T.contiguous()
     images = table.new_empty(count, 3, lists.height, lists.width)
     alphas = table.new_empty(count, lists.height, lists.width)
-    masks = min(_MASKS, triton.next_power_of_2(count))
-    tiles.launch(
-        composite_masked, (lists.tiles, -(-count // masks)), table, lists.starts, lists.gaussians,
-        background.contiguous(), ratios, images, alphas, count, lists.width, lists.height, splats.lists.columns,
-        STRIDE=table.shape[1], TILE=lists.tile, MASKS=masks,
-    )  # fmt: skip
+    size, background = (lists.width, lists.height, splats.lists.columns), background.contiguous()
+    # Whole groups first, then what is left, in as small a group as holds it.
+    groups = count // _MASKS
+    for first, programs, masks in (
+        (0, groups, _MASKS),
+        (groups * _MASKS, min(1, count % _MASKS), triton.next_power_of_2(count % _MASKS)),
+    ):
+        tiles.launch(
+            composite_masked, (lists.tiles, programs), table, lists.starts, lists.gaussians, background, ratios,
+            images, alphas, first, count, *size, STRIDE=table.shape[1], TILE=lists.tile, MASKS=masks,
+        )  # fmt: skip
     return images, alphas
 
 
 def absolute_gradients(splats: Splats, rendered: Tensor, gradient: Tensor) -> Tensor:
     """Sum the absolute gradients of the centers, see `Engine.absolute_gradients`."""
-    lists, table = Lists.of(splats.lists), tiles.make_table(splats, splats.projection.depths[:, None])
+    lists, table = Lists.of(splats.lists), tiles.make_table(splats, splats.projection.depths)
     rows = _gradients(lists, table, rendered[:4], rendered[4], gradient[:4], gradient[4], absolute=True)
     return rows[:, :2].contiguous()

@@ -12,13 +12,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
-from reference_trainer.render.splats import Projection
+from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
+from reference_trainer.render.splats import Projected, Projection
 from reference_trainer.render.triton.tiles import launch
 
 __all__ = ["project"]
 
 _DILATION = tl.constexpr(DILATION)
+_MIN_ALPHA, _NEAR_PLANE = tl.constexpr(MIN_ALPHA), tl.constexpr(NEAR_PLANE)
 _BLOCK = 128  # Gaussians of a program, one per lane: neighbors in memory, whose rows share cache lines
 
 # Normalization of the real spherical harmonics of degrees 0 to 3, as in `evaluate_sh`.
@@ -166,22 +167,47 @@ def _towards(mean, view):
     return _times(inverse, offset), inverse
 
 
+@triton.jit
+def _add_unless_finite(numbers, x):
+    """Make the second number nan if one of x is nan or infinite, whose product with 0 is nan."""
+    bad = tl.sum(0 * x)
+    if bad != 0:
+        tl.atomic_add(numbers + 1, bad.to(tl.float64), sem="relaxed")
+
+
+@triton.jit(do_not_specialize=["count"])
+def find_visible(means, opacities, view, visible, numbers, count, BLOCK: tl.constexpr):
+    """Tell who is in view; the numbers (18,) are those of `check_projection`, zeros before."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    real = i < count
+    opacity = tl.load(opacities + i, mask=real, other=0.0)
+    _right, _down, forward = _view(view)
+    z = tl.where(real, _dot(forward, _load3(means + 3 * i, real)) + tl.load(view + 11), 0.0)
+    tl.store(visible + i, ((z > _NEAR_PLANE) & (opacity >= _MIN_ALPHA)).to(tl.uint8), mask=real)
+    _add_unless_finite(numbers, z + 0 * opacity)
+    if tl.program_id(0) == 0:
+        j = tl.arange(0, 16)
+        tl.store(numbers + 2 + j, tl.load(view + j).to(tl.float64))
+
+
 @triton.jit(do_not_specialize=["count"])
 def project_forward(
-    indices, means, quaternions, scales, sh, view, centers,
-    factors, covariances, depths, colors, count, fx, fy, cx, cy,
+    indices, means, quaternions, scales, sh, opacities, view, centers,
+    factors, covariances, depths, colors, shown_opacities, numbers, count, fx, fy, cx, cy,
     limit_x, limit_y, BANDS: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Project and color; BANDS harmonics of the ROW given ones, or plain colors if it is 0."""
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     real = k < count
     i = tl.load(indices + k, mask=real, other=0)
+    tl.store(shown_opacities + k, tl.load(opacities + i, mask=real), mask=real)
     mean, s = _load3(means + 3 * i, real), _load3(scales + 3 * i, real)
     r0, r1, r2, _unit, _scale = _rotation(quaternions + 4 * i, real)
     slopes, _rows, _axes, _u, _det, covariance, factor = _ellipse(mean, r0, r1, r2, s, view, fx, fy, limit_x, limit_y)
     l11, l22 = factor
-    tl.store(centers + 2 * k, fx * slopes[0] + cx, mask=real)
-    tl.store(centers + 2 * k + 1, fy * slopes[1] + cy, mask=real)
+    x, y = fx * slopes[0] + cx, fy * slopes[1] + cy
+    tl.store(centers + 2 * k, x, mask=real)
+    tl.store(centers + 2 * k + 1, y, mask=real)
     _store3(factors + 3 * k, (l11, -covariance[1] * (l22 * l22) * l11, l22), real)
     _store3(covariances + 3 * k, covariance, real)
     tl.store(depths + k, slopes[2], mask=real)
@@ -197,16 +223,23 @@ def project_forward(
         r, g, b = color
         color = tl.where(r < 0, 0 * r, r), tl.where(g < 0, 0 * g, g), tl.where(b < 0, 0 * b, b)
     _store3(colors + 3 * k, color, real)
+    nothing = 0 * (color[0] + color[1] + color[2]) + 0 * (covariance[0] + covariance[1] + covariance[2]) + 0 * (x + y)
+    _add_unless_finite(numbers, tl.where(real, nothing, 0.0))
+    tl.atomic_add(numbers, tl.sum(tl.where(real, slopes[2], 0.0)).to(tl.float64), sem="relaxed")
 
 
-@triton.jit(do_not_specialize=["count"])
+@triton.jit(do_not_specialize=["count", *(f"row_{x}" for x in ("centers", "factors", "depths", "colors", "opacities"))])
 def project_backward(
     indices, means, quaternions, scales, sh, view, colors,
-    to_centers, to_factors, to_depths, to_colors, to_means, to_quaternions,
-    to_scales, to_sh, count, fx, fy, limit_x, limit_y, BANDS: tl.constexpr,
-    ROW: tl.constexpr, BLOCK: tl.constexpr,
+    to_centers, to_factors, to_depths, to_colors, to_shown_opacities, to_means, to_quaternions,
+    to_scales, to_sh, to_opacities, count, fx, fy, limit_x, limit_y,
+    row_centers, row_factors, row_depths, row_colors, row_opacities,
+    DEPTHS: tl.constexpr, BANDS: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Carry gradients back to the Gaussians; nothing is kept of the forward pass but the colors that were cut at 0."""
+    """Carry gradients back to the Gaussians; nothing is kept of the forward pass but the colors that were cut at 0.
+
+    The gradients come as columns of larger rows, of ``row_`` numbers each.
+    """
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     real = k < count
     i = tl.load(indices + k, mask=real, other=0)
@@ -219,7 +252,9 @@ def project_backward(
     cross, spread = det
     xy = covariance[1]
     l11, l22 = factor
-    t11, t21, t22 = _load3(to_factors + 3 * k, real)
+    to_opacity = tl.load(to_shown_opacities + row_opacities * k, mask=real, other=0.0)
+    tl.store(to_opacities + i, to_opacity, mask=real)
+    t11, t21, t22 = _load3(to_factors + row_factors * k, real)
     # l21 = -xy l22^2 l11; l11 = square^(-1/2) with square = |cross|^2 + spread l22^2, cross = u_x x (l22 u_y), and
     # spread = dilation (xx + yy - dilation); l22 = yy^(-1/2).
     to_xy = -t21 * l22 * l22 * l11
@@ -256,14 +291,16 @@ def project_backward(
     )  # fmt: skip
     # row = f / z (axis - clipped slope x forward), center = f slope + c, slope = x / z; the clip passes no gradient.
     right, down, forward = _view(view)
-    to_slope_x = fx * tl.load(to_centers + 2 * k, mask=real, other=0.0)
-    to_slope_y = fy * tl.load(to_centers + 2 * k + 1, mask=real, other=0.0)
+    to_slope_x = fx * tl.load(to_centers + row_centers * k, mask=real, other=0.0)
+    to_slope_y = fy * tl.load(to_centers + row_centers * k + 1, mask=real, other=0.0)
     to_slope_x -= tl.where(tl.abs(slope_x) <= limit_x, fx / z * _dot(forward, to_row_x), 0.0)
     to_slope_y -= tl.where(tl.abs(slope_y) <= limit_y, fy / z * _dot(forward, to_row_y), 0.0)
-    to_z = tl.load(to_depths + k, mask=real, other=0.0)
+    to_z = tl.zeros_like(z)
+    if DEPTHS:
+        to_z = tl.load(to_depths + row_depths * k, mask=real, other=0.0)
     to_z -= (_dot(row_x, to_row_x) + _dot(row_y, to_row_y) + slope_x * to_slope_x + slope_y * to_slope_y) / z
     to_mean = _plus(_plus(_times(to_slope_x / z, right), to_slope_y / z, down), to_z, forward)
-    shown, to_color = _load3(colors + 3 * k, real), _load3(to_colors + 3 * k, real)
+    shown, to_color = _load3(colors + 3 * k, real), _load3(to_colors + row_colors * k, real)
     if BANDS == 0:
         _store3(to_sh + 3 * i, to_color, real)
     else:
@@ -285,10 +322,12 @@ def project_backward(
 
 
 class _Project(torch.autograd.Function):
+    """Means, factors, covariances, depths, colors and opacities of the Gaussians at the indices."""
+
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, indices: Tensor, camera: Camera,
-        bands: int,
+        ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, opacities: Tensor, indices: Tensor,
+        numbers: Tensor, camera: Camera, bands: int,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         limits = (
             FRUSTUM_MARGIN * 0.5 * size / f for size, f in ((camera.width, camera.fx), (camera.height, camera.fy))
@@ -297,37 +336,63 @@ class _Project(torch.autograd.Function):
         ctx.limits = tuple(limits)
         ctx.constants = {"warps": 4, "BANDS": bands, "ROW": sh.shape[1], "BLOCK": _BLOCK}
         given = [x.detach().contiguous() for x in (indices, means, quaternions, scales, sh)]
-        given.append(camera.world_to_camera.contiguous())
-        outputs = tuple(means.new_empty(len(indices), *shape) for shape in ((2,), (3,), (3,), (), (3,)))
-        grid = (triton.cdiv(len(indices), _BLOCK),)
-        launch(project_forward, grid, *given, *outputs, *ctx.size, camera.cx, camera.cy, *ctx.limits, **ctx.constants)
-        ctx.save_for_backward(*given, outputs[-1])
+        view = camera.world_to_camera.contiguous()
+        outputs = tuple(means.new_empty(len(indices), *shape) for shape in ((2,), (3,), (3,), (), (3,), ()))
+        launch(
+            project_forward, (triton.cdiv(len(indices), _BLOCK),), *given, opacities.detach().contiguous(), view,
+            *outputs, numbers, *ctx.size, camera.cx, camera.cy, *ctx.limits, **ctx.constants,
+        )  # fmt: skip
+        ctx.save_for_backward(*given, view, outputs[4])
         ctx.mark_non_differentiable(outputs[2])
+        ctx.set_materialize_grads(False)
         return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        to_centers, to_factors, _, to_depths, to_colors = (x.contiguous() for x in gradients)
-        found = [torch.zeros_like(x) for x in saved[1:5]]
-        grid, upstream = (triton.cdiv(ctx.size[0], _BLOCK),), (to_centers, to_factors, to_depths, to_colors)
-        launch(project_backward, grid, *saved, *upstream, *found, *ctx.size, *ctx.limits, **ctx.constants)
-        return (*found, None, None, None)
+        (indices, *given, _, colors), depths = saved, gradients[3] is not None
+        upstream = [
+            _rows(colors.new_zeros(len(colors), *shape) if x is None else x)
+            for x, shape in zip((*gradients[:2], *gradients[4:]), ((2,), (3,), (3,), ()), strict=True)
+        ]
+        upstream.insert(2, _rows(gradients[3]) if depths else upstream[-1])
+        # One fill for all of them, and none if everything is written. Aligned alike whatever their sizes: kernels are
+        # compiled for the alignment of what they are given.
+        shapes = [x.shape for x in given] + [given[0].shape[:1]]
+        whole = len(indices) == len(given[0]) and max(1, ctx.constants["BANDS"]) == ctx.constants["ROW"]
+        sizes = [-(-shape.numel() // 32) * 32 for shape in shapes]
+        parts = (colors.new_empty if whole else colors.new_zeros)(sum(sizes)).split(sizes)
+        found = [x[: shape.numel()].view(shape) for x, shape in zip(parts, shapes, strict=True)]
+        launch(
+            project_backward, (triton.cdiv(len(indices), _BLOCK),), *saved, *upstream, *found, *ctx.size, *ctx.limits,
+            *(x.stride(0) for x in upstream), DEPTHS=depths, **ctx.constants,
+        )  # fmt: skip
+        return (*found, None, None, None, None)
 
 
-def project(
-    inputs: dict[str, Tensor], indices: Tensor, camera: Camera, degree: int | None
-) -> tuple[Projection, Tensor]:
+def _rows(x: Tensor) -> Tensor:
+    """Return a tensor whose rows may lie apart, but not their numbers."""
+    return x if x.ndim == 1 or x.stride(1) == 1 else x.contiguous()
+
+
+def project(inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
     """Project and color Gaussians, see `Engine.project`.
 
     Raises:
         NotImplementedError: if the camera's pose requires a gradient, which this engine does not compute.
     """
-    if camera.world_to_camera.requires_grad:
+    view, means, opacities = camera.world_to_camera, inputs["means"], inputs["opacities"]
+    if view.requires_grad:
         raise NotImplementedError("the engine triton has no gradient of the camera's pose: use_engine('torch') has.")
+    count = len(means)
+    visible = torch.empty(count, dtype=torch.bool, device=means.device)
+    numbers = torch.zeros(2 + 16, dtype=torch.float64, device=means.device)
+    given = [x.detach().contiguous() for x in (means, opacities, view)]
+    launch(find_visible, (triton.cdiv(count, 1024),), *given, visible.view(torch.uint8), numbers, count, BLOCK=1024)
+    indices = torch.nonzero(visible).squeeze(1)
     sh, bands = (inputs["colors"][:, None], 0) if degree is None else (inputs["sh"], (degree + 1) ** 2)
-    *projection, colors = _Project.apply(  # type: ignore[no-untyped-call]
-        inputs["means"], inputs["quaternions"], inputs["scales"], sh, indices, camera, bands
+    *found, colors, shown = _Project.apply(  # type: ignore[no-untyped-call]
+        means, inputs["quaternions"], inputs["scales"], sh, opacities, indices, numbers, camera, bands
     )
-    return Projection(*projection), colors
+    return Projected(indices, Projection(*found), shown, colors, numbers)

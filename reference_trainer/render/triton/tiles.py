@@ -20,8 +20,8 @@ from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
-    "FAINT", "LAUNCHED", "ROW", "Lists", "add_row", "alpha_at", "geometry_sums", "gradient_rows", "launch", "load3",
-    "make_row", "make_table", "over_tiles", "pixels", "store3", "sum_rows",
+    "FAINT", "LAUNCHED", "ROW", "Lists", "add_row", "alpha_at", "fill_table", "geometry_sums", "gradient_rows",
+    "launch", "load3", "make_row", "make_table", "over_tiles", "pixels", "store3", "sum_rows",
 ]  # fmt: skip
 
 ROW = tl.constexpr(16)
@@ -83,10 +83,32 @@ def over_tiles(kernel: Any, lists: Lists, table: Tensor, *arguments: Any, progra
     )  # fmt: skip
 
 
-def make_table(splats: Splats, *more: Tensor) -> Tensor:
+@triton.jit(do_not_specialize=["count"])
+def fill_table(
+    means, factors, opacities, colors, more, table, count, MORE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Put what the kernels of a tile read of a splat into one row: see `make_table`."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    real = i < count
+    row = table + i * (9 + MORE)
+    for j in tl.static_range(2):
+        tl.store(row + j, tl.load(means + 2 * i + j, mask=real), mask=real)
+    for j in tl.static_range(3):
+        tl.store(row + 2 + j, tl.load(factors + 3 * i + j, mask=real), mask=real)
+        tl.store(row + 6 + j, tl.load(colors + 3 * i + j, mask=real), mask=real)
+    tl.store(row + 5, tl.log2(tl.load(opacities + i, mask=real, other=1.0)), mask=real)
+    for j in tl.static_range(MORE):
+        tl.store(row + 9 + j, tl.load(more + MORE * i + j, mask=real), mask=real)
+
+
+def make_table(splats: Splats, more: Tensor | None = None) -> Tensor:
     """Return x, y, l11, l21, l22, log2 of the opacity, red, green, blue, and more of M splats, shape (M, 9 or more)."""
-    p, opacities = splats.projection, splats.opacities.detach()
-    return torch.cat([p.means, p.factors, opacities.log2()[:, None], splats.colors, *more], dim=1).detach()
+    p, count, columns = splats.projection, len(splats.opacities), 0 if more is None else more[:1].numel()
+    given = p.means, p.factors, splats.opacities, splats.colors, p.means if more is None else more
+    table = p.means.new_empty(count, 9 + columns)
+    grid, constants = (triton.cdiv(count, 256),), {"warps": 4, "MORE": columns, "BLOCK": 256}
+    launch(fill_table, grid, *(x.detach().contiguous() for x in given), table, count, **constants)
+    return table
 
 
 def gradient_rows(lists: Lists, table: Tensor) -> tuple[Tensor, bool]:
