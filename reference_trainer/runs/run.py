@@ -172,7 +172,7 @@ def run_experiment(
         begun = settings_of_run(out, options, config, auto=auto, given=given)  # perhaps since, by another process
         if (out / RESULTS).exists():
             return _complete(out)
-        settings = _planned(scene, config, out, auto=auto, given=given) if begun is None else begun
+        settings = _planned(scene, config, out, auto=auto, given=given, device=device) if begun is None else begun
         remove_leftovers(out, below=False)  # an evaluation of the run may be writing to a subfolder right now
         remove_leftovers(out / VIEWS)
         resumed = (out / CHECKPOINT).exists()
@@ -215,12 +215,14 @@ def _complete(out: Path) -> dict[str, Any]:
     return read_results(out)
 
 
-def _planned(scene: Scene, config: TrainConfig, out: Path, *, auto: bool, given: Collection[str]) -> TrainConfig:
+def _planned(
+    scene: Scene, config: TrainConfig, out: Path, *, auto: bool, given: Collection[str], device: torch.device | str
+) -> TrainConfig:
     """Return the settings that a run begins with; with ``auto`` those of a plan, which is written."""
     if not auto:
         (out / PLAN).unlink(missing_ok=True)  # left by a run that stopped before its config.json was written
         return config
-    plan = make_plan(scene, config, given=given)
+    plan = make_plan(scene, config, given=given, device=device)
     write_json(out / PLAN, plan.as_dict())
     changing = [row for row in plan.rows() if row["change"] != "-"]
     for row in changing:

@@ -22,11 +22,12 @@ from reference_trainer.training.config import TrainConfig
 __all__ = ["Density", "ModelState", "initial_gaussians", "seen_by_any"]
 
 
-def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
+def initial_gaussians(scene: Scene, config: TrainConfig, device: torch.device | str = "cpu") -> Gaussians:
     """Make one isotropic Gaussian per point, as wide as the distance to its neighbors times ``config.initial_scale``.
 
     If the scene has a model to start from, its Gaussians are taken as they are, their spherical harmonics cut or padded
     with zeros to ``config.sh_degree``.
+    ``device`` renders what tells which are seen.
 
     Raises:
         ValueError: if only seen points are to be taken and there are none.
@@ -51,7 +52,7 @@ def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
         )
     if config.initial_points == "all":
         return start
-    seen = seen_by_any(start, scene.train)
+    seen = seen_by_any(start, scene.train, device)
     if not bool(seen.any()):
         raise ValueError(
             f"no initial Gaussian of scene {scene.name!r} has a pixel in a training view: give other points."
@@ -60,13 +61,17 @@ def initial_gaussians(scene: Scene, config: TrainConfig) -> Gaussians:
 
 
 @torch.no_grad()
-def seen_by_any(gaussians: Gaussians, views: tuple[View, ...]) -> Tensor:
-    """Return which Gaussians have a pixel in some view, shape (N,), bool. The others never receive a gradient."""
-    seen = torch.zeros(len(gaussians), dtype=torch.bool)
+def seen_by_any(gaussians: Gaussians, views: tuple[View, ...], device: torch.device | str = "cpu") -> Tensor:
+    """Return which Gaussians have a pixel in some view, shape (N,), bool. The others never receive a gradient.
+
+    All are on the CPU, and so is the result; ``device`` renders.
+    """
+    gaussians = gaussians.to(device)
+    seen = torch.zeros(len(gaussians), dtype=torch.bool, device=device)
     for view in views:
-        splats = splat(**arguments(gaussians), camera=view.camera, sh_degree=0)
+        splats = splat(**arguments(gaussians), camera=view.camera.to(device), sh_degree=0)
         seen[splats.indices[splats.touched]] = True
-    return seen
+    return seen.cpu()
 
 
 class Density(Protocol):
@@ -130,7 +135,7 @@ class ModelState(Generic[D]):
         # The label names random streams: with another word than "field", trainings would come out differently.
         self.label = f"field {index}/" if index else ""
         self.regularizer = regularizer
-        learns, start = regularizer.learns, initial_gaussians(scene, config)
+        learns, start = regularizer.learns, initial_gaussians(scene, config, device)
         known = start.learned  # of a model with the same regularizers
         learned = {name: known.get(name, torch.full((len(start),), x.start)) for name, x in learns.items()}
         start = replace(start, learned=learned)

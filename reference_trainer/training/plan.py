@@ -5,12 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
+
+import torch
 
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.assembly import check
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.plan_rules import RULES, PlanItem
+from reference_trainer.training.plan_rules import RULES, PlanItem, unseen
 
 __all__ = ["Plan", "PlanItem", "make_plan"]
 
@@ -80,12 +83,15 @@ class Plan:
         ]
 
 
-def make_plan(scene: Scene, config: TrainConfig, *, given: Collection[str] = ()) -> Plan:
+def make_plan(
+    scene: Scene, config: TrainConfig, *, given: Collection[str] = (), device: torch.device | str = "cpu"
+) -> Plan:
     """Look at a scene and decide what its training needs.
 
     A choice of the user always wins: fields of ``config`` that differ from the defaults of `TrainConfig` (a recipe's
-    among them), and those that ``given`` names because they were asked for at their default, are never changed. Raises
-    ValueError if ``given`` names something that is not a field of `TrainConfig`.
+    among them), and those that ``given`` names because they were asked for at their default, are never changed.
+    ``device`` renders what the plan must see rendered. Raises ValueError if ``given`` names something that is not a
+    field of `TrainConfig`.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
@@ -98,7 +104,8 @@ def make_plan(scene: Scene, config: TrainConfig, *, given: Collection[str] = ())
         raise ValueError(f"given must name fields of TrainConfig, got {sorted(unknown)}.")
     check(config)
     kept = _kept(config, given)
-    return Plan(tuple(_item(rule(scene, config), config, kept) for rule in RULES))
+    rules = (partial(rule, device=device) if rule is unseen else rule for rule in RULES)  # the one that renders
+    return Plan(tuple(_item(rule(scene, config), config, kept) for rule in rules))
 
 
 def _kept(config: TrainConfig, given: Collection[str]) -> set[str]:

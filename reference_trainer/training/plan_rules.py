@@ -171,11 +171,11 @@ def regularizer_inputs(scene: Scene, config: TrainConfig) -> PlanItem:
     return PlanItem("inputs of the regularizers", "left out", reason)
 
 
-def unseen(scene: Scene, config: TrainConfig) -> PlanItem:
+def unseen(scene: Scene, config: TrainConfig, device: torch.device | str = "cpu") -> PlanItem:
     """Initial Gaussians that have no pixel in a training view: they would stay as they are and fog the test views."""
     name = "Gaussians outside every view"
     start = initial_gaussians(scene, replace(config, initial_points="all"))
-    outside = len(start) - int(seen_by_any(start, scene.train).sum())
+    outside = len(start) - int(seen_by_any(start, scene.train, device).sum())
     counts = f"{outside} of {len(start)} initial Gaussians have no pixel in a training view"
     if outside == 0:
         return PlanItem(name, "left out", f"by construction: {counts}")

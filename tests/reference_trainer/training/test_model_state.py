@@ -5,15 +5,18 @@ import gc
 
 import pytest
 import torch
+from stand_ins.card import CARD, pretended_card
 
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import PointCloud, Scene, View
+from reference_trainer.training import model_state
 from reference_trainer.training.assembly import check
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.model_state import initial_gaussians, seen_by_any
+from reference_trainer.training.plan import make_plan
 from reference_trainer.training.step import Step
 from reference_trainer.training.trainer import Trainer
 
@@ -45,6 +48,24 @@ def test_a_gaussian_is_drawn_where_its_footprint_reaches_the_picture():
     gaussians = Gaussians.from_points(means, torch.rand(4, 3), torch.ones(4), sh_degree=0)
     view = View("a", camera(), torch.zeros(3, 24, 32))
     assert seen_by_any(gaussians, (view,)).tolist() == [True, True, False, False]
+
+
+def test_what_is_seen_is_drawn_where_it_is_asked_for(tiny_scene, monkeypatch):
+    """On a card the CPU draws nothing, for which its loops would have to be compiled."""
+    devices, original = [], model_state.splat
+
+    def splat(means, **given):
+        devices.append(means.device.type)
+        return original(means, **given)
+
+    monkeypatch.setattr(model_state, "splat", splat)
+    scene = with_points(tiny_scene, BEHIND)
+    with pretended_card() as card:
+        make_plan(scene, TrainConfig(), device=card)
+        found = initial_gaussians(scene, TrainConfig(initial_points="seen"), card)
+    assert set(devices) == {CARD}
+    on_cpu = initial_gaussians(scene, TrainConfig(initial_points="seen"))
+    assert torch.equal(found.means, on_cpu.means)
 
 
 def test_unseen_points_change_nothing_at_the_training_views(tiny_scene):
