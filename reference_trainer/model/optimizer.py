@@ -39,7 +39,12 @@ class GaussianOptimizer:
     def step(self) -> None:
         """Update all parameters and clear their gradients."""
         self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+        self.clear_gradients()
+
+    def clear_gradients(self) -> None:
+        """Forget the gradients without a step."""
+        for _, x in self.gaussians.named():
+            x.grad = None
 
     def set_means_rate(self, rate: float) -> None:
         """Set the learning rate of the means, world units per step."""

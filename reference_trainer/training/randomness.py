@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,10 +33,15 @@ def view_order(seed: int, step: int, count: int) -> int:
         >>> sorted(view_order(0, step, 3) for step in range(3))
         [0, 1, 2]
     """
-    # Drawn anew from the epoch alone: a resumed run needs no state to continue in the middle of one.
     epoch, position = divmod(step, count)
-    order = torch.randperm(count, generator=stream(seed, epoch, "views"))
-    return int(order[position])
+    return _epoch_order(seed, epoch, count)[position]
+
+
+@functools.lru_cache(maxsize=8)
+def _epoch_order(seed: int, epoch: int, count: int) -> list[int]:
+    """Return the order of the views in an epoch, from that alone: a resumed run needs no state to continue in one."""
+    order: list[int] = torch.randperm(count, generator=stream(seed, epoch, "views")).tolist()
+    return order
 
 
 @contextmanager

@@ -19,7 +19,27 @@ from reference_trainer.render import MomentImages, Rendering, ViewSplats
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.randomness import stream
 
-__all__ = ["Step"]
+__all__ = ["Step", "read_later"]
+
+
+def read_later(x: Tensor) -> Callable[[], float]:
+    """Begin to read a number, and return the function that waits for it, but not for what is begun in between.
+
+    Example:
+        >>> read_later(torch.tensor(0.5))()
+        0.5
+    """
+    if x.device.type != "cuda":
+        return x.item
+    # Into pinned memory, which PyTorch takes by itself: the host goes on launching.
+    copied = x.to("cpu", non_blocking=True)
+    done = torch.cuda.current_stream(x.device).record_event()
+
+    def read() -> float:
+        done.synchronize()
+        return copied.item()
+
+    return read
 
 
 @dataclass(eq=False, repr=False)

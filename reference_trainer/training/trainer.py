@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import logging
 import math
@@ -27,7 +28,7 @@ from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingStoppedError, hold_interrupts
 from reference_trainer.training.model_state import ModelState
 from reference_trainer.training.randomness import stream, view_order
-from reference_trainer.training.step import Step
+from reference_trainer.training.step import Step, read_later
 
 __all__ = ["Trainer"]
 
@@ -45,8 +46,9 @@ class Trainer:
     Attributes:
         step: the number of steps taken.
         seconds: wall-clock time that they took.
+        mse: mean squared error of the first model's (regularized) render in the last step; nan before the first.
         processor_seconds: CPU time that all threads spent on them: the fairer figure on a busy machine.
-        loss: of the last step, of all fields together; nan before the first.
+        loss: of the last step, of all models together; nan before the first.
         renderer: what draws all but moments.
         models: what is trained; the first is the one that is measured and written.
         optimizer: of the first model.
@@ -72,6 +74,7 @@ class Trainer:
         if scene.start is not None:  # whose colors have all bands already
             config = dataclasses.replace(config, sh_every=0)
         self.scene = scene
+        self._extent = scene.extent  # computed from the cameras at every look
         self.config = config
         self.device = torch.device(device)
         self.renderer = make_renderer(config)
@@ -79,6 +82,7 @@ class Trainer:
         self.step = 0
         self.seconds = self.processor_seconds = 0.0
         self.loss = math.nan
+        self._shown: tuple[Tensor, Tensor] | None = None  # the last render, and its photograph
         self.views = [view.to(self.device) for view in scene.train]
         self.background = scene.background.to(self.device)
         self.models = [
@@ -141,23 +145,27 @@ class Trainer:
             while self.step < last:
                 stop_if_interrupted()
                 start, spent = time.perf_counter(), time.process_time()
-                _, mse = self.train_step()
+                self.train_step()
                 self.seconds += time.perf_counter() - start
                 self.processor_seconds += time.process_time() - spent
                 if progress and self.step % 10 == 0:
-                    psnr = -10 * math.log10(max(mse, 1e-12))
+                    psnr = -10 * math.log10(max(self.mse, 1e-12))
                     bar.set_postfix_str(f"{psnr:.1f} dB, {len(self.gaussians):,} Gaussians", refresh=False)
                 bar.update()
                 if after_step is not None:
                     after_step(self)
             stop_if_interrupted()  # also after the last step
 
-    def train_step(self) -> tuple[float, float]:
-        """Take one step on one view.
+    @property
+    def mse(self) -> float:
+        """Mean squared error of the first model's (regularized) render in the last step; nan before the first."""
+        if self._shown is None:
+            return math.nan
+        image, photograph = self._shown
+        return torch.nn.functional.mse_loss(image.clamp(0, 1), photograph).item()
 
-        Returns:
-            The loss, of all models together, and the mean squared error of the first one's (regularized) render.
-        """
+    def train_step(self) -> float:
+        """Take one step on one view; return the loss, of all models together."""
         terms = [term for term in self.losses if term.acts(self.step)]
         try:  # also where density control renders
             for model in self.models:
@@ -169,27 +177,32 @@ class Trainer:
                     step.expect()
                 else:
                     step.sample(depth=any("depth" in term.needs for term in terms))
-            loss = sum((term(step) for step in steps for term in terms), start=steps[0].image.new_zeros(()))
+            values = [term(step) for step in steps for term in terms] or [steps[0].image.new_zeros(())]
+            loss = functools.reduce(torch.add, values)
         except NotFiniteError as error:
             raise TrainingStoppedError(f"step {self.step + 1} cannot be rendered: {error}") from error
-        mse = torch.nn.functional.mse_loss(steps[0].image.detach().clamp(0, 1), steps[0].view.image)
-        value, squared_error = torch.stack([loss.detach(), mse]).tolist()  # one wait for a GPU
-        if not math.isfinite(value):
-            raise TrainingStoppedError(f"the loss became {value} at step {self.step + 1}: lower the learning rates.")
+        read = read_later(loss.detach())
         if loss.requires_grad:
             loss.backward()  # type: ignore[no-untyped-call]
+        value = read()  # only now: a card has computed it meanwhile
+        if not math.isfinite(value):
+            for model in self.models:
+                model.optimizer.clear_gradients()
+            raise TrainingStoppedError(f"the loss became {value} at step {self.step + 1}: lower the learning rates.")
+        if loss.requires_grad:
             for model, step in zip(self.models, steps, strict=True):
                 for splats, camera in step.observed if model.density.observes(self.step) else ():
                     if splats.means.grad is not None:  # none if nothing was drawn, or no term saw it
                         model.density.observe(splats, camera)
-                model.optimizer.set_means_rate(self.config.means_rate_at(self.step) * self.scene.extent)
+                model.optimizer.set_means_rate(self.config.means_rate_at(self.step) * self._extent)
                 model.optimizer.step()
         self.step += 1
         self.loss = value
+        self._shown = steps[0].image.detach(), steps[0].view.image
         if self._guards:
             self._guard()
         steps.clear()  # each step refers to all: a cycle would keep their graphs until garbage collection
-        return value, squared_error
+        return value
 
     def save(self, path: Path) -> None:
         """Write a checkpoint from which `load` continues to the identical result.

@@ -31,7 +31,7 @@ def ctrl_c(monkeypatch) -> Callable[[int], AbstractContextManager[None]]:
 
     @contextmanager
     def pressed_at(step: int) -> Iterator[None]:
-        def train_step(trainer: Trainer) -> tuple[float, float]:
+        def train_step(trainer: Trainer) -> float:
             if trainer.step == step:
                 signal.raise_signal(signal.SIGINT)
             return original(trainer)

@@ -109,7 +109,7 @@ def test_sigterm_saves_and_then_ends_the_process_as_its_sender_expects(
 ):
     original, received = Trainer.train_step, []
 
-    def train_step(trainer: Trainer) -> tuple[float, float]:
+    def train_step(trainer: Trainer) -> float:
         if trainer.step == 5:
             signal.raise_signal(signal.SIGTERM)
         return original(trainer)

@@ -95,10 +95,10 @@ def test_the_co_adaptation_term_is_the_weighted_mean_variance(tiny_scene, busy):
     plain = dataclasses.replace(busy, dropout=0.3, noise=0.0, analytic=True)
     losses = []
     for loss in ("photometric", "photometric + co_adaptation(3.0)", "co_adaptation(3.0)"):
-        losses.append(Trainer(tiny_scene, dataclasses.replace(plain, loss=loss)).train_step()[0])
+        losses.append(Trainer(tiny_scene, dataclasses.replace(plain, loss=loss)).train_step())
     assert losses[1] - losses[0] == pytest.approx(losses[2], rel=1e-4)
     sampled = dataclasses.replace(plain, analytic=False, loss="co_adaptation(3.0, p=0.3)")
-    assert Trainer(tiny_scene, sampled).train_step()[0] == pytest.approx(losses[2], rel=1e-5)
+    assert Trainer(tiny_scene, sampled).train_step() == pytest.approx(losses[2], rel=1e-5)
 
 
 def test_the_multiplier_is_that_of_what_training_samples():
@@ -125,7 +125,7 @@ def test_training_lowers_the_loss_and_draws_nothing(tiny_scene, busy):
     for _ in range(2):
         trainer = Trainer(tiny_scene, config)
         state = torch.random.get_rng_state()
-        losses.append([trainer.train_step()[0] for _ in range(12)])
+        losses.append([trainer.train_step() for _ in range(12)])
         assert torch.equal(torch.random.get_rng_state(), state)
         assert trainer.regularizer.keep is None
     assert losses[0] == losses[1]

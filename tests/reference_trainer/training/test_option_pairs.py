@@ -193,7 +193,7 @@ def test_a_pair_is_what_its_options_say_or_refused(pair, gsplat):
         at, analytic = (draws if begun else Draws()), config.analytic and begun
         put(trainer, two(world, config.sh_degree, torch.float32))
         with deterministic() if "deterministic" in pair else nullcontext():
-            loss, _ = trainer.train_step()
+            loss = trainer.train_step()
         if analytic:
             mean, variance = enumerated(at, config.sh_degree, white)
             expected = expected_photometric_loss(mean, variance, target.double(), lambda_dssim)
