@@ -5,6 +5,9 @@ generator of another device, a factory function that forgot the device, `numpy()
 itself where that is asked for: each fails here as it would on CUDA, and what makes the host wait for the card can be
 counted. What it does not show is CUDA's rounding, memory and speed.
 
+It is for machines without a card. PyTorch has one accelerator per process, and this one would take the place of CUDA:
+gradients on a real card then fail (`opt_ready_stream && opt_parent_stream INTERNAL ASSERT FAILED`).
+
 Two things it cannot do while PyTorch computes gradients: make tensors of Python numbers (`torch.tensor`, `new_tensor`),
 and say what was refused in a gradient that PyTorch computes itself (`SystemError: ... returned NULL`).
 """
@@ -124,7 +127,7 @@ class _Module:
 
 @contextmanager
 def pretended_card(*, order: int | None = None) -> Iterator[torch.device]:
-    """Make the device "card" usable; skips where PyTorch has no devices written in Python.
+    """Make the device "card" usable; skips where there is a real card, or PyTorch has no devices written in Python.
 
     Args:
         order: seed of the order in which `index_add` adds, which CUDA leaves open; as on a processor by default.
@@ -133,6 +136,8 @@ def pretended_card(*, order: int | None = None) -> Iterator[torch.device]:
         The device.
     """
     global _order
+    if torch.cuda.is_available():
+        pytest.skip("the pretended card is for machines without a card")
     if not register_card():
         pytest.skip("this PyTorch has no devices that are written in Python")
     _order = None if order is None else torch.Generator().manual_seed(order)
@@ -160,11 +165,11 @@ def counted_synchronizations() -> Iterator[Counter[str]]:
 
 @cache
 def register_card() -> bool:
-    """Make the device known to PyTorch; return whether that can be done.
+    """Make the device known to PyTorch; return whether that can be done, and there is no real card to disturb.
 
     It must happen before the first backward pass of a process: PyTorch counts the devices then.
     """
-    if not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"):
+    if torch.cuda.is_available() or not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"):
         return False
     backend_registration._setup_privateuseone_for_python_backend(CARD, backend_module=_Module())
     every, aten = torch.library.Library("_", "IMPL"), torch.library.Library("aten", "IMPL")
