@@ -216,6 +216,7 @@ def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, dev
     }
     origin = {"commit": _commit(), "version": results["machine"]["ca_reg"], "cpu": results["machine"]["cpu"]}
     origin |= {"lpips": metric} if (metric := results.get("perceptual_metric")) else {}
+    origin |= {} if device == "cpu" else {"device": results["machine"]["device"]}
     row: Row = {"setting": dict(cell.setting), "seed": cell.seed, **means, "gaussians": results["gaussians"],
                 "seconds": results["processor_seconds"]}  # fmt: skip
     if "path" in cell.needs:

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 from benchmarks.paper.claims import CLAIMS, Check, Claim
 from benchmarks.paper.rows import Row, Rows, label, resolved, value
-from benchmarks.paper.scenes import SCENES
+from benchmarks.paper.scenes import PAPER_SIZE, SCENES
 
 __all__ = [
     "ERRORS",
@@ -95,7 +95,7 @@ class Kept:
 
 def tested(claim: Claim, kept: Kept) -> list[str]:
     """Return the kept scenes that a claim is tested on: those it names, and a user's own."""
-    return [scene for scene in kept.scenes if scene in claim.scenes or scene not in SCENES]
+    return [scene for scene in kept.scenes if scene in claim.scenes or scene not in SCENES | PAPER_SIZE]
 
 
 def differences(check: Check, scene: str, kept: Kept) -> list[float]:

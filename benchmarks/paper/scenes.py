@@ -11,7 +11,7 @@ from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.losses import LOSSES
 from reference_trainer.training.losses.term import PriorTerm
 
-__all__ = ["SCENES", "PaperScene", "chosen_scenes"]
+__all__ = ["PAPER_SIZE", "SCENES", "PaperScene", "chosen_scenes"]
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,14 @@ SCENES = {
 }
 """The declared scenes by name, the cheapest first."""
 
+PAPER_SIZE = {
+    "fern-504": PaperScene(replace(SCENES["fern"].options, images="images_8"), "fern at 504x378"),
+    "lego-400": PaperScene(replace(SCENES["lego"].options, downscale=1.0), "lego at 400x400"),
+    "dtu-scan65-400": PaperScene(replace(SCENES["dtu-scan65"].options, downscale=1.0), "DTU scan65 at 400x300"),
+    "dtu-scan24-384": PaperScene(replace(SCENES["dtu-scan24"].options, downscale=1.0), "DTU scan24 at 384x384"),
+}
+"""Scenes of the paper's data sets again, with pictures of its size, for 10,000 steps on a card."""
+
 
 def chosen_scenes(names: Sequence[str], data: Path, own: SceneOptions) -> dict[str, PaperScene]:
     """Return the scenes of a study by name.
@@ -113,6 +121,7 @@ def chosen_scenes(names: Sequence[str], data: Path, own: SceneOptions) -> dict[s
         return {name: PaperScene(own, depth="true" if own.path == "synthetic" else "points")}
     if own != SceneOptions(""):
         raise ValueError("the options of a scene apply to one of your own, the declared ones have theirs: give --path.")
-    if unknown := [name for name in names if name not in SCENES]:
-        raise ValueError(f"there is no declared scene {unknown[0]}; choose of {', '.join(SCENES)}, or give --path.")
-    return {name: SCENES[name].below(data) for name in names or SCENES}
+    every = SCENES | PAPER_SIZE
+    if unknown := [name for name in names if name not in every]:
+        raise ValueError(f"there is no declared scene {unknown[0]}; choose of {', '.join(every)}, or give --path.")
+    return {name: every[name].below(data) for name in names or every}
