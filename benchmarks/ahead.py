@@ -21,6 +21,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from reference_trainer.render.triton import binning, compositing, moments, projection, tiles
+from reference_trainer.training.losses import _ssim_triton
 
 __all__ = ["KERNELS", "TARGETS", "Compiled", "Kernel", "compile_ahead", "markdown", "measure_nvidia"]
 
@@ -33,7 +34,7 @@ _TYPES |= {"indices": "*i64", "order": "*i64", "ends": "*i64", "keys": "*i16", "
 _TYPES |= {name: "*u8" for name in ("touched", "visible")}
 _TYPES |= {name: "i32" for name in ("first", "count", "width", "height", "columns", "listing")}
 _TYPES |= {f"row_{name}": "i32" for name in ("centers", "factors", "depths", "colors", "opacities")}
-_TYPES |= {name: "fp32" for name in ("fx", "fy", "cx", "cy", "limit_x", "limit_y")}
+_TYPES |= {name: "fp32" for name in ("fx", "fy", "cx", "cy", "limit_x", "limit_y", "of_error", "of_ssim")}
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,17 @@ def _projection(bands: int) -> list[Kernel]:
     ]
 
 
+def _photometric(label: str, **constants: Any) -> list[Kernel]:
+    block = {"WIDE": 32, "HIGH": 16}
+    expected = {"EXPECTED": constants["EXPECTED"]}
+    return [
+        Kernel(f"{label}, rows", _ssim_triton.blur_pictures, expected | block, 8, walks=False),
+        Kernel(f"{label}, columns", _ssim_triton.compare_pictures, constants | block, 8, walks=False),
+        Kernel(f"{label} backward, rows", _ssim_triton.blur_slopes, block, 8, walks=False),
+        Kernel(f"{label} backward, columns", _ssim_triton.gather_gradients, constants | block, 8, walks=False),
+    ]
+
+
 _DRAWN = {"DEPTH": False, "ABSOLUTE": False, "EACH": False}
 KERNELS = [
     Kernel("find visible", projection.find_visible, {"BLOCK": 1024}, 4, walks=False),
@@ -93,6 +105,9 @@ KERNELS = [
     _tiled("moments backward, in order", moments.moments_backward, 11, MAX=0.99, EACH=True),
     _tiled("moments, gsplat's tiles", moments.moments_forward, 11, 16, 4, MAX=0.999),
     _tiled("shares, gsplat's tiles", moments.moments_backward, 11, 16, 4, MAX=0.999, EACH=False),
+    *_photometric("SSIM", EXPECTED=False, LOSS=False),
+    *_photometric("loss", EXPECTED=False, LOSS=True),
+    *_photometric("expected loss", EXPECTED=True, LOSS=True),
 ]
 
 

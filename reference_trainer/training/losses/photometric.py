@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -12,17 +11,11 @@ from ca_reg._check import check_count
 from ca_reg.functional import expected_absolute_error
 from ca_reg.schedules import Schedule
 from reference_trainer.render.engine import engine_for
+from reference_trainer.training.losses._ssim_constants import C1, C2, WEIGHTS
 from reference_trainer.training.losses.term import WeightedTerm
 from reference_trainer.training.step import Step
 
 __all__ = ["Photometric", "Views", "check_lambda", "expected_photometric_loss", "photometric_loss", "ssim_map"]
-
-_RADIUS = 5
-_SIGMA = 1.5
-_SIDE = [math.exp(-(offset**2) / (2 * _SIGMA**2)) for offset in range(_RADIUS + 1)]
-_WEIGHTS = [weight / (2 * sum(_SIDE) - 1) for weight in _SIDE]  # of the window's center and one side; they add up to 1
-_C1 = 0.01**2
-_C2 = 0.03**2
 
 
 class Photometric(WeightedTerm):
@@ -64,9 +57,7 @@ def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -
         >>> image.grad.shape
         torch.Size([3, 16, 16])
     """
-    check_lambda(lambda_dssim)
-    _check_pair(image, target)
-    return _with_ssim(torch.nn.functional.l1_loss(image, target), image, target, None, lambda_dssim)
+    return _loss(image, target, None, lambda_dssim)
 
 
 def expected_photometric_loss(mean: Tensor, variance: Tensor, target: Tensor, lambda_dssim: float = 0.2) -> Tensor:
@@ -86,9 +77,7 @@ def expected_photometric_loss(mean: Tensor, variance: Tensor, target: Tensor, la
         >>> losses[0] < losses[1]
         True
     """
-    check_lambda(lambda_dssim)
-    _check_pair(mean, target)
-    return _with_ssim(expected_absolute_error(mean, variance, target).mean(), mean, target, variance, lambda_dssim)
+    return _loss(mean, target, variance, lambda_dssim)
 
 
 def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None = None) -> Tensor:
@@ -107,19 +96,33 @@ def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None = None) -> T
         >>> bool(torch.allclose(ssim_map(image, image), torch.ones_like(image)))
         True
     """
-    _check_pair(image, target)
+    _check_pair(image, target, variance)
+    if engine_for(image.device, image.dtype).name == "triton":
+        from reference_trainer.training.losses import _ssim_triton
+
+        return _ssim_triton.ssim_map(image, target, variance)
     similarity: Tensor = _SSIMMap.apply(image, target, variance)  # type: ignore[no-untyped-call]
     return similarity
 
 
-def _with_ssim(error: Tensor, image: Tensor, target: Tensor, variance: Tensor | None, lambda_dssim: float) -> Tensor:
-    """Mix an error with the structural term, which is not computed if its weight is 0."""
+def _loss(image: Tensor, target: Tensor, variance: Tensor | None, lambda_dssim: float) -> Tensor:
+    """Mix the error with the structural term, which is not computed if its weight is 0."""
+    check_lambda(lambda_dssim)
+    _check_pair(image, target, variance)
+    if lambda_dssim != 0 and engine_for(image.device, image.dtype).name == "triton":
+        from reference_trainer.training.losses import _ssim_triton
+
+        return _ssim_triton.photometric_loss(image, target, variance, lambda_dssim)
+    if variance is None:
+        error = torch.nn.functional.l1_loss(image, target)
+    else:
+        error = expected_absolute_error(image, variance, target).mean()
     if lambda_dssim == 0:
         return error
     return error * (1 - lambda_dssim) + (1 - ssim_map(image, target, variance).mean()) * lambda_dssim
 
 
-def _check_pair(image: Tensor, target: Tensor) -> None:
+def _check_pair(image: Tensor, target: Tensor, variance: Tensor | None) -> None:
     """Raise unless a picture can be compared with a photograph."""
     if image.ndim != 3 or image.shape != target.shape:
         raise ValueError(
@@ -129,6 +132,15 @@ def _check_pair(image: Tensor, target: Tensor) -> None:
         raise ValueError(
             "image and target must share one floating-point dtype and one device, got "
             f"{image.dtype} on {image.device} and {target.dtype} on {target.device}."
+        )
+    if variance is not None and (variance.shape, variance.dtype, variance.device) != (
+        image.shape,
+        image.dtype,
+        image.device,
+    ):
+        raise ValueError(
+            f"the variance must have shape, dtype and device of its image, {tuple(image.shape)}, {image.dtype} and "
+            f"{image.device}, got {tuple(variance.shape)}, {variance.dtype} and {variance.device}."
         )
     if target.requires_grad:
         raise ValueError("target is a constant here, but it requires a gradient: pass target.detach().")
@@ -174,11 +186,11 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
     if engine_for(blurred.device, blurred.dtype).name == "numba":
         from reference_trainer.training.losses._ssim_numba import similarity
 
-        return similarity(blurred, _C1, _C2)
+        return similarity(blurred, C1, C2)
     mean_x, mean_y, mean_xy, mean_squares = blurred
     product, squares = mean_x * mean_y, torch.addcmul(mean_x * mean_x, mean_y, mean_y)
-    a1, a2 = 2 * product + _C1, (mean_xy - product).mul_(2).add_(_C2)
-    b1, b2 = squares + _C1, (mean_squares - squares).add_(_C2)
+    a1, a2 = 2 * product + C1, (mean_xy - product).mul_(2).add_(C2)
+    b1, b2 = squares + C1, (mean_squares - squares).add_(C2)
     weight = 1 / (b1 * b2)
     result = a1 * a2 * weight
     to_mean = 2 * weight * (mean_y * (a2 - a1) + result * mean_x * (b1 - b2))
@@ -190,9 +202,9 @@ def _blur(maps: Tensor) -> Tensor:
     if engine_for(maps.device, maps.dtype).name == "numba":
         from reference_trainer.training.losses._ssim_numba import blur
 
-        return blur(maps, _WEIGHTS)
+        return blur(maps, WEIGHTS)
     # Sums of shifted slices: on a CPU faster than a depthwise convolution, whose speed depends on the memory layout.
-    center, *sides = _WEIGHTS
+    center, *sides = WEIGHTS
     for axis in (-2, -1):
         size = maps.shape[axis]
         blurred = maps * center

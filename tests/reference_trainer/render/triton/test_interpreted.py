@@ -1,4 +1,4 @@
-"""Runs this file's neighbors in processes of their own: in Triton's interpreter and, where there is one, on a card."""
+"""Runs this file's neighbors and the losses' tests of float32 in processes of their own: interpreted, or on a card."""
 
 import subprocess
 import sys
@@ -10,13 +10,18 @@ from subprocesses import subprocess_environment
 
 pytest.importorskip("triton")
 FOLDER = Path(__file__).parent
+LOSSES = "../../training/losses/test_photometric.py"
 
 
-def passes(marked, interpret, name="interpreted.py"):
-    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-m", marked]
-    environment = subprocess_environment(TRITON_INTERPRET=interpret)
+def passes(marked, interpret, name="interpreted.py", *, named=""):
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-m", marked, "-k", named]
+    environment = subprocess_environment(TRITON_INTERPRET=interpret, CA_REG_ENGINE="triton")
     done = subprocess.run(
-        [*command, str(FOLDER / name)], cwd=FOLDER.parents[3], env=environment, capture_output=True, text=True
+        [*command, str((FOLDER / name).resolve())],
+        cwd=FOLDER.parents[3],
+        env=environment,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     assert " passed" in done.stdout
@@ -26,6 +31,11 @@ def passes(marked, interpret, name="interpreted.py"):
 @pytest.mark.parametrize("marked", ["not slow", "slow"])
 def test_in_the_interpreter(marked):
     passes(marked, "1")
+
+
+@pytest.mark.slow
+def test_losses():
+    passes("not slow", "1", LOSSES, named="float32")
 
 
 @pytest.mark.slow
@@ -39,3 +49,4 @@ def test_on_a_card():
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     passes("slow or not slow", "0")
+    passes("not slow", "0", LOSSES, named="float32")

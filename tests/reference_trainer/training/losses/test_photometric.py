@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 import torch
 from torch import Tensor
@@ -13,6 +15,9 @@ from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import LOSSES
 from reference_trainer.training.losses.photometric import Views, expected_photometric_loss, photometric_loss, ssim_map
 from reference_trainer.training.trainer import Trainer
+
+CHOSEN = os.environ.get("CA_REG_ENGINE") == "triton"  # by `tests/reference_trainer/render/triton/test_interpreted.py`
+DEVICE = torch.device("cuda" if CHOSEN and os.environ.get("TRITON_INTERPRET") != "1" else "cpu")
 
 
 def pair(height: int, width: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -58,17 +63,49 @@ def test_gradient_of_the_map(size):
 @pytest.mark.parametrize("size", [(1, 1), (3, 4), (13, 70), (40, 61)])
 @pytest.mark.parametrize("spread", [0.0, 0.1])
 def test_float32_agrees_with_float64(size, spread):
-    """With numba, float32 on the processor is computed by loops; float64 never is."""
+    """Float32 is computed by numba's loops on the processor and by Triton's kernels on a card; float64 never is."""
     results = []
-    for dtype in (torch.float32, torch.float64):
-        image, target = pair(*size, dtype=dtype)
+    for dtype, device in ((torch.float32, DEVICE), (torch.float64, "cpu")):
+        image, target = (x.to(device) for x in pair(*size, dtype=dtype))
         image, variance = image.requires_grad_(), (spread * image.detach() ** 2).requires_grad_()
-        weights = pair(*size, dtype=dtype, seed=1)[0]
+        weights = pair(*size, dtype=dtype, seed=1)[0].to(device)
         similarity = ssim_map(image, target, variance)
         results.append([similarity.detach(), *torch.autograd.grad((similarity * weights).sum(), (image, variance))])
     for short, long in zip(*results, strict=True):
         # Rounding: the squares of colors near 1, against the constant 9e-4 that they are compared with.
-        assert (short - long).norm() <= 1e-4 * long.norm()
+        assert (short.cpu() - long).norm() <= 1e-4 * long.norm()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (17, 6)])
+@pytest.mark.parametrize("spread", [None, 0.0, 0.1])
+def test_float32_losses_agree_with_float64(size, spread):
+    """Of strided pictures, some of whose pixels are those of the photograph, within a larger expression."""
+    results = []
+    for dtype, device in ((torch.float32, DEVICE), (torch.float64, "cpu")):
+        image, target = (x.to(device, dtype) for x in pair(*size, dtype=torch.float32))
+        image = torch.cat([image, target[:1]]).permute(1, 2, 0).contiguous().permute(2, 0, 1).requires_grad_()
+        variance = None if spread is None else (spread * image.detach()[:3] ** 2).requires_grad_()
+        losses = [
+            photometric_loss(x, target, 0.3) if spread is None else expected_photometric_loss(x, variance, target, 0.3)
+            for x in (image[:3], torch.cat([image[3:], image[:2]]))
+        ]
+        value = losses[0] + losses[1] ** 2
+        leaves = (image,) if spread is None else (image, variance)
+        results.append([value.detach(), *torch.autograd.grad(value, leaves)])
+    for short, long in zip(*results, strict=True):
+        assert (short.cpu() - long).norm() <= 1e-5 * long.norm()
+
+
+@pytest.mark.skipif(not CHOSEN, reason="counts the launches of Triton's kernels")
+def test_float32_takes_two_launches_and_two_back():
+    from reference_trainer.render.triton.tiles import LAUNCHED
+
+    image, target = (x.to(DEVICE) for x in pair(5, 6, dtype=torch.float32))
+    before = LAUNCHED.total()
+    loss = photometric_loss(image.requires_grad_(), target)
+    assert LAUNCHED.total() - before == 2
+    loss.backward()
+    assert LAUNCHED.total() - before == 4
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
@@ -92,7 +129,8 @@ def test_float32_stays_near_float64(level):
     # dozen operations over the smallest denominator, 9e-4, bound the error. Flat images are the worst case.
     generator = torch.Generator().manual_seed(0)
     target = (level + 1e-3 * torch.randn(3, 40, 50, generator=generator)).float()
-    image = (target + 1e-3 * torch.randn(3, 40, 50, generator=generator)).float()
+    image = (target + 1e-3 * torch.randn(3, 40, 50, generator=generator)).float().to(DEVICE)
+    target = target.to(DEVICE)
     bound = 32 * 2**-24 * max(level, 0.05) ** 2 / 9e-4 + 1e-5
     exact, x = ssim_map(image.double(), target.double()), image.clone().requires_grad_()
     assert (ssim_map(image, target) - exact).abs().max() < bound
@@ -104,11 +142,11 @@ def test_float32_stays_near_float64(level):
 
 def test_float32_gradient_of_textured_images():
     image, target = pair(40, 50)
-    image32, target32 = image.float().requires_grad_(), target.float()
+    image32, target32 = image.float().to(DEVICE).requires_grad_(), target.float().to(DEVICE)
     photometric_loss(image32, target32).backward()
     image.requires_grad_()
     photometric_loss(image, target).backward()
-    assert (image32.grad - image.grad).norm() < 1e-5 * image.grad.norm()
+    assert (image32.grad.cpu() - image.grad).norm() < 1e-5 * image.grad.norm()
 
 
 def test_layout_does_not_matter():
@@ -139,6 +177,17 @@ def test_inputs_are_untouched():
 def test_wrong_images(image, target, message):
     with pytest.raises(ValueError, match=message):
         ssim_map(image, target)
+
+
+@pytest.mark.parametrize("variance", [torch.zeros(3, 4, 4), torch.zeros(3, 4, 5).double()])
+def test_wrong_variance(variance):
+    image = torch.zeros(3, 4, 5)
+    for function in (
+        lambda: ssim_map(image, image, variance),
+        lambda: expected_photometric_loss(image, variance, image),
+    ):
+        with pytest.raises(ValueError, match="variance must have shape, dtype and device of its image"):
+            function()
 
 
 @pytest.mark.parametrize("weight", [-0.1, 1.1, float("nan")])
