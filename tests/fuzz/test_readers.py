@@ -22,5 +22,5 @@ def test_damaged_files(target, tmp_path):
 @pytest.mark.slow
 @targets
 def test_many_damaged_files(target, tmp_path):
-    count = 500 if target.form == "state" else 1000
+    count = 100 if target.form == "state" else 250
     assert not fuzz(target, tmp_path, range(1000, 1000 + count)).defects
