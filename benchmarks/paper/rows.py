@@ -19,9 +19,9 @@ from reference_trainer.training.recipes import with_recipe, with_steps
 __all__ = ["Row", "Rows", "config_of", "label", "resolved", "value"]
 
 Row = dict[str, Any]
-"""``setting`` and ``seed``, ``commit``, ``version``, ``cpu``, ``device`` unless it is that, and the kind of ``lpips``, and the figures: ``test`` and
-``train`` from `evaluate`, as means over views, ``gaussians``, ``seconds`` of processor time, and ``path``, ``renders``
-and ``depth`` where measured."""
+"""``setting`` and ``seed``, ``commit``, ``version``, ``cpu``, ``device`` unless that is it, the kind of ``lpips``, and
+figures: ``test`` and ``train`` from `evaluate`, as means over views, ``gaussians``, ``seconds`` of processor time, and
+``path``, ``renders`` and ``depth`` where measured."""
 
 
 def resolved(setting: Setting, recipe: str, iterations: int) -> dict[str, Any]:
