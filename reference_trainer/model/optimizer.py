@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.render.engine import engine_for
 
 __all__ = ["GaussianOptimizer"]
 
@@ -31,14 +32,16 @@ class GaussianOptimizer:
     """
 
     def __init__(self, gaussians: Gaussians, rates: Mapping[str, float]) -> None:
-        self.gaussians = gaussians.map(lambda x: x.detach().clone().requires_grad_())
+        # Where Triton renders, one launch does what PyTorch takes two for every parameter for.
+        self._in_one = engine_for(gaussians.means.device, gaussians.means.dtype).name == "triton"
+        self.gaussians = gaussians.map(lambda x: self._leaf(x.clone()))
         groups = [{"params": [x], "lr": rates[name], "name": name} for name, x in self.gaussians.named()]
         # The INRIA code's epsilon: gradients of single Gaussians can be far below Adam's usual 1e-8.
         self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def step(self) -> None:
         """Update all parameters and clear their gradients."""
-        self._adam.step()
+        self._step_in_one() if self._in_one else self._adam.step()
         self.clear_gradients()
 
     def clear_gradients(self) -> None:
@@ -85,16 +88,46 @@ class GaussianOptimizer:
     def state_dict(self) -> dict[str, Any]:
         """Return parameters and moments as plain tensors, for a checkpoint."""
         moments = {
-            name: {key: value.clone() for key, value in self._adam.state[x].items()}
+            name: {
+                key: value.clone() if isinstance(value, Tensor) else torch.tensor(float(value))
+                for key, value in self._adam.state[x].items()
+            }
             for name, x in self.gaussians.named()
         }
         return {"gaussians": {name: x.detach().clone() for name, x in self.gaussians.named()}, "moments": moments}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self._replace({name: x.detach().clone().requires_grad_() for name, x in state["gaussians"].items()})
+        self._replace({name: self._leaf(x.clone()) for name, x in state["gaussians"].items()})
         for name, x in self.gaussians.named():
-            self._adam.state[x] = {key: value.clone() for key, value in state["moments"][name].items()}
+            self._adam.state[x] = {
+                key: int(value) if self._in_one and key == "step" else value.clone()
+                for key, value in state["moments"][name].items()
+            }
+
+    def _step_in_one(self) -> None:
+        """Do what Adam does, to the rounding, in one launch for six tensors."""
+        from reference_trainer.render.triton.adam import adam_step
+
+        by_step: dict[int, list[tuple[Tensor, Tensor, Tensor, Tensor, float]]] = {}
+        for group in self._adam.param_groups:
+            (x,) = group["params"]
+            if x.grad is None:
+                continue
+            state = self._adam.state[x]
+            if not state:
+                state |= {"step": 0, "exp_avg": torch.zeros_like(x), "exp_avg_sq": torch.zeros_like(x)}
+            state["step"] += 1
+            given = x, x.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"], group["lr"]
+            by_step.setdefault(state["step"], []).append(given)
+        options = self._adam.defaults
+        for step, tensors in by_step.items():  # one, unless some have had no gradient
+            adam_step(tensors, step, options["betas"], options["eps"])
+
+    def _leaf(self, x: Tensor) -> Tensor:
+        """Return a parameter to be trained; the kernel walks through it as it lies in memory."""
+        x = x.detach()
+        return (x.contiguous() if self._in_one else x).requires_grad_()
 
     def _group(self, name: str) -> dict[str, Any]:
         return next(group for group in self._adam.param_groups if group["name"] == name)
@@ -112,7 +145,7 @@ class GaussianOptimizer:
         # "step" is one number per tensor, which no resizing changes.
         old = {name: self._adam.state[x] for name, x in self.gaussians.named()}
         with torch.no_grad():
-            self._replace({n: parameter(n, x).detach().requires_grad_() for n, x in self.gaussians.named()})
+            self._replace({n: self._leaf(parameter(n, x)) for n, x in self.gaussians.named()})
             for name, x in self.gaussians.named():
                 self._adam.state[x] = {
                     key: value if key == "step" else moment(value) for key, value in old[name].items()

@@ -1,9 +1,12 @@
 """Rows are independent in Adam: the surviving rows must move as if the others had never been there."""
 
 import copy
+import subprocess
+import sys
 
 import pytest
 import torch
+from subprocesses import subprocess_environment
 
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
@@ -193,3 +196,60 @@ def test_a_model_without_higher_bands():
     optimizer.select(torch.tensor([2]))
     run(optimizer, torch.tensor([2.0]), range(2, 4))
     assert optimizer.gaussians.sh_rest.shape == (1, 0, 3)
+
+
+@pytest.mark.slow
+def test_the_kernel_in_the_interpreter_passes_all_tests_of_this_file():
+    pytest.importorskip("triton")
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-m", "not slow", __file__]
+    environment = subprocess_environment(TRITON_INTERPRET="1", CA_REG_ENGINE="triton")
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+    assert " passed" in done.stdout
+
+
+def test_a_parameter_whose_numbers_lie_in_another_order_in_memory():
+    """As spherical harmonics do that come from a file channel by channel."""
+    start, ids = some(4), torch.arange(4.0)
+    turned = some(4)
+    turned.sh_rest.set_(turned.sh_rest.mT.contiguous().mT)
+    assert not turned.sh_rest.is_contiguous()
+    optimizer, plain = GaussianOptimizer(turned, RATES), Plain(start)
+    run(optimizer, ids, range(5))
+    plain.run(ids, range(5))
+    assert_same(optimizer.gaussians, plain.gaussians)
+
+
+def test_what_got_no_gradient_stays_and_counts_no_step():
+    optimizer, plain = GaussianOptimizer(some(3), RATES), Plain(some(3))
+    for step in range(4):
+        for one in (optimizer.gaussians, plain.gaussians):
+            push(one, torch.arange(3.0), step)
+            if step % 2:
+                one.means.grad = None
+        optimizer.step()
+        plain.adam.step()
+        plain.adam.zero_grad()
+    assert_same(optimizer.gaussians, plain.gaussians)
+    steps = {name: moments["step"].item() for name, moments in optimizer.state_dict()["moments"].items()}
+    assert steps == {name: 2 if name == "means" else 4 for name in steps}
+
+
+@pytest.mark.gpu
+def test_on_a_card_it_moves_as_on_a_processor_and_goes_on_from_there():
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    ids, plain = torch.arange(3000.0), Plain(some(3000, degree=3))
+    optimizer = GaussianOptimizer(some(3000, degree=3).to("cuda"), RATES)
+    run(optimizer, ids.cuda(), range(5))
+    restored = GaussianOptimizer(some(3000, degree=3), RATES)
+    state = optimizer.state_dict()
+    restored.load_state_dict(
+        {
+            "gaussians": {name: x.cpu() for name, x in state["gaussians"].items()},
+            "moments": {name: {key: x.cpu() for key, x in of.items()} for name, of in state["moments"].items()},
+        }
+    )
+    run(restored, ids, range(5, 8))
+    plain.run(ids, range(8))
+    assert_same(restored.gaussians, plain.gaussians)
