@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from reference_trainer.render.triton import adam, binning, compositing, moments, projection, tiles
+from reference_trainer.render.triton import adam, binning, compositing, densification, moments, projection, tiles
 from reference_trainer.training.losses import _ssim_triton
 
 __all__ = ["KERNELS", "TARGETS", "Compiled", "Kernel", "compile_ahead", "markdown", "measure_nvidia"]
@@ -30,13 +30,14 @@ TARGETS |= {f"gfx{x}": GPUTarget("hip", f"gfx{x}", 64 if x[0] == "9" else 32) fo
 
 # Types by the names of the arguments, which are the same in all kernels; the others are float32 numbers in memory.
 _TYPES = {name: "*i32" for name in ("starts", "gaussians", "counts")}
-_TYPES |= {f"count{i}": "i32" for i in range(6)} | {f"rate{i}": "fp32" for i in range(6)}
 _TYPES |= {"indices": "*i64", "order": "*i64", "ends": "*i64", "keys": "*i16", "numbers": "*fp64"}
 _TYPES |= {name: "*u8" for name in ("touched", "visible")}
 _TYPES |= {name: "i32" for name in ("first", "count", "width", "height", "columns", "listing")}
+_TYPES |= {name: "i32" for name in ("stride", "absolute_stride", *(f"count{i}" for i in range(6)))}
 _TYPES |= {f"row_{name}": "i32" for name in ("centers", "factors", "depths", "colors", "opacities")}
-_TYPES |= {name: "fp32" for name in ("fx", "fy", "cx", "cy", "limit_x", "limit_y", "of_error", "of_ssim")}
-_TYPES |= {name: "fp32" for name in ("gain1", "gain2", "correction", "epsilon")}
+_TYPES |= {name: "fp32" for name in ("fx", "fy", "cx", "cy", "limit_x", "limit_y", "half_width", "half_height")}
+_TYPES |= {name: "fp32" for name in ("of_error", "of_ssim", "gain1", "gain2", "correction", "epsilon")}
+_TYPES |= {f"rate{i}": "fp32" for i in range(6)}
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,11 @@ KERNELS = [
     Kernel("find visible", projection.find_visible, {"BLOCK": 1024}, 4, walks=False),
     *(kernel for bands in (0, 1, 4, 9, 16) for kernel in _projection(bands)),
     Kernel("fill table", tiles.fill_table, {"MORE": 2, "BLOCK": 256}, 4, walks=False),
-    Kernel("list tiles", binning.list_tiles, {"TILE": 8, "GROUP": 16, "LANES": 8}, 4, walks=False),
+    Kernel("list tiles", binning.list_tiles, {"TILE": 8, "GROUP": 32, "LANES": 8}, 1, walks=False),
+    *(
+        Kernel("densification", densification.add_gradients, {"ABSOLUTE": x, "BLOCK": 256}, 4, walks=False)
+        for x in (False, True)
+    ),
     Kernel("Adam", adam.adam, {"BLOCK": 1024}, 4, walks=False),
     _tiled("composite", compositing.composite_forward, 9, DEPTH=False),
     _tiled("composite, depth", compositing.composite_forward, 10, DEPTH=True),

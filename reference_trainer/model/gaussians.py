@@ -12,7 +12,7 @@ from torch import Tensor
 from ca_reg import Params
 from reference_trainer.camera import Camera
 
-__all__ = ["PARAMETERS", "SH_C0", "Gaussians", "compute_relocation"]
+__all__ = ["PARAMETERS", "SH_C0", "Gaussians", "compute_relocation", "positions"]
 
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 """The parameters of every Gaussian, by the names of the fields."""
@@ -142,11 +142,24 @@ class Gaussians:
         return Gaussians.from_named({name: function(tensor) for name, tensor in self.named()})
 
     def __getitem__(self, index: Tensor) -> Gaussians:
-        return self.map(lambda x: x[index])
+        places = positions(index)
+        return self.map(lambda x: x[places])
 
     def to(self, device: torch.device | str) -> Gaussians:
         """Return the Gaussians on another device."""
         return self.map(lambda x: x.to(device))
+
+
+def positions(index: Tensor) -> Tensor:
+    """Return the positions where a mask is set; positions as they are.
+
+    For several tensors that one mask selects from: a card makes the host wait for every mask, to know the size.
+
+    Example:
+        >>> positions(torch.tensor([True, False, True]))
+        tensor([0, 2])
+    """
+    return index.nonzero()[:, 0] if index.dtype == torch.bool else index
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.gaussians import Gaussians, positions
 from reference_trainer.render.engine import engine_for
 
 __all__ = ["GaussianOptimizer"]
@@ -55,7 +55,8 @@ class GaussianOptimizer:
 
     def select(self, index: Tensor) -> None:
         """Keep only the Gaussians at ``index`` (bool mask or positions), with their optimizer state."""
-        self._rebuild(lambda name, x: x[index], lambda moment: moment[index])
+        places = positions(index)
+        self._rebuild(lambda name, x: x[places], lambda moment: moment[places])
 
     def append(self, new: Gaussians) -> None:
         """Add Gaussians; their optimizer state starts at zero."""

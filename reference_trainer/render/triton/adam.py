@@ -88,7 +88,7 @@ def adam_step(
     for begin in range(0, len(given), _AT_ONCE):
         some = given[begin : begin + _AT_ONCE]
         missing = [0] * (_AT_ONCE - len(some))  # for which pointers must be there all the same
-        pointers = [x.detach() for one in (*some, *(some[0] for _ in missing)) for x in one[:4]]
+        pointers = [x for one in (*some, *(some[0] for _ in missing)) for x in (one[0].detach(), *one[1:4])]
         counts = [one[0].numel() for one in some]
         rates = [one[4] / mean_correction for one in some] + [0.0 for _ in missing]
         blocks = sum(-(-count // _BLOCK) for count in counts)

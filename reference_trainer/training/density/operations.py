@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.model.optimizer import GaussianOptimizer
+from reference_trainer.render.engine import engine_for
 from reference_trainer.rotations import rotation_matrices
 from reference_trainer.training.interruption import TrainingStoppedError
 
@@ -60,6 +61,12 @@ class DensityStatistics:
             height: image height, pixels.
             absolute: the sums over the pixels of the absolute gradients, shape (M, 2).
         """
+        if engine_for(gradient.device, gradient.dtype).name == "triton":
+            from reference_trainer.render.triton.densification import count_gradients
+
+            sums = self.gradient_sum, self.steps, self.absolute_sum
+            count_gradients(indices, rendered, gradient, absolute, *sums, width, height)
+            return
         for total, x in ((self.gradient_sum, gradient), (self.absolute_sum, absolute)):
             if total is not None and x is not None:
                 # From pixels to normalized device coordinates, in which thresholds do not depend on
@@ -121,7 +128,8 @@ def refuse_not_finite(optimizer: GaussianOptimizer, step: int) -> None:
 
     Pruning would remove Gaussians with a nan opacity as too faint.
     """
-    if not all(bool(x.isfinite().all()) for _, x in optimizer.gaussians.named()):
+    # One wait for a card, not one for every parameter.
+    if not bool(torch.stack([x.isfinite().all() for _, x in optimizer.gaussians.named()]).all()):
         raise TrainingStoppedError(f"Gaussians became nan or infinite by step {step}: lower the learning rates.")
 
 

@@ -1,8 +1,11 @@
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
 from strategies import begun
+from subprocesses import subprocess_environment
 
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
@@ -193,6 +196,35 @@ def seen_in(scene, gaussians: Gaussians, view, opacities) -> tuple[torch.Tensor,
     (rendering.image - view.image).square().sum().backward()
     splats = rendering.splats
     return splats.indices, splats.touched, splats.means.grad
+
+
+@pytest.mark.slow
+def test_the_kernel_in_the_interpreter_counts_the_same():
+    pytest.importorskip("triton")
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", __file__]
+    environment = subprocess_environment(TRITON_INTERPRET="1", CA_REG_ENGINE="triton")
+    done = subprocess.run(
+        [*command, "-k", "are_counted or dilute or many_gaussians"], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+    assert "4 passed" in done.stdout
+
+
+@pytest.mark.parametrize("scale", [1e-2, 1e-25])  # the squares of the second are 0 in float32
+def test_many_gaussians_are_counted_with_their_absolute_gradients(scale):
+    g = torch.Generator().manual_seed(5)
+    statistics, expected = DensityStatistics.zeros(700, absolute=True), torch.zeros(3, 700, dtype=torch.float64)
+    for _ in range(3):
+        index = torch.randperm(700, generator=g)[:600].sort().values
+        rows = scale * torch.randn(600, 16, generator=g)
+        drawn = torch.rand(600, generator=g) < 0.7
+        # As a part of what the backward pass leaves: its rows have further columns.
+        statistics.update(index, drawn, rows[:, :2], 200, 100, rows[:, 3:5].abs())
+        for row, x in ((0, rows[:, :2]), (2, rows[:, 3:5])):
+            expected[row, index] += (x.double() * torch.tensor([100.0, 50.0])).square().sum(1).sqrt()
+        expected[1, index] += drawn.double()
+    found = statistics.gradient_sum, statistics.steps, statistics.absolute_sum
+    torch.testing.assert_close(torch.stack(found).double(), expected, rtol=1e-5, atol=0)
 
 
 def test_dropped_gaussians_leave_no_trace(tiny_scene):
