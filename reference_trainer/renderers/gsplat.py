@@ -120,15 +120,16 @@ def render_by(
         eps2d=DILATION,
         sh_degree=degree,
         packed=True,  # projected means, whose gradient is wanted, of M Gaussians instead of a batch of views
-        backgrounds=None if background is None else background.to(means)[None],
         render_mode="RGB+D" if depth else "RGB",
         absgrad=absgrad,
     )
     # As in `rasterize`: projected centers are no leaves, and density control reads their gradient.
     if info["means2d"].requires_grad:
         info["means2d"].retain_grad()
-    image = images[0].permute(2, 0, 1)
+    image, alpha = images[0].permute(2, 0, 1), alphas[0, ..., 0]
+    # Here, because gsplat 1.5 takes no background with packed Gaussians.
+    shown = image[:3] if background is None else image[:3] + (1 - alpha) * background.to(means)[:, None, None]
     splats = GsplatSplats(
         indices=info["gaussian_ids"].long(), means=info["means2d"], touched=info["tiles_per_gauss"] > 0
     )
-    return GsplatRendering(image[:3], alphas[0, ..., 0], image[3] if depth else None, splats)
+    return GsplatRendering(shown, alpha, image[3] if depth else None, splats)

@@ -56,7 +56,9 @@ def test_masking_with_zeroed_radii_is_removing_the_gaussians(form, device):
         expected = torch.autograd.grad(loss_of(subset["render"]), model.parameters())
         torch.testing.assert_close(package["render"], subset["render"], rtol=1e-6, atol=1e-6)
         for ours_, theirs in zip(gradients, expected, strict=True):
-            torch.testing.assert_close(ours_, theirs, rtol=1e-6, atol=0)
+            # A card adds up in any order, so that a sum that nearly cancels errs by the rounding of its summands.
+            rounding = 1e-7 * theirs.abs().max().item() if device.type == "cuda" else 0.0
+            torch.testing.assert_close(ours_, theirs, rtol=1e-6, atol=rounding)
         full_radii = torch.zeros(n, dtype=torch.int32, device=device)
         full_points = torch.zeros(n, 3, device=device)
         full_radii[keep], full_points[keep] = subset["radii"], subset["viewspace_points"].grad

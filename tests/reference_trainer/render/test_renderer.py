@@ -332,8 +332,10 @@ def test_a_backward_pass_inside_autocast_keeps_the_precision_of_the_compositing(
         with torch.autocast(scene.means.device.type, dtype=torch.bfloat16, enabled=enabled):
             loss.backward()
         gradients.append([x.grad for x in leaves])
+    # A card adds up in any order; half precision would err by 1e-3.
+    order = 1e-5 if scene.means.is_cuda else 0.0
     for plain, cast in zip(*(of[1:] for of in gradients), strict=True):
-        assert torch.equal(plain, cast)
+        torch.testing.assert_close(plain, cast, rtol=order, atol=order * plain.abs().max().item())
 
 
 def test_tensors_of_whole_numbers_are_refused():
