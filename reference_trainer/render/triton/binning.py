@@ -16,9 +16,8 @@ from reference_trainer.render.triton.tiles import launch
 __all__ = ["bin_gaussians"]
 
 _MIN_ALPHA = tl.constexpr(MIN_ALPHA)
-_GROUP = 16  # Gaussians of a program, and columns of tiles that it lists at once: most cover fewer than 8,
-_LANES = 8  # and one that covers 10,000 tiles keeps a program busy for 1,250 steps, not for 10,000
-_WARPS = 4
+_GROUP = 32  # Gaussians of a program, one per lane of a warp,
+_LANES = 8  # and columns of tiles that it lists at once: one that covers 10,000 tiles takes 1,250 steps
 
 
 @triton.jit
@@ -105,7 +104,7 @@ def bin_gaussians(projected: Projected, width: int, height: int, check: Callable
 
     def fill(keys: Tensor, gaussians: Tensor, listing: int) -> None:
         size = count, width, height, columns, listing
-        constants = {"warps": _WARPS, "TILE": TILE, "GROUP": _GROUP, "LANES": _LANES}
+        constants = {"TILE": TILE, "GROUP": _GROUP, "LANES": _LANES}
         launch(list_tiles, (-(-count // _GROUP),), *given, keys, gaussians, *size, **constants)
 
     nothing = counts[:0]
