@@ -16,7 +16,7 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,9 @@ from benchmarks.counts import Model, counts_table, lists_table
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier
 from reference_trainer.render import describe_engine, rasterize, render_masks, render_moments, splat, use_engine
+from reference_trainer.scenes.synthetic import synthetic_scene
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.trainer import Trainer
 
 __all__ = ["main"]
 ROOT = Path(__file__).resolve().parents[1]
@@ -60,13 +63,11 @@ def _tests() -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
-def _times() -> str:
-    """Return milliseconds, peak memory, kernel launches and waits of renders, gradients, masks and scores."""
+def _times() -> Iterator[str]:
+    """Yield milliseconds, peak memory, kernel launches and waits of renders, gradients, masks, scores and steps."""
     device = torch.device("cuda")
-    out = [
-        "| workload | work | engine | ms, median of 20 | peak MiB | launches | waits |",
-        "|:--|:--|:--|---:|---:|---:|---:|",
-    ]
+    yield "| workload | work | engine | ms, median of 20 | peak MiB | launches | waits |"
+    yield "|:--|:--|:--|---:|---:|---:|---:|"
     for name, size in _SIZES.items():
         model = Model.of(*size, device)
         keep = (torch.rand(5, size[0], device=device) > 0.5).float()
@@ -92,9 +93,11 @@ def _times() -> str:
         for engine in ("triton", *(["torch"] if name == "small" else [])):
             use_engine(engine)
             for label, work in works.items():
-                out.append(f"| {name} | {label} | {engine} | {' | '.join(_measure(work))} |")
-        out += _gsplat_times(name, model)
-    return "\n".join(out)
+                yield f"| {name} | {label} | {engine} | {' | '.join(_measure(work))} |"
+        yield from _gsplat_times(name, model)
+    use_engine("triton")
+    trainer = Trainer(synthetic_scene(), TrainConfig(dropout=0.2), device)
+    yield f"| built-in scene | training step, dropout | triton | {' | '.join(_measure(trainer.train_step))} |"
 
 
 def _measure(work: Callable[[], Any]) -> list[str]:
@@ -136,12 +139,12 @@ def _measured(work: Callable[[], Any]) -> list[str]:
     return [f"{statistics.median(times):.2f}", f"{peak:.0f}", str(kernels), str(waits)]
 
 
-def _gsplat_times(name: str, model: Model) -> list[str]:
-    """Return rows of gsplat's own render, and of the exact score over its lists; none where it is missing."""
+def _gsplat_times(name: str, model: Model) -> Iterator[str]:
+    """Yield rows of gsplat's own render, and of the exact score over its lists; none where it is missing."""
     try:
         import gsplat
     except ImportError:
-        return []
+        return
     from reference_trainer.render.triton.gsplat import GsplatMoments
 
     means, quats, scales, opacities, colors = model.tensors
@@ -158,7 +161,8 @@ def _gsplat_times(name: str, model: Model) -> list[str]:
         "exact score over its lists": lambda: CAScore.exact(moments, drop_rate=0.5)(opacities, None),
     }
     label = f"gsplat {gsplat.__version__}"
-    return [f"| {name} | {what} | {label} | {' | '.join(_measure(work))} |" for what, work in works.items()]
+    for what, work in works.items():
+        yield f"| {name} | {what} | {label} | {' | '.join(_measure(work))} |"
 
 
 def _rasterize(gsplat: Any, model: Model, *tensors: Tensor) -> Any:
@@ -200,7 +204,7 @@ def _agreement() -> str:
 
 def main(arguments: list[str]) -> int:
     """Print one section, or all that this machine can do; return the number of those that failed."""
-    alone: dict[str, Callable[[], str]] = {
+    alone: dict[str, Callable[[], str | Iterator[str]]] = {
         "ahead": partial(_ahead, arguments[1:]),
         "count": counts_table,
         "lists": lists_table,
@@ -219,14 +223,16 @@ def main(arguments: list[str]) -> int:
     failed = 0
     for name, section in sections.items():
         begun = time.perf_counter()
+        if not arguments:
+            print(f"### {name}\n")
         try:
             text = section()
+            for line in [text] if isinstance(text, str) else text:
+                print(line, flush=True)
         except Exception as error:  # a card can refuse anything: name it, and go on
             failed += 1
-            text = f"FAILED: {''.join(traceback.format_exception_only(error)).strip()}"
-        if not arguments:
-            print(f"### {name} ({time.perf_counter() - begun:.0f} s)\n")
-        print(text + "\n", flush=True)
+            print(f"FAILED: {''.join(traceback.format_exception_only(error)).strip()}")
+        print(f"\n{time.perf_counter() - begun:.0f} s\n" if not arguments else "", flush=True)
     return failed
 
 

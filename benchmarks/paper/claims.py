@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmarks.paper.scenes import PAPER_SIZE, SCENES
 
-__all__ = ["CLAIMS", "GAINS", "QUALITY", "TIMED", "Check", "Claim", "Setting", "chosen"]
+__all__ = ["AT_PAPER_SIZE", "CLAIMS", "GAINS", "QUALITY", "TIMED", "Check", "Claim", "Setting", "chosen"]
 
 Setting = Mapping[str, Any]
 """What a training changes relative to its recipe: fields of `TrainConfig`, ``recipe`` if it differs from the study's,
@@ -293,6 +293,9 @@ CLAIMS |= {
     "size-binocular": _with_recipe("binocular", CLAIMS["size"], *PAPER_SIZE),
 }
 """The seventeen claims by their number, then further questions of the field by name."""
+
+AT_PAPER_SIZE = ("size", "size-binocular")
+"""Those that have a page of their own."""
 
 GAINS: Mapping[str, Mapping[str, Mapping[float, tuple[Setting, Setting]]]] = {
     "dropout rate": {"": {p: (each, _PLAIN) for p, each in _RATE.items()}},

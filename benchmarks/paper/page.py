@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
-from benchmarks.paper.claims import CLAIMS, TIMED, Check
+from benchmarks.paper.claims import AT_PAPER_SIZE, CLAIMS, TIMED, Check
 from benchmarks.paper.comparison import (
     ERRORS,
     Kept,
@@ -47,7 +47,7 @@ def claims_table(kept: Kept) -> str:
     rows: list[dict[str, object]] = []
     columns = ["", "claim", "the paper", "verdict", "scenes (seeds)"]
     for name, claim in CLAIMS.items():
-        if not claim.checks:
+        if not claim.checks or name in AT_PAPER_SIZE:
             continue
         scenes = judged(claim, kept)
         known = [end for seeds, end in scenes.values() if seeds > 1]
@@ -96,6 +96,8 @@ def scenes_table(kept: Kept) -> str:
     lines = []
     for scene, rows in kept.scenes.items():
         of = [row for row in rows.rows if row["setting"]["iterations"] == kept.iterations]
+        if not of:
+            continue
         found: dict[str, dict[int, float]] = {}
         for row in of:
             found.setdefault(label(row["setting"]), {})[row["seed"]] = value(row, "test psnr")
@@ -129,7 +131,7 @@ def page(text: str, kept: Kept) -> str:
         elif name:
             body = (gains if what == "gains" else details)(name, of) or "Not yet measured.\n"
         else:
-            found = {key: details(key, of) for key in CLAIMS}
+            found = {key: details(key, of) for key in CLAIMS if key not in AT_PAPER_SIZE}
             headed = [f"## {_heading(key)}\n\n{text}" for key, text in found.items() if text]
             missing = ", ".join(key for key, text in found.items() if not text)
             body = "\n".join(

@@ -16,7 +16,7 @@ from benchmarks.paper.cells import Grid, declared, depths, is_done, renders, row
 from benchmarks.paper.claims import CLAIMS, chosen
 from benchmarks.paper.comparison import Kept, judged
 from benchmarks.paper.rows import Rows, config_of, resolved, value
-from benchmarks.paper.scenes import SCENES, chosen_scenes
+from benchmarks.paper.scenes import PAPER_SIZE, SCENES, chosen_scenes
 from ca_reg.regularizers import REGULARIZERS
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.trained_model import TrainedModel
@@ -29,7 +29,8 @@ from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import View
 from reference_trainer.training.assembly import check
 
-ALL = Grid(CLAIMS, SCENES)
+EVERY = SCENES | PAPER_SIZE
+ALL = Grid(CLAIMS, EVERY)
 """Everything."""
 
 
@@ -53,11 +54,11 @@ def test_every_training_is_declared_once_and_covers_its_claims():
 
 
 def test_every_training_is_one_that_the_trainer_takes():
-    for cell in declared(Grid(CLAIMS, SCENES, seeds=1)):
+    for cell in declared(Grid(CLAIMS, EVERY, seeds=1)):
         config = config_of(cell.setting, cell.seed)
         check(config)
         assert config.iterations == 3_000
-        options = SCENES[cell.scene].options_for(cell.setting, config.loss)
+        options = EVERY[cell.scene].options_for(cell.setting, config.loss)
         needs_depth = cell.setting["recipe"] in ("fsgs", "dngaussian")
         assert (options.depth is not None) == needs_depth
         assert options.views == cell.setting.get("views")
@@ -78,13 +79,15 @@ def test_the_declared_scenes_start_without_their_test_views(data_root):
         views[name] = len(loaded.train), len(loaded.test)
         seen = loaded.points.seen_by or frozenset()
         assert not seen & {view.name for view in loaded.test}
-        assert (loaded.test[0].mask is not None) == (name in ("dtu-scan65", "cape"))
+        assert (loaded.test[0].mask is not None) == (name in ("dtu-scan65", "dtu-scan65-400", "cape"))
     assert views == {
         "synthetic": (3, 3), "fern": (3, 3), "lego": (8, 25), "dtu-scan65": (3, 25), "dtu-scan24": (3, 25),
         "fountain": (3, 2), "herz-jesu": (3, 2), "sceaux": (3, 4), "cape": (3, 8),
+        "fern-504": (3, 3), "lego-400": (8, 25), "dtu-scan65-400": (3, 25), "dtu-scan24-384": (3, 25),
     }  # fmt: skip
     assert widths.pop("synthetic") == 160
-    assert all(252 <= width <= 400 for width in widths.values())
+    assert all(width == int(name.rpartition("-")[2]) for name, width in widths.items() if name in PAPER_SIZE)
+    assert all(252 <= width <= 400 for name, width in widths.items() if name not in PAPER_SIZE)
 
 
 def test_unknown_names_are_refused(tmp_path):
