@@ -55,11 +55,14 @@ class RenderOptions:
             device: where to render.
             trains: whether all loops will be needed: those not compiled yet are then compiled now, with progress.
         """
+        import torch
+
         from reference_trainer.render import describe_engine, use_engine
 
         if self.engine is not None:
             use_engine(self.engine)
-        print(f"Engine: {describe_engine(device)}", flush=True)
+        hint = "; a CUDA card is here: --device cuda uses it" if device == "cpu" and torch.cuda.is_available() else ""
+        print(f"Engine: {describe_engine(device)}{hint}", flush=True)
         if trains and device == "cpu":
             from reference_trainer.runs.warmup import warm_up
 
