@@ -5,6 +5,7 @@ of which gsplat 1.5 itself has in torch as well.
 """
 
 import functools
+import inspect
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -30,7 +31,13 @@ _since_1_5, _until_1_4 = (make_rasterization(_signature, per_axis=per_axis) for 
 
 @functools.wraps(_signature, assigned=())
 def rasterization(*args, **kwargs):
-    """gsplat 1.5: Gaussians below 1/255 are culled by the projection, radii are [C, N, 2] or [nnz, 2]."""
+    """gsplat 1.5: Gaussians below 1/255 are culled by the projection, radii are [C, N, 2] or [nnz, 2].
+
+    Its kernels take a background only for Gaussians that are not packed.
+    """
+    given = inspect.signature(_signature).bind(*args, **kwargs)
+    given.apply_defaults()
+    assert given.arguments["backgrounds"] is None or not given.arguments["packed"]
     images, alphas, info = _since_1_5(*args, **kwargs)
     return images, alphas, info | {"tiles_per_gauss": info["radii"].amin(-1)}
 
