@@ -39,7 +39,8 @@ COMMANDS = [
 QUICK = {
     "run": ["--quick", "--no-open"],
     "train": ["--iterations", "4", "--images", "images"],
-    "compare": ["--iterations", "2", "--images", "images", "--seeds", "1"],  # a process for each run
+    # a process for each run
+    "compare": ["--iterations", "2", "--images", "images", "--seeds", "1", "--strategies", "baseline", "dropout"],
 }
 
 
@@ -141,18 +142,12 @@ def camera_file(scene):
     return json.dumps({"frames": frames})
 
 
-@pytest.fixture(params=["built in", pytest.param("fern", marks=pytest.mark.data)])
-def my_photos(request, tmp_path, monkeypatch):
-    """A folder of three photographs: with cameras, or real ones without."""
+@pytest.fixture
+def my_photos(tmp_path, monkeypatch):
+    """A folder of three photographs with cameras; `test_tutorial.py` has real ones without."""
     folder = tmp_path / "my_photos" / "images"
     folder.mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
-    if request.param == "fern":
-        pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
-        source = request.getfixturevalue("data_root") / "fern" / "images_8"
-        for name in ("image001.png", "image010.png", "image019.png"):
-            shutil.copy(source / name, folder)
-        return tmp_path
     scene = synthetic_scene(width=48, height=36)
     for view in scene.train:
         pixels = (view.image.permute(1, 2, 0) * 255).round().byte().numpy()
@@ -163,11 +158,11 @@ def my_photos(request, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_from_photographs_to_a_page(my_photos, capsys, monkeypatch):
-    """Every command for photographs, one after the other, with few steps; what waits for a browser is left out."""
+    """Every command for photographs, one after the other, with few steps."""
     monkeypatch.setattr(photos, "PRESETS", {"quick": (30, 20_000)})
     for _, *arguments in (command for command in COMMANDS if command[0] == "ca-reg"):
         name = arguments[0]
-        if name == "view" or (name == "poses" and (my_photos / "my_photos/transforms.json").exists()):
+        if name in ("view", "poses"):  # which wait for a browser, and look for cameras
             continue
         if name == "evaluate":  # a model trained without dropout, for `clean` too
             shutil.copy(my_photos / "runs/compare/baseline/seed_0/point_cloud.ply", my_photos)

@@ -59,16 +59,23 @@ def test_a_second_monitor_of_the_same_folder_is_refused_until_the_first_is_close
 
 
 def test_another_process_is_refused_as_well(tmp_path):
-    code = (
-        "import sys, torch; from ca_reg import CAMonitor, CAScore; "
-        "score = CAScore(lambda opacity, view: (opacity[:48].view(3, 4, 4), torch.ones(4, 4))); "
-        "CAMonitor(score, sys.argv[1], views={'test': [None]})"
-    )
+    code = """
+import sys, torch
+from ca_reg import CAMonitor, CAScore
+score = CAScore(lambda opacity, view: (opacity[:48].view(3, 4, 4), torch.ones(4, 4)))
+try:
+    CAMonitor(score, sys.argv[1], views={"test": [None]})
+except BlockingIOError:
+    print("refused", flush=True)
+sys.stdin.read()  # until the other monitor is closed
+CAMonitor(score, sys.argv[1], views={"test": [None]})
+"""
     command = [sys.executable, "-c", code, str(tmp_path)]
-    with make(tmp_path):
-        done = subprocess.run(command, capture_output=True, text=True)
-    assert "BlockingIOError" in done.stderr
-    assert subprocess.run(command, capture_output=True).returncode == 0
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        with make(tmp_path):
+            assert process.stdout.readline() == "refused\n"
+        process.stdin.close()
+        assert process.wait() == 0
 
 
 def test_the_values_are_those_of_the_score(tmp_path):
