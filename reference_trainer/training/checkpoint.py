@@ -32,8 +32,9 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """
     content = io.BytesIO()  # torch.save to a file hides the error of a full disk behind one of its own
     torch.save({"format": _FORMAT, **moved(state, "cpu")}, content)
-    with replacing(path) as place:
-        place.write_bytes(content.getbuffer())
+    # The view ends here: one that a traceback keeps alive crashes Python 3.12.1 when its garbage is collected.
+    with replacing(path) as place, place.open("wb") as file, content.getbuffer() as view:
+        file.write(view)
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
