@@ -1,7 +1,12 @@
 """Tiny scenes and schedules of seconds, for everything that trains."""
 
+from pathlib import Path
+
 import pytest
 
+from ca_reg.neighbors import rms_neighbor_distance
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.ply import save_ply
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
@@ -47,3 +52,13 @@ def short() -> TrainConfig:
     return TrainConfig(
         iterations=11, dropout=0.2, noise=0.3, sh_every=4, densify_from=2, densify_every=4, densify_gradient=2e-3
     )
+
+
+def save_few(path: Path) -> None:
+    """Save a start for `--init` from a tenth of the built-in scene's points.
+
+    What an engine in torch computes grows with the longest list, and on the pretended card every operation costs.
+    """
+    points = synthetic_scene(width=20, height=15).points
+    places, colors = points.positions[::10], points.colors[::10]
+    save_ply(Gaussians.from_points(places, colors, rms_neighbor_distance(places), sh_degree=0, opacity=0.5), path)

@@ -3,14 +3,10 @@
 import json
 
 import pytest
+from tiny import save_few
 
-from ca_reg.neighbors import rms_neighbor_distance
 from reference_trainer.cli import main
-from reference_trainer.model.gaussians import Gaussians
-from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import RESULTS
-from reference_trainer.scenes import load_scene
-from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.trainer import Trainer
 
 TRAIN = (
@@ -22,11 +18,7 @@ TRAIN = (
 @pytest.mark.slow
 @pytest.mark.parametrize("options", ["--noise 0.4 --monitor-every 2", "--analytic --monitor-every 0"])
 def test_commands(card, tmp_path, options):
-    """From a tenth of the points: the card counts every operation, and the longest list decides how many there are."""
-    points = load_scene(SceneOptions(downscale=8.0)).points
-    places, colors = points.positions[::10], points.colors[::10]
-    start = Gaussians.from_points(places, colors, rms_neighbor_distance(places), sh_degree=0, opacity=0.5)
-    save_ply(start, tmp_path / "start.ply")
+    save_few(tmp_path / "start.ply")
     main([*TRAIN.split(), *options.split(), "--init", str(tmp_path / "start.ply"), "--out", str(tmp_path)])
     assert json.loads((tmp_path / RESULTS).read_text())["mean"]["test"]["psnr"] > 15
     main(["render", str(tmp_path), "--device", "card"])

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 from subprocesses import PYTHONPATH, subprocess_environment
+from tiny import save_few
 
 pytestmark = pytest.mark.slow  # each starts interpreters that import torch
 
@@ -185,15 +186,16 @@ sys.meta_path[sys.meta_path.index(importlib.machinery.PathFinder)] = Hiding
 
 
 def test_without_numba_everything_is_there(tmp_path):
+    save_few(tmp_path / "start.ply")
     out = run(
         HIDE
         + f"""
 from reference_trainer.cli import main
-out = {str(tmp_path / "run")!r}
-main(["train", "--downscale", "16", "--iterations", "3", "--monitor-every", "0", "--dropout", "0.2", "--out", out])
+out, start = {str(tmp_path / "run")!r}, {str(tmp_path / "start.ply")!r}
+train = ["train", "--downscale", "16", "--init", start, "--monitor-every", "0", "--dropout", "0.2"]
+main([*train, "--iterations", "3", "--out", out])
 main(["evaluate", out])
-main(["train", "--downscale", "16", "--iterations", "2", "--monitor-every", "0", "--dropout", "0.2", "--analytic",
-      "--out", out + "2"])
+main([*train, "--iterations", "2", "--analytic", "--out", out + "2"])
 main(["warmup"])
 assert "numba" not in sys.modules
 try:
