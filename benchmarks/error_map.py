@@ -1,9 +1,10 @@
 """How well an error map knows the error: leave one scene out, against its rivals, on the same models.
 
-    python -m benchmarks.error_map SCENE-SETTING-SEED=RUN ... [--keep FOLDER] [--rivals] [--weights]
+    python -m benchmarks.error_map SCENE-SETTING-SEED=RUN ... [--keep FOLDER] [--rivals] [--weights] [--rows FILE]
     python -m benchmarks.error_map NAME=RUN ... --picture docs/images/error_map.webp
 
-RUN is the folder of a finished training. Prints the tables of ``benchmarks/error_map.md``, which has the protocol;
+RUN is the folder of a finished training; RUN,RUN,... that of the model and those of other seeds, whose spread is a
+rival. Prints the tables of ``benchmarks/error_map.md``, which has the protocol, and writes them as JSON to ``--rows``;
 ``--weights`` prints those of `ca_reg.error_maps.FORMS`, fitted on all scenes. What is measured of a model is kept in
 the folder, and not measured again.
 """
@@ -11,7 +12,9 @@ the folder, and not measured again.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
+import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -142,7 +145,9 @@ class Fisher:
         return total.sqrt()
 
 
-def look(model: TrainedModel, scene: Scene, *, rivals: bool) -> tuple[list[Seen], dict[str, float]]:
+def look(
+    model: TrainedModel, scene: Scene, ensemble: Sequence[TrainedModel] = (), *, rivals: bool
+) -> tuple[list[Seen], dict[str, float]]:
     """Measure a model at its test views; return also seconds of the processor, per view where a view is measured."""
     views = scene.test[:: max(1, -(-len(scene.test) // VIEWS))]
     spent: dict[str, float] = {}
@@ -179,6 +184,10 @@ def look(model: TrainedModel, scene: Scene, *, rivals: bool) -> tuple[list[Seen]
             "1 - alpha": features["empty"],
             "random": torch.rand(out.alpha.shape, generator=torch.Generator().manual_seed(number)),
         }  # fmt: skip
+        images = torch.stack([out.image, *(other.test_rendering(view).image for other in ensemble)]).clamp(0, 1)
+        for count in (3, 5):
+            if count <= len(images):
+                others[f"ensemble of {count}"] = images[:count].double().var(0).mean(0).sqrt()
         if fisher is not None:
             with torch.no_grad():
                 splats = model.splats(model.gaussians.opacities, view)
@@ -270,9 +279,14 @@ def scene_of(name: str) -> str:
     return name.rsplit("-", 2)[0]
 
 
+def setting_of(name: str) -> str:
+    """Return the setting of SCENE-SETTING-SEED."""
+    return name.rsplit("-", 2)[1]
+
+
 def held_out(models: Mapping[str, list[Seen]], terms: Sequence[str], *, kinds: bool = False) -> dict[str, Any]:
     """Fit for every scene on the others; with ``kinds``, models with and without dropout apart."""
-    plain = {name: name.rsplit("-", 2)[1] == "plain" for name in models}
+    plain = {name: setting_of(name) in ("plain", "binocular") for name in models}
     known: dict[Any, Any] = {}
     for name in models:
         key = scene_of(name), plain[name] if kinds else None
@@ -287,12 +301,54 @@ def held_out(models: Mapping[str, list[Seen]], terms: Sequence[str], *, kinds: b
     return {name: known[scene_of(name), plain[name] if kinds else None] for name in models}
 
 
-def row(
-    label: str, models: Mapping[str, list[Seen]], of: Callable[[str, Seen], np.ndarray], score: Callable[..., float]
+def figure_of(
+    models: Mapping[str, list[Seen]], of: Callable[[str, Seen], np.ndarray], score: Callable[..., float]
 ) -> list[float]:
-    """Print and return a figure of every model, mean over its views, and their mean over models."""
-    found = [float(np.mean([score(of(name, v), v.error) for v in views])) for name, views in models.items()]
-    print(f"| {label} | " + " | ".join(f"{x:.3f}" for x in found) + f" | {np.mean(found):.3f} |", flush=True)
+    """Return a figure of every model, mean over its views; nan where the prediction is not known."""
+
+    def mean(name: str, views: Sequence[Seen]) -> float:
+        with contextlib.suppress(KeyError):
+            return float(np.mean([score(of(name, v), v.error) for v in views]))
+        return math.nan
+
+    return [mean(name, views) for name, views in models.items()]
+
+
+def say(title: str, names: Sequence[str], columns: Mapping[str, Sequence[float]]) -> None:
+    """Print a table, one row per name and one of their means."""
+    print(f"\n| {title} | " + " | ".join(columns) + " |\n|:---" + "|---:" * len(columns) + "|")
+    table = np.array([[*column] for column in columns.values()])
+    for name, cells in zip([*names, "mean"], np.column_stack([table, np.nanmean(table, 1)]).T, strict=True):
+        print(f"| {name} | " + " | ".join("-" if math.isnan(x) else f"{x:.3f}" for x in cells) + " |", flush=True)
+
+
+class Quality(NamedTuple):
+    """Of one view: mean absolute error and PSNR, measured and expected."""
+
+    error: float
+    expected_error: float
+    psnr: float
+    expected_psnr: float
+
+    @classmethod
+    def of(cls, view: Seen, by: Fitted) -> Quality:
+        """Measure a view."""
+        found = by.expect(view)
+        psnr, expected = (-10 * math.log10(x) for x in (view.squared.mean(), by.peaked * (found**2).mean()))
+        return cls(float(view.error.mean()), float(found.mean()), psnr, expected)
+
+
+def ranked(views: Mapping[str, Sequence[Quality]], first: str, second: str) -> dict[str, tuple[float, float]]:
+    """Return by how many dB models of a second setting are better than those of a first: measured, and as expected.
+
+    By scene and seed, where both exist; mean over the views.
+    """
+    found = {}
+    for name, own in views.items():
+        if setting_of(name) == first and (other := views.get(f"{scene_of(name)}-{second}-{name.rsplit('-', 1)[1]}")):
+            both = [np.mean([getattr(v, f) for v in other]) - np.mean([getattr(v, f) for v in own])
+                    for f in ("psnr", "expected_psnr")]  # fmt: skip
+            found[f"{scene_of(name)}, seed {name.rsplit('-', 1)[1]}"] = (float(both[0]), float(both[1]))
     return found
 
 
@@ -325,6 +381,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, default=Path("error_map"))
     parser.add_argument("--rivals", action="store_true")
     parser.add_argument("--weights", action="store_true")
+    parser.add_argument("--rows", type=Path)
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     if options.picture:
@@ -337,8 +394,9 @@ def main() -> None:
     for name, run in (each.split("=") for each in sorted(options.runs)):
         file = options.keep / f"{name}{'-rivals' if options.rivals else ''}.pt"
         if not file.exists():
-            model, scene = load_run_model(Path(run))
-            found, spent = look(model, scene, rivals=options.rivals)
+            model, scene = load_run_model(Path(run.split(",")[0]))
+            ensemble = [load_run_model(Path(other))[0] for other in run.split(",")[1:]]
+            found, spent = look(model, scene, ensemble, rivals=options.rivals)
             torch.save(([tuple(v) for v in found], spent), file)
             print("measured", name, flush=True)
         found, times[name] = torch.load(file, weights_only=False)
@@ -349,61 +407,82 @@ def main() -> None:
             found = fitted([v for views in models.values() for v in views], terms)
             print({t: round(w, 4) for t, w in found.weights.items()}, found[1:])
         return
-    print("| AUSE-MAE | " + " | ".join(models) + " | mean |\n|:---" + "|---:" * (len(models) + 1) + "|")
-    for rival in next(iter(models.values()))[0].rivals:
-        row(rival, models, lambda _, v, r=rival: v.rivals[r], ause)
+    columns = {}
     best = {}
-    shapes = [("all features", forms[0], False), ("all features, kinds apart", forms[0], True)]
-    names = ("model alone", "moments", "image and alpha")
+    shapes = [("error map", forms[0], False), ("kinds apart", forms[0], True)]
+    names = ("model alone", "image, alpha and deviation", "image and alpha")
     for label, terms, kinds in [*shapes, *((name, form, False) for name, form in zip(names, forms[1:], strict=True))]:
         best[label] = held_out(models, terms, kinds=kinds)
-        row(label, models, lambda n, v, b=best[label]: b[n].expect(v), ause)
-    chosen = best["all features"]
+        columns[label] = figure_of(models, lambda n, v, b=best[label]: b[n].expect(v), ause)
+    ships = Fitted(dict(form_of.FORMS[0].weights), form_of.TRANSFER, form_of.FORMS[0].peaked, form_of.FORMS[0].spread)
+    columns["weights as shipped"] = figure_of(models, lambda _, v: ships.expect(v), ause)
+    for rival in dict.fromkeys(r for views in models.values() for r in views[0].rivals):
+        columns[rival] = figure_of(models, lambda _, v, r=rival: v.rivals[r], ause)
+    say("AUSE-MAE", [*models], columns)
+    chosen = best["error map"]
     of = lambda n, v: chosen[n].expect(v)  # noqa: E731
+    without = {}
     for term in forms[0]:
         less = held_out(models, [t for t in forms[0] if t != term])
-        row(f"without {term}", models, lambda n, v, b=less: b[n].expect(v), ause)
-    print("\nothers:")
-    row("AUSE-RMSE", models, of, lambda u, e: ause(u, e, root=True))
-    row("AUSE-RMSE, deviation", models, lambda _, v: v.rivals["deviation"], lambda u, e: ause(u, e, root=True))
-    row("Spearman", models, of, lambda u, e: float(spearmanr(u, e).statistic))
-    row(
-        "Spearman, deviation", models, lambda _, v: v.rivals["deviation"], lambda u, e: float(spearmanr(u, e).statistic)
-    )
-    row("expected over measured mean error", models, of, lambda u, e: float(u.mean() / e.mean()))
-    row(
-        "share of errors below 2.303 expected (0.9 if exponential)",
-        models,
-        of,
-        lambda u, e: float((e < math.log(10) * u).mean()),
-    )
-    row("negative log likelihood, exponential", models, of, lambda u, e: float((np.log(u) + e / u).mean()))
-    row(
-        "the same, of one number, the view's true mean",
-        models,
-        lambda _, v: np.full_like(v.error, v.error.mean()),
-        lambda u, e: float((np.log(u) + e / u).mean()),
-    )
+        without[term] = figure_of(models, lambda n, v, b=less: b[n].expect(v), ause)
+    say("AUSE-MAE without", [*models], without)
+    rank = lambda u, e: float(spearmanr(u, e).statistic)  # noqa: E731
+    root = lambda u, e: ause(u, e, root=True)  # noqa: E731
+    likely = lambda u, e: float((np.log(u) + e / u).mean())  # noqa: E731
+    deviation = lambda _, v: v.rivals["deviation"]  # noqa: E731
+    others = {
+        "AUSE-RMSE": figure_of(models, of, root),
+        "AUSE-RMSE, deviation": figure_of(models, deviation, root),
+        "Spearman": figure_of(models, of, rank),
+        "Spearman, deviation": figure_of(models, deviation, rank),
+        "expected over measured mean error": figure_of(models, of, lambda u, e: float(u.mean() / e.mean())),
+        # 90 % if exponential
+        "errors below 2.303 expected": figure_of(models, of, lambda u, e: float((e < math.log(10) * u).mean())),
+        "negative log likelihood": figure_of(models, of, likely),
+        "of the view's true mean": figure_of(models, lambda _, v: np.full_like(v.error, v.error.mean()), likely),
+    }
+    say("others", [*models], others)
     deciles = np.zeros((2, 10))
-    errors, off = [], []
     for name, views in models.items():
         for v in views:
             u = of(name, v)
             for i, part in enumerate(np.array_split(np.argsort(u), 10)):
                 deciles[:, i] += u[part].mean(), v.error[part].mean()
-            errors.append(u.mean() / v.error.mean())
-            off.append(-10 * math.log10(chosen[name].peaked * (u**2).mean()) + 10 * math.log10(v.squared.mean()))
-    count = sum(map(len, models.values()))
-    print(
-        "deciles, expected:",
-        *(f"{x:.3f}" for x in deciles[0] / count),
-        "\ndeciles, measured:",
-        *(f"{x:.3f}" for x in deciles[1] / count),
-    )
-    ratio, shift = np.array(errors), np.array(off)
-    close, rms = np.mean((ratio > 0.8) & (ratio < 1.25)), np.sqrt((shift**2).mean())
-    print(f"{count} views, mean error within 20 %: {close:.0%}; PSNR off by {shift.mean():+.2f} dB, rms {rms:.2f}")
-    print(f"in the interval of 80 %: {np.mean(np.abs(shift) < 1.2816 * form_of.FORMS[0].spread):.0%}")
+    deciles /= sum(map(len, models.values()))
+    print("\ndeciles, expected:", *(f"{x:.3f}" for x in deciles[0]))
+    print("deciles, measured:", *(f"{x:.3f}" for x in deciles[1]))
+    quality = {name: [Quality.of(v, chosen[name]) for v in views] for name, views in models.items()}
+    for setting in ["", *dict.fromkeys(map(setting_of, models))]:
+        each = np.array([v for name, views in quality.items() for v in views if setting in ("", setting_of(name))])
+        ratio, shift = each[:, 1] / each[:, 0], each[:, 3] - each[:, 2]
+        close, wider = ((ratio > 1 / x) & (ratio < x) for x in (1.25, 1.5))
+        inside = np.abs(shift) < 1.2816 * form_of.FORMS[0].spread
+        print(
+            f"{setting or 'all'}, {len(each)} views: mean error within 20 % {close.mean():.0%}, a factor of 1.5 "
+            f"{wider.mean():.0%}; PSNR off by {shift.mean():+.2f} dB, rms {np.sqrt((shift**2).mean()):.2f}, in the "
+            f"interval of 80 % {inside.mean():.0%}; rank correlation of mean errors "
+            f"{spearmanr(each[:, 0], each[:, 1]).statistic:.2f}"
+        )
+    pairs = {}
+    settings = [*dict.fromkeys(map(setting_of, models))]
+    for i, first in enumerate(settings):
+        for second in settings[i + 1 :]:
+            if by_scene := ranked(quality, first, second):
+                pairs[f"{second} over {first}"] = by_scene
+                right = [measured * expected > 0 for measured, expected in by_scene.values()]
+                print(f"\n{second} over {first}, dB: the sign is right in {sum(right)} of {len(right)}")
+                print(*(f"{who}: {m:+.2f}, expected {e:+.2f}" for who, (m, e) in by_scene.items()), sep="; ")
+    print()
+    if options.rows:
+        figures = {**columns, **{f"without {term}": each for term, each in without.items()}, **others}
+        rows: dict[str, Any] = {
+            name: {label: round(each[i], 4) for label, each in figures.items() if not math.isnan(each[i])}
+            | {"views": [[round(x, 4) for x in v] for v in quality[name]]}
+            for i, name in enumerate(models)
+        }
+        found = {**rows, "pairs": pairs, "deciles": deciles.round(4).tolist()}
+        lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(each)}" for name, each in found.items())
+        options.rows.write_text(f"{{\n{lines}\n}}\n")
     for name, spent in times.items():
         print(name, {k: round(v, 3) for k, v in spent.items()})
 

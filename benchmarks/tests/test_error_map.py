@@ -2,8 +2,13 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-from benchmarks.error_map import Seen, ause, fitted, predict
+from benchmarks.clean_by_error import error_shares
+from benchmarks.error_map import Quality, Seen, ause, fitted, predict, ranked
+from reference_trainer.evaluation.shares import blend_weights
+from reference_trainer.evaluation.trained_model import TrainedModel
+from reference_trainer.model.gaussians import Gaussians
 
 
 def by_loop(predicted: np.ndarray, error: np.ndarray) -> float:
@@ -52,3 +57,29 @@ def test_a_fit_finds_the_weights_and_the_unit_of_planted_errors():
     squares = predict(views[0], truth) ** 2
     assert found.peaked == pytest.approx(4, rel=0.15)
     assert math.isfinite(squares.mean())
+
+
+def test_models_are_ranked_within_a_scene_and_a_seed():
+    def of(psnr: float, expected: float) -> list[Quality]:
+        return [Quality(0.1, 0.1, psnr - 1, expected), Quality(0.1, 0.1, psnr + 1, expected + 2)]
+
+    views = {
+        "dtu-scan24-plain-0": of(20, 25), "dtu-scan24-dropout-0": of(22, 24), "dtu-scan24-dropout-1": of(30, 30),
+        "fern-plain-0": of(21, 20), "fern-dropout-0": of(22.5, 21), "lego-plain-0": of(25, 25),
+    }  # fmt: skip
+    found = ranked(views, "plain", "dropout")
+    assert found == {"dtu-scan24, seed 0": (2.0, -1.0), "fern, seed 0": (1.5, 1.0)}
+
+
+def test_errors_are_handed_out_by_weight_in_the_render(tiny_scene):
+    """The same everywhere: the blend weights times the error. In one pixel: what the Gaussians weigh there."""
+    points = tiny_scene.points
+    sizes = torch.full((len(points.colors),), 0.2)
+    gaussians = Gaussians.from_points(points.positions, points.colors, sizes, opacity=0.6, sh_degree=0)
+    model, views = TrainedModel(gaussians, tiny_scene.background, "dropout(0.2)"), tiny_scene.train[:2]
+    even = [(view, torch.full(view.image.shape[1:], 0.3)) for view in views]
+    torch.testing.assert_close(error_shares(model, even), 0.3 * blend_weights(model, views), rtol=1e-5, atol=1e-6)
+    error = torch.zeros(views[0].image.shape[1:])
+    error[8, 10] = 2.0
+    alpha = model.test_rendering(views[0]).alpha[8, 10]
+    assert error_shares(model, [(views[0], error)]).sum().item() == pytest.approx(2 * alpha.item(), abs=1e-5)
