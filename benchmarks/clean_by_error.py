@@ -94,7 +94,8 @@ def main() -> None:
         if name not in rows:
             found = compared(Path(run), options.fractions, options.steps)
             rows[name] = {what: [*(round(x, 3) for x in values)] for what, values in found.items()}
-            options.rows.write_text(json.dumps(dict(sorted(rows.items())), indent=1) + "\n")
+            lines = ",\n".join(f"{json.dumps(n)}: {json.dumps(rows[n])}" for n in sorted(rows))
+            options.rows.write_text(f"{{\n{lines}\n}}\n")
             print("measured", name, rows[name], flush=True)
     kinds = [*dict.fromkeys(setting_of(name) for name in rows)]
     print("\n| dB over nothing removed, after the steps | " + " | ".join([*rows, *kinds]) + " |")

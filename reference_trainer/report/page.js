@@ -8,7 +8,8 @@ const TERMS = {
     + "less is better if the quality is no worse.",
   "CA (": "Co-adaptation estimated from a few random renders, as in the paper. Noisy; compare models by the exact CA.",
   "expected PSNR": "What the model and the training photographs let expect of a view that has no photograph; so not of the "
-    + "training views. Below it, or beside it as from and to, where the measured PSNR of a view lies in 80 % of the cases.",
+    + "training views. Below it, or beside it as from and to, where the measured PSNR of a view lies in 80 % of the cases. "
+    + "It does not rank models: one trained without dropout expects too much of itself.",
   "PSNR": "Peak signal-to-noise ratio against the photograph, in dB. Higher is better; 1 dB is a fifth less squared error.",
   "SSIM": "Structural similarity to the photograph, at most 1. Higher is better.",
   "LPIPS": "Perceptual distance to the photograph, by a neural network. Lower is better.",
