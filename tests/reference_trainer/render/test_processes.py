@@ -44,9 +44,14 @@ def picture(*_):
 
 
 def test_forks_after_the_first_use():
+    """And no thread is left at the end: what still waits for the GIL then is unwound, which once aborted a process."""
     pytest.importorskip("numba")
     assert run(
-        DRAW
+        """
+import atexit, threading
+atexit.register(lambda: print(*(thread.name for thread in threading.enumerate())))  # first in, last out
+"""
+        + DRAW
         + """
 expected = picture()
 for _ in range(3):
@@ -65,9 +70,9 @@ for _ in range(3):
 with multiprocessing.get_context("fork").Pool(2) as pool:
     assert pool.map(picture, range(4)) == [expected] * 4
 assert picture() == expected
-print("done")
+assert threading.active_count() > 1
 """
-    ) == "done\n"  # fmt: skip
+    ) == "MainThread\n"  # fmt: skip
 
 
 def test_spawned_processes(tmp_path):
@@ -100,23 +105,6 @@ assert answers == [Value(expected)] * 4, answers
 print("done")
 """
     )
-
-
-def test_no_thread_is_left_when_the_interpreter_ends():
-    """One that still waits for the GIL by then is unwound wherever it stands, which once aborted a process."""
-    pytest.importorskip("numba")
-    script = (
-        """
-import atexit, threading
-atexit.register(lambda: print(*(thread.name for thread in threading.enumerate())))  # first in, last out
-"""
-        + DRAW
-        + """
-picture()
-assert threading.active_count() > 1
-"""
-    )
-    assert run(script) == "MainThread\n"
 
 
 def test_a_thread_that_outlives_the_main_one_still_draws():
