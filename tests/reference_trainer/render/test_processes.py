@@ -1,4 +1,7 @@
-"""The loops in other processes: forked, spawned, Ray's, without numba, and at the end of the interpreter."""
+"""The loops in other processes: forked, spawned, without numba, and at the end of the interpreter.
+
+In those of Ray: `tests/reference_trainer/runs/test_compare.py`.
+"""
 
 import subprocess
 import sys
@@ -88,23 +91,6 @@ if __name__ == "__main__":
 """
     )
     subprocess.run([sys.executable, str(script)], env=subprocess_environment(), check=True, timeout=300)
-
-
-def test_ray_workers_draw_with_the_chosen_engine():
-    pytest.importorskip("numba")
-    pytest.importorskip("ray")
-    assert "done" in run(
-        DRAW
-        + """
-from reference_trainer.runs.executors import Task, Value
-from reference_trainer.runs.executors import RayCluster
-from reference_trainer.runs.executors import run_all
-expected = picture()
-answers = [answer for _, answer in run_all(RayCluster(2), [Task(str(i), picture, ()) for i in range(4)])]
-assert answers == [Value(expected)] * 4, answers
-print("done")
-"""
-    )
 
 
 def test_a_thread_that_outlives_the_main_one_still_draws():
