@@ -20,7 +20,9 @@ from reference_trainer.training.plan import make_plan
 
 pytest.importorskip("numba")
 # Where compiled loops are kept is decided here: in the tests' own folders each process would compile them again.
-import reference_trainer.compiled.stereo  # noqa: F401
+from reference_trainer.compiled import stereo  # noqa: F401
+from reference_trainer.render.numba import binning, compositing, moments, projection  # noqa: F401
+from reference_trainer.training.losses import _ssim_numba  # noqa: F401
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""Every kernel compiled ahead of time for cards that differ most, and nothing spilled.
+"""The kernels compiled ahead of time for cards that differ most, and nothing spilled.
 
 They are NVIDIA's oldest and newest, and AMD's two widths of a warp; `python -m benchmarks.gpu ahead` takes all cards
 that the installed Triton knows. In processes of their own: a kernel that was made for Triton's interpreter cannot be
@@ -33,7 +33,9 @@ def compiled(code):
 @pytest.mark.slow
 @pytest.mark.parametrize(("target", "registers"), [("sm_75", 128), ("sm_120", 128), ("gfx90a", 256), ("gfx1201", 256)])
 def test_nothing_spills(target, registers):
-    rows = compiled(f"[dataclasses.asdict(compile_ahead(k, {target!r})) for k in KERNELS]")
+    """The projections of one and two bands lie between those of none and of three, and took a quarter of the time."""
+    some = "[k for k in KERNELS if not k.label.endswith(('degree 1', 'degree 2'))]"
+    rows = compiled(f"[dataclasses.asdict(compile_ahead(k, {target!r})) for k in {some}]")
     assert rows
     assert [row["kernel"] for row in rows if row["spills"]] == []
     assert max(row["registers"] for row in rows) <= registers
