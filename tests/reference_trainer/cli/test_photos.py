@@ -179,6 +179,7 @@ def test_nothing_of_somebody_else_is_overwritten(garden, tmp_path, capsys, name,
 def test_what_cannot_work_is_refused_at_once(garden, capsys, monkeypatch):
     (garden.parent / "one").mkdir()
     shutil.copy(garden / "train_0.png", garden.parent / "one")
+    monkeypatch.setattr(photos, "find_spec", lambda name: name)
     assert "holds 1 photograph that" in refused(["run", "one"], capsys)
     with monkeypatch.context() as patched:
         patched.setattr(photos, "find_spec", lambda name: None)
