@@ -47,9 +47,9 @@ def test_one_of_each_kind_is_a_class_in_a_file_of_the_user(kind, parts, capsys):
 
 @pytest.mark.slow
 def test_a_regularizer_of_a_user_is_known_to_every_command(parts, capsys):
-    """`compare` in processes of its own, `evaluate` of the run and of its PLY, `bake`."""
+    """`compare` in a process of its own, `evaluate` of the run and of its PLY, `bake`."""
     expression = ADDED["regularizer"]
-    main(["compare", "--out", "c", *TRAIN[2:-1], "--strategies", "baseline", expression, "--seeds", "1"])
+    main(["compare", "--out", "c", *TRAIN[2:-1], "--strategies", expression, "--seeds", "1"])
     (run,) = (parts / "c").glob("my_module*/seed_0")
     main(["evaluate", str(run), "--samples", "2", "--out", "again", "--trust", "my_module"])
     again, before = (json.loads((parts / p).read_text()) for p in ("again/evaluation.json", run / "results.json"))
