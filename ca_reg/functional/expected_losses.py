@@ -18,7 +18,7 @@ from ca_reg._check import check_finite, check_tensor
 __all__ = ["expected_absolute_error", "expected_squared_error"]
 
 # Standard deviation of what rounding to 8 bits adds to a photograph: uniform over one of 255 steps.
-_ROUNDING = 1.0 / (255.0 * math.sqrt(12.0))
+ROUNDING = 1.0 / (255.0 * math.sqrt(12.0))
 
 # Beyond this erf(x) rounds to 1 and exp(-x^2) is negligible; further out it is subnormal, which is slow to compute.
 _FAR = 9.0
@@ -41,7 +41,7 @@ def expected_squared_error(mean: Tensor, variance: Tensor, target: Tensor) -> Te
     return (mean - target).square() + variance
 
 
-def expected_absolute_error(mean: Tensor, variance: Tensor, target: Tensor, *, min_std: float = _ROUNDING) -> Tensor:
+def expected_absolute_error(mean: Tensor, variance: Tensor, target: Tensor, *, min_std: float = ROUNDING) -> Tensor:
     """Return ``E |x - t|`` for a normal ``x``, pixel by pixel: the mean of the folded normal distribution.
 
     With ``d = mean - t``, ``s^2 = variance + min_std^2``, and phi the density of the standard normal distribution,

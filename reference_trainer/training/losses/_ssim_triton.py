@@ -15,7 +15,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ca_reg.functional.expected_losses import _ROUNDING
+from ca_reg.functional.expected_losses import ROUNDING
 from reference_trainer.render.triton.tiles import launch, store3
 from reference_trainer.training.losses._ssim_constants import C1, C2, WEIGHTS
 
@@ -24,7 +24,7 @@ __all__ = ["photometric_loss", "ssim_map"]
 _CENTER = tl.constexpr(WEIGHTS[0])
 _RATIO = tl.constexpr(WEIGHTS[1] / WEIGHTS[0])  # a Gaussian's weight at k pixels is _CENTER _RATIO^(k^2)
 _C1, _C2 = tl.constexpr(C1), tl.constexpr(C2)
-_FLOOR = tl.constexpr(_ROUNDING**2)  # of the variance, as in `expected_absolute_error`
+_FLOOR = tl.constexpr(ROUNDING**2)  # of the variance, as in `expected_absolute_error`
 _ROOT_PI = tl.constexpr(1 / math.sqrt(math.pi))
 _WIDE, _HIGH, _WARPS = 32, 16, 8  # of a program: a warp reads rows of 32 pixels, a lane holds two
 
