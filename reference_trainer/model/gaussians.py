@@ -141,8 +141,8 @@ class Gaussians:
         """Return Gaussians whose tensors are ``function(tensor)``."""
         return Gaussians.from_named({name: function(tensor) for name, tensor in self.named()})
 
-    def __getitem__(self, index: Tensor) -> Gaussians:
-        places = positions(index)
+    def __getitem__(self, index: Tensor | slice) -> Gaussians:
+        places = index if isinstance(index, slice) else positions(index)
         return self.map(lambda x: x[places])
 
     def to(self, device: torch.device | str) -> Gaussians:
