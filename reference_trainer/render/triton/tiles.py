@@ -96,7 +96,9 @@ def fill_table(
     for j in tl.static_range(3):
         tl.store(row + 2 + j, tl.load(factors + 3 * i + j, mask=real), mask=real)
         tl.store(row + 6 + j, tl.load(colors + 3 * i + j, mask=real), mask=real)
-    tl.store(row + 5, tl.log2(tl.load(opacities + i, mask=real, other=1.0)), mask=real)
+    # Far below `FAINT`, but not 0, which has no logarithm.
+    opacity = tl.maximum(tl.load(opacities + i, mask=real, other=1.0), 1e-30)
+    tl.store(row + 5, tl.log2(opacity), mask=real)
     for j in tl.static_range(MORE):
         tl.store(row + 9 + j, tl.load(more + MORE * i + j, mask=real), mask=real)
 
