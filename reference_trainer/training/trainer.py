@@ -46,7 +46,6 @@ class Trainer:
     Attributes:
         step: the number of steps taken.
         seconds: wall-clock time that they took.
-        mse: mean squared error of the first model's (regularized) render in the last step; nan before the first.
         processor_seconds: CPU time that all threads spent on them: the fairer figure on a busy machine.
         loss: of the last step, of all models together; nan before the first.
         renderer: what draws all but moments.
