@@ -92,8 +92,8 @@ class Findings:
             (normalize(gaussians.quaternions, dim=1), 1 / 256),
             (self.opacities.cpu()[order][:, None], 1 / 512),
             (heat, 1 / 255),
-            (gaussians.sh[:, 0], 1 / 256),
-            (gaussians.sh[:, 1 : (degree + 1) ** 2].flatten(1), 1 / 40),  # an error of 2 gray levels
+            (gaussians.sh[:, 0], 1 / 128),  # a quarter of a gray level
+            (gaussians.sh[:, 1 : (degree + 1) ** 2].flatten(1), 1 / 36),  # an error of 2 gray levels
         ]
         return {
             "label": self.label,

@@ -22,11 +22,11 @@ def image_uri(image: Tensor) -> str:
 
 
 def heat_uri(image: Tensor) -> str:
-    """Return a heat map (3, H, W) as the data URI of a WebP without loss, of 64 of its colors.
+    """Return a heat map (3, H, W) as the data URI of a WebP without loss, of 48 of its colors.
 
     A photograph's compression blurs colors, which in a heat map are the values.
     """
-    return _uri(as_pillow(image).quantize(64, dither=0).convert("RGB"), "webp", lossless=True, method=6)
+    return _uri(as_pillow(image).quantize(48, dither=0).convert("RGB"), "webp", lossless=True, method=6)
 
 
 def _uri(picture: Any, kind: str, **options: Any) -> str:

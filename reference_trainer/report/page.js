@@ -88,7 +88,6 @@ for (const [label, markdown] of Object.entries(data.perView))
   $("each").append(make("h3", {}, label), table(markdown, "", `views of ${label}`));
 if (data.curves.length) addCharts();
 else $("dynamics").append(make("p", { className: "quiet" }, "Nothing was measured while the runs were trained."));
-addEventListener("beforeprint", () => document.querySelectorAll("details").forEach(part => { part.open = true; }));
 
 // The views: two pictures upon each other, the right one shown to the right of the wipe, or both in turn.
 const KINDS = { photograph: "photograph", render: "render", error: "error", "expected error": "expected error", "co-adaptation": "CA map" };
@@ -140,6 +139,17 @@ for (const [view, kinds] of [...data.views.map(view => [view]), ...data.unseen.m
   });
   $(kinds ? "worst" : "views").append(make("div", { className: "side" }, ...figures));
 }
+// Paper cannot be wiped: there the pictures of a view stand beside each other.
+addEventListener("beforeprint", () => {
+  document.querySelectorAll("details").forEach(part => { part.open = true; });
+  for (const { view, run, kinds, box } of stacks) {
+    const pictures = { photograph: view.photograph, ...view.pictures[run] };
+    const shown = Object.keys(KINDS).filter(kind => pictures[kind] && !kinds).map(kind =>
+      make("span", {}, make("img", { src: pictures[kind], alt: "" }), KINDS[kind]));
+    if (shown.length) box.after(make("div", { className: "sheet" }, ...shown));
+  }
+});
+addEventListener("afterprint", () => document.querySelectorAll(".sheet").forEach(sheet => sheet.remove()));
 for (const id of ["left", "right", "wipe"]) $(id).oninput = refreshAll;
 $("wide").oninput = () => { $("wipe").value = $("wide").value; refreshAll(); };
 $("flicker").oninput = () => {

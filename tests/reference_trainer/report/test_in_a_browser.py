@@ -167,6 +167,29 @@ def test_any_two_pictures_are_wiped_flickered_and_enlarged(turned, opened):
 
 @pytest.mark.slow
 @needs_browser
+def test_on_paper_all_pictures_of_a_view_stand_beside_each_other(turned, opened):
+    data = Parsed(turned[1]).data
+    kinds = "photograph", "render", "error", "expected error", "co-adaptation"
+    expected = [
+        [source for kind in kinds if (source := ({"photograph": view["photograph"]} | pictures).get(kind))]
+        for view in data["views"]
+        for pictures in view["pictures"]
+    ]
+    assert len(expected[0]) >= 4
+    opened("Emulation.setEmulatedMedia", media="print")
+    sheets = "[...document.querySelectorAll('#views .sheet')].map(sheet => [...sheet.querySelectorAll('img')]"
+    on_paper = opened.run(f"dispatchEvent(new Event('beforeprint')), {sheets}.map(image => image.src))")
+    assert on_paper == expected
+    assert opened.run(f"{sheets}.every(image => image.clientWidth > 50)).every(Boolean)")
+    assert opened.run("stacks.filter(({ box }) => box.clientWidth).every(({ kinds }) => kinds)")  # none that is wiped
+    opened.run("dispatchEvent(new Event('afterprint'))")
+    opened("Emulation.setEmulatedMedia", media="")
+    assert opened.run("document.querySelectorAll('.sheet').length") == 0
+    assert opened.run("stacks.every(({ box }) => box.clientWidth)")
+
+
+@pytest.mark.slow
+@needs_browser
 def test_the_models_move_by_keys_and_along_the_flight_and_are_reset(turned, opened):
     flight, state = Parsed(turned[1]).data["flight"], "JSON.stringify(camera)"
     before = opened.run(f"$('reset').click(); {state}")

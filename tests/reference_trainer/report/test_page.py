@@ -166,8 +166,8 @@ def test_the_models_are_those_of_the_runs(pair):
         bands = (packed["degree"] + 1) ** 2
         assert packed["degree"] == 2
         colors = table["sh"].reshape(n, bands, 3)
-        np.testing.assert_allclose(colors[:, 0], gaussians.sh[:, 0], atol=0.6 / 256)
-        np.testing.assert_allclose(colors[:, 1:], gaussians.sh[:, 1:bands], atol=0.6 / 40)
+        np.testing.assert_allclose(colors[:, 0], gaussians.sh[:, 0], atol=0.6 / 128)
+        np.testing.assert_allclose(colors[:, 1:], gaussians.sh[:, 1:bands], atol=0.6 / 36)
         held, tenth = packed["held"], order[-(n // 10) :]
         assert (held[0], held[100]) == (0, 1)
         assert held[10] == pytest.approx(shares.numpy()[tenth].sum() / shares.sum().item(), abs=1e-3)
