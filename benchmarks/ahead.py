@@ -20,7 +20,9 @@ from scipy.sparse.csgraph import connected_components
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from reference_trainer.render.triton import adam, binning, compositing, densification, moments, projection, tiles
+from reference_trainer.model import _adam_triton
+from reference_trainer.render.triton import binning, compositing, moments, projection, tiles
+from reference_trainer.training.density import _statistics_triton
 from reference_trainer.training.losses import _ssim_triton
 
 __all__ = ["KERNELS", "TARGETS", "Compiled", "Kernel", "compile_ahead", "markdown", "measure_nvidia"]
@@ -97,10 +99,10 @@ KERNELS = [
     Kernel("fill table", tiles.fill_table, {"MORE": 2, "BLOCK": 256}, 4, walks=False),
     Kernel("list tiles", binning.list_tiles, {"TILE": 8, "GROUP": 32, "LANES": 8}, 1, walks=False),
     *(
-        Kernel("densification", densification.add_gradients, {"ABSOLUTE": x, "BLOCK": 256}, 4, walks=False)
+        Kernel("densification", _statistics_triton.add_gradients, {"ABSOLUTE": x, "BLOCK": 256}, 4, walks=False)
         for x in (False, True)
     ),
-    Kernel("Adam", adam.adam, {"BLOCK": 1024}, 4, walks=False),
+    Kernel("Adam", _adam_triton.adam, {"BLOCK": 1024}, 4, walks=False),
     _tiled("composite", compositing.composite_forward, 9, DEPTH=False),
     _tiled("composite, depth", compositing.composite_forward, 10, DEPTH=True),
     _tiled("composite backward", compositing.composite_backward, 9, **_DRAWN),

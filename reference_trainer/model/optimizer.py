@@ -108,7 +108,7 @@ class GaussianOptimizer:
 
     def _step_in_one(self) -> None:
         """Do what Adam does, to the rounding, in one launch for six tensors."""
-        from reference_trainer.render.triton.adam import adam_step
+        from reference_trainer.model._adam_triton import adam_step
 
         by_step: dict[int, list[tuple[Tensor, Tensor, Tensor, Tensor, float]]] = {}
         for group in self._adam.param_groups:

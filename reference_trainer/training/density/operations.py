@@ -62,7 +62,7 @@ class DensityStatistics:
             absolute: the sums over the pixels of the absolute gradients, shape (M, 2).
         """
         if engine_for(gradient.device, gradient.dtype).name == "triton":
-            from reference_trainer.render.triton.densification import count_gradients
+            from reference_trainer.training.density._statistics_triton import count_gradients
 
             sums = self.gradient_sum, self.steps, self.absolute_sum
             count_gradients(indices, rendered, gradient, absolute, *sums, width, height)
