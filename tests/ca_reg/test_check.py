@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ERRORS = """
 import tempfile, torch, ca_reg
 from ca_reg import CAMonitor, CAPenalty, CAScore
@@ -86,6 +88,7 @@ def test_every_error_is_raised(capsys):
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_every_error_is_raised_where_others_check_nothing():
     """Without assertions and kornia's checks."""
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "KORNIA_CHECKS": "0"}

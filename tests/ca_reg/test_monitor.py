@@ -58,6 +58,7 @@ def test_a_second_monitor_of_the_same_folder_is_refused_until_the_first_is_close
     assert [record["step"] for record in lines(tmp_path)] == [10, 20, 30]
 
 
+@pytest.mark.slow
 def test_another_process_is_refused_as_well(tmp_path):
     code = """
 import sys, torch

@@ -11,6 +11,7 @@ from reference_trainer.scenes.images import read_image
 SIZE = 50_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "what"), EXPANDING)
 def test_memory_is_in_proportion_to_the_file(name, what, tmp_path):
     target = target_of(name)

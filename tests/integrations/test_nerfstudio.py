@@ -256,6 +256,7 @@ def test_loading_the_entry_point_never_raises(only_stub, kind):
         _ = nerfstudio.SplatfactoCAModel
 
 
+@pytest.mark.slow
 def test_a_fresh_process_without_nerfstudio_imports_the_module():
     code = f"import importlib, sys; sys.modules['nerfstudio'] = None; sys.modules['gsplat'] = None\n\
 module, name = '{ENTRY_POINT}'.split(':')\nprint(getattr(importlib.import_module(module), name))"

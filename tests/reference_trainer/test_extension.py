@@ -34,6 +34,7 @@ ADDED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ADDED)
 def test_one_of_each_kind_is_a_class_in_a_file_of_the_user(kind, parts, capsys):
     losses = {}

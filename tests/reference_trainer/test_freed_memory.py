@@ -30,6 +30,7 @@ def _faults(**variables: str) -> int:
     return int(ran.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the allocator of glibc")
 def test_freed_memory_stays_unless_the_environment_says_otherwise():
     """Tensors of 16 MiB, one after the other: at pages of 4 KiB, 4,096 faults each where they are returned."""

@@ -38,6 +38,7 @@ def contents(path, old, power, action, *arguments):
         seen.append(path.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power", [False, True])
 def test_a_file_is_the_old_one_or_the_new_wherever_its_writer_is_killed(tmp_path, power):
     path = tmp_path / "folder" / "note.txt"

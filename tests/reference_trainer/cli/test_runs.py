@@ -74,7 +74,7 @@ def test_a_ply_is_known_by_its_name(monkeypatch, tmp_path):
     assert asked == [str(tmp_path / "a.PLY")]
 
 
-@pytest.mark.parametrize("engine", ["torch", "numba"])
+@pytest.mark.parametrize("engine", [pytest.param("torch", marks=pytest.mark.slow), "numba"])
 def test_the_engine_is_chosen_said_and_noted(engine, trained, capsys, tmp_path, monkeypatch):
     if engine == "numba":
         pytest.importorskip("numba")
@@ -240,6 +240,7 @@ def test_nothing_is_written_to_the_photographs_or_over_other_files(trained, caps
     assert {path.read_text() for path in other.iterdir()} == {"precious"}
 
 
+@pytest.mark.slow
 def test_without_test_views_the_training_views_are_rendered(capsys, tmp_path):
     out = tmp_path / "all"
     main(["train", "--out", str(out), "--downscale", "8", "--test", "none", "--iterations", "1"])
@@ -249,6 +250,7 @@ def test_without_test_views_the_training_views_are_rendered(capsys, tmp_path):
     assert "no test view: give --what train" in refused(["render", str(out), "--what", "test"], capsys)
 
 
+@pytest.mark.slow
 def test_own_code_is_trusted_where_the_command_line_names_it(capsys, tmp_path, monkeypatch):
     """What a training prints can be pasted; without --trust nothing of the run is imported."""
     (tmp_path / "own_drop.py").write_text(

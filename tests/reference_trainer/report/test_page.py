@@ -219,6 +219,7 @@ def test_a_damaged_log_is_told_from_none(tmp_path):
     assert notes[1] == "none: no CA and PSNR against the step, because nothing was measured while it trained."
 
 
+@pytest.mark.slow
 def test_opacities_that_depend_on_the_camera_are_drawn_plain(tmp_path, options, short):
     config = dataclasses.replace(short, initial_opacity=0.9, regularizer="depth(0.4, scale=True)")
     trainer = unfinished(tmp_path, options, config)
@@ -257,6 +258,7 @@ def test_text_from_files_cannot_end_the_data(run, found, tmp_path, monkeypatch):
 # In a browser.
 
 
+@pytest.mark.slow
 def test_no_file_but_a_report_is_overwritten(run, tmp_path):
     (tmp_path / "thesis.html").write_text("<!doctype html>precious")
     with pytest.raises(ValueError, match=r"thesis\.html is no report of ca-reg and is not overwritten"):
@@ -266,6 +268,7 @@ def test_no_file_but_a_report_is_overwritten(run, tmp_path):
         write_report([run[0]], tmp_path / "mine.html", views=1)
 
 
+@pytest.mark.slow
 def test_a_comparison_stands_for_the_first_seed_of_each_strategy(run, tmp_path):
     for name, seeds in (("dropout", (2, 10)), ("baseline", (0, 1))):
         for seed in seeds:
@@ -277,6 +280,7 @@ def test_a_comparison_stands_for_the_first_seed_of_each_strategy(run, tmp_path):
     assert labels == [f"Dropout 0.2 + noise 0.3 ({name})" for name in ("baseline/seed_0", "dropout/seed_2")]
 
 
+@pytest.mark.slow
 def test_the_scores_of_a_comparison_are_those_of_all_its_seeds(run, tmp_path):
     settings, results = (json.loads((run[0] / name).read_text()) for name in (CONFIG, "results.json"))
     for name, dropout, noise, psnr in (("mine", 0.2, 0.0, (20.0, 22.0)), ("baseline", 0.0, 0.0, (19.0, 20.0))):

@@ -75,6 +75,7 @@ def test_a_model_that_was_trained_with_dropout_is_refused(run, options, tmp_path
     assert not (tmp_path / "c.ply").exists()
 
 
+@pytest.mark.slow
 def test_what_hangs_goes_and_nothing_else(run, options, tmp_path, said):
     """A model that the guard finds something in: opaque Gaussians close before cameras beside the training cameras."""
     model, scene = load_run_model(run[0])

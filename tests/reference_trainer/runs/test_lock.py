@@ -122,6 +122,7 @@ def test_a_run_is_locked_from_its_first_file_to_its_last(tmp_path, options, shor
         run_experiment(options, short, tmp_path, monitoring=Monitoring(0))
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, options, short, ctrl_c, elsewhere, said):
     with ctrl_c(5):
         run_experiment(options, short, tmp_path, monitoring=Monitoring(0))
@@ -168,6 +169,7 @@ def test_a_sweep_goes_on_without_the_run_that_is_at_work_elsewhere(tmp_path, opt
     assert not (tmp_path / "a" / "seed_0" / CHECKPOINT).exists()
 
 
+@pytest.mark.slow
 def test_what_another_sweep_finished_meanwhile_counts(tmp_path, options, short, said):
     class Other(Here):
         """The other sweep has the first run, and finishes it while the second is done here."""

@@ -297,6 +297,7 @@ def test_the_table_holds_medians_and_root_mean_squares():
     assert "exact, numba has none" in text.partition("## y")[2]
 
 
+@pytest.mark.slow
 def test_the_figure_can_be_drawn_without_an_error_of_the_exact_estimate(tmp_path):
     figure = Figure(layout="constrained")
     module._draw({"a": known(5e-4), "b": known(0.0), "c": known(1e-6)}, figure)

@@ -232,6 +232,7 @@ def test_steps_scale_with_the_iterations_and_all_else_stays():
             assert config.density.count("(") == recipe.config.density.count("(")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECIPES)
 @pytest.mark.parametrize("regularizer", ["", "dropout(0.2)"])
 def test_all_train_and_repeat_themselves(scene, name, regularizer):

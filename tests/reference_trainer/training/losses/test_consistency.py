@@ -84,6 +84,7 @@ def test_the_sampled_form_is_l1_and_dssim_to_the_render_of_one_mask():
     assert len(seen) > 4
 
 
+@pytest.mark.slow
 def test_the_mean_of_sampled_squared_errors_is_the_exact_form():
     """Through the masks that the term draws: 400 of them within 4.5 standard errors, false in 1 of 100,000 seeds."""
     gaussians, view = four()
