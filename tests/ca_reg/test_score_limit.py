@@ -340,6 +340,7 @@ def test_renders_of_different_sizes_are_refused():
 # --- how far a few renders are from the limit ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("samples", "ddof"), [(2, 0), (2, 1), (3, 0), (3, 2)])
 def test_limit_is_the_exact_score_in_expectation(monkeypatch, samples, ddof):
     """Every tuple of masks once, each as likely as any other at rate 1/2: the mean is the expectation, exactly."""

@@ -91,6 +91,7 @@ def test_damage_depends_on_the_seed_alone(form):
     assert sum(damage(good, form, seed)[1] != good for seed in range(300)) > 270
 
 
+@pytest.mark.slow
 def test_a_damaged_state_is_an_intact_file_and_depends_on_the_seed_alone(tmp_path):
     samples.write_trainer(tmp_path)
     good = (tmp_path / "checkpoint.pt").read_bytes()

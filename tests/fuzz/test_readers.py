@@ -10,6 +10,7 @@ from fuzz.targets import TARGETS
 targets = pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)
 
 
+@pytest.mark.slow
 @targets
 def test_damaged_files(target, tmp_path):
     count = 20 if target.form == "state" else 120

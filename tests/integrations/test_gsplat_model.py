@@ -99,6 +99,7 @@ def test_lists_go_on_behind_an_opaque_surface(package):
     assert float(lists.alphas.max()) == pytest.approx(0.99)
 
 
+@pytest.mark.slow
 def test_what_hangs_between_the_cameras_is_found(package):
     """A wall that both cameras see, and a veil between them that neither does, by the lines of docs/lists.md."""
     x, y = torch.meshgrid(torch.linspace(-3, 3, 13), torch.linspace(-1, 1, 5), indexing="ij")

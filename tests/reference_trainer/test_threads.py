@@ -51,6 +51,7 @@ def test_threads_are_only_ever_fewer_and_come_back(processors, four):
         assert torch.get_num_threads() == 4
 
 
+@pytest.mark.slow
 def test_a_run_of_small_pictures_uses_one(processors, four, options, short, tmp_path, monkeypatch):
     seen = []
     original = Trainer.train_step

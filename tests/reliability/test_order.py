@@ -21,11 +21,13 @@ def trainer_on(device):
     return trainer
 
 
+@pytest.mark.slow
 def test_orders_of_additions_differ_by_no_more_than_what_is_stated(card):
     differences = gradient_differences(trainer_on(card), range(3))
     assert 0 < max(map(max, differences.values())) <= BOUND
 
 
+@pytest.mark.slow
 def test_what_repeats_itself_has_one_order(card):
     with deterministic(card):
         differences = gradient_differences(trainer_on(card), range(3))

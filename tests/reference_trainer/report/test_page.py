@@ -125,6 +125,7 @@ def test_the_views_come_with_their_pictures(pair):
         assert set(entry["pictures"][1]) == {"render", "error", "co-adaptation", "caption"} | expected
 
 
+@pytest.mark.slow
 def test_the_worst_views_that_nobody_took_come_first(found, monkeypatch):
     monkeypatch.setattr(page_module, "pictures_of", lambda _, view, expected: {"caption": str(expected.psnr)})
     unseen = [(view, map_._replace(psnr=float(30 - i))) for i, (view, map_) in enumerate(found.unseen)]
@@ -182,6 +183,7 @@ def test_numbers_that_do_not_fit_their_step_get_a_larger_one():
     assert list(planes[3:6]) == [255, 255, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("opacity", [0.9, 0.005])  # with a score, and too faint for one
 def test_what_a_run_lacks_is_left_out_with_a_word(tmp_path, options, short, opacity):
     none = dataclasses.replace(options, test="none")

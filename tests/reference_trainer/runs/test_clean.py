@@ -17,6 +17,7 @@ def rows(means: torch.Tensor) -> list[tuple[float, ...]]:
     return [tuple(row) for row in means.tolist()]
 
 
+@pytest.mark.slow
 def test_those_that_co_adapt_most_for_what_they_contribute_go(run, options, tmp_path, said):
     model, scene = load_run_model(run[0])
     found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.3, refine=0, anyway=True)
@@ -33,6 +34,7 @@ def test_those_that_co_adapt_most_for_what_they_contribute_go(run, options, tmp_
     assert f"| {found['as it was'].mean('test', 'psnr'):.2f} |" in table
 
 
+@pytest.mark.slow
 def test_refining_closes_the_holes(run, options, tmp_path):
     found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.3, refine=20, anyway=True)
     holes, closed = found["taken out"], found["after 20 steps"]

@@ -164,6 +164,7 @@ def test_failed_runs_are_listed_at_the_end(tmp_path, said):
     ]
 
 
+@pytest.mark.slow
 def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch, said):
     """Nothing is held out: exact CA is reported at the training views, between them and around them."""
     options = dataclasses.replace(options, test="none")

@@ -139,6 +139,7 @@ def test_an_interrupted_run_leaves_its_lock_and_continues_with_it(tmp_path, opti
     assert f"{tmp_path}: continues from step 6" in said
 
 
+@pytest.mark.slow
 def test_what_another_process_finished_while_the_scene_was_read_is_not_trained_again(
     tmp_path, options, short, monkeypatch
 ):
@@ -159,6 +160,7 @@ def test_what_another_process_finished_while_the_scene_was_read_is_not_trained_a
     assert found == results[0]
 
 
+@pytest.mark.slow
 def test_a_sweep_goes_on_without_the_run_that_is_at_work_elsewhere(tmp_path, options, short, elsewhere):
     elsewhere(tmp_path / "a" / "seed_0")
     comparison = compare({tmp_path: options}, {"a": short}, [0, 1], Running(Here(), monitoring=Monitoring(0)))[tmp_path]

@@ -382,6 +382,7 @@ def test_divergence_keeps_the_last_checkpoint(options, short, monkeypatch, tmp_p
         assert not (tmp_path / RESULTS).exists()
 
 
+@pytest.mark.slow
 def test_a_model_that_vanishes_does_not_overwrite_the_checkpoint(options, short, tmp_path):
     config = dataclasses.replace(short, prune_opacity=0.99)
     for _ in range(2):

@@ -65,6 +65,7 @@ def test_a_ply_without_dropout_is_used_as_it_is(tmp_path, run):
     assert load_ply_model(tmp_path / "model.ply", background=torch.zeros(3))[0].regularizer == ""
 
 
+@pytest.mark.slow
 def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options, tmp_path):
     out, results = scaled
     scene = load_scene(options)
@@ -133,6 +134,7 @@ def test_what_is_written_for_an_orbit(tmp_path):
         assert picture.size == (40, 40)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", ["orbit", "scene"])
 def test_an_interrupted_measurement_continues_to_the_same_files(tmp_path, options, monkeypatch, on, said):
     save_ply(ball(), tmp_path / "ball.ply")
@@ -237,6 +239,7 @@ def test_a_ply_on_its_scene(run, options, tmp_path, said):
     assert "where nobody took a photograph" in said[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("photographs", ["options", "masked"])  # where the noise beside the masks is no measure
 def test_a_model_that_fits_no_photograph(tmp_path, photographs, request):
     """It is in the pictures, so only the photographs can tell."""

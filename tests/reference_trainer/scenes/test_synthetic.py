@@ -117,6 +117,7 @@ def test_same_seed_same_scene_and_global_state_untouched():
         assert torch.equal(a.image, c.image)
 
 
+@pytest.mark.slow
 def test_a_larger_picture_shows_the_same():
     small, large = synthetic_scene(48, 36, points=1), synthetic_scene(96, 72, points=1)
     shrunk = torch.nn.functional.avg_pool2d(large.train[1].image, 2)

@@ -137,6 +137,7 @@ def test_models_start_alike_and_draw_on_their_own(tiny_scene):
     assert len(set(random)) == 3
 
 
+@pytest.mark.slow
 def test_a_training_of_two_fields_is_resumed_to_the_identical_result(tiny_scene, busy, tmp_path):
     loss = "photometric + co_regularization(between(1.0, 4))"
     config = dataclasses.replace(busy, iterations=16, loss=loss, density=SEGS, models=2, regularizer="concrete")

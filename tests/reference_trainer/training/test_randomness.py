@@ -121,6 +121,7 @@ def test_on_a_card_the_order_of_additions_does_not_matter(tiny_scene, busy, chan
     assert all(torch.equal(x, other[name]) for name, x in one.items())
 
 
+@pytest.mark.slow
 def test_on_a_card_it_matters_without(tiny_scene, busy):
     config = dataclasses.replace(busy, iterations=6)
     one, other = (trained_on_a_card(tiny_scene, config, order, repeatable=False) for order in (0, 1))

@@ -123,6 +123,7 @@ def test_a_photograph_is_laid_over_its_own_camera_only(run, viewer, page):
     assert "No photograph from here" in viewer._status.content
 
 
+@pytest.mark.slow
 def test_two_models_share_the_width_and_a_screenshot_names_them(run, scaled, viewer, page):
     model, scene = load_run_model(scaled[0])
     viewer.show(model, measured_views(scene), "other")
@@ -193,6 +194,7 @@ def test_up_is_across_the_horizontal_axes_of_cameras_held_level():
         np.testing.assert_array_equal(_pose(camera, 1.0, up)["up_direction"], up.numpy() if leveled else own)
 
 
+@pytest.mark.slow
 def test_a_training_that_is_watched_ends_with_the_same_model(run, options, short, tmp_path, viewer):
     client = Client(load_scene(options).train[0].camera)
     viewer._connected(client)
