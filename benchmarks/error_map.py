@@ -1,10 +1,12 @@
 """How well an error map knows the error: leave one scene out, against its rivals, on the same models.
 
     python -m benchmarks.error_map SCENE-SETTING-SEED=RUN ... [--keep FOLDER] [--rivals] [--weights] [--rows FILE]
+    python -m benchmarks.error_map --rows benchmarks/data/error_map.json
     python -m benchmarks.error_map NAME=RUN ... --picture docs/images/error_map.webp
 
 RUN is the folder of a finished training; RUN,RUN,... that of the model and those of other seeds, whose spread is a
-rival. Prints the tables of ``benchmarks/error_map.md``, which has the protocol, and writes them as JSON to ``--rows``;
+rival. Prints figures of every model and writes them as JSON to ``--rows``; without a RUN, prints what was written as
+the tables of ``benchmarks/error_map.md``, which has the protocol.
 ``--weights`` prints those of `ca_reg.error_maps.FORMS`, fitted on all scenes. What is measured of a model is kept in
 the folder, and not measured again.
 """
@@ -34,6 +36,7 @@ from reference_trainer.evaluation.evaluate import error_picture, expected_error_
 from reference_trainer.evaluation.metrics import ssim
 from reference_trainer.evaluation.pictures import heat_map
 from reference_trainer.evaluation.style import WIDTH, new_figure, readable
+from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.render.renderer import render_moments
@@ -314,7 +317,7 @@ def figure_of(
     return [mean(name, views) for name, views in models.items()]
 
 
-def say(title: str, names: Sequence[str], columns: Mapping[str, Sequence[float]]) -> None:
+def say(title: str, names: Sequence[object], columns: Mapping[str, Sequence[float]]) -> None:
     """Print a table, one row per name and one of their means."""
     print(f"\n| {title} | " + " | ".join(columns) + " |\n|:---" + "|---:" * len(columns) + "|")
     table = np.array([[*column] for column in columns.values()])
@@ -352,6 +355,81 @@ def ranked(views: Mapping[str, Sequence[Quality]], first: str, second: str) -> d
     return found
 
 
+SETTINGS = {"recommended": "recommended", "dropout": "dropout alone", "plain": "plain", "binocular": "Binocular3DGS",
+            "expectation": "expectation"}  # fmt: skip
+PREDICTORS = {
+    "error map": "**error map**", "weights as shipped": "weights as shipped",
+    "ensemble of 3": "ensemble of three trainings", "ensemble of 5": "ensemble of five",
+    "deviation": "deviation, training rate", "100 masks": "100 sampled masks", "5 masks": "5 sampled masks",
+    "PH-Dropout's rate": "deviation, PH-Dropout's rate", "colors": "colors along the ray",
+    "gradient": "gradient of the render", "1 - alpha": "1 - alpha", "random": "random",
+    "Fisher": "diagonal Fisher information", "model alone": "model alone (no photographs)",
+    "image, alpha and deviation": "image, alpha and deviation", "image and alpha": "image and alpha",
+}  # fmt: skip
+RIVALS = ("deviation", "100 masks", "5 masks", "PH-Dropout's rate", "colors", "gradient", "1 - alpha", "Fisher")
+
+
+def tables(rows: Mapping[str, Any]) -> str:
+    """Return the tables of the page, made of what ``--rows`` wrote."""
+    models = {name: row for name, row in rows.items() if name not in ("pairs", "deciles")}
+    kinds = [kind for kind in SETTINGS if kind in map(setting_of, models)]
+    scenes = sorted({scene_of(name) for name in models}, key=lambda scene: (scene == "synthetic", scene))
+    of = {(scene_of(name), setting_of(name)): row for name, row in models.items()}
+    short = "{:.3f}".format
+    means, parts = [], []
+    for kind in kinds:
+        own = [scene for scene in scenes if (scene, kind) in of]
+        lines = []
+        for key, label in PREDICTORS.items():
+            found = {scene: of[scene, kind][key] for scene in own if key in of[scene, kind]}
+            if found:
+                mean = short(float(np.mean([*found.values()]))) if len(found) == len(own) else "-"
+                cells = {readable(scene): short(found[scene]) if scene in found else "-" for scene in own}
+                lines.append({f"{SETTINGS[kind]}, AUSE-MAE": label, **cells, "mean": mean})
+        parts.append(markdown_table(lines, [*lines[0]]))
+        best = [s for s in own if of[s, kind]["error map"] < min(of[s, kind].get(rival, math.inf) for rival in RIVALS)]
+        means.append({"mean AUSE-MAE": SETTINGS[kind], "scenes": str(len(own))}
+                     | {key: short(float(np.mean([of[s, kind][key] for s in own]))) for key in PREDICTORS
+                        if key != "random" and all(key in row for row in models.values())}
+                     | {"ahead of every rival": f"{len(best)} of {len(own)}"})  # fmt: skip
+    psnr = [
+        {"mean PSNR, dB: measured / expected": readable(scene)}
+        | {
+            SETTINGS[kind]: "{:.2f} / {:.2f}".format(*np.mean([v[2:] for v in of[scene, kind]["views"]], axis=0))
+            if (scene, kind) in of
+            else "-"
+            for kind in kinds
+        }
+        for scene in scenes
+    ]
+    quality = []
+    for kind in [*kinds, ""]:
+        each = np.array([v for name, row in models.items() for v in row["views"] if kind in ("", setting_of(name))])
+        ratio, shift = each[:, 1] / each[:, 0], each[:, 3] - each[:, 2]
+        quality.append({
+            "views": f"{SETTINGS.get(kind, 'all')}, {len(each)}",
+            "mean error within 20 %": f"{np.mean((ratio > 0.8) & (ratio < 1.25)):.0%}",
+            "within a factor of 1.5": f"{np.mean((ratio > 1 / 1.5) & (ratio < 1.5)):.0%}",
+            "PSNR off by, dB": f"{shift.mean():+.2f}",
+            "root mean square, dB": f"{np.sqrt((shift**2).mean()):.1f}",
+            "in the interval of 80 %": f"{np.mean(np.abs(shift) < 1.2816 * form_of.FORMS[0].spread):.0%}",
+        })  # fmt: skip
+    order = []
+    for first in kinds:
+        for second in kinds[: kinds.index(first)]:
+            found = rows["pairs"].get(f"{second} over {first}") or {
+                who: (-m, -e) for who, (m, e) in rows["pairs"].get(f"{first} over {second}", {}).items()
+            }
+            if found:
+                right = sum(m * e > 0 for m, e in found.values())
+                measured, expected = np.mean([*found.values()], axis=0)
+                order.append({"which is better?": f"{SETTINGS[second]} over {SETTINGS[first]}",
+                              "scenes": str(len(found)), "measured, dB": f"{measured:+.2f}",
+                              "expected, dB": f"{expected:+.2f}", "the sign is right in": str(right)})  # fmt: skip
+    summary = [markdown_table(each, [*each[0]]) for each in (means, psnr, order, quality) if each]
+    return "\n".join([*summary, *parts])
+
+
 def draw(runs: Mapping[str, str], file: Path) -> None:
     """Draw the last test view of every run: render, measured error, expected error, and what no photograph shows."""
     with new_figure(file) as figure:
@@ -377,7 +455,7 @@ def draw(runs: Mapping[str, str], file: Path) -> None:
 def main() -> None:
     """Measure, fit, print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("runs", nargs="+")
+    parser.add_argument("runs", nargs="*")
     parser.add_argument("--keep", type=Path, default=Path("error_map"))
     parser.add_argument("--rivals", action="store_true")
     parser.add_argument("--weights", action="store_true")
@@ -386,6 +464,9 @@ def main() -> None:
     options = parser.parse_args()
     if options.picture:
         draw(dict(each.split("=") for each in options.runs), options.picture)
+        return
+    if not options.runs:
+        print(tables(json.loads(options.rows.read_text("utf-8"))))
         return
     torch.set_num_threads(1)
     options.keep.mkdir(parents=True, exist_ok=True)
@@ -418,7 +499,6 @@ def main() -> None:
     columns["weights as shipped"] = figure_of(models, lambda _, v: ships.expect(v), ause)
     for rival in dict.fromkeys(r for views in models.values() for r in views[0].rivals):
         columns[rival] = figure_of(models, lambda _, v, r=rival: v.rivals[r], ause)
-    say("AUSE-MAE", [*models], columns)
     chosen = best["error map"]
     of = lambda n, v: chosen[n].expect(v)  # noqa: E731
     without = {}
@@ -449,38 +529,24 @@ def main() -> None:
             for i, part in enumerate(np.array_split(np.argsort(u), 10)):
                 deciles[:, i] += u[part].mean(), v.error[part].mean()
     deciles /= sum(map(len, models.values()))
-    print("\ndeciles, expected:", *(f"{x:.3f}" for x in deciles[0]))
-    print("deciles, measured:", *(f"{x:.3f}" for x in deciles[1]))
+    say("deciles of the expectation", range(1, 11), {"expected": deciles[0], "measured": deciles[1]})
     quality = {name: [Quality.of(v, chosen[name]) for v in views] for name, views in models.items()}
-    for setting in ["", *dict.fromkeys(map(setting_of, models))]:
-        each = np.array([v for name, views in quality.items() for v in views if setting in ("", setting_of(name))])
-        ratio, shift = each[:, 1] / each[:, 0], each[:, 3] - each[:, 2]
-        close, wider = ((ratio > 1 / x) & (ratio < x) for x in (1.25, 1.5))
-        inside = np.abs(shift) < 1.2816 * form_of.FORMS[0].spread
-        print(
-            f"{setting or 'all'}, {len(each)} views: mean error within 20 % {close.mean():.0%}, a factor of 1.5 "
-            f"{wider.mean():.0%}; PSNR off by {shift.mean():+.2f} dB, rms {np.sqrt((shift**2).mean()):.2f}, in the "
-            f"interval of 80 % {inside.mean():.0%}; rank correlation of mean errors "
-            f"{spearmanr(each[:, 0], each[:, 1]).statistic:.2f}"
-        )
-    pairs = {}
     settings = [*dict.fromkeys(map(setting_of, models))]
-    for i, first in enumerate(settings):
-        for second in settings[i + 1 :]:
-            if by_scene := ranked(quality, first, second):
-                pairs[f"{second} over {first}"] = by_scene
-                right = [measured * expected > 0 for measured, expected in by_scene.values()]
-                print(f"\n{second} over {first}, dB: the sign is right in {sum(right)} of {len(right)}")
-                print(*(f"{who}: {m:+.2f}, expected {e:+.2f}" for who, (m, e) in by_scene.items()), sep="; ")
-    print()
+    pairs = {
+        f"{second} over {first}": found
+        for i, first in enumerate(settings)
+        for second in settings[i + 1 :]
+        if (found := ranked(quality, first, second))
+    }
+    figures = {**columns, **{f"without {term}": each for term, each in without.items()}, **others}
+    rows: dict[str, Any] = {
+        name: {label: round(each[i], 4) for label, each in figures.items() if not math.isnan(each[i])}
+        | {"views": [[round(x, 4) for x in v] for v in quality[name]]}
+        for i, name in enumerate(models)
+    }
+    found = {**rows, "pairs": pairs, "deciles": deciles.round(4).tolist()}
+    print(f"\n{tables(found)}")
     if options.rows:
-        figures = {**columns, **{f"without {term}": each for term, each in without.items()}, **others}
-        rows: dict[str, Any] = {
-            name: {label: round(each[i], 4) for label, each in figures.items() if not math.isnan(each[i])}
-            | {"views": [[round(x, 4) for x in v] for v in quality[name]]}
-            for i, name in enumerate(models)
-        }
-        found = {**rows, "pairs": pairs, "deciles": deciles.round(4).tolist()}
         lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(each)}" for name, each in found.items())
         options.rows.write_text(f"{{\n{lines}\n}}\n")
     for name, spent in times.items():

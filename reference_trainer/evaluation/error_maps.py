@@ -114,6 +114,14 @@ class ErrorMaps:
             features |= self._warped(view.camera, _depth(out), image, without)
         return features
 
+    @torch.no_grad()
+    def support(self, view: Viewpoint) -> Tensor:
+        """Return how many of the `NEAREST` photographs show the surface of a pixel, (H, W); nan without a surface."""
+        view = view.to(self.model.background.device)
+        out = self.model.test_rendering(view, depth=True)
+        depth = _depth(out)
+        return self._warped(view.camera, depth, out.image)["support"].where(depth.isfinite(), torch.nan)
+
     def _warped(self, camera: Camera, depth: Tensor, image: Tensor, without: int | None = None) -> dict[str, Tensor]:
         """Bring the nearest training photographs into a view by the model's depth, and compare."""
         others = [each for i, each in enumerate(self._photographs) if i != without]
@@ -121,7 +129,7 @@ class ErrorMaps:
         height, width = depth.shape
         grid = create_meshgrid(height, width, normalized_coordinates=False, device=depth.device, dtype=depth.dtype)[0]
         points = camera.lift(grid + 0.5, depth)
-        least = torch.full_like(depth, torch.inf)
+        least, support = torch.full_like(depth, torch.inf), torch.zeros_like(depth)
         for other, photograph in others[:NEAREST]:
             at, far = other.project(points)
             # kornia's pixel centers are integers. A border: a pixel center may lie half a pixel inside the picture.
@@ -129,8 +137,9 @@ class ErrorMaps:
             there = remap(photograph[None], x, y, padding_mode="border", align_corners=True)[0]
             same = other.inside(at, far) & ((there[3] - far).abs() < AGREEMENT * far)
             least = torch.where(same, torch.minimum(least, (there[:3] - image).abs().mean(0)), least)
-        found = least.isfinite()
-        return {"warp": torch.where(found, least, 0.0), "hidden": (~found).to(depth)}
+            support += same
+        found = support > 0
+        return {"warp": torch.where(found, least, 0.0), "hidden": (~found).to(depth), "support": support}
 
 
 def error_map(model: TrainedModel, view: Viewpoint, train: Sequence[View] = ()) -> ErrorMap:

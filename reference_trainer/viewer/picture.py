@@ -13,21 +13,21 @@ from torch.nn.functional import grid_sample
 
 from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise, Reason
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.error_maps import ErrorMaps
+from reference_trainer.evaluation.error_maps import NEAREST, ErrorMaps
 from reference_trainer.evaluation.evaluate import (
     CA_PICTURE_RANGE,
     ERROR_PICTURE_RANGE,
     ca_picture,
     expected_error_picture,
 )
-from reference_trainer.evaluation.pictures import heat_colors
+from reference_trainer.evaluation.pictures import heat_colors, heat_map
 from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE, Heat, colored_by
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.scenes.scene import View, Viewpoint
 
 __all__ = ["DisplayOptions", "Mode", "Picture", "ViewerModel", "with_photograph"]
 
-Mode = Literal["render", "co-adaptation", "expected error", "depth", "heat"]
+Mode = Literal["render", "co-adaptation", "expected error", "support", "depth", "heat"]
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class DisplayOptions:
     """How a model is shown.
 
     Args:
-        mode: the test-time render, the exact CA map, where the render is expected to be wrong (`ErrorMaps`), depth, or
-            the Gaussians in the colors of their `Heat`.
+        mode: the test-time render, the exact CA map, where the render is expected to be wrong (`ErrorMaps`), how many
+            training photographs show what is there, depth, or the Gaussians in the colors of their `Heat`.
         drop_rate: of the CA map and of the mask, in [0, 1).
         noise: standard deviation of the opacity noise, at least 0: the CA map is that of dropout and noise together,
             all other pictures show one draw of it.
@@ -66,7 +66,7 @@ class ViewerModel:
         model: what to draw.
         views: that its heat is measured at, on the model's device.
         beside: whose mean heat is the unit of the colors, so that two models can be compared; by default its own.
-        train: the photographs that the model was trained on, for the expected error.
+        train: the photographs that the model was trained on, for the expected error and the support.
 
     Example:
         >>> from reference_trainer.model.gaussians import Gaussians
@@ -106,12 +106,18 @@ class ViewerModel:
         """Draw the model.
 
         Raises:
-            ValueError: if heat is needed (for its colors or to hide Gaussians) and cannot be measured, see `heat`.
+            ValueError: if heat is needed (for its colors or to hide Gaussians) and cannot be measured, see `heat`; or
+                support without photographs.
         """
         if options != self._chosen_last[0]:
             self._chosen_last = options, self._chosen(options)
         model, view = self._chosen_last[1], Viewpoint("", camera.to(self.model.gaussians.means.device))
-        draw = {"co-adaptation": self._co_adaptation, "expected error": self._expected_error, "depth": self._depth}
+        draw = {
+            "co-adaptation": self._co_adaptation,
+            "expected error": self._expected_error,
+            "support": self._support,
+            "depth": self._depth,
+        }
         return draw.get(options.mode, self._render)(options, model, view)
 
     def _render(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
@@ -144,6 +150,15 @@ class ViewerModel:
         low, high = found.interval
         scale = "0", f"{ERROR_PICTURE_RANGE:g}", "expected absolute error of the color"
         return Picture(expected_error_picture(found), f"expected {found.psnr:.1f} dB, {low:.1f} to {high:.1f}", scale)
+
+    def _support(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
+        """Draw how many training photographs show the surface of the whole model, as `_expected_error` does."""
+        if not self.train:
+            raise ValueError("the support is told by the training photographs, of which there are none: give --scene.")
+        most, support = min(len(self.train), NEAREST), self.error_maps.support(view)
+        none, one = ((support == count).double().mean().item() for count in (0, 1))
+        scale = "0", f"{most}", "photographs that show it, by the model's depth; gray: nothing covers half of the pixel"
+        return Picture(heat_map(support, most), f"shown by no photograph {none:.0%}, by one {one:.0%}", scale)
 
     def _depth(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
         """Draw the nearness of what covers half of a pixel at least."""

@@ -270,7 +270,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         gui = self._server.gui
         gui.configure_theme(show_share_button=False, show_logo=False)
         self._controls = [
-            gui.add_dropdown("Show", get_args(Mode), hint="The expected error is that of the whole model."),
+            gui.add_dropdown("Show", get_args(Mode), hint="Expected error and support are those of the whole model."),
             gui.add_slider("Drop rate", 0.0, 0.95, 0.05, 0.5, hint="Of the co-adaptation, and of the mask."),
             gui.add_slider("Noise", 0.0, 2.0, 0.1, 0.0, hint="Opacity noise: a draw of it, or in the co-adaptation."),
             gui.add_checkbox("Draw a mask", False, hint="Leave Gaussians out at random, as many as the drop rate says, "

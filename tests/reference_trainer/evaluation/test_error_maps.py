@@ -77,6 +77,17 @@ def test_what_no_photograph_saw_is_hidden(plane):
     assert hidden[:, 13:].all()
 
 
+def test_support_counts_the_photographs_that_show_a_place(plane):
+    """A camera at x sees the pixels of a view at 0 from 12 x to 24 + 12 x."""
+    photographs, view = [photograph("a", -1.0), photograph("b", 0.5)], Viewpoint("new", camera_at(0.0))
+    support = ErrorMaps(plane, photographs).support(view)
+    for columns, count in ((slice(0, 5), 1), (slice(7, 11), 2), (slice(13, 23), 1)):
+        assert bool((support[1:-1, columns] == count).all())
+    assert bool((ErrorMaps(plane, photographs[:1]).support(view)[1:-1, 13:23] == 0).all())
+    faint = dataclasses.replace(plane.gaussians, opacity_logits=torch.full_like(plane.gaussians.opacity_logits, -5.0))
+    assert bool(ErrorMaps(dataclasses.replace(plane, gaussians=faint), photographs).support(view).isnan().all())
+
+
 def test_what_another_surface_hides_from_the_photograph_is_hidden(plane):
     """A wall at half the depth, from -0.3 to 0.8, hides the plane at 0.8 from a camera at 0, not from one at 1.2."""
     near = torch.tensor([[x, y, 1.0] for x in torch.arange(-0.3, 0.8, 0.02) for y in torch.arange(-0.6, 0.6, 0.02)])

@@ -54,6 +54,19 @@ def test_the_expected_error_is_told_by_the_training_photographs(model):
     assert not torch.equal(alone.image, image)
 
 
+def test_the_support_is_how_many_training_photographs_show_what_is_there(model):
+    opaque = replace(model, gaussians=replace(model.gaussians, opacity_logits=torch.full((400,), 4.0)))
+    photographs = [View(name, CAMERA, torch.zeros(3, 30, 40)) for name in "ab"]  # from where the page looks
+    image, note, scale = ViewerModel(opaque, [], train=photographs).render(DisplayOptions("support"), CAMERA)
+    covered = opaque.test_rendering(Viewpoint("", CAMERA)).alpha > 0.5
+    assert covered.double().mean() > 0.5
+    torch.testing.assert_close(image, heat_map(torch.where(covered, 2.0, torch.nan), 2.0))
+    assert note == "shown by no photograph 0%, by one 0%"
+    assert scale[:2] == ("0", "2")
+    with pytest.raises(ValueError, match="photographs"):
+        ViewerModel(opaque, []).render(DisplayOptions("support"), CAMERA)
+
+
 @pytest.mark.parametrize("mask", [False, True])  # which an exact map has no use for
 def test_the_co_adaptation_is_that_of_the_chosen_rate(model, mask):
     image, *_ = ViewerModel(model, []).render(DisplayOptions("co-adaptation", drop_rate=0.3, mask=mask), CAMERA)
