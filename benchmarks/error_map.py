@@ -317,14 +317,6 @@ def figure_of(
     return [mean(name, views) for name, views in models.items()]
 
 
-def say(title: str, names: Sequence[object], columns: Mapping[str, Sequence[float]]) -> None:
-    """Print a table, one row per name and one of their means."""
-    print(f"\n| {title} | " + " | ".join(columns) + " |\n|:---" + "|---:" * len(columns) + "|")
-    table = np.array([[*column] for column in columns.values()])
-    for name, cells in zip([*names, "mean"], np.column_stack([table, np.nanmean(table, 1)]).T, strict=True):
-        print(f"| {name} | " + " | ".join("-" if math.isnan(x) else f"{x:.3f}" for x in cells) + " |", flush=True)
-
-
 class Quality(NamedTuple):
     """Of one view: mean absolute error and PSNR, measured and expected."""
 
@@ -426,7 +418,25 @@ def tables(rows: Mapping[str, Any]) -> str:
                 order.append({"which is better?": f"{SETTINGS[second]} over {SETTINGS[first]}",
                               "scenes": str(len(found)), "measured, dB": f"{measured:+.2f}",
                               "expected, dB": f"{expected:+.2f}", "the sign is right in": str(right)})  # fmt: skip
-    summary = [markdown_table(each, [*each[0]]) for each in (means, psnr, order, quality) if each]
+    others = {
+        "AUSE-RMSE": "AUSE-RMSE", "AUSE-RMSE, deviation": "of the deviation", "Spearman": "Spearman",
+        "Spearman, deviation": "of the deviation ", "errors below 2.303 expected": "errors below 2.303 expected",
+        "negative log likelihood": "negative log likelihood", "of the view's true mean": "of the view's true mean",
+        **{f"without {term}": f"AUSE-MAE without {term.replace('*', ' ')}" for term in form_of.FORMS[0].weights},
+    }  # fmt: skip
+    more = [
+        {"mean": SETTINGS[kind]}
+        | {
+            label: short(float(np.mean([row[key] for name, row in models.items() if setting_of(name) == kind])))
+            for key, label in others.items()
+        }
+        for kind in kinds
+    ]
+    calibration = [
+        {"deciles of the expectation": name} | {str(i): short(x) for i, x in enumerate(found, start=1)}
+        for name, found in zip(("expected", "measured"), rows["deciles"], strict=True)
+    ]
+    summary = [markdown_table(each, [*each[0]]) for each in (means, psnr, order, quality, calibration, more) if each]
     return "\n".join([*summary, *parts])
 
 
@@ -505,7 +515,6 @@ def main() -> None:
     for term in forms[0]:
         less = held_out(models, [t for t in forms[0] if t != term])
         without[term] = figure_of(models, lambda n, v, b=less: b[n].expect(v), ause)
-    say("AUSE-MAE without", [*models], without)
     rank = lambda u, e: float(spearmanr(u, e).statistic)  # noqa: E731
     root = lambda u, e: ause(u, e, root=True)  # noqa: E731
     likely = lambda u, e: float((np.log(u) + e / u).mean())  # noqa: E731
@@ -521,7 +530,6 @@ def main() -> None:
         "negative log likelihood": figure_of(models, of, likely),
         "of the view's true mean": figure_of(models, lambda _, v: np.full_like(v.error, v.error.mean()), likely),
     }
-    say("others", [*models], others)
     deciles = np.zeros((2, 10))
     for name, views in models.items():
         for v in views:
@@ -529,7 +537,6 @@ def main() -> None:
             for i, part in enumerate(np.array_split(np.argsort(u), 10)):
                 deciles[:, i] += u[part].mean(), v.error[part].mean()
     deciles /= sum(map(len, models.values()))
-    say("deciles of the expectation", range(1, 11), {"expected": deciles[0], "measured": deciles[1]})
     quality = {name: [Quality.of(v, chosen[name]) for v in views] for name, views in models.items()}
     settings = [*dict.fromkeys(map(setting_of, models))]
     pairs = {

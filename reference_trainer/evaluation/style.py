@@ -45,6 +45,7 @@ _NAMES = {
     "d2gs": "D²GS", "position_noise": "position noise", "scale_noise": "scale noise", "sh_noise": "color noise",
     "consistency": "consistency loss", "opacity_decay": "opacity decay", "analytic": "expectation",
     "fern": "Fern", "synthetic": "built-in scene", "herz-jesu": "Herz-Jesu", "fountain": "Fountain", "lego": "Lego",
+    "dtu-scan24": "DTU scan24", "dtu-scan65": "DTU scan65", "sceaux": "Sceaux", "cape": "Cape",
 }  # fmt: skip
 
 
