@@ -10,6 +10,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,8 @@ import torch
 from devices import DEVICES
 from stand_ins.card import CARD, pretended_card, register_card
 from tiers import pytest_cmdline_main as pytest_cmdline_main
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="session")
@@ -90,9 +93,20 @@ def pytest_collection_finish(session):
         warm_up()
 
 
+class _WithoutTriton:
+    """Leaves out the kernels and their tests: Triton has no wheels for macOS and Windows."""
+
+    @staticmethod
+    def pytest_ignore_collect(collection_path):
+        path = collection_path.relative_to(ROOT) if collection_path.is_relative_to(ROOT) else collection_path
+        return True if "triton" in path.as_posix() or path == Path("benchmarks/ahead.py") else None
+
+
 def pytest_configure(config):
     """Prepare what must be before the first test."""
     register_card()
+    if find_spec("triton") is None:
+        config.pluginmanager.register(_WithoutTriton())
     # A shell starts background jobs deaf to Ctrl-C, and some tests send it to themselves.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
