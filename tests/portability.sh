@@ -41,6 +41,10 @@ for threads in 1 2 3 4; do check "threads-$threads" env OMP_NUM_THREADS="$thread
 check one-process env PYTEST_ADDOPTS="-n 0"
 check no-data env CA_REG_DATA=/nonexistent
 
+# As where Triton has no wheels.
+mkdir -p "$out/no-triton" && echo 'import sys; sys.modules["triton"] = None' >"$out/no-triton/sitecustomize.py"
+check no-triton env PYTHONPATH="$out/no-triton"
+
 # A compiler that fails, and a PATH without one.
 check broken-compiler env CC=/bin/false CXX=/bin/false
 rm -rf "$out/bin" && mkdir -p "$out/bin"

@@ -46,6 +46,8 @@ def test_python_runs_and_prints_what_stands_below_it(name):
 def test_excerpts_import_what_exists(excerpt):
     for node in ast.walk(ast.parse(excerpt)):
         if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ("ca_reg", "reference_trainer"):
+            if "triton" in node.module:
+                pytest.importorskip("triton")
             module = importlib.import_module(node.module)
             assert [name.name for name in node.names if not hasattr(module, name.name)] == []
 
