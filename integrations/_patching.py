@@ -57,7 +57,8 @@ class AfterImport(MetaPathFinder):
         callback = self._callbacks.get(fullname)
         if callback is None:
             return None
-        others = (finder for finder in sys.meta_path if finder is not self)
+        # Only those after it: another watch for the same module, asked in turn, would ask this one again.
+        others = sys.meta_path[sys.meta_path.index(self) + 1 :]
         specs = (finder.find_spec(fullname, path, target) for finder in others)
         spec = next((spec for spec in specs if spec is not None), None)
         if spec is None or spec.loader is None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import difflib
+import importlib
 import importlib.util
 import io
 import sys
@@ -9,7 +10,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from stand_ins.inria import PIPE, Model, make_render
+from stand_ins.inria import PIPE, Model, make_rasterizer, make_render
 from torch import nn
 
 from ca_reg import GaussianDropout
@@ -68,6 +69,23 @@ def test_two_hooks_are_refused(rasterizer):
         hook.uninstall()
     with hook:  # and it can be installed again
         pass
+
+
+def test_hooks_of_two_rasterizers_wait_for_the_same_model(monkeypatch, tmp_path):
+    """Both hooks watch for the import of scene.gaussian_model, and both follow its steps."""
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "gaussian_model.py").write_text("from stand_ins.inria import Model as GaussianModel\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    classes = make_rasterizer(), make_rasterizer()
+    first, second = (RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer) for rasterizer in classes)
+    with first, second:
+        model = importlib.import_module("scene.gaussian_model").GaussianModel()
+        model.update_learning_rate(5)
+        for rasterizer in classes:
+            make_render(rasterizer)(model.camera, model, PIPE, BLACK)
+    assert [hook.tally.first_step for hook in (first, second)] == [5, 5]
+    for name in ("scene", "scene.gaussian_model"):
+        del sys.modules[name]
 
 
 def test_installed_rasterizers_are_found_whenever_they_are_imported(monkeypatch, tmp_path):
