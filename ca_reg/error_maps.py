@@ -127,6 +127,7 @@ def expected_error(features: Mapping[str, Tensor], mask: Tensor | None = None, *
     return ErrorMap(error, psnr, (psnr - _NORMAL_80 * form.spread, psnr + _NORMAL_80 * form.spread))
 
 
+@torch.no_grad()
 def error_map(
     render_fn: RenderFn,
     opacity: Tensor,

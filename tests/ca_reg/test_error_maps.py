@@ -76,6 +76,11 @@ def test_what_is_not_covered_is_expected_to_be_wrong():
     assert error[4, 9] > error[4, 2]
 
 
+def test_a_map_of_opacities_in_training_can_be_shown():
+    error = error_map(wall, torch.full((4,), 0.9, requires_grad=True), None).error
+    assert error.numpy().shape == SIZE
+
+
 def test_moments_and_lists_are_asked_where_they_are_offered():
     moments, asked = ListMoments(lists_fn), []
 
