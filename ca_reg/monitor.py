@@ -172,7 +172,9 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         return record
 
     def close(self) -> None:
-        """Close the files. A second call does nothing."""
+        """Close the files and sinks. A second call does nothing."""
+        if self._file.closed:
+            return
         self._file.close()
         self._unlock()
         if self.writer is not None:

@@ -14,6 +14,7 @@ from PIL import Image
 
 from ca_reg import CAMonitor, CAScore
 from ca_reg.monitor import plot_dynamics, read_dynamics
+from ca_reg.sinks import Sink
 
 OPACITY = torch.linspace(0.1, 0.9, 30)
 COLORS = torch.rand(3, 30, generator=torch.Generator().manual_seed(0)) / 50  # in [0, 1] in all views
@@ -211,9 +212,15 @@ def test_opacities_with_gradients_are_left_alone(tmp_path):
 
 
 def test_closing_twice_is_fine_and_using_it_then_is_an_error(tmp_path):
-    monitor = make(tmp_path)
-    monitor.close()
-    monitor.close()
+    class Closed(Sink):
+        count = 0
+
+        def close(self):
+            self.count += 1
+
+    with make(tmp_path, sinks=[sink := Closed()]) as monitor:
+        monitor.close()
+    assert sink.count == 1
     with pytest.raises(ValueError, match="closed"):
         monitor(10, OPACITY)
 
