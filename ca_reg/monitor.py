@@ -125,8 +125,8 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         self._unlock = weakref.finalize(self, _lock(folder))
         try:
             self._logged = _keep_lines(self.path, resume_step)
-            self._file = self.path.open("ab", buffering=0)
             board = _summary_writer(folder, resume_step)
+            self._file = self.path.open("ab", buffering=0)
         except BaseException:
             self._unlock()
             raise
@@ -166,7 +166,6 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
                 record[f"psnr/{name}"] = self._mean_psnr(self.psnr, opacity, group)
         record.update(asdict(self.score.settings))
         self._write(record)
-        self._logged = step
         if self.details is not None and self.writer is not None:
             self._show(self.writer, self.details, opacity, step)
         return record
@@ -206,9 +205,10 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
                     add(f"{name}/{group}", x, step)
         writer.flush()
 
-    def _write(self, record: dict[str, float | int | str | None]) -> None:
+    def _write(self, record: dict[str, Any]) -> None:
         """Append one line, and the scalars to TensorBoard."""
         self._append(json.dumps(record, allow_nan=False).encode() + b"\n")
+        self._logged = int(record["step"])  # before the sinks: if one fails, the step is not logged again
         if self.writer is None:
             return
         half = record.get("method") == "exact" and record.get("drop_rate") == 0.5

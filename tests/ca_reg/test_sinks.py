@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from ca_reg import CAMonitor, CAScore
-from ca_reg.sinks import MLflowSink, Sinks, WandbSink
+from ca_reg.sinks import MLflowSink, Sink, Sinks, WandbSink
 
 SCRIPT = """
 import sys, torch
@@ -86,6 +86,19 @@ def test_any_object_with_the_methods_of_a_writer_gets_every_curve(tmp_path):
     assert sink.calls == other.calls
     with pytest.raises(AttributeError):
         Sinks([sink]).add_video  # noqa: B018
+
+
+def test_a_step_is_logged_once_though_a_sink_fails(tmp_path):
+    class Unreachable(Sink):
+        def add_scalar(self, name, value, step):
+            raise ConnectionError(name)
+
+    score = CAScore(lambda opacity, view: (opacity[:48].view(3, 4, 4), torch.ones(4, 4)))
+    with CAMonitor(score, tmp_path, views={"test": [None]}, every=10, sinks=[Unreachable()]) as monitor:
+        with pytest.raises(ConnectionError):
+            monitor(10, torch.ones(48))
+        assert monitor(10, torch.ones(48)) is None
+    assert len((tmp_path / "ca.jsonl").read_text().splitlines()) == 1
 
 
 @pytest.mark.parametrize(("kind", "name"), [(WandbSink, "wandb"), (MLflowSink, "mlflow")])
