@@ -318,7 +318,8 @@ def _measurement(line: bytes) -> dict[str, Any]:
     if not isinstance(record, dict) or not isinstance(record.get("step"), int):
         raise ValueError("expected an object with a whole number 'step'")
     for name, x in record.items():
-        if not isinstance(x, int | float | str | None) or (isinstance(x, int) and x.bit_length() > 64):
+        # 1023 bits are a float, which these become; a seed may well have the 128 of secrets.randbits.
+        if not isinstance(x, int | float | str | None) or (isinstance(x, int) and x.bit_length() > 1023):
             raise ValueError(f"{name!r} must be a number, text or null")
     return record
 

@@ -243,6 +243,12 @@ def test_wrong_arguments_are_refused_before_a_file_is_touched(tmp_path, argument
     assert not (tmp_path / "new").exists()
 
 
+def test_a_log_of_a_long_seed_is_read(tmp_path):
+    with CAMonitor(CAScore(render_fn, seed=2**127 + 1), tmp_path, views=VIEWS, every=10) as monitor:
+        monitor(10, OPACITY)
+    assert read_dynamics(tmp_path)["seed"] == [2.0**127]
+
+
 def test_dynamics_are_read_as_columns(tmp_path):
     records = run(make(tmp_path), 1, 31)
     columns = read_dynamics(tmp_path)
