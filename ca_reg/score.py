@@ -336,7 +336,13 @@ class CAScore:
             yield from (self._render(opacity, view) for opacity in drawn)
         else:
             while some := list(itertools.islice(drawn, BATCH)):
-                yield from (self._read(x) for x in zip(*render_batch(torch.stack(some), view), strict=True))
+                answers = list(zip(*render_batch(torch.stack(some), view), strict=True))
+                if len(answers) != len(some):
+                    raise ValueError(
+                        f"render_batch must return an image and an alpha for each of the {len(some)} sets of "
+                        f"opacities, got {len(answers)}."
+                    )
+                yield from map(self._read, answers)
 
     def _render(self, opacity: Tensor, view: Any) -> tuple[Tensor, Tensor]:
         """Render colors (3, H, W) and alpha (H, W) with these opacities."""

@@ -224,6 +224,19 @@ def test_nan_in_exact_moments_is_not_finite(name, where, neutral):
 # --- what an empty region and rare drops are to adaptive scores ---
 
 
+@pytest.mark.parametrize("make", [CAScore, partial(CAScore.adaptive, relative_error=0.1)])
+def test_a_batch_of_another_length_is_refused(make):
+    class OneForAll:
+        def __call__(self, opacity, view):
+            return torch.rand(3, 4, 5), torch.ones(4, 5)
+
+        def render_batch(self, opacities, view):
+            return torch.rand(1, 3, 4, 5), torch.ones(1, 4, 5)
+
+    with pytest.raises(ValueError, match=r"for each of the \d sets of opacities, got 1"):
+        make(OneForAll())(torch.full((9,), 0.5), None)
+
+
 def test_an_empty_region_is_empty_whatever_the_masks():
     """Expected alpha 0.72 everywhere, which a good part of the renders exceeds: they must not make a region."""
 
