@@ -225,14 +225,15 @@ class PatchedClasses:
 
         def make(update: Callable[..., Any]) -> Callable[..., Any]:
             @functools.wraps(update)
-            def update_learning_rate(model: Any, iteration: int, *args: Any, **kwargs: Any) -> Any:
+            def update_learning_rate(model: Any, *args: Any, **kwargs: Any) -> Any:
+                given = [*args, *kwargs.values()]  # the iteration first, by whatever name
                 # Called by an override in a subclass, or not for Gaussians, as that of a network that deforms them.
-                if self._updated is model or not _has_opacities(model):
-                    return update(model, iteration, *args, **kwargs)
-                self._update(model, int(iteration))
+                if self._updated is model or not given or not _has_opacities(model):
+                    return update(model, *args, **kwargs)
+                self._update(model, int(given[0]))
                 self._updated = model
                 try:
-                    return update(model, iteration, *args, **kwargs)
+                    return update(model, *args, **kwargs)
                 finally:
                     self._updated = None
 

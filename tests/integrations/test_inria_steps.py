@@ -4,6 +4,7 @@ import gc
 import re
 import sys
 import weakref
+from types import ModuleType
 
 import pytest
 import torch
@@ -44,6 +45,20 @@ def densify(model, optimizer):
 def computed_means(model):
     """Positions of a deformed field."""
     return {"means3D": model.get_xyz + 0.0 * model.get_scaling}
+
+
+def test_an_iteration_may_have_any_name(rasterizer, monkeypatch):
+    class GaussianModel(Model):
+        def update_learning_rate(self, step):
+            return step
+
+    monkeypatch.setitem(sys.modules, "my_model", module := ModuleType("my_model"))
+    module.GaussianModel = GaussianModel
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, models=["my_model:GaussianModel"]) as hook:
+        model = GaussianModel()
+        assert model.update_learning_rate(step=7) == 7
+        make_render(rasterizer)(model.camera, model, PIPE, BLACK)
+    assert hook.tally.first_step == 7
 
 
 @pytest.mark.parametrize("deformed", [False, True])
