@@ -138,9 +138,10 @@ def _parse(arguments: Sequence[str] | None, *, in_child: bool = False) -> argpar
         "regularized (default: 100), or fail at its end; 0 for neither")  # fmt: skip
     add("--allow-zeros", action="store_true", help="opacities of 0 are no dropout of the code base's own")
     add("-m", dest="module", nargs=argparse.REMAINDER, help="run a module as python -m does; all that follows is its")
-    add("script", type=Path, nargs="?", help="train.py or render.py of the code base")
-    add("arguments", nargs=argparse.REMAINDER, help="of the script")
+    # One list: argparse would take a "--" between a script and its arguments for its own.
+    add("command", nargs=argparse.REMAINDER, help="train.py or render.py of the code base, and its arguments")
     options = parser.parse_args(arguments)
+    command = options.command[options.command[:1] == ["--"] :]
     if options.module is not None:
         if not options.module:
             parser.error("-m needs the name of a module")
@@ -148,10 +149,10 @@ def _parse(arguments: Sequence[str] | None, *, in_child: bool = False) -> argpar
         # Only the package: finding a submodule would import the package, before the hook is installed.
         if find_spec(options.script.partition(".")[0]) is None:
             parser.error(f"there is no module {options.script}")
-    elif options.script is None or (script := find_script(options.script)) is None:
-        parser.error(f"there is no script {options.script or ''}".rstrip())
+    elif not command or (script := find_script(Path(command[0]))) is None:
+        parser.error(f"there is no script {' '.join(command[:1])}".rstrip())
     else:
-        options.script = script
+        options.script, options.arguments = script, command[1:]
     options.sources = sources = read_script(options.script)
     of_inria = sources.rasterizers or not sources.packages.isdisjoint(MODULES)
     # A rasterizer by name is one of INRIA's: gsplat may be another, optional back end.

@@ -5,7 +5,7 @@ import os
 import re
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 
@@ -66,9 +66,11 @@ def test_a_users_own_regularizer_from_the_present_folder(repository, my_module, 
 
 def test_the_script_sees_what_python_would_show_it(repository, capsys):
     script = repository / "train.py"
-    launch("--seed", 4, "--scope", "all", script, 1, "--seed", 7, "--dropout", "theirs")
-    line = capsys.readouterr().out.splitlines()[0]
-    assert line == f"argv ['1', '--seed', '7', '--dropout', 'theirs'] path {repository} file {script}"
+    for own in ([1, "--seed", 7, "--dropout", "theirs"], ["--", 1], ["-m", 1]):
+        with suppress(ValueError):  # of the last two, whose first argument is no number
+            launch("--seed", 4, "--scope", "all", script, *own)
+        line = capsys.readouterr().out.splitlines()[0]
+        assert line == f"argv {[*map(str, own)]} path {repository} file {script}"
 
 
 def test_a_ramp_and_noise(repository, tmp_path, capsys):
