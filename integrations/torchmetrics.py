@@ -55,8 +55,8 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
 
     Attributes:
         score: the score that measures the views.
-        sums: the state, summed over ranks: values, squared standard errors, views, and how many of them have each reason
-            to have no value; (7,) float64. Not in ``state_dict`` unless ``persistent(True)`` is called.
+        sums: the state, summed over ranks: values, squared standard errors, views, and how many of them have no value
+            for each reason; (7,) float64. Not in ``state_dict`` unless ``persistent(True)`` is called.
 
     Raises:
         ImportError: if torchmetrics is missing; it comes with ``ca_reg[torchmetrics]``.
