@@ -33,16 +33,16 @@ from ca_reg.types import (
 __all__ = ["CAScore", "ExactScore", "view_position"]
 
 
+# Renders are pooled in at most this many groups, which bounds the memory; fewer groups would make the standard error
+# less certain (its relative error is about 1/sqrt(2 (groups - 1)), here 27 %).
 GROUPS = 8
-"""Renders are pooled in at most this many groups, which bounds the memory; fewer groups would make the standard error
-less certain (its relative error is about 1/sqrt(2 (groups - 1)), here 27 %)."""
 
+# Renders that adaptive sampling adds between checks of the error, and that ``render_batch`` makes at once.
 BATCH = 8
-"""Renders that adaptive sampling adds between checks of the error, and that ``render_batch`` makes at once."""
 
+# Renders before the first check: the error is then known to 18 %. Stopping where the estimated error happens to be
+# small biases it downward, the more so the less certain it is: with 8 renders it is known to 27 %.
 MIN_RENDERS = 16
-"""Renders before the first check: the error is then known to 18 %. Stopping where the estimated error happens to be
-small biases it downward, the more so the less certain it is: with 8 renders it is known to 27 %."""
 
 
 class CAScore:
@@ -119,9 +119,11 @@ class CAScore:
         check_count(ddof, "ddof", minimum=0)
         if ddof >= samples:
             raise ValueError(f"ddof must be below samples, got ddof {ddof} and {samples} samples.")
-        self._begin(p, drop_rate, regularizer, layout)
-        self._begin_sampling(render_fn, alpha_fn, seed)
-        self.settings = self._settings("sampling", threshold, samples=int(samples), ddof=int(ddof), seed=self.seed)
+        self._set_renderer(render_fn, alpha_fn, seed)
+        self._set(
+            "sampling", threshold, layout, p, drop_rate, regularizer,
+            samples=int(samples), ddof=int(ddof), seed=int(seed),
+        )  # fmt: skip
 
     @classmethod
     def exact(
@@ -153,8 +155,7 @@ class CAScore:
             >>> round(CAScore.exact(moments_fn, threshold=0.3)(torch.tensor([0.8]), view=None).value, 6)  # 0 or 0.8
             0.16
         """
-        draws = {"p": p, "drop_rate": drop_rate, "regularizer": regularizer, "layout": layout}
-        return ExactScore(moments_fn, neutral, threshold, **draws)
+        return ExactScore(moments_fn, neutral, threshold, layout, p, drop_rate, regularizer)
 
     @classmethod
     def adaptive(
@@ -189,13 +190,17 @@ class CAScore:
             >>> result.std_error / result.value <= 0.2, result.samples in range(16, 257, 8)
             (True, True)
         """
-        draws = {"p": p, "drop_rate": drop_rate, "regularizer": regularizer, "layout": layout}
-        return _AdaptiveScore(render_fn, relative_error, max_samples, threshold, alpha_fn, seed, **draws)
+        limits = relative_error, max_samples
+        return _AdaptiveScore(render_fn, alpha_fn, seed, limits, threshold, layout, p, drop_rate, regularizer)
 
-    def _begin(self, p: float, drop_rate: float | None, regularizer: Regularizer | None, layout: Layout) -> None:
-        """Check and store what all methods have in common."""
+    def _set(
+        self, method: Method, threshold: float, layout: Layout, p: float, drop_rate: float | None,
+        regularizer: Regularizer | None, **others: Any,
+    ) -> None:  # fmt: skip
+        """Check and store what all methods have in common, and the settings, which the results carry."""
         check_layout(layout)
         check_rate(p)
+        check_finite(threshold, "threshold")
         if not (regularizer is None or isinstance(regularizer, Regularizer)):
             raise TypeError(
                 f"regularizer must be a ca_reg.Regularizer, got {type(regularizer).__name__}: wrap it in ca_reg.Chain."
@@ -204,26 +209,22 @@ class CAScore:
             rate = 1.0 - (1.0 - p) / 2.0 if drop_rate is None else drop_rate
             check_rate(rate, "drop_rate")
             self.regularizer: Regularizer = GaussianDropout(rate)
-            self._draws: dict[str, Any] = {"drop_rate": float(rate)}
+            others["drop_rate"] = float(rate)
         elif p != 0 or drop_rate is not None:
             raise ValueError("p and drop_rate do not apply to the draws of a regularizer, which has rates of its own.")
         else:
-            self.regularizer, self._draws = regularizer, {"regularizer": repr(regularizer)}
+            self.regularizer, others["regularizer"] = regularizer, repr(regularizer)
         self.p, self.layout = float(p), layout
+        self.settings = CASettings(method=method, threshold=float(threshold), **others)
         self.reset()
 
-    def _begin_sampling(self, render_fn: RenderFn, alpha_fn: RenderFn | None, seed: int) -> None:
+    def _set_renderer(self, render_fn: RenderFn, alpha_fn: RenderFn | None, seed: int) -> None:
         """Check and store what draws and renders."""
         check_callable(render_fn, "render_fn")
         if alpha_fn is not None:
             check_callable(alpha_fn, "alpha_fn")
         check_count(seed, "seed", minimum=0)
         self.render_fn, self.alpha_fn, self.seed = render_fn, alpha_fn, int(seed)
-
-    def _settings(self, method: Method, threshold: float, **others: Any) -> CASettings:
-        """Return the settings of a score, which its results carry."""
-        check_finite(threshold, "threshold")
-        return CASettings(method=method, threshold=float(threshold), **self._draws, **others)
 
     def __call__(self, opacity: Tensor | Params, view: Any, *, index: int = 0) -> CAResult:
         """Measure one view without counting it in :meth:`compute`; return the score with its maps and its reason.
@@ -376,16 +377,15 @@ class _AdaptiveScore(CAScore):
     """See :meth:`CAScore.adaptive`."""
 
     def __init__(
-        self, render_fn: RenderFn, target: float, most: int, threshold: float, alpha_fn: Any, seed: int, **draws: Any
+        self, render_fn: RenderFn, alpha_fn: RenderFn | None, seed: int, limits: tuple[float, int], *common: Any
     ) -> None:
+        target, most = limits
         check_finite(target, "relative_error")
         if target <= 0:
             raise ValueError(f"relative_error must be above 0, got {target}; CAScore.exact has no error.")
         check_count(most, "max_samples", minimum=MIN_RENDERS)
-        self._begin(**draws)
-        self._begin_sampling(render_fn, alpha_fn, seed)
-        limits = {"relative_error": float(target), "max_samples": int(most)}
-        self.settings = self._settings("adaptive", threshold, ddof=1, seed=self.seed, **limits)
+        self._set_renderer(render_fn, alpha_fn, seed)
+        self._set("adaptive", *common, ddof=1, seed=self.seed, relative_error=float(target), max_samples=int(most))
 
     def _measure(self, x: Params, view: Any, index: int) -> CAResult:
         """Render until the error is small enough.
@@ -394,6 +394,7 @@ class _AdaptiveScore(CAScore):
         """
         settings = self.settings
         assert settings.max_samples is not None
+        assert settings.relative_error is not None
         mean, multiplier = self._alpha_factor(x)
         expected, alpha = self._render((mean.opacities * multiplier.mean).view_as(x.opacities), view)
         visible = alpha > settings.threshold
@@ -412,22 +413,15 @@ class _AdaptiveScore(CAScore):
                 value, reason = visible_mean(variance, visible, broken, k / (k - 1))
                 if reason is Reason.OK and k == settings.max_samples:
                     reason = effect_of(value, differ)
-                result = self._result(value, self._error(value, deviations), variance, visible, reason, k)
-                if self._is_settled(result):
+                if value == 0:  # no render differed, which is certain only if nothing is dropped
+                    error = 0.0 if settings.drop_rate == 0 else math.nan
+                else:
+                    error = deviations.std_error() if math.isfinite(value) else math.nan
+                result = self._result(value, error, variance, visible, reason, k)
+                if reason is not Reason.OK or error <= settings.relative_error * value:
                     break
         assert result is not None
         return result
-
-    def _error(self, value: float, deviations: Deviations) -> float:
-        """Return the standard error of an adaptive score; nan if no render differed, unless nothing is dropped."""
-        if value == 0:
-            return 0.0 if self.settings.drop_rate == 0 else math.nan
-        return deviations.std_error() if math.isfinite(value) else math.nan
-
-    def _is_settled(self, result: CAResult) -> bool:
-        """Whether to stop rendering: the error is small enough, or there is no value to refine."""
-        target = self.settings.relative_error
-        return result.reason is not Reason.OK or (target is not None and result.std_error <= target * result.value)
 
 
 class ExactView(NamedTuple):
@@ -442,11 +436,10 @@ class ExactView(NamedTuple):
 class ExactScore(CAScore):
     """See :meth:`CAScore.exact`."""
 
-    def __init__(self, moments_fn: MomentsFn, neutral: bool, threshold: float, **draws: Any) -> None:
+    def __init__(self, moments_fn: MomentsFn, neutral: bool, *common: Any) -> None:
         check_callable(moments_fn, "moments_fn", "opacity, view, multiplier, background")
-        self._begin(**draws)
+        self._set("exact_neutral" if neutral else "exact", *common)
         self.moments_fn = moments_fn
-        self.settings = self._settings("exact_neutral" if neutral else "exact", threshold)
 
     def _measure(self, x: Params, view: Any, index: int) -> CAResult:
         return self._exact(x, view).result
