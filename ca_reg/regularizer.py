@@ -39,7 +39,6 @@ class Params(NamedTuple):
         step: the training step, from 0 on, which schedules follow; None for that of the module or score that is called.
 
     Example:
-        >>> import torch
         >>> x = Params(torch.full((4,), 0.5), means=torch.zeros(4, 3))
         >>> x._replace(opacities=x.opacities * 0.8).opacities
         tensor([0.4000, 0.4000, 0.4000, 0.4000])

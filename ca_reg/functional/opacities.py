@@ -206,7 +206,6 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
         ValueError: if its shape is neither (N,) nor (N, 1), or ``p`` is outside [0, 1) or not one number per Gaussian.
 
     Example:
-        >>> import torch
         >>> scale_opacity(torch.tensor([0.5, 1.0]), 0.2)
         tensor([0.4000, 0.8000])
     """
@@ -236,7 +235,6 @@ def expected_opacity(opacity: Tensor, sigma: float, *, clip: bool = False) -> Te
             finite, or its square overflows.
 
     Example:
-        >>> import torch
         >>> expected_opacity(torch.tensor([0.1, 0.5, 1.0]), 0.8)
         tensor([0.1040, 0.5000, 0.7213])
     """

@@ -99,13 +99,10 @@ class AnchorDropout(ClusteredDropout):
         every: steps between neighbor searches; the paper does not say.
 
     Example:
-        >>> import torch
-        >>> from ca_reg import Params
-        >>> anchors = AnchorDropout()
-        >>> anchors.draw(Params(torch.ones(500), means=torch.rand(500, 3), step=0)).keep is None
+        >>> x = Params(torch.ones(500), means=torch.rand(500, 3))
+        >>> AnchorDropout().draw(x._replace(step=0)).keep is None
         True
-        >>> keep = anchors.draw(Params(torch.ones(500), means=torch.rand(500, 3), step=10_000)).keep
-        >>> bool(keep.all())
+        >>> bool(AnchorDropout().draw(x._replace(step=10_000)).keep.all())
         False
     """
 

@@ -156,7 +156,6 @@ class DropGaussian(GaussianDropout):
         steps: length of the ramp; the source trains for 10,000 steps, shorter trainings should pass their own length.
 
     Example:
-        >>> import torch
         >>> dropout = DropGaussian()
         >>> dropout.set_step(5_000)
         >>> opacity = torch.full((4,), 0.5)
