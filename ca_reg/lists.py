@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+from torch.utils.checkpoint import checkpoint
 
 from ca_reg._check import check_callable, check_count, check_opacity
 from ca_reg.functional import Multiplier
@@ -232,7 +232,9 @@ class _Walk(NamedTuple):
 
     def moments(self, terms: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Return mean and variance of the values, (4, H, W); ``terms`` collects what `_advance` does, by chunk."""
-        advance = _Chunk.apply if terms is None else partial(_advance, terms=terms)
+        # Nothing is kept for the backward pass but the states between chunks: it computes again what is between them.
+        again = partial(checkpoint, _advance, use_reentrant=False, preserve_rng_state=False)
+        advance = again if terms is None and torch.is_grad_enabled() else partial(_advance, terms=terms)
         mean = variance = self.behind[:0]
         chunks = self._chunks()
         ends = [0, *(counts[-1] for counts, _, _ in chunks), len(self.ranks)]
@@ -322,28 +324,6 @@ def _advance(
     if terms is not None:
         terms.append(torch.cat(found))
     return mean, variance
-
-
-class _Chunk(torch.autograd.Function):
-    """`_advance`, computed again in the backward pass: nothing is kept but the states between chunks."""
-
-    @staticmethod
-    def forward(ctx: Any, counts: list[int], gaussians: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        ctx.counts = counts
-        ctx.save_for_backward(gaussians, *inputs)
-        return _advance(counts, gaussians, *inputs)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        gaussians, *saved = ctx.saved_tensors
-        inputs = [x.detach().requires_grad_(needed) for x, needed in zip(saved, ctx.needs_input_grad[2:], strict=True)]
-        with torch.enable_grad():
-            pairs = zip(_advance(ctx.counts, gaussians, *inputs), gradients, strict=True)
-            out, upstream = zip(*((x, g) for x, g in pairs if x.requires_grad), strict=True)
-            leaves = [x for x in inputs if x.requires_grad]
-            found = iter(torch.autograd.grad(list(out), leaves, list(upstream), allow_unused=True))
-        return None, None, *(next(found) if x.requires_grad else None for x in inputs)
 
 
 def _background_of(lists: PixelLists, background: Tensor | None) -> Tensor:
