@@ -13,11 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = [
-    "Rate", "check_callable", "check_count", "check_finite", "check_opacity", "check_opacity_range",
-    "check_per_gaussian", "check_rate", "check_rates", "check_sigma", "check_tensor", "is_zero", "rate_like",
-]  # fmt: skip
-
 MAX_SIGMA = 1e30
 
 Rate = float | Tensor

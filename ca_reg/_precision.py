@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["at_least_single", "without_autocast"]
-
 
 def at_least_single(x: Tensor, *, copy: bool = False) -> Tensor:
     """Return a tensor in float32, or in its own dtype if that is wider."""

@@ -8,8 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["draw_numbers", "seeded"]
-
 
 def draw_numbers(
     sample: Callable[..., Tensor], n: int, generator: torch.Generator | None, device: torch.device | str | None
@@ -17,8 +15,7 @@ def draw_numbers(
     """Return n float32 numbers of ``torch.rand`` or ``torch.randn``, drawn on the generator's device if one is given.
 
     A generator need not be on the device of the Gaussians: that of a score is on the CPU, so that its masks are the
-    same on every device. Without a generator, the global one of ``device`` is taken. ``sample`` is ``torch.rand`` or
-    ``torch.randn``.
+    same on every device. Without a generator, the global one of ``device`` is taken.
 
     Raises:
         RuntimeError: if a generator is used during a backward pass, where a recomputed draw would differ.

@@ -20,11 +20,6 @@ from ca_reg import Chain, OpacityNoise, Params
 
 from ._report import Skip, Tally
 
-__all__ = [
-    "MODULES", "RASTERIZERS", "Call", "CallSite", "RasterizerCall", "Signature", "chain_of", "check_installed",
-    "class_in", "forward_signature", "hide_dropped", "rasterizer_classes", "second_regularizers", "white_alpha",
-]  # fmt: skip
-
 _OF_CALL = ("view_matrix", "step")  # fields that are not per Gaussian
 
 

@@ -19,8 +19,6 @@ from torch import Tensor
 
 from ._calls import RasterizerCall, Signature, class_in, forward_signature
 
-__all__ = ["AfterImport", "ClassPatch", "PatchedClasses", "is_overridden", "override"]
-
 
 class AfterImport(MetaPathFinder):
     """Call back with a module right after its import, by whomever; at :meth:`start` if it is imported already.

@@ -13,8 +13,6 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
 from ca_reg._check import check_count
 
-__all__ = ["Hook", "Skip", "Tally"]
-
 
 class Skip(StrEnum):
     """Why a render was left alone."""

@@ -22,11 +22,6 @@ from unittest.mock import patch
 
 from ._patching import AfterImport
 
-__all__ = [
-    "Sources", "Watch", "explain_download", "find_script", "folder_of_reports", "in_children", "old_aliases",
-    "read_folder", "read_script", "reports_of_children", "run_script", "set_command_line",
-]  # fmt: skip
-
 _SUFFIXES = ("Rasterizer", "RasterizationSettings")
 _NOT_READ = {"submodules", "build", "site-packages"}  # extensions and environments within a repository
 

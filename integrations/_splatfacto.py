@@ -18,8 +18,6 @@ from ca_reg.regularizers import parse
 
 from .gsplat import Rasterization, regularized
 
-__all__ = ["CoAdaptation"]
-
 _of_the_model: ContextVar[Rasterization | None] = ContextVar("_of_the_model", default=None)
 
 

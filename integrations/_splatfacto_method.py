@@ -11,8 +11,6 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from ._splatfacto import CoAdaptation
 
-__all__ = ["SplatfactoCAModel", "SplatfactoCAModelConfig", "make_method"]
-
 if not hasattr(splatfacto, "rasterization"):
     raise ImportError("its splatfacto does not call gsplat.rendering.rasterization; nerfstudio 1.1.1 and newer does")
 

@@ -8,8 +8,6 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-__all__ = ["Iterations", "ModelSteps", "Steps", "leaf_of"]
-
 Steps = Literal["updates", "parameters"]
 """What marks a new step: a call of ``update_learning_rate``, or a change of the parameters."""
 
