@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from functools import partial
-from itertools import cycle, islice
+from itertools import count, cycle, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -151,23 +151,16 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         check_opacity(x.opacities)
         opacity = x.opacities.detach()
         record: dict[str, float | int | str | None] = {"step": step, "gaussians": opacity.shape[0]}
-        index = 0
+        position = count()
         for name, group in self.views.items():
-            results = []
-            for view in group:
-                results.append(self.score(x, view, index=index))
-                index += 1
-            summary = summarize(results).as_dict()
+            summary = summarize(self.score(x, view, index=next(position)) for view in group).as_dict()
             record[f"ca/{name}"] = summary["value"]
-            record[f"ca_std_error/{name}"] = summary["std_error"]
-            record[f"ca_reason/{name}"] = summary["reason"]
-            record[f"ca_empty_views/{name}"] = summary["empty_views"]
+            record |= {f"ca_{key}/{name}": summary[key] for key in ("std_error", "reason", "empty_views")}
             if self.psnr is not None:
                 record[f"psnr/{name}"] = self._mean_psnr(self.psnr, opacity, group)
         record.update(asdict(self.score.settings))
         self._write(record)
-        if self.details is not None and self.writer is not None:
-            self._show(self.writer, self.details, opacity, step)
+        self._show(opacity, step)
         return record
 
     def close(self) -> None:
@@ -190,20 +183,16 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         return mean if math.isfinite(mean) else None
 
     @torch.no_grad()
-    def _show(
-        self,
-        writer: Sinks,
-        details: Callable[[Tensor, Any], Mapping[str, Tensor]],
-        opacity: Tensor,
-        step: int,
-    ) -> None:
-        """Write the details of the first view of each group to TensorBoard."""
+    def _show(self, opacity: Tensor, step: int) -> None:
+        """Write the details of the first view of each group, if they are asked for."""
+        if self.details is None or self.writer is None:
+            return
         for group, views in self.views.items():
-            for name, x in details(opacity.clone(), views[0]).items():
+            for name, x in self.details(opacity.clone(), views[0]).items():
                 if x.numel():  # such as no share above 0
-                    add = writer.add_histogram if x.ndim == 1 else writer.add_image
+                    add = self.writer.add_histogram if x.ndim == 1 else self.writer.add_image
                     add(f"{name}/{group}", x, step)
-        writer.flush()
+        self.writer.flush()
 
     def _write(self, record: dict[str, Any]) -> None:
         """Append one line, and the scalars to TensorBoard."""

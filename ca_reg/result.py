@@ -178,9 +178,8 @@ class CAResult(_Score):
     visible: Tensor
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Plot the standard deviation of every pixel as a heat map; pixels that do not count stay gray.
+        """Plot the root of ``variance``, in units of color, as a heat map; pixels that do not count stay gray.
 
-        The map shows the square root of ``variance``, in units of color, as a few pixels hold most of the variance.
         Draws on ``ax``, by default in a new figure, and returns it.
 
         Raises:

@@ -26,12 +26,7 @@ Schedule = Callable[[int], float]
 
 @dataclass(frozen=True)
 class Constant:
-    """The same rate at every step, as in the paper.
-
-    Example:
-        >>> Constant(0.2)(1000)
-        0.2
-    """
+    """The same rate at every step, as in the paper."""
 
     value: float
 
@@ -156,12 +151,7 @@ SCHEDULES = {"ramp": LinearRamp, "between": StartStop, "decay": ExponentialDecay
 
 
 def as_schedule(rate: float | Schedule) -> Schedule:
-    """Return ``rate`` if it is callable, else the constant schedule of that rate.
-
-    Example:
-        >>> as_schedule(0.2)
-        Constant(value=0.2)
-    """
+    """Return ``rate`` if it is callable, else the constant schedule of that rate."""
     return rate if callable(rate) else Constant(rate)
 
 
