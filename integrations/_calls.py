@@ -35,11 +35,7 @@ def chain_of(regularizer: nn.Module) -> Chain:
 
 
 class Signature:
-    """Binds the arguments of calls of one function, where all have names in a tenth of the time that inspect takes.
-
-    Attributes:
-        full: what inspect knows of the function.
-    """
+    """Binds the arguments of calls of one function, where all have names in a tenth of the time that inspect takes."""
 
     def __init__(self, full: inspect.Signature) -> None:
         self.full = full
@@ -61,16 +57,10 @@ class Signature:
 
 
 class Call:
-    """A call of a rasterizer whose bound arguments may be changed before it is made.
+    """A call of a rasterizer whose bound ``arguments`` may be changed before it is made."""
 
-    Attributes:
-        arguments: the bound arguments by name.
-        names: argument names by field of :class:`~ca_reg.Params`, where the two differ.
-        instead: which arguments replace these in some calls, for messages.
-    """
-
-    names: ClassVar[Mapping[str, str]] = {}
-    instead: ClassVar[str] = ""
+    names: ClassVar[Mapping[str, str]] = {}  # of arguments, by field of Params, where the two differ
+    instead: ClassVar[str] = ""  # which arguments replace these in some calls, for messages
 
     def __init__(self, function: Callable[..., Any], signature: Signature, args: Sequence[Any], kwargs: Any) -> None:
         self.function = function
@@ -248,11 +238,8 @@ def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
 
     Densification derives visibility from these. Besides the radii some rasterizers return flags (3dgs-mcmc) or counts
     (taming-3dgs); floating-point sums of a Gaussian of opacity 0 are 0 already. Zeroes integers and bools of shape
-    (N,), (N, 1) or (N, 2) where ``keep``, (N,) bool, is False, and returns the tuple.
-
-    Raises:
-        TypeError: if ``returned`` is not a tuple.
-        ValueError: if no member is such a per-Gaussian tensor.
+    (N,), (N, 1) or (N, 2) where ``keep``, (N,) bool, is False. Raises a TypeError for anything but a tuple, and a
+    ValueError for one without such a member.
     """
     if not isinstance(returned, tuple):
         raise TypeError(f"the rasterizer returned {type(returned).__name__}, expected a tuple with colors and radii.")
@@ -310,14 +297,11 @@ class CallSite(NamedTuple):
 
     The tensors tell neither a viewer's render from a training render nor which model they belong to. The local
     variables of the function do, in every code base of the family and in any import order; they are only read.
-
-    Args:
-        variables: its local variables.
-        place: code and instruction of each frame from it outward: the same for all renders of one call in a loop.
     """
 
     variables: Mapping[str, Any]
     place: tuple[tuple[CodeType, int], ...]
+    """Code and instruction of each frame from it outward: the same for all renders of one call in a loop."""
 
     @classmethod
     def find(cls) -> CallSite:

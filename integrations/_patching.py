@@ -7,7 +7,7 @@ import inspect
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -21,17 +21,7 @@ from ._calls import RasterizerCall, Signature, class_in, forward_signature
 
 
 class AfterImport(MetaPathFinder):
-    """Call back with a module right after its import, by whomever; at :meth:`start` if it is imported already.
-
-    Example:
-        >>> import colorsys
-        >>> seen = []
-        >>> watch = AfterImport({"colorsys": lambda module: seen.append(module.__name__)})
-        >>> watch.start()
-        >>> watch.stop()
-        >>> seen
-        ['colorsys']
-    """
+    """Call back with a module right after its import, by whomever; at :meth:`start` if it is imported already."""
 
     def __init__(self, callbacks: Mapping[str, Callable[[ModuleType], None]]) -> None:
         self._callbacks = callbacks
@@ -45,7 +35,7 @@ class AfterImport(MetaPathFinder):
 
     def stop(self) -> None:
         """Stop watching; no effect if not watching."""
-        if self in sys.meta_path:
+        with suppress(ValueError):
             sys.meta_path.remove(self)
 
     def find_spec(
@@ -76,20 +66,7 @@ _INHERITED = object()
 
 
 class ClassPatch:
-    """Replaces a method of a class, its own or inherited, by ``make(method)`` until :meth:`remove`.
-
-    Example:
-        >>> class Greeter:
-        ...     def greet(self):
-        ...         return "hello"
-        >>> before = vars(Greeter)["greet"]
-        >>> patch = ClassPatch(Greeter, "greet", lambda greet: lambda self: greet(self).upper())
-        >>> Greeter().greet()
-        'HELLO'
-        >>> patch.remove()
-        >>> vars(Greeter)["greet"] is before
-        True
-    """
+    """Replaces a method of a class, its own or inherited, by ``make(method)`` until :meth:`remove`."""
 
     def __init__(self, owner: type, name: str, make: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
         self.owner = owner
@@ -127,10 +104,6 @@ class PatchedClasses:
         rasterize: handles every call of a rasterizer.
         update: is called with a model and an iteration before its learning rate is updated.
         check: is called with the signature of a rasterizer, and may raise.
-
-    Attributes:
-        models: the model classes wrapped so far.
-        names: names of the rasterizers wrapped so far, for messages.
     """
 
     def __init__(
@@ -143,8 +116,8 @@ class PatchedClasses:
         update: Callable[[Any, int], None],
         check: Callable[[Any], None],
     ) -> None:
-        self.models: tuple[type, ...] = ()
-        self.names: list[str] = []
+        self.models: tuple[type, ...] = ()  # classes wrapped so far
+        self.names: list[str] = []  # of the rasterizers wrapped so far, for messages
         self._patches: list[ClassPatch] = []
         self._rasterize, self._update, self._check = rasterize, update, check
         self._updated: Any = None  # the model whose update_learning_rate is running
@@ -252,14 +225,12 @@ def _has_opacities(model: Any) -> bool:
 
 
 class _Override(NamedTuple):
-    """The override of one thread: its rasterizers, its opacities, and the calls so far."""
-
     rasterizers: tuple[type, ...]
     opacity: Tensor
-    calls: list[RasterizerCall]
+    calls: list[RasterizerCall]  # so far
 
 
-_current: ContextVar[_Override | None] = ContextVar("_current", default=None)
+_current: ContextVar[_Override | None] = ContextVar("_current", default=None)  # of the thread
 _lock = threading.Lock()
 _patches: dict[type, tuple[ClassPatch, int]] = {}  # patch and number of active overrides of every class
 
@@ -279,52 +250,47 @@ def override(rasterizers: Sequence[type], opacity: Tensor) -> Iterator[list[Rast
     mine = _Override(tuple(rasterizers), opacity, [])
     with ExitStack() as undo:
         for rasterizer in mine.rasterizers:
-            _acquire(rasterizer)
-            undo.callback(_release, rasterizer)
-        token = _current.set(mine)
-        undo.callback(_current.reset, token)
+            undo.enter_context(_patched(rasterizer))
+        undo.callback(_current.reset, _current.set(mine))
         yield mine.calls
 
 
-def _acquire(rasterizer: type) -> None:
-    """Patch a class unless an active override has."""
+@contextmanager
+def _patched(rasterizer: type) -> Iterator[None]:
+    """Keep a class patched, once for all overrides that need it."""
     with _lock:
-        patch, users = _patches.get(rasterizer) or (ClassPatch(rasterizer, "forward", _make(rasterizer)), 0)
+        make = functools.partial(_with_other_opacities, rasterizer)
+        patch, users = _patches.get(rasterizer) or (ClassPatch(rasterizer, "forward", make), 0)
         _patches[rasterizer] = patch, users + 1
+    try:
+        yield
+    finally:
+        with _lock:
+            patch, users = _patches.pop(rasterizer)
+            if users > 1:
+                _patches[rasterizer] = patch, users - 1
+            else:
+                patch.remove()
 
 
-def _release(rasterizer: type) -> None:
-    """Restore a class unless another override needs the patch."""
-    with _lock:
-        patch, users = _patches[rasterizer]
-        if users > 1:
-            _patches[rasterizer] = patch, users - 1
-        else:
-            patch.remove()
-            del _patches[rasterizer]
-
-
-def _make(rasterizer: type) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return the function that wraps the forward of a class."""
+def _with_other_opacities(rasterizer: type, forward: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap the forward of a class."""
     signature = Signature(forward_signature(rasterizer))
 
-    def make(forward: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(forward)
-        def with_other_opacities(*args: Any, **kwargs: Any) -> Any:
-            mine = _current.get()
-            if mine is None or rasterizer not in mine.rasterizers:
-                return forward(*args, **kwargs)
-            call = RasterizerCall(forward, signature, args, kwargs)
-            given = call.arguments["opacities"]
-            if given.numel() != mine.opacity.numel():
-                raise ValueError(
-                    f"render rasterizes {given.numel()} Gaussians, but {mine.opacity.numel()} opacities were given; "
-                    "give those of all Gaussians, and switch off any dropout of its own."
-                )
-            call.arguments["opacities"] = mine.opacity.reshape(given.shape)
-            mine.calls.append(call)
-            return call()
+    @functools.wraps(forward)
+    def with_other_opacities(*args: Any, **kwargs: Any) -> Any:
+        mine = _current.get()
+        if mine is None or rasterizer not in mine.rasterizers:
+            return forward(*args, **kwargs)
+        call = RasterizerCall(forward, signature, args, kwargs)
+        given = call.arguments["opacities"]
+        if given.numel() != mine.opacity.numel():
+            raise ValueError(
+                f"render rasterizes {given.numel()} Gaussians, but {mine.opacity.numel()} opacities were given; "
+                "give those of all Gaussians, and switch off any dropout of its own."
+            )
+        call.arguments["opacities"] = mine.opacity.reshape(given.shape)
+        mine.calls.append(call)
+        return call()
 
-        return with_other_opacities
-
-    return make
+    return with_other_opacities

@@ -30,23 +30,14 @@ class Skip(StrEnum):
 
 @dataclass
 class Tally:
-    """Counts of rasterizer calls.
+    """Counts of rasterizer calls; the steps are those of the first and the last regularized render, if there is one."""
 
-    Args:
-        regularized: training renders whose Gaussians were dropped or perturbed.
-        scaled: renders without gradients, or for a viewer, with test-time values.
-        skipped: renders left alone, by reason.
-        first_step: step of the first regularized render; None if there was none.
-        last_step: step of the last regularized render; None if there was none.
-        lost: training steps without a render that could be regularized.
-    """
-
-    regularized: int = 0
-    scaled: int = 0
-    skipped: Counter[Skip] = field(default_factory=Counter)
+    regularized: int = 0  # training renders whose Gaussians were dropped or perturbed
+    scaled: int = 0  # renders without gradients, or for a viewer, with test-time values
+    skipped: Counter[Skip] = field(default_factory=Counter)  # renders left alone, by reason
     first_step: int | None = None
     last_step: int | None = None
-    lost: int = 0
+    lost: int = 0  # training steps without a render that could be regularized
 
     def count_regularized(self, step: int) -> None:
         """Count a regularized render."""
@@ -100,16 +91,8 @@ class Hook(abc.ABC):
     Optimizer steps count if a parameter group is named ``opacity`` or ``opacities``: other optimizers train networks,
     poses or exposures.
 
-    Args:
-        patience: number of optimizer steps in a row without a regularized render, and total number of training steps
-            without a render, beyond which an error is raised; 0 for no limit.
-
-    Attributes:
-        tally: counts of what was done so far.
-
-    Raises:
-        TypeError: if ``patience`` is not an integer.
-        ValueError: if it is negative.
+    More than ``patience`` optimizer steps in a row without a regularized render, or training steps in all without a
+    render, are an error; 0 for no limit. ``tally`` counts what was done so far.
     """
 
     def __init__(self, patience: int) -> None:
@@ -148,11 +131,7 @@ class Hook(abc.ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Uninstall the hook.
-
-        Raises:
-            RuntimeError: if training ended without being regularized, see :meth:`problem`.
-        """
+        """Uninstall the hook; raise a RuntimeError if training was not regularized, see :meth:`problem`."""
         self.uninstall()
         if error is None and self._optimized and (problem := self.problem()):
             raise RuntimeError(problem)

@@ -28,19 +28,16 @@ _NOT_READ = {"submodules", "build", "site-packages"}  # extensions and environme
 
 @dataclass
 class Sources:
-    """What the files of a code base import and define.
-
-    Args:
-        imports: dotted names of all modules, and of what may be one, that are imported.
-        rasterizers: names ``...Rasterizer`` and ``...RasterizationSettings`` imported from foreign modules, by module.
-        models: classes with a method ``update_learning_rate(iteration)``, as ``module:Class``.
-        root: the folder of the script, or its parent if files are imported from there.
-    """
+    """What the files of a code base import and define."""
 
     imports: set[str] = field(default_factory=set)
+    """Dotted names of all modules, and of what may be one."""
     rasterizers: dict[str, set[str]] = field(default_factory=dict)
+    """Names ``...Rasterizer`` and ``...RasterizationSettings`` imported from foreign modules, by module."""
     models: list[str] = field(default_factory=list)
+    """Classes with a method ``update_learning_rate(iteration)``, as ``module:Class``."""
     root: Path = Path()
+    """The folder of the script, or its parent if files are imported from there."""
 
     @property
     def packages(self) -> set[str]:
@@ -281,29 +278,22 @@ def reports_of_children() -> list[dict[str, Any]]:
 
 
 class Watch:
-    """Notices files that a script writes and processes that it starts, within a ``with`` block.
-
-    Attributes:
-        saved: path of the model that was written last, as far as Python's own files go; None if there was none.
-        missed: commands of Python processes that do not see the environment of :func:`in_children`.
-    """
+    """Notices files that a script writes and processes that it starts, within a ``with`` block."""
 
     _current: Watch | None = None
     _hooked = False
 
     def __init__(self) -> None:
-        self.saved: str | None = None
-        self.missed: list[str] = []
+        self.saved: str | None = None  # path of the model that was written last, as far as Python's own files go
+        self.missed: list[str] = []  # commands of Python processes that do not see the environment of `in_children`
 
     def __enter__(self) -> Watch:
-        """Watch."""
         if not Watch._hooked:  # such a hook cannot be removed
             sys.addaudithook(_audit)
         Watch._hooked, Watch._current = True, self
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Stop watching."""
         Watch._current = None
 
     def notice(self, event: str, arguments: tuple[Any, ...]) -> None:

@@ -100,13 +100,10 @@ class _GsplatCall(Call):
 
 
 class Regularized:
-    """A rasterization whose Gaussians pass through a regularizer; made by :func:`regularized`.
+    """A ``rasterization`` whose Gaussians pass through a ``regularizer``; made by :func:`regularized`.
 
-    Attributes:
-        rasterization: the wrapped function.
-        regularizer: the module, as given.
-        chain: the same as a :class:`~ca_reg.Chain`.
-        tally: counts of what was done; in an :class:`Installation`, by all its functions.
+    ``chain`` is the regularizer as a :class:`~ca_reg.Chain`. ``tally`` counts what was done; in an
+    :class:`Installation`, by all its functions.
     """
 
     _eager: Any = None
@@ -197,13 +194,11 @@ class Regularized:
 class Installation(Hook):
     """The replacements that :func:`install` made; undone by :meth:`uninstall` or at the end of a ``with`` block.
 
-    Attributes:
-        rasterization: the replacement of ``gsplat.rasterization``.
-        functions: all replacements, by name of the function.
-        tally: counts of what all of them did.
+    ``functions`` are all of them by name, ``tally`` counts what they did.
     """
 
     rasterization: Regularized
+    """The replacement of ``gsplat.rasterization``."""
 
     def __init__(
         self, regularizer: nn.Module, *, generator: torch.Generator | None = None, seed: int | None = None,
@@ -269,16 +264,9 @@ def install(regularizer: nn.Module, *, generator: torch.Generator | None = None,
     ``gsplat.rendering``. Install before the script is imported: modules that have imported a name already keep the old
     function. Such a script does not set the step: the regularizer's step is the number of training calls so far.
 
-    Args:
-        regularizer: as for :func:`regularized`.
-        generator: as for :func:`regularized`.
-        patience: number of steps in a row, of optimizers with a parameter group ``opacity`` or ``opacities``, without a
-            regularized call, beyond which a RuntimeError ends the training; 0 for no limit.
-
-    Raises:
-        ImportError: if gsplat is missing.
-        TypeError: as :func:`regularized`, or if ``patience`` is not an integer.
-        ValueError: as :func:`regularized`, in particular if installed already, or if ``patience`` is negative.
+    Arguments and errors are those of :func:`regularized`, besides an ImportError if gsplat is missing and a ValueError
+    if it is installed already. More than ``patience`` steps in a row, of optimizers with a parameter group ``opacity``
+    or ``opacities``, without a regularized call end the training in a RuntimeError; 0 for no limit.
 
     Example:
         >>> import runpy

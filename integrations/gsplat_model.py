@@ -21,15 +21,9 @@ _ALL = 2**31 - 1  # end of the range of Gaussian batches per tile: all of them
 
 
 class GsplatView(NamedTuple):
-    """A camera in gsplat's terms.
+    """A camera in gsplat's terms: OpenCV axes, half-pixel centers.
 
-    Convention: OpenCV camera, half-pixel centers.
-
-    Attributes:
-        viewmat: world to camera, shape (4, 4).
-        K: intrinsics, pixels, shape (3, 3).
-        width: of the image, in pixels.
-        height: of the image, in pixels.
+    ``viewmat``, (4, 4), is world to camera, ``K``, (3, 3), the intrinsics in pixels; width and height are the image's.
     """
 
     viewmat: Tensor
@@ -52,8 +46,8 @@ class GsplatModel:
         colors: RGB, shape (N, 3), or with ``sh_degree`` spherical-harmonic coefficients, shape (N, K, 3).
         sh_degree: highest degree to evaluate; None for RGB.
         background: color behind everything, shape (3,); None for black.
-        near_plane: as in ``gsplat.rasterization``.
-        eps2d: as in ``gsplat.rasterization``.
+        near_plane: as in ``gsplat.rasterization``, like ``eps2d``.
+        eps2d: see there.
         antialiased: whether the model was trained with ``rasterize_mode="antialiased"``.
 
     Example:
@@ -76,14 +70,9 @@ class GsplatModel:
     antialiased: bool = False
 
     def render(self, opacity: Tensor, view: GsplatView) -> tuple[Tensor, Tensor]:
-        """Render a view with activated opacities (N,) or (N, 1): a render callable for :class:`~ca_reg.CAScore`.
+        """Render a view with activated opacities (N,) or (N, 1); return image (3, H, W) and accumulated alpha (H, W).
 
-        Returns:
-            Image (3, H, W) and accumulated alpha (H, W).
-
-        Raises:
-            ImportError: if gsplat is missing.
-            RuntimeError: if the Gaussians are not on a CUDA device.
+        Raises an ImportError without gsplat, a RuntimeError if the Gaussians are not on a CUDA device.
         """
         colors, alphas, _ = unregularized(load_gsplat(self.means.device).rasterization)(
             **self._camera(view),

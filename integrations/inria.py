@@ -55,10 +55,9 @@ class RasterizerHook(Hook):
     Renders under ``no_grad`` and for a viewer get the test-time values. All others, such as depth renders with constant
     opacities or detached positions, are left alone; :attr:`tally` counts them by reason.
 
-    The training step, which schedules and masks follow, is inferred from calls of ``update_learning_rate`` of the
-    ``models``; for a code base without it, call :meth:`step` or infer it from the parameters (``steps``). The masks
-    depend on the seed, the model and the step alone, and the global random state is untouched: a script picks the same
-    cameras with and without the hook.
+    The training step, which schedules and masks follow, is told by the ``models``, the parameters (see ``steps``), or
+    calls of :meth:`step`. The masks depend on the seed, the model and the step alone, and the global random state is
+    untouched: a script picks the same cameras with and without the hook.
 
     Training without regularization is an error, raised in :meth:`step`, ``update_learning_rate``,
     ``optimizer.step()`` or ``backward()``; see ``patience``.
@@ -149,11 +148,9 @@ class RasterizerHook(Hook):
     def install(self) -> Self:
         """Wrap the rasterizers, now or once they are imported; return the hook.
 
-        Raises:
-            ImportError: if no rasterizer is installed and none was given.
-            RuntimeError: if this hook or another one is installed already.
-            TypeError: if the rasterizer is not of the INRIA family.
-            ValueError: if it does not take what the regularizer needs.
+        Raises an ImportError if no rasterizer is installed and none was given, a RuntimeError if this hook or another
+        one is installed already, a TypeError if the rasterizer is not of the INRIA family, and a ValueError if it does
+        not take what the regularizer needs.
         """
         if self._patched is not None:
             raise RuntimeError("this hook is installed already; uninstall it first.")
@@ -178,8 +175,7 @@ class RasterizerHook(Hook):
     def uninstall(self) -> None:
         """Restore the classes exactly.
 
-        Raises:
-            RuntimeError: if the hook is not installed, or the classes were wrapped again since; nothing changes then.
+        Raises a RuntimeError if it is not installed, or the classes were wrapped again since; nothing changes then.
         """
         if self._patched is None:
             raise RuntimeError("this hook is not installed.")
@@ -326,15 +322,9 @@ def render_fn(
     ``render`` returns, the alpha if it is named (the paper's code, Binocular3DGS, CoR-GS, DNGaussian). Else a second
     pass with the same opacities measures it, white on black: a depth is never mistaken for an alpha.
 
-    Args:
-        render: ``render(view, gaussians, pipe, background)`` of the code base.
-        gaussians: its model.
-        pipe: its pipeline settings.
-        background: color, shape (3,).
-        rasterizer: the class that ``render`` uses; by default the installed ones.
-
-    Returns:
-        A callable ``(opacity, view) -> Rendering(image (3, H, W), alpha (H, W))``.
+    ``render(view, gaussians, pipe, background)`` is the code base's, the other arguments are what it takes: model,
+    pipeline settings, a color (3,). ``rasterizer`` is the class that it uses, by default the installed ones. A call
+    ``(opacity, view)`` returns a :class:`~ca_reg.types.Rendering`.
 
     Raises:
         ImportError: when called, if no rasterizer is installed and none was given.

@@ -18,23 +18,15 @@ from ca_reg.types import RenderFn
 __all__ = ["CAScoreMetric"]
 
 
-class _NoTorchmetrics:
-    """Stands in for the base class where torchmetrics is missing, so that this module can be imported."""
-
-    def __init__(self, **_: Any) -> None:
-        raise ImportError("CAScoreMetric needs torchmetrics; install it with: pip install 'ca_reg[torchmetrics]'")
-
-
-_Metric: Any
 try:
-    from torchmetrics import Metric as _Metric
-except ImportError:
-    _Metric = _NoTorchmetrics
+    from torchmetrics import Metric
+except ImportError as error:
+    raise ImportError("CAScoreMetric needs torchmetrics: pip install 'ca_reg[torchmetrics]'") from error
 
 _numbers = count()
 
 
-class CAScoreMetric(_Metric):  # type: ignore[misc]
+class CAScoreMetric(Metric):
     """The mean co-adaptation score of the views seen since the last reset, as a torchmetrics metric.
 
     ``update(opacity, view)`` measures one view, ``forward`` also returns its score, ``compute`` returns the mean over
@@ -59,7 +51,6 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
             for each reason; (7,) float64. Not in ``state_dict`` unless ``persistent(True)`` is called.
 
     Raises:
-        ImportError: if torchmetrics is missing; it comes with ``ca_reg[torchmetrics]``.
         TypeError: if ``score`` is neither.
 
     Example:
@@ -94,17 +85,13 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
     def forward(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> Tensor:
         """Measure one view, count it, and return its score as a scalar; arguments as for :meth:`update`."""
         # The base class resets the metric during the call, and with it the count of updates.
-        index = self._position(self.update_count) if index is None else index
+        index = view_position(self.update_count, self.process_group) if index is None else index
         value: Tensor = super().forward(opacity, view, index=index)
         return value
 
     def update(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> None:
-        """Measure one view and count it; arguments as for :meth:`ca_reg.CAScore.update`.
-
-        Raises:
-            TypeError, ValueError: as for a call of the score.
-        """
-        index = self._position(self.update_count - 1) if index is None else index
+        """Measure one view and count it; arguments and errors are those of :meth:`ca_reg.CAScore.update`."""
+        index = view_position(self.update_count - 1, self.process_group) if index is None else index
         self.sums = self.sums + row_of(self.score(opacity, view, index=index)).to(self.sums)
 
     def compute(self) -> Tensor:
@@ -117,11 +104,7 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
             return summary_of(self.sums, self.score.settings)
 
     def plot(self, val: Tensor | Sequence[Tensor] | None = None, ax: Any = None) -> Any:
-        """Draw one value or a sequence of them, by default the present mean; return the figure and its axes.
-
-        Raises:
-            ModuleNotFoundError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
-        """
+        """Draw one value or a sequence of them, by default the present mean; return the figure and its axes."""
         return self._plot(val, ax)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> CAScoreMetric:
@@ -131,7 +114,3 @@ class CAScoreMetric(_Metric):  # type: ignore[misc]
         memo[id(self)] = twin
         twin.__setstate__(deepcopy(self.__getstate__(), memo))
         return twin
-
-    def _position(self, before: int) -> int:
-        """Return the position of the view that follows ``before`` others on this rank."""
-        return view_position(before, self.process_group)
