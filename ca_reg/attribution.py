@@ -76,8 +76,7 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
         view: passed on to both callables.
 
     Raises:
-        TypeError: as for a call of the score.
-        ValueError: as for a call of the score, if the score is not exact, or ``shares_fn`` returns another shape.
+        ValueError: if the score is not exact, or ``shares_fn`` returns another shape; others are those of the score.
 
     Example:
         A red Gaussian in front of a blue one, over black:
@@ -130,9 +129,6 @@ def hanging(
     Returns:
         Which Gaussians hang, bool, shape (N,).
 
-    Raises:
-        ValueError: if the shapes differ, or a number is out of range.
-
     Example:
         The second Gaussian is seen beside the training cameras only; the third too, but hardly matters.
 
@@ -157,11 +153,7 @@ def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATota
     """Measure a view exactly and find how much the score would fall if one Gaussian's factor were fixed at its mean.
 
     Costs the score, and a forward and backward pass of its moments callable, which must be differentiable in the
-    variance of the multiplier, a tensor (N,). The arguments are those of :func:`attribute`.
-
-    Raises:
-        TypeError: as for a call of the score.
-        ValueError: as for a call of the score, if the score is not exact, or its moments are not differentiable.
+    variance of the multiplier, a tensor (N,). Arguments and errors are those of :func:`attribute`.
 
     In the example of :func:`attribute` the effects are 0.0275 and 0.0333: the interaction now counts for the Gaussian
     in front as well.

@@ -69,8 +69,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         writer: of TensorBoard and all sinks, for curves of one's own; None where there is neither.
 
     Raises:
-        TypeError: if ``views`` is not a mapping or an argument is of the wrong type.
-        ValueError: if there are no views, a group is empty, a number is out of range, or a line of the log is damaged.
+        ValueError: if a group is empty, a number is out of range, or a line of the log is damaged.
         OSError: if the log cannot be written, such as on a full disk; its earlier lines stay intact. A BlockingIOError
             if another monitor has the directory open.
 
@@ -284,18 +283,14 @@ def read_log(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         ValueError: if another line is not a measurement; the message names file and line.
     """
     *whole, rest = path.read_bytes().split(b"\n")
-    for number, line in enumerate(whole, start=1):
+    for number, line in enumerate([*whole, rest]):
         try:
             yield line.decode(), _measurement(line)
         except ValueError as error:
-            raise ValueError(
-                f"{path}, line {number}, is no measurement of a CAMonitor: {error}; remove that line to go on."
-            ) from error
-    try:
-        record = _measurement(rest)
-    except ValueError:
-        return
-    yield rest.decode(), record
+            if number < len(whole):
+                raise ValueError(
+                    f"{path}, line {number + 1}, is no measurement of a CAMonitor: {error}; remove that line to go on."
+                ) from error
 
 
 def _measurement(line: bytes) -> dict[str, Any]:
@@ -357,10 +352,7 @@ def plot_dynamics(
     matplotlib's, else that of its label in ``colors``; its last group of views (test) is solid. Draws on two ``axes``,
     by default in a new figure, and returns them: co-adaptation, PSNR.
 
-    Raises:
-        ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
-        FileNotFoundError: if a log is missing.
-        ValueError: if there is no run, or a log is empty.
+    Raises an ImportError without matplotlib, which comes with ``ca_reg[plot]``, and what :func:`read_dynamics` does.
     """
     labelled = runs if isinstance(runs, Mapping) else {"": runs}
     if not labelled:

@@ -83,10 +83,6 @@ class CAScore:
         seed: seed of the masks. They are drawn on the CPU from (seed, view index) alone: the same on every device, and
             whatever other views there are. More renders extend the same sequence.
 
-    Raises:
-        TypeError: if an argument is of the wrong type.
-        ValueError: if one is out of range.
-
     Example:
         A wall of ten gray layers; where one is missing, the next shows.
 

@@ -114,10 +114,6 @@ class GaussianDropout(IndependentDropout):
         p: drop rate in [0, 1), or a schedule of it. The paper uses 0.2.
         compensate: scale the survivors in training rather than all opacities in evaluation.
 
-    Raises:
-        TypeError: if ``p`` is neither a number nor callable.
-        ValueError: if a constant ``p`` is outside [0, 1); a schedule is checked at each use.
-
     Example:
         >>> dropout = GaussianDropout(p=0.2)
         >>> opacity = torch.full((5,), 0.5)
@@ -125,6 +121,9 @@ class GaussianDropout(IndependentDropout):
         >>> torch.equal(in_training, opacity * dropout.keep)
         True
         >>> torch.equal(dropout(opacity, drawn=dropout.last), in_training)  # replay
+        True
+        >>> radii = torch.tensor([3, 1, 2, 5, 4])  # of the rasterizer
+        >>> torch.equal(dropout.mask_radii(radii) > 0, dropout.keep)
         True
         >>> dropout.eval()(opacity)
         tensor([0.4000, 0.4000, 0.4000, 0.4000, 0.4000])
