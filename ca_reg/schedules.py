@@ -9,6 +9,7 @@ import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -166,12 +167,13 @@ class Scheduled(nn.Module):
     """
 
     rate_name: ClassVar[str] = ""  # name of the rate's argument, if there is one
+    _check_rate: ClassVar[staticmethod[[Any, str], None]] = staticmethod(partial(check_finite, minimum=0.0))
 
     def __init__(self, rate: float | Schedule | None = None) -> None:
         super().__init__()
         value = rate.value if isinstance(rate, Constant) else rate
         if not callable(value) and (value is not None or self.rate_name):
-            self._check_rate(value, self.rate_name or "the rate")  # type: ignore[arg-type]  # refuses None
+            self._check_rate(value, self.rate_name or "the rate")  # refuses None
         self._schedule = as_schedule(0.0 if rate is None else rate)
         self._opacity_seen = False
         self._rate: Tensor | None = None
@@ -190,10 +192,6 @@ class Scheduled(nn.Module):
             # A graph reads the rate from a tensor; a number would be baked in, with a recompilation at each step.
             # A new tensor, because one created in inference mode cannot be overwritten outside it.
             self._rate = torch.tensor(self._present_rate(), dtype=torch.float64, device="cpu")
-
-    def _check_rate(self, rate: float, name: str) -> None:
-        """Raise unless the rate is in range: finite and at least 0, unless overridden."""
-        check_finite(rate, name, minimum=0.0)
 
     def _present_rate(self, step: int | None = None) -> float:
         """Return the rate at a step, by default the current one, after a check."""

@@ -43,15 +43,13 @@ class ClusteredDropout(Regularizer):
 
     needs = ("means",)
     rate_name = "p"
+    _check_rate = staticmethod(check_rate)
 
     def __init__(self, p: float | Schedule, k: int = 10, *, every: int = 100) -> None:
         check_count(k, "k", minimum=1)
         super().__init__(p)
         self.k = k
         self.neighbors = Refreshed(every)
-
-    def _check_rate(self, rate: float, name: str) -> None:
-        check_rate(rate, name)
 
     def anchor_rate(self, rate: Rate, neighbors: Tensor) -> Rate:
         """Return the rate of the anchors, given ``p`` at the step and the neighbor indices of all Gaussians, (N, k)."""
@@ -137,6 +135,7 @@ class SHDropout(Regularizer):
     needs = ("sh",)
     drops = False
     rate_name = "p"
+    _check_rate = staticmethod(check_rate)
 
     def __init__(self, p: float | Schedule = 0.2, until: Sequence[int] = (2_000, 4_000, 6_000)) -> None:
         for step in until:
@@ -145,9 +144,6 @@ class SHDropout(Regularizer):
             raise ValueError(f"until must be steps in rising order, got {tuple(until)}.")
         super().__init__(p)
         self.until = tuple(until)
-
-    def _check_rate(self, rate: float, name: str) -> None:
-        check_rate(rate, name)
 
     def draw(self, x: Params, generator: torch.Generator | None = None) -> Draw:
         """Draw which Gaussians keep all degrees, (N,) bool, and note how many coefficients the others keep."""

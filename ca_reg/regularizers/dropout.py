@@ -34,6 +34,8 @@ class IndependentDropout(Regularizer):
         tensor([0.4000, 1.0000])
     """
 
+    _check_rate = staticmethod(check_rate)
+
     def __init__(self, rate: float | Schedule | None = None, *, compensate: bool = False, scale: bool = True) -> None:
         super().__init__(rate)
         self.compensate = compensate
@@ -86,9 +88,6 @@ class IndependentDropout(Regularizer):
             # Survivors may exceed 1: the renderer's clamp must see them before the factor does.
             x = x._replace(opacities=x.opacities / (1.0 - rate_like(rates, x.opacities)))
         return x, Multiplier.dropout(rates)
-
-    def _check_rate(self, rate: float, name: str) -> None:
-        check_rate(rate, name)
 
 
 class GaussianDropout(IndependentDropout):

@@ -42,14 +42,12 @@ class ParameterNoise(Regularizer):
 
     drops = False
     rate_name = "sigma"
+    _check_rate = staticmethod(check_sigma)
     field: ClassVar[str]
 
     def __init__(self, sigma: float | Schedule, *, clip: bool = False) -> None:
         super().__init__(sigma)
         self.clip = clip
-
-    def _check_rate(self, rate: float, name: str) -> None:
-        check_sigma(rate, name)
 
     @property
     def sigma(self) -> float:
