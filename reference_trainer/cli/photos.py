@@ -134,7 +134,7 @@ class Run:
             scene = self.photos
         if scene != self.photos and find_spec("pycolmap") is None:
             raise ImportError("these photographs have no cameras, and finding them needs pip install 'ca_reg[colmap]'.")
-        if scene != self.photos and len(sources) < 2 and not is_video(self.photos):
+        if scene != self.photos and len(sources) < 2 and not any(map(is_video, sources)):
             held = f"{len(sources) or 'no'} photograph{'s' * (len(sources) != 1)}"
             raise ValueError(f"{self.photos} holds {held} that can be read; it takes at least 2, better 3 or more.")
         about: dict[str, Any] = {"frames": self.frames, "files": {path.name: path.stat().st_size for path in sources}}

@@ -189,6 +189,29 @@ def test_what_cannot_work_is_refused_at_once(garden, capsys, monkeypatch):
 
 
 @pytest.mark.slow
+def test_a_folder_with_one_video_is_enough(tmp_path, capsys, monkeypatch):
+    av = pytest.importorskip("av", reason="needs ca_reg[photos]")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "walk").mkdir()
+    with av.open("walk/clip.mp4", "w") as file:
+        stream = file.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for level in range(0, 200, 25):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((48, 64, 3), level, np.uint8), format="rgb24")))
+        file.mux(stream.encode(None))
+    monkeypatch.setattr(photos, "find_spec", lambda name: name)
+    monkeypatch.setattr(warmup, "step_seconds", lambda *size: 0.5)
+    monkeypatch.setattr(
+        poses, "find_poses", lambda scene, **rest: pytest.fail(str(sorted((scene / "images").iterdir())))
+    )
+    with pytest.raises(pytest.fail.Exception, match=r"clip_0000\.jpg.*clip_0002\.jpg"):
+        main(["run", "walk", "--frames", "3"])
+    (tmp_path / "broken.mp4").write_bytes(b"no video")
+    assert "it takes at least 2" in refused(["run", "broken.mp4"], capsys)
+    assert not (tmp_path / "runs/broken").exists()
+
+
+@pytest.mark.slow
 @pytest.mark.data
 def test_three_real_photographs_from_nothing_to_the_page(data_root, tmp_path, capsys, monkeypatch):
     pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
