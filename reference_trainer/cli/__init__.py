@@ -102,10 +102,12 @@ def _parse(arguments: Sequence[str]) -> Any:
     peek.add_argument("--recipe", nargs="?")
     peek.add_argument("--iterations", nargs="?")
     peeked, given = peek.parse_known_args(arguments)[0], given_fields(arguments)
-    recipe, steps = peeked.recipe, peeked.iterations or ""
+    recipe = peeked.recipe
     if recipe and recipe not in RECIPES:
         raise ValueError(f"there is no recipe {recipe!r}; choose one of {', '.join(RECIPES)}.")
-    asked = {"iterations": int(steps)} if steps.isdecimal() else {} if recipe else {"iterations": usual.iterations}
+    asked = {} if recipe else {"iterations": usual.iterations}
+    with contextlib.suppress(ValueError):  # what is no number tyro refuses
+        asked = {"iterations": int(peeked.iterations or "")}
     config = with_recipe(recipe or "3dgs", **asked)
     defaults: dict[str, Any] = {
         "demo": Demo(),

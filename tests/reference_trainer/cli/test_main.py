@@ -107,6 +107,12 @@ def test_settings_given_in_groups_are_those_of_the_training(monkeypatch):
     assert {"noise", "analytic", "densify_until", "means_rate"} <= command.given
 
 
+def test_steps_of_a_recipe_scale_however_their_number_is_written():
+    asked = with_recipe("fsgs", iterations=2000)
+    for written in ("2000", "2_000", "+2000"):
+        assert cli._parse(["train", "--recipe", "fsgs", "--iterations", written]).config == asked
+
+
 def test_the_list_of_commands_says_what_each_does(capsys):
     with pytest.raises(SystemExit):
         main(["--help"])
