@@ -158,10 +158,10 @@ def runs_of(folder: Path) -> list[Path]:
     order: list[str] = []
     with suppress(OSError, ValueError, AttributeError, TypeError):
         order = [*read_json(folder / COMPARISON)["runs"]]
-    seeds = sorted(folder.glob(f"*/seed_*/{CONFIG}"), key=lambda path: int(path.parent.name[5:] or 0))
+    seeds = [path.parent for path in folder.glob(f"*/seed_*/{CONFIG}") if path.parent.name[5:].isdecimal()]
     first: dict[str, Path] = {}
-    for path in seeds:
-        first.setdefault(path.parents[1].name, path.parent)
+    for run in sorted(seeds, key=lambda run: int(run.name[5:])):
+        first.setdefault(run.parent.name, run)
     return [first[name] for name in sorted(first, key=lambda name: (name not in order, [*order, name].index(name)))]
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -316,6 +317,7 @@ def test_a_folder_of_runs_names_one(capsys, tmp_path):
     run = tmp_path / "baseline" / "seed_0"
     run.mkdir(parents=True)
     (run / "config.json").write_text("{}")
+    shutil.copytree(run, run.with_name("seed_0 copy"))  # made by a file manager, and no seed
     assert f"holds no run itself, but 1 below it: give one, such as {run}" in refused(["render", str(tmp_path)], capsys)
 
 
