@@ -17,6 +17,7 @@ from reference_trainer.cli.options import (
     Trust,
     check_model,
     check_out,
+    check_ply,
     place_of,
 )
 from reference_trainer.cli.training import PORT, Lpips
@@ -249,6 +250,7 @@ class Bake:
 
     def check(self) -> None:
         """Refuse what cannot work, before anything heavy is imported."""
+        check_ply(self.ply)
         check_model(self.ply, OrbitOptions())
 
     def __call__(self) -> None:
@@ -295,10 +297,8 @@ class Clean:
 
     def check(self) -> None:
         """Refuse what cannot work, before anything heavy is imported."""
-        place = place_of(self.ply, self.scene, self.orbit)
-        if place is None:
-            raise ValueError(f"{self.ply} is no PLY: give the point_cloud.ply of a run.")
-        check_model(self.ply, place)
+        check_ply(self.ply)
+        check_model(self.ply, place_of(self.ply, self.scene, self.orbit))
 
     def __call__(self) -> None:
         from reference_trainer.runs.edit_ply import clean_ply

@@ -17,8 +17,8 @@ from reference_trainer.runs.folder import CONFIG, check_output, check_run, read_
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 
 __all__ = [
-    "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_out", "check_scenes",
-    "place_of", "refuse_old_options",
+    "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_out", "check_ply",
+    "check_scenes", "place_of", "refuse_old_options",
 ]  # fmt: skip
 
 
@@ -114,6 +114,12 @@ def check_model(source: Path, place: SceneOptions | OrbitOptions | None) -> None
         raise FileNotFoundError(f"there is no file {source}: expected a standard 3DGS .ply, or the folder of a run.")
     elif isinstance(place, SceneOptions):
         check_scenes([place.path])
+
+
+def check_ply(source: Path) -> None:
+    """Refuse the folder of a run, or another file, where a command takes a PLY alone, with a ValueError."""
+    if not is_ply(source):
+        raise ValueError(f"{source} is no PLY: give one, such as the point_cloud.ply of a run.")
 
 
 def check_out(out: Path | None, source: Path, place: SceneOptions | OrbitOptions | None = None) -> None:

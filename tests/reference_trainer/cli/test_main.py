@@ -230,6 +230,8 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["evaluate", "a.ply", "--size", "0"], "size of at least 1 pixel"),
         (["view", "a.ply", "--arc", "nan"], "an arc in (0, 360] degrees, got cameras=8, size=384 and arc=nan"),
         (["bake", "nowhere.ply"], "there is no file nowhere.ply: expected a standard 3DGS .ply"),
+        (["bake", "run"], "run is no PLY: give one, such as the point_cloud.ply of a run"),
+        (["clean", "run"], "run is no PLY: give one, such as the point_cloud.ply of a run"),
         (["poses", "nowhere"], "there is no folder nowhere"),
         (["plan", "nowhere"], "there is no scene folder nowhere"),
         (["compare", "nowhere"], "there is no scene folder nowhere"),
