@@ -167,9 +167,10 @@ def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
     if folder.is_dir() and all(path.is_file() for path in paths.values()):
         return paths
     files = list_images(folder)
-    by_stem = {file.stem: file for file in files}
-    if len(by_stem) == len(files) and all(Path(name).stem in by_stem for name in names):
-        return {name: by_stem[Path(name).stem] for name in names}
+    by_stem, stems = {file.stem: file for file in files}, {name: Path(name).stem for name in names}
+    unique = len(by_stem) == len(files) and len(set(stems.values())) == len(names)  # not so for two folders of cameras
+    if unique and by_stem.keys() >= set(stems.values()):
+        return {name: by_stem[stem] for name, stem in stems.items()}
     if len(files) == len(names):
         return dict(zip(sorted(names), files, strict=True))
     missing = [name for name in names if not paths[name].is_file()]

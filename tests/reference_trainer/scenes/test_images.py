@@ -106,6 +106,13 @@ def test_match_images_by_name_stem_and_order(tmp_path):
         match_images(tmp_path / "a", ["IMG_1.JPG", "IMG_2.JPG"])
 
 
+def test_photographs_of_one_name_in_two_folders_are_not_one_file(tmp_path, save_image):
+    for number in range(3):
+        save_image(tmp_path / "small" / f"{number}.png", np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(ValueError, match="Choose another image folder"):
+        match_images(tmp_path / "small", ["left/0.jpg", "right/0.jpg"])
+
+
 def test_list_images_refuses_empty_and_missing_folders(tmp_path):
     touch(tmp_path, "notes.txt")
     with pytest.raises(ValueError, match=r"holds no images .* convert others, such as HEIC"):
