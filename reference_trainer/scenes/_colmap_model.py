@@ -127,62 +127,45 @@ def view_matrix_from_quaternion(qvec: Sequence[float], tvec: Sequence[float]) ->
     return matrix
 
 
-@dataclass(frozen=True)
-class ColmapImage:
+class ColmapImage(NamedTuple):
     """One registered image: its number, path within the image folder, camera number and pose (4, 4), float64.
 
-    Its 2D features lie at ``keypoints`` (K, 2), pixels, float64, and observe the 3D points numbered ``point_ids``
-    (K,), -1 for none. Raises ValueError if a feature has no finite position.
+    Its 2D features, most of the file, are not read.
     """
 
     id: int
     name: str
     camera_id: int
     world_to_camera: NDArray[np.float64]
-    keypoints: NDArray[np.float64]
-    point_ids: NDArray[np.int64]
-
-    def __post_init__(self) -> None:
-        if not np.isfinite(self.keypoints).all():
-            raise ValueError(f"image {self.id} ({self.name!r}) has features without a finite position.")
 
 
-@dataclass(frozen=True)
-class ColmapPoints:
-    """The M triangulated points: numbers (M,), world coordinates (M, 3), float64, and RGB (M, 3), uint8.
+class ColmapPoints(NamedTuple):
+    """The M triangulated points: world coordinates (M, 3), float64, and RGB (M, 3), uint8.
 
     ``tracks`` holds, for each point, an int64 array of the numbers of the images that observe it; the array is empty
-    if the reconstruction does not say. Raises ValueError if a position is not finite.
+    if the reconstruction does not say.
     """
 
-    ids: NDArray[np.int64]
     positions: NDArray[np.float64]
     colors: NDArray[np.uint8]
     tracks: tuple[NDArray[np.int64], ...]
-
-    def __post_init__(self) -> None:
-        bad = self.ids[~np.isfinite(self.positions).all(axis=1)]
-        if len(bad):
-            raise ValueError(f"{len(bad)} of {len(self.ids)} points have no finite position, such as point {bad[0]}.")
 
 
 class PointRecords:
     """Accumulates the points of a file in compact arrays: as Python objects they would take ten times the memory."""
 
     def __init__(self) -> None:
-        self._ids, self._positions, self._colors = array("q"), array("d"), array("B")
-        self._images, self._ends = array("q"), array("q")
+        self._positions, self._colors, self._images, self._ends = (array(kind) for kind in "dBqq")
 
-    def add(self, number: int, position: Sequence[float], color: Sequence[int], images: NDArray[np.integer]) -> None:
+    def add(self, position: Sequence[float], color: Sequence[int], images: NDArray[np.integer]) -> None:
         """Add a point and the numbers of the images in its track.
 
         Raises:
             ValueError: if there are not three coordinates and three colors.
-            OverflowError: if a number does not fit 64 bits, or a color a byte.
+            OverflowError: if a color does not fit a byte.
         """
         if len(position) != 3 or len(color) != 3:
             raise ValueError(f"a point has three coordinates and three colors, got {[*position]} and {[*color]}.")
-        self._ids.append(number)
         self._positions.extend(position)
         self._colors.extend(color)
         self._images.frombytes(images.astype(np.int64).tobytes())
@@ -191,9 +174,11 @@ class PointRecords:
     def finish(self) -> ColmapPoints:
         """Return the points. Raises ValueError if a position is not finite."""
         images = np.asarray(self._images, np.int64)
+        positions = np.asarray(self._positions, np.float64).reshape(-1, 3)
+        if bad := int((~np.isfinite(positions)).any(axis=1).sum()):
+            raise ValueError(f"{bad} of {len(positions)} points have no finite position.")
         return ColmapPoints(
-            np.asarray(self._ids, np.int64),
-            np.asarray(self._positions, np.float64).reshape(-1, 3),
+            positions,
             np.asarray(self._colors, np.uint8).reshape(-1, 3),
             tuple(images[start:end] for start, end in zip([0, *self._ends], self._ends, strict=False)),
         )
@@ -233,7 +218,7 @@ class ColmapModel:
         return frozenset(names.get(i, f"<image {i}>") for i in used)
 
 
-_KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+_FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _TRACK = np.dtype([("image", "<i4"), ("feature", "<i4")])
 
 
@@ -303,9 +288,9 @@ def read_images_binary(path: Path) -> list[ColmapImage]:
     images = []
     for _ in cursor.records(64 + 1 + 8, "images"):
         number, *pose, camera = cursor.take("i7di", "an image")
-        name, keypoints = cursor.text("the name of an image"), cursor.array(_KEYPOINT, "features")
-        xy, points = keypoints["xy"].astype(np.float64), keypoints["point"].astype(np.int64)
-        images.append(ColmapImage(number, name, camera, view_matrix_from_quaternion(pose[:4], pose[4:]), xy, points))
+        name = cursor.text("the name of an image")
+        cursor.array(_FEATURE, "features")
+        images.append(ColmapImage(number, name, camera, view_matrix_from_quaternion(pose[:4], pose[4:])))
     return images
 
 
@@ -314,8 +299,8 @@ def read_points_binary(path: Path) -> ColmapPoints:
     cursor = _Cursor(path)
     points = PointRecords()
     for _ in cursor.records(43 + 8, "points"):
-        number, x, y, z, red, green, blue, _error = cursor.take("q3d3Bd", "a point")
-        points.add(number, (x, y, z), (red, green, blue), cursor.array(_TRACK, "track elements")["image"])
+        _number, *numbers, _error = cursor.take("q3d3Bd", "a point")
+        points.add(numbers[:3], numbers[3:], cursor.array(_TRACK, "track elements")["image"])
     return points.finish()
 
 
@@ -354,12 +339,6 @@ def _records(path: Path) -> Iterator[tuple[int, str]]:
     return ((number, line) for number, line in _lines(path) if line)
 
 
-def _numbers(text: str, kind: type[float] | type[int]) -> NDArray[Any]:
-    """Read words as numbers, one at a time: a list of all words would take 30 times the memory of the text."""
-    words = (kind(word[0]) for word in re.finditer(r"\S+", text))
-    return np.fromiter(words, np.float64 if kind is float else np.int64)
-
-
 def _damaged(path: Path, number: int, error: Exception) -> ValueError:
     """Return an error that names the line that could not be read."""
     return ValueError(f"{path}, line {number}, is truncated or not COLMAP text: {error}")
@@ -385,18 +364,13 @@ def read_images_text(path: Path) -> list[ColmapImage]:
     for number, line in lines:
         if not line and not images:  # blank lines at the beginning
             continue
-        _, second = next(lines, (0, ""))
+        next(lines, None)  # its features
         if not line:  # and at the end
             continue
         try:
             words = line.split(maxsplit=9)  # a name may contain spaces
             matrix = view_matrix_from_quaternion([*map(float, words[1:5])], [*map(float, words[5:8])])
-            features = _numbers(second, float).reshape(-1, 3)
-            if not (np.abs(features[:, 2]) <= 2**53).all():  # also refuses nan
-                raise ValueError("a feature has no number of a point.")
-            # The ids go through float64, which is exact up to 2^53.
-            points = features[:, 2].astype(np.int64)
-            images.append(ColmapImage(int(words[0]), words[9], int(words[8]), matrix, features[:, :2], points))
+            images.append(ColmapImage(int(words[0]), words[9], int(words[8]), matrix))
         except (ValueError, IndexError) as error:
             raise _damaged(path, number, error) from error
     return images
@@ -412,8 +386,10 @@ def read_points_text(path: Path) -> ColmapPoints:
             if not all(0 <= x <= 255 for x in color):
                 raise ValueError(f"a color must be three numbers from 0 to 255, got {color}.")
             float(words[7])  # the reprojection error, unused but required
-            track = _numbers(words[8] if len(words) > 8 else "", int).reshape(-1, 2)[:, 0]
-            points.add(int(words[0]), [float(word) for word in words[1:4]], color, track)
+            # One word at a time: a list of all of them would take 30 times the memory of the text.
+            track = (int(word[0]) for word in re.finditer(r"\S+", words[8] if len(words) > 8 else ""))
+            images = np.fromiter(track, np.int64).reshape(-1, 2)[:, 0]
+            points.add([float(word) for word in words[1:4]], color, images)
         except (ValueError, IndexError, OverflowError) as error:
             raise _damaged(path, number, error) from error
     return points.finish()

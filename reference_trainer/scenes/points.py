@@ -121,7 +121,7 @@ def colmap_points(folder: Path) -> PointCloud | None:
         ValueError: if a file is damaged.
     """
     model = read_colmap(folder)
-    if len(model.points.ids):
+    if len(model.points.positions):
         positions = torch.from_numpy(model.points.positions).to(torch.float32)
         colors = torch.from_numpy(model.points.colors).to(torch.float32) / 255
         return PointCloud(positions, colors, source=str(folder), seen_by=model.seen_by())

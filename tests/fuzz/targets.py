@@ -35,9 +35,8 @@ NAMES = [f"r_{i}.png" for i in range(samples.VIEWS)]
 
 def _model_fits(model: Any) -> None:
     points = model.points
-    assert len(points.ids) == len(points.positions) == len(points.colors) == len(points.tracks)
+    assert len(points.positions) == len(points.colors) == len(points.tracks)
     assert points.positions.shape[1:] == points.colors.shape[1:] == (3,)
-    assert all(image.keypoints.shape == (len(image.point_ids), 2) for image in model.images)
     assert all(np.allclose(i.world_to_camera[:3, :3] @ i.world_to_camera[:3, :3].T, np.eye(3)) for i in model.images)
 
 
