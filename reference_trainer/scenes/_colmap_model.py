@@ -155,7 +155,7 @@ class PointRecords:
     """Accumulates the points of a file in compact arrays: as Python objects they would take ten times the memory."""
 
     def __init__(self) -> None:
-        self._positions, self._colors, self._images, self._ends = (array(kind) for kind in "dBqq")
+        self._positions, self._colors, self._images, self._ends = array("d"), array("B"), array("q"), array("q")
 
     def add(self, position: Sequence[float], color: Sequence[int], images: NDArray[np.integer]) -> None:
         """Add a point and the numbers of the images in its track.
