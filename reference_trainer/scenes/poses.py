@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from reference_trainer.progress import progress_bar
+from reference_trainer.scenes._colmap_model import CAMERA_MODELS
 from reference_trainer.scenes.colmap import colmap_folders
 from reference_trainer.scenes.images import check_image, image_size, list_images, unreadable_photographs
 
@@ -83,11 +84,14 @@ def find_poses(
     Raises:
         ImportError: if pycolmap is missing.
         FileNotFoundError: if there is no such folder.
-        ValueError: if it holds fewer than two photographs, one is damaged or unknown to COLMAP, or they show too little
-            in common for any camera.
+        ValueError: if it holds fewer than two photographs, one is damaged or unknown to COLMAP, they show too little in
+            common for any camera, or there is no such camera model.
         FileExistsError: if the scene has cameras already.
         OSError: if it cannot be written.
     """
+    known = [model.name for model in CAMERA_MODELS]
+    if camera is not None and camera not in known:
+        raise ValueError(f"there is no camera model {camera!r}; choose one of {', '.join(known)}.")
     scene = Path(scene)
     out = scene if out is None else Path(out)
     photos = list_images(scene / "images" if (scene / "images").is_dir() else scene)

@@ -105,6 +105,11 @@ def test_photographs_with_nothing_in_common(noise):
     assert sorted(path.name for path in noise.iterdir()) == ["0.png", "1.png", "2.png"]
 
 
+def test_an_unknown_camera_model_is_answered_with_those_that_there_are(noise):
+    with pytest.raises(ValueError, match=r"no camera model 'opencv'; choose one of SIMPLE_PINHOLE, .*, OPENCV,"):
+        find_poses(noise, camera="opencv")
+
+
 def test_without_pycolmap(noise, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(SystemExit) as stop:
