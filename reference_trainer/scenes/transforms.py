@@ -134,11 +134,16 @@ def _world_to_camera(entry: dict[str, Any], back: NDArray[np.float64]) -> torch.
         raise ValueError(f"transform_matrix of {entry['file_path']}: {error}") from error
 
 
-def _points(path: Path, content: dict[str, Any], frames: list[Frame]) -> PointCloud | None:
+def _points(path: Path, content: dict[str, Any], frames: list[Frame], options: SceneOptions) -> PointCloud | None:
     """Read the points that the file names, if any: in the world of its matrices, and possibly from any image."""
-    if "ply_file_path" not in content:
+    if "ply_file_path" not in content or options.init is not None or options.points.startswith("random"):
         return None
-    cloud = ply_points(_inside(path.parent, str(content["ply_file_path"])))
+    file = _inside(path.parent, str(content["ply_file_path"]))
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"{path} names the points {file}, which are not there: copy them, or say --points random."
+        )
+    cloud = ply_points(file)
     back = torch.from_numpy(np.linalg.inv(_applied(content))).to(cloud.positions)
     positions = cloud.positions @ back[:3, :3].T + back[:3, 3]
     return PointCloud(positions, cloud.colors, cloud.source, frozenset(frame.name for frame in frames))
@@ -148,7 +153,7 @@ def _read_transforms(root: Path, options: SceneOptions) -> Capture:
     """Read a scene of one file."""
     path = root / "transforms.json"
     frames, content = read_transforms(path, options.images), read_json(path)
-    points, split = _points(path, content, frames), "transforms" if "train_filenames" in content else "llff"
+    points, split = _points(path, content, frames, options), "transforms" if "train_filenames" in content else "llff"
     return Capture(sorted(frames, key=lambda frame: frame.name), points=points, split=split)
 
 

@@ -162,6 +162,16 @@ def test_nerfstudio(nerfstudio):
     assert straight.train[0].camera.cx == 33
 
 
+def test_points_that_are_not_there_are_no_obstacle_to_others(nerfstudio):
+    (nerfstudio / "sparse_pc.ply").unlink()
+    with pytest.raises(
+        FileNotFoundError, match=r"transforms\.json names the points .*sparse_pc\.ply, .* --points random"
+    ):
+        load_scene(SceneOptions(nerfstudio))
+    _, read = find_format(nerfstudio, "auto")
+    assert read(nerfstudio, SceneOptions(nerfstudio, points="random")).points is None
+
+
 def _change(path, **entries):
     path.write_text(json.dumps(json.loads(path.read_text()) | entries))
 
