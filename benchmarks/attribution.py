@@ -16,10 +16,11 @@ import tyro
 from torch import Tensor
 
 from ca_reg import CAResult, Reason
+from ca_reg.attribution import total_effects
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE, ca_picture
 from reference_trainer.evaluation.pictures import file_names, save_png, side_by_side
 from reference_trainer.evaluation.results import machine, write_json
-from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE, Heat, colored_by, concentration, mean_effects
+from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE, Heat, colored_by, concentration
 from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing, write_text
@@ -88,8 +89,10 @@ def study_attribution(
         raise ValueError(f"the scene of {run} has no {split} view: give --split train.")
     heat = Heat.of(model, views, drop_rate=drop_rate)
     shares, weights, results = heat.shares, heat.weights, heat.results
-    effects = mean_effects(model, views, drop_rate=drop_rate)
     values = [result.value for result in results if result.reason is Reason.OK]
+    score = model.exact_ca_score(drop_rate=drop_rate)
+    found = [total_effects(score, model.gaussians.opacities, view).effects for view in views]  # 0 without a score
+    effects = torch.stack(found).sum(0) / len(values)
     scales = {
         "share": [end * shares.mean().item() for end in _SHARE_SCALE],
         "share_per_weight": [end * heat.mean for end in PER_WEIGHT_SCALE],

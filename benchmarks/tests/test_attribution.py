@@ -13,7 +13,7 @@ from benchmarks import attribution as shares_module
 from benchmarks.attribution import study_attribution
 from ca_reg import Reason
 from reference_trainer.evaluation.results import write_json
-from reference_trainer.evaluation.shares import blend_weights, colored_by, concentration, mean_effects, mean_shares
+from reference_trainer.evaluation.shares import blend_weights, colored_by, concentration, mean_shares
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply
@@ -170,7 +170,6 @@ def test_a_view_without_a_score_does_not_count(run):
     both, results = mean_shares(model, [away, view])
     assert [result.reason is Reason.OK for result in results] == [False, True]
     assert torch.equal(both, alone)
-    assert torch.equal(mean_effects(model, [away, view]), mean_effects(model, [view]))
     for views in ([away], []):
         with pytest.raises(ValueError, match=f"none of the {len(views)} views has a score"):
             mean_shares(model, views)

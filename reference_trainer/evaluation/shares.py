@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from ca_reg import CAResult, Reason, attribute
-from ca_reg.attribution import hanging, total_effects
+from ca_reg.attribution import hanging
 from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
@@ -20,7 +20,7 @@ from reference_trainer.scenes.virtual_cameras import unseen_views
 
 __all__ = [
     "PER_WEIGHT_SCALE", "Guard", "Heat", "all_but_highest", "blend_weights", "colored_by", "concentration", "guard",
-    "mean_effects", "mean_shares", "share_per_weight", "unseen_shares",
+    "mean_shares", "share_per_weight", "unseen_shares",
 ]  # fmt: skip
 
 PER_WEIGHT_SCALE = (0.1, 10.0)
@@ -191,13 +191,18 @@ def mean_shares(
         ValueError: if no view has a score.
     """
     score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
-    return _mean_over_views(lambda view: attribute(score, model.shares, opacities, view), views)
-
-
-def mean_effects(model: TrainedModel, views: Sequence[Viewpoint], *, drop_rate: float = 0.5) -> Tensor:
-    """Return the total effects of the Gaussians, averaged as the shares in `mean_shares`."""
-    score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
-    return _mean_over_views(lambda view: total_effects(score, opacities, view), views)[0]
+    total, results = torch.zeros_like(opacities, dtype=torch.float64), []
+    for view in views:
+        shares, result = attribute(score, model.shares, opacities, view)
+        results.append(result)
+        total += shares  # 0 without a score
+    count = sum(result.reason is Reason.OK for result in results)
+    if count == 0:
+        raise ValueError(
+            f"none of the {len(views)} views has a score to attribute, because no pixel has an expected alpha above "
+            "the threshold: choose the other split, or a lower drop rate."
+        )
+    return total / count, results
 
 
 def concentration(shares: Tensor) -> dict[str, float]:
@@ -217,21 +222,3 @@ def concentration(shares: Tensor) -> dict[str, float]:
     held, n = held / held[-1], len(shares)
     found = {f"top {part:.1%}".replace(".0%", "%"): held[max(1, round(part * n)) - 1].item() for part in _TOP}
     return {**found, "half": (int((held < 0.5).sum()) + 1) / n}
-
-
-def _mean_over_views(
-    measure: Callable[[Viewpoint], tuple[Tensor, CAResult]], views: Sequence[Viewpoint]
-) -> tuple[Tensor, list[CAResult]]:
-    """Measure every view; return the mean over those that have a score, and all results."""
-    total, results = torch.zeros(()), []
-    for view in views:
-        values, result = measure(view)
-        results.append(result)
-        total = total.to(values) + values  # values are 0 without a score
-    count = sum(result.reason is Reason.OK for result in results)
-    if count == 0:
-        raise ValueError(
-            f"none of the {len(views)} views has a score to attribute, because no pixel has an expected alpha above "
-            "the threshold: choose the other split, or a lower drop rate."
-        )
-    return total / count, results
